@@ -1,0 +1,1 @@
+"""evermap keeps landmark maps true while the world changes."""

@@ -1,0 +1,92 @@
+"""Planar rigid motions as arrays of `(x, y, theta)`; every function broadcasts over leading axes.
+
+Right-perturbation convention: `pose * exp(xi)` with `xi = (forward, left, turn)`, the one of `types`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.types import FloatArray
+
+
+def wrap(angle_rad: ArrayLike) -> FloatArray:
+    """Angles wrapped to (-pi, pi]."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
+
+
+def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
+    """`a * b`: the pose `b`, given in the frame `a`. Shapes (..., 3), broadcast."""
+    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def inverse(a: ArrayLike) -> FloatArray:
+    """The motion that undoes `a`. Shape (..., 3)."""
+    a = np.asarray(a, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -c * a[..., 0] - s * a[..., 1]
+    y = s * a[..., 0] - c * a[..., 1]
+    return np.stack([x, y, wrap(-a[..., 2])], axis=-1)
+
+
+def between(a: ArrayLike, b: ArrayLike) -> FloatArray:
+    """`a^-1 * b`: the pose `b` seen from `a`. Shapes (..., 3), broadcast."""
+    return compose(inverse(a), b)
+
+
+def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
+    """Points (..., 2) of the frame `pose` in the frame that `pose` is given in."""
+    pose, point = np.asarray(pose, dtype=np.float64), np.asarray(point, dtype=np.float64)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    x = pose[..., 0] + c * point[..., 0] - s * point[..., 1]
+    y = pose[..., 1] + s * point[..., 0] + c * point[..., 1]
+    return np.stack([x, y], axis=-1)
+
+
+def exp(twist: ArrayLike) -> FloatArray:
+    """Motion along a constant twist (forward, left, turn) for unit time. Shape (..., 3)."""
+    twist = np.asarray(twist, dtype=np.float64)
+    turn = twist[..., 2]
+    sinc = np.sinc(turn / np.pi)
+    # (1 - cos w) / w = sin(w/2) sinc(w/2): no cancellation at w = 0
+    cosc = np.sin(turn / 2) * np.sinc(turn / (2 * np.pi))
+    x = sinc * twist[..., 0] - cosc * twist[..., 1]
+    y = cosc * twist[..., 0] + sinc * twist[..., 1]
+    return np.stack([x, y, wrap(turn)], axis=-1)
+
+
+def log(pose: ArrayLike) -> FloatArray:
+    """The twist whose `exp` is `pose`, of smallest turn. Shape (..., 3)."""
+    pose = np.asarray(pose, dtype=np.float64)
+    turn = wrap(pose[..., 2])
+    half = turn / 2
+    small = np.abs(half) < 1e-6
+    safe = np.where(small, 1.0, half)
+    cot = np.where(small, 1.0 - half**2 / 3.0, safe / np.tan(safe))
+    x = cot * pose[..., 0] + half * pose[..., 1]
+    y = -half * pose[..., 0] + cot * pose[..., 1]
+    return np.stack([x, y, turn], axis=-1)
+
+
+def adjoint(pose: ArrayLike) -> FloatArray:
+    """Adjoint matrices (..., 3, 3): `pose * exp(xi) = exp(Ad xi) * pose`."""
+    pose = np.asarray(pose, dtype=np.float64)
+    c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    out = np.zeros((*pose.shape[:-1], 3, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = c, -s, pose[..., 1]
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = s, c, -pose[..., 0]
+    out[..., 2, 2] = 1.0
+    return out
+
+
+def rotation(angle_rad: ArrayLike) -> FloatArray:
+    """Rotation matrices (..., 2, 2)."""
+    angle = np.asarray(angle_rad, dtype=np.float64)
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

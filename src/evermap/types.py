@@ -1,0 +1,345 @@
+"""The nouns of evermap: frozen dataclasses of arrays, one row an item. Imports nothing of ours.
+
+Conventions that hold everywhere:
+
+* units are seconds, metres and radians, and stand in the name (`stamp_s`, `range_m`, `bearing_rad`);
+* frames stand in the name: `pose_world_robot` maps robot coordinates to world coordinates and is `(x, y, theta)`;
+* covariances of poses are in the robot's own frame (right perturbation: `pose * exp(xi)`, `xi = (forward, left, turn)`);
+* every stamp says its clock; arrays are C-contiguous float64 or int64; unknown ids are `UNKNOWN` (-1);
+* what was *not* seen is data: `Frames` lists every instant at which the sensor looked, `Misses` what it should have seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+UNKNOWN: int = -1
+"""Id of a landmark or class that is not known."""
+
+
+class Clock(StrEnum):
+    """What a stamp counts. Stamps of different clocks are never compared."""
+
+    UNIX = "unix"
+    """Seconds since 1970-01-01 UTC."""
+    RECORDING = "recording"
+    """Seconds since an arbitrary start, monotonic within one recording."""
+    LOCAL_WALL = "local_wall"
+    """Seconds since 1970-01-01 as the clocks on the wall show them (for daily rhythms)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """Body velocities; row `i` holds from `stamp_s[i]` until `stamp_s[i + 1]` (zero-order hold).
+
+    Attributes:
+        stamp_s: (N,) strictly increasing.
+        forward_mps: (N,) velocity along the robot's x axis.
+        lateral_mps: (N,) velocity along its y axis (zeros for a differential drive).
+        angular_radps: (N,) turn rate, counter-clockwise positive.
+    """
+
+    stamp_s: FloatArray
+    forward_mps: FloatArray
+    lateral_mps: FloatArray
+    angular_radps: FloatArray
+    clock: Clock = Clock.RECORDING
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Frames:
+    """Every instant at which the sensor looked, also when it saw nothing.
+
+    Attributes:
+        stamp_s: (F,) strictly increasing.
+        complete: False where the recording does not log empty frames (then absence of a frame is no evidence).
+    """
+
+    stamp_s: FloatArray
+    complete: bool = True
+    clock: Clock = Clock.RECORDING
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Detections:
+    """Hits: one row a detection, sorted by frame.
+
+    Attributes:
+        frame: (M,) row of `Frames`.
+        landmark_id: (M,) identity given by the front end, or `UNKNOWN`.
+        range_m: (M,) distance from the sensor, as reported (uncalibrated).
+        bearing_rad: (M,) counter-clockwise from the sensor's x axis, as reported.
+        class_id: (M,) row of `Recording.class_names`, or `UNKNOWN`.
+        sigma_range_m, sigma_bearing_rad: (M,) standard deviations given for this very detection, nan where none is.
+        source_line: (M,) line in the input file, for messages; 0 where there is none.
+    """
+
+    frame: IntArray
+    landmark_id: IntArray
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    class_id: IntArray
+    sigma_range_m: FloatArray
+    sigma_bearing_rad: FloatArray
+    source_line: IntArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class Misses:
+    """Misses: landmarks that were expected in a frame and not detected; one row a (frame, landmark).
+
+    Attributes:
+        frame: (K,) row of `Frames`.
+        landmark_id: (K,) the landmark that was expected.
+        p_detect: (K,) probability with which it would have been detected, were it there.
+    """
+
+    frame: IntArray
+    landmark_id: IntArray
+    p_detect: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What the sensor can see and how well: limits and nominal noise of a range-bearing sensor.
+
+    Attributes:
+        range_min_m, range_max_m: limits of the range.
+        bearing_min_rad, bearing_max_rad: limits of the field of view.
+        sigma_range_m, sigma_bearing_rad: nominal noise, a starting value where noise is estimated; None = unknown.
+        p_detect: probability of detecting a landmark in view; p_false: probability of a false detection a frame.
+        mount_robot_sensor: pose (x, y, theta) of the sensor in the robot's frame.
+    """
+
+    range_min_m: float = 0.0
+    range_max_m: float = float("inf")
+    bearing_min_rad: float = -float(np.pi)
+    bearing_max_rad: float = float(np.pi)
+    sigma_range_m: float | None = None
+    sigma_bearing_rad: float | None = None
+    p_detect: float = 0.9
+    p_false: float = 0.01
+    mount_robot_sensor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotSightings:
+    """Sightings of other robots: read and reported, not used as landmarks. One row a sighting."""
+
+    stamp_s: FloatArray
+    robot_id: IntArray
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    clock: Clock = Clock.RECORDING
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Stamped planar poses.
+
+    Attributes:
+        stamp_s: (N,) strictly increasing.
+        pose_world_robot: (N, 3) x [m], y [m], theta [rad, wrapped to (-pi, pi]].
+        covariance: (N, 3, 3) in the robot's frame (right perturbation); zeros where the poses are exact.
+        frame: what 'world' is: 'first_pose', 'prior_map' or 'truth'.
+    """
+
+    stamp_s: FloatArray
+    pose_world_robot: FloatArray
+    covariance: FloatArray
+    frame: str = "first_pose"
+    clock: Clock = Clock.RECORDING
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """Map records, one row a landmark, sorted by id. Estimates, a prior map and surveyed truth share this form.
+
+    Attributes:
+        landmark_id: (L,) unique.
+        position_m: (L, 2) in the map's frame.
+        covariance_m2: (L, 2, 2); zeros where exact.
+        class_id: (L,) row of `class_names`, or `UNKNOWN`.
+        p_exists: (L,) probability that it is there now.
+        n_hits, n_misses: (L,) detections used, and expected detections that did not come.
+        first_seen_s, last_seen_s: (L,) stamps, nan where never seen.
+        frame: what the coordinates refer to, as in `Trajectory.frame`.
+    """
+
+    landmark_id: IntArray
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    class_id: IntArray
+    p_exists: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+    first_seen_s: FloatArray
+    last_seen_s: FloatArray
+    class_names: tuple[str, ...] = ()
+    frame: str = "first_pose"
+    clock: Clock = Clock.RECORDING
+
+    def __len__(self) -> int:
+        return len(self.landmark_id)
+
+    @classmethod
+    def at(
+        cls,
+        landmark_id: Any,
+        position_m: Any,
+        *,
+        sigma_m: Any = 0.0,
+        class_id: Any = None,
+        class_names: tuple[str, ...] = (),
+        frame: str = "truth",
+    ) -> Landmarks:
+        """Known positions with one standard deviation each (scalar, (L,) or (L, 2) metres), e.g. a surveyed map."""
+        ids = np.asarray(landmark_id, dtype=np.int64)
+        order = np.argsort(ids, kind="stable")
+        count = len(ids)
+        sigma = np.asarray(sigma_m, dtype=np.float64)
+        sigma = np.broadcast_to(sigma[:, None] if sigma.ndim == 1 else sigma, (count, 2))[order]
+        covariance = np.zeros((count, 2, 2))
+        covariance[:, [0, 1], [0, 1]] = sigma**2
+        classes = np.full(count, UNKNOWN) if class_id is None else np.asarray(class_id, dtype=np.int64)
+        return cls(
+            landmark_id=ids[order],
+            position_m=np.asarray(position_m, dtype=np.float64).reshape(count, 2)[order],
+            covariance_m2=covariance,
+            class_id=classes[order],
+            p_exists=np.ones(count),
+            n_hits=np.zeros(count, dtype=np.int64),
+            n_misses=np.zeros(count, dtype=np.int64),
+            first_seen_s=np.full(count, np.nan),
+            last_seen_s=np.full(count, np.nan),
+            class_names=class_names,
+            frame=frame,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One robot's session: what a reader returns and the pipeline consumes.
+
+    Attributes:
+        name: short label, e.g. 'MRCLAM_Dataset6 robot 1'.
+        truth: reference trajectory, for evaluation only; None where unknown, may cover a part of the recording.
+        true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
+        robot_sightings: sightings of other robots, reported only.
+        warnings: counted, human-readable remarks of the reader ('3 detections of unknown barcodes dropped').
+        source: where it was read from.
+    """
+
+    name: str
+    odometry: Odometry
+    frames: Frames
+    detections: Detections
+    sensor: Sensor = field(default_factory=Sensor)
+    truth: Trajectory | None = None
+    true_landmarks: Landmarks | None = None
+    robot_sightings: RobotSightings | None = None
+    class_names: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    source: str = ""
+    clock: Clock = Clock.RECORDING
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterEstimate:
+    """One calibration state or noise level: what was assumed, what the recording says.
+
+    Attributes:
+        name: e.g. 'odometry_delay_s', 'range_bias_m', 'sigma_range_m'.
+        value, sigma: estimate and standard deviation (0 where fixed).
+        prior_mean, prior_sigma: the weak prior; nan where there is none.
+        unit: 's', 'm', 'rad', '1' ...
+        fixed: True where the configuration fixed it.
+        meaning: half a sentence for the report.
+    """
+
+    name: str
+    value: float
+    sigma: float
+    prior_mean: float
+    prior_sigma: float
+    unit: str
+    fixed: bool = False
+    meaning: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Innovations:
+    """What each detection said before it was used: one row a detection that had a prediction.
+
+    Attributes:
+        stamp_s: (K,) frame stamps.
+        detection: (K,) row of `Recording.detections`.
+        landmark_id: (K,) landmark it was compared with.
+        nis: (K,) squared Mahalanobis distance of the innovation, chi-square with 2 degrees of freedom if consistent.
+        p_inlier: (K,) final probability that it is no outlier, after smoothing.
+    """
+
+    stamp_s: FloatArray
+    detection: IntArray
+    landmark_id: IntArray
+    nis: FloatArray
+    p_inlier: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class SlamResult:
+    """Everything a run estimated.
+
+    Attributes:
+        trajectory: smoothed poses at every frame that has one, and in between where the gap is long.
+        online: causal poses (what the robot knew at the time), one a frame.
+        landmarks: the map.
+        parameters: calibration states and noise levels.
+        innovations: consistency of every detection.
+        misses: expected and not detected.
+        step_s: (F,) processing time of every step.
+        dead_reckoning: odometry alone from the first pose, at the stamps of `trajectory`.
+        warnings: counted remarks of the estimator.
+        interrupted: True where the run was stopped before the end of the recording.
+    """
+
+    trajectory: Trajectory
+    online: Trajectory
+    landmarks: Landmarks
+    parameters: tuple[ParameterEstimate, ...]
+    innovations: Innovations
+    misses: Misses
+    step_s: FloatArray
+    dead_reckoning: Trajectory
+    warnings: tuple[str, ...] = ()
+    interrupted: bool = False
