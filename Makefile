@@ -1,0 +1,79 @@
+# Everything starts here; nothing is needed but python3 (3.11 or newer) and make.
+#   make demo    set up and run the demonstration       make test    set up and run the tests
+#   make lint    style, formatting and types            make docs-check    run the commands of the documents
+#   make bench   compare with the committed baseline    make clean   remove what make made
+# Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
+PYTHON ?= python3
+VENV ?= .venv
+OUT ?= out/demo
+PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
+RUNTIME = $(VENV)/.stamp-runtime
+DEVELOPMENT = $(VENV)/.stamp-development
+
+.DEFAULT_GOAL := help
+.PHONY: help setup setup-dev demo test test-all lint format docs-check bench lock clean
+
+help:
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 5
+
+setup: $(RUNTIME)
+setup-dev: $(DEVELOPMENT)
+
+demo: $(RUNTIME)
+	$(VENV)/bin/evermap demo --out $(OUT) --force
+
+test: $(DEVELOPMENT)
+	$(VENV)/bin/python -m pytest
+
+test-all: $(DEVELOPMENT)
+	$(VENV)/bin/python -m pytest -m "slow or not slow"
+
+lint: $(DEVELOPMENT)
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+format: $(DEVELOPMENT)
+	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix .
+
+docs-check: $(DEVELOPMENT)
+	$(VENV)/bin/python -m pytest tests/docs -m "slow or not slow"
+
+bench: $(DEVELOPMENT)
+	$(VENV)/bin/evermap bench
+
+# A virtual environment. Debian keeps `venv` in a package of its own: install it where we may, else say so in a line.
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "evermap needs Python 3.11 or newer; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) >/dev/null 2>&1 \
+	  || { rm -rf $(VENV); $(PYTHON) -m virtualenv --quiet $(VENV) >/dev/null 2>&1; } \
+	  || { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+	       && echo "installing python3-venv" && apt-get -qq update >/dev/null \
+	       && DEBIAN_FRONTEND=noninteractive apt-get -qq install --yes python3-venv >/dev/null \
+	       && rm -rf $(VENV) && $(PYTHON) -m venv $(VENV); } \
+	  || { rm -rf $(VENV); echo "evermap needs Python's venv module; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
+
+# The lock files pin every version; the project itself is installed in place, without resolving anything.
+$(RUNTIME): requirements.lock pyproject.toml | $(VENV)/bin/python
+	$(PIP_INSTALL) --requirement requirements.lock
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(DEVELOPMENT): requirements-dev.lock pyproject.toml | $(VENV)/bin/python
+	$(PIP_INSTALL) --requirement requirements-dev.lock
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	@touch $(RUNTIME) $@
+
+# For maintainers: renew the pins. Index addresses are kept out of the files: they are the machine's business.
+COMPILE = $(VENV)/bin/pip-compile --quiet --upgrade --strip-extras --no-header --annotation-style=line \
+          --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
+lock: $(DEVELOPMENT)
+	$(PIP_INSTALL) pip-tools
+	$(COMPILE) --extra rerun --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml
+	$(COMPILE) --extra rerun --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
