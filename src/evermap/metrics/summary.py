@@ -1,0 +1,154 @@
+"""All numbers of a run in one dictionary with stable keys."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
+from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, evaluate_landmarks
+from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
+from evermap.types import FloatArray, Recording, SlamResult
+
+RATE_HZ = 2.0
+ONLINE_MAX_GAP_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A run compared with what is known about the truth; None where nothing is.
+
+    Attributes:
+        poses: smoothed trajectory, after its own alignment.
+        online: causal poses, after their own alignment, where the sensor looked within `ONLINE_MAX_GAP_S`.
+        dead_reckoning: odometry alone, after its own alignment (which flatters it).
+        landmarks: after the alignment of `poses`.
+        landmarks_anchored: after the alignment that makes the first pose exact (for NEES).
+        landmarks_own: after the landmarks' own alignment.
+        nis: innovation consistency.
+    """
+
+    poses: PoseErrors | None
+    online: PoseErrors | None
+    dead_reckoning: PoseErrors | None
+    landmarks: LandmarkErrors | None
+    landmarks_anchored: LandmarkErrors | None
+    landmarks_own: LandmarkErrors | None
+    nis: NisSummary
+
+
+def compare_with_truth(recording: Recording, result: SlamResult) -> Evaluation:
+    """All comparisons that the recording's truth allows. Deterministic."""
+    poses = online = dead_reckoning = landmarks = anchored = own = None
+    if recording.truth is not None:
+        poses = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=RATE_HZ)
+        online = evaluate_trajectory(result.online, recording.truth, rate_hz=RATE_HZ, max_gap_s=ONLINE_MAX_GAP_S)
+        dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=RATE_HZ)
+    if recording.true_landmarks is not None:
+        own = evaluate_landmarks(result.landmarks, recording.true_landmarks, None)
+        if poses is not None:
+            landmarks = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_estimate)
+            if poses.pose_truth_anchor is not None:
+                anchored = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_anchor)
+    return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, summarise_nis(result.innovations))
+
+
+def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
+    """The stable keys of `metrics` in `summary.json`: plain floats, None where there is no truth, no key missing."""
+    poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
+    landmarks, own, nis = evaluation.landmarks, evaluation.landmarks_own, evaluation.nis
+    anchored = evaluation.landmarks_anchored
+    return {
+        "pose_rmse_m": _number(poses and poses.rmse_m),
+        "pose_mean_m": _number(poses and poses.mean_m),
+        "pose_median_m": _number(poses and poses.median_m),
+        "pose_max_m": _number(poses and poses.max_m),
+        "heading_rmse_deg": _number(poses and poses.heading_rmse_deg),
+        "drift_m_per_m": _number(poses and poses.drift_m_per_m),
+        "online_pose_rmse_m": _number(online and online.rmse_m),
+        "online_heading_rmse_deg": _number(online and online.heading_rmse_deg),
+        "dead_reckoning_rmse_m": _number(odometry and odometry.rmse_m),
+        "dead_reckoning_heading_rmse_deg": _number(odometry and odometry.heading_rmse_deg),
+        "landmark_rmse_m": _number(landmarks and landmarks.rmse_m),
+        "landmark_max_m": _number(landmarks and landmarks.max_m),
+        "landmark_rmse_own_alignment_m": _number(own and own.rmse_m),
+        "landmarks_scored": int(own.scored.sum()) if own else None,
+        "landmark_min_sightings": MIN_SIGHTINGS,
+        "nis_mean": _number(nis.mean),
+        "nis_mean_all": _number(nis.mean_all),
+        "nis_median": _number(nis.median),
+        "nis_mean_band": [_number(edge) for edge in nis.mean_band] if nis.mean_band else None,
+        "nis_in_band_share": _number(nis.in_band_share),
+        "nis_in_two_sided_band_share": _number(nis.in_two_sided_band_share),
+        "nis_lag1_autocorrelation": _number(nis.lag1),
+        "nis_count": nis.count,
+        "outlier_share": _number(nis.outlier_share),
+        "pose_nees_mean": _mean(poses.nees if poses else None),
+        "pose_nees_in_band_share": share_in_band(poses.nees) if poses else None,
+        "pose_nees_anchored_mean": _mean(poses.anchored_nees if poses else None),
+        "landmark_nees_mean": _mean(landmarks.nees[landmarks.scored] if landmarks else None),
+        "landmark_nees_in_band_share": share_in_band(landmarks.nees[landmarks.scored]) if landmarks else None,
+        "landmark_nees_anchored_mean": _mean(anchored.nees[anchored.scored] if anchored else None),
+        "alignment": _alignment(evaluation),
+    }
+
+
+def evaluate(recording: Recording, result: SlamResult) -> dict[str, Any]:
+    """`metrics_dict(compare_with_truth(recording, result))`: what the run is worth, ready for JSON."""
+    return metrics_dict(compare_with_truth(recording, result))
+
+
+def _alignment(evaluation: Evaluation) -> dict[str, Any]:
+    """How estimates were brought into the frame of the truth, and how much truth was scored."""
+    out: dict[str, Any] = {
+        "purpose": "evaluation only; nothing of it flows back into the estimate",
+        "rate_hz": RATE_HZ,
+        "method": None,
+        "pose_truth_estimate": None,
+        "pose_truth_dead_reckoning": None,
+        "pose_truth_online": None,
+        "scored_stamps": 0,
+        "scored_from_s": None,
+        "scored_to_s": None,
+        "online_scored_stamps": 0,
+        "online_skipped_stamps": 0,
+    }
+    poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
+    if poses:
+        out |= {
+            "method": poses.alignment,
+            "pose_truth_estimate": _pose(poses.pose_truth_estimate),
+            "scored_stamps": len(poses.stamp_s),
+            "scored_from_s": _number(poses.stamp_s[0]),
+            "scored_to_s": _number(poses.stamp_s[-1]),
+        }
+    if odometry:
+        out["pose_truth_dead_reckoning"] = _pose(odometry.pose_truth_estimate)
+    if online:
+        out |= {
+            "pose_truth_online": _pose(online.pose_truth_estimate),
+            "online_scored_stamps": len(online.stamp_s),
+            "online_skipped_stamps": online.skipped,
+        }
+    return out
+
+
+def _pose(pose: FloatArray) -> dict[str, float | None]:
+    return {"x_m": _number(pose[0]), "y_m": _number(pose[1]), "theta_rad": _number(pose[2])}
+
+
+def _mean(values: FloatArray | None) -> float | None:
+    if values is None or not np.any(np.isfinite(values)):
+        return None
+    return float(np.mean(values[np.isfinite(values)]))
+
+
+def _number(value: Any) -> float | None:
+    """A JSON number: a finite float, or None."""
+    if value is None:
+        return None
+    number = float(value)
+    return number if math.isfinite(number) else None

@@ -1,0 +1,196 @@
+"""Pose errors against a reference trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evermap import se2
+from evermap.metrics.alignment import align_poses, interpolate
+from evermap.metrics.consistency import nees
+from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
+
+_ANCHOR_SLACK_S = 1.0
+"""The truth must begin this close to the first pose for errors to be anchored there."""
+
+_DRIFT_DISTANCE_M = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class PoseErrors:
+    """Errors of a trajectory at K stamps of the truth.
+
+    **Alignment and NEES.** `nees` uses the aligned errors. Alignment removes the three degrees of freedom of the
+    frame, while the covariances of a map made from an unknown start are those relative to its first pose and grow
+    with the distance from it; aligned NEES is therefore too small on average (looks cautious), and only values above
+    the band say anything. `anchored_nees` instead fixes the frame at the first scored pose, the gauge in which the
+    covariances hold: its expectation is 2, but it inherits the truth's own heading error at that one stamp times the
+    distance, and its values are one draw rather than many, so its mean scatters widely. Without alignment (map frame
+    given) `nees` has expectation 2 and `anchored_nees` is None.
+
+    Attributes:
+        stamp_s: (K,) stamps of the truth that were scored.
+        truth, estimate: (K, 3) poses, the estimate interpolated to the stamp and aligned.
+        covariance: (K, 3, 3) of the estimate, in the robot's frame (see `interpolate`).
+        position_error_m: (K,) distances; heading_error_rad: (K,) estimate minus truth, wrapped.
+        pose_truth_estimate: (3,) the alignment, identity if not aligned; align landmarks with this one too.
+        alignment: 'umeyama_se2', 'mean_heading' (robot stood still) or 'none'.
+        nees, anchored_nees: (K,) of the position (2 degrees of freedom), nan where the pose is exact.
+        pose_truth_anchor: (3,) the alignment that makes the first pose exact, None without one.
+        drift_m_per_m: median translation error over 10 m travelled, divided by 10 m; None on shorter runs.
+        skipped: stamps left out because the estimate has no pose near them.
+    """
+
+    stamp_s: FloatArray
+    truth: FloatArray
+    estimate: FloatArray
+    covariance: FloatArray
+    position_error_m: FloatArray
+    heading_error_rad: FloatArray
+    pose_truth_estimate: FloatArray
+    alignment: str
+    nees: FloatArray
+    anchored_nees: FloatArray | None
+    pose_truth_anchor: FloatArray | None
+    drift_m_per_m: float | None
+    skipped: int
+
+    @property
+    def rmse_m(self) -> float:
+        """Translation root mean square error [m]."""
+        return float(np.sqrt(np.mean(self.position_error_m**2)))
+
+    @property
+    def mean_m(self) -> float:
+        """Mean translation error [m]."""
+        return float(np.mean(self.position_error_m))
+
+    @property
+    def median_m(self) -> float:
+        """Median translation error [m]."""
+        return float(np.median(self.position_error_m))
+
+    @property
+    def max_m(self) -> float:
+        """Largest translation error [m]."""
+        return float(np.max(self.position_error_m))
+
+    @property
+    def heading_rmse_deg(self) -> float:
+        """Root mean square heading error [degrees], mean offset included."""
+        return float(np.degrees(np.sqrt(np.mean(self.heading_error_rad**2))))
+
+
+def scored_stamps(truth: Trajectory, first_s: float, last_s: float, rate_hz: float) -> IntArray:
+    """Rows of the truth to score: for every tick of a regular clock the nearest truth stamp, within half a tick.
+
+    Truth is never interpolated; where it has holes nothing is scored.
+    """
+    period_s = 1.0 / rate_hz
+    overlap = np.flatnonzero((truth.stamp_s >= first_s) & (truth.stamp_s <= last_s))
+    if len(overlap) == 0:
+        return overlap.astype(np.int64)
+    stamps = truth.stamp_s[overlap]
+    ticks = np.arange(stamps[0], stamps[-1] + 1e-6, period_s)
+    right = np.clip(np.searchsorted(stamps, ticks), 1, max(len(stamps) - 1, 1))
+    left = right - 1
+    right = np.minimum(right, len(stamps) - 1)
+    nearest = np.where(ticks - stamps[left] <= stamps[right] - ticks, left, right)
+    near = np.abs(stamps[nearest] - ticks) <= 0.5 * period_s + 1e-9
+    return np.asarray(overlap[np.unique(nearest[near])], dtype=np.int64)
+
+
+def evaluate_trajectory(
+    estimate: Trajectory,
+    truth: Trajectory,
+    *,
+    rate_hz: float = 2.0,
+    align: bool = True,
+    max_gap_s: float = float("inf"),
+) -> PoseErrors | None:
+    """Pose errors at stamps of the truth, after an SE(2) alignment without scale; None where they share too little.
+
+    Args:
+        estimate: poses with covariance, dense enough to be interpolated.
+        truth: reference poses.
+        rate_hz: how densely truth is sampled over the overlap.
+        align: estimate rotation and translation on the positions first; False compares as it stands.
+        max_gap_s: leave out stamps whose neighbouring estimates are further apart than this (for causal poses,
+            which exist only where the sensor looked). The whole overlap is scored by default.
+    """
+    if len(estimate) == 0 or len(truth) == 0 or estimate.clock != truth.clock:
+        return None
+    rows = scored_stamps(truth, estimate.stamp_s[0], estimate.stamp_s[-1], rate_hz)
+    raw, covariance, gap_s = interpolate(estimate, truth.stamp_s[rows])
+    usable: BoolArray = gap_s <= max_gap_s
+    skipped = int(np.count_nonzero(~usable))
+    rows, raw, covariance = rows[usable], raw[usable], covariance[usable]
+    if len(rows) < 2:
+        return None
+    stamps, reference = truth.stamp_s[rows], truth.pose_world_robot[rows]
+
+    pose_truth_estimate, how = align_poses(raw, reference) if align else (np.zeros(3), "none")
+    aligned = se2.compose(pose_truth_estimate, raw)
+    anchor = None
+    if align and estimate.frame == "first_pose" and stamps[0] - estimate.stamp_s[0] <= _ANCHOR_SLACK_S:
+        anchor = se2.compose(reference[0], se2.inverse(raw[0]))
+    position_error_m = _ape(aligned, reference)
+    return PoseErrors(
+        stamp_s=stamps,
+        truth=reference,
+        estimate=aligned,
+        covariance=covariance,
+        position_error_m=position_error_m,
+        heading_error_rad=se2.wrap(aligned[:, 2] - reference[:, 2]),
+        pose_truth_estimate=pose_truth_estimate,
+        alignment=how,
+        nees=_position_nees(aligned, reference, covariance),
+        anchored_nees=None if anchor is None else _position_nees(se2.compose(anchor, raw), reference, covariance),
+        pose_truth_anchor=anchor,
+        drift_m_per_m=drift_per_metre(aligned, reference),
+        skipped=skipped,
+    )
+
+
+def _ape(estimate: FloatArray, truth: FloatArray) -> FloatArray:
+    """Absolute position errors (K,) by evo."""
+    from evo.core import metrics
+
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((_evo_path(truth), _evo_path(estimate)))
+    return np.asarray(ape.error, dtype=np.float64)
+
+
+def _evo_path(poses: FloatArray) -> Any:
+    from evo.core.trajectory import PosePath3D
+
+    half = 0.5 * poses[:, 2]
+    zero = np.zeros(len(poses))
+    return PosePath3D(
+        positions_xyz=np.stack([poses[:, 0], poses[:, 1], zero], axis=1),
+        orientations_quat_wxyz=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
+    )
+
+
+def _position_nees(estimate: FloatArray, truth: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Position NEES (K,): the error is turned into the robot's frame, where the covariance lives."""
+    error_world = estimate[:, :2] - truth[:, :2]
+    error_robot = np.einsum("kji,kj->ki", se2.rotation(estimate[:, 2]), error_world)
+    return nees(error_robot, covariance[:, :2, :2])
+
+
+def drift_per_metre(estimate: FloatArray, truth: FloatArray, distance_m: float = _DRIFT_DISTANCE_M) -> float | None:
+    """Median relative translation error over stretches of `distance_m` of the true path, per metre.
+
+    Needs no alignment (relative pose error). None if the path is shorter than the distance.
+    """
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1))])
+    end = np.searchsorted(travelled, travelled + distance_m)
+    start = np.flatnonzero(end < len(travelled))
+    if len(start) == 0:
+        return None
+    end = end[start]
+    wrong = se2.between(se2.between(truth[start], truth[end]), se2.between(estimate[start], estimate[end]))
+    return float(np.median(np.linalg.norm(wrong[:, :2], axis=1) / (travelled[end] - travelled[start])))
