@@ -1,0 +1,114 @@
+"""The checks that every recording passes, whatever it was read from, and what is survived with a counted warning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from evermap.errors import DataError, InputError
+from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
+
+ODOMETRY_GAP_S: float = 10.0
+"""Pauses of the odometry beyond this are reported, and frames farther than this from any odometry are left out."""
+
+
+def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
+    """Raises InputError at the first stamp that is smaller than the one before."""
+    back = np.flatnonzero(np.diff(stamp_s) < 0)
+    if len(back):
+        row = int(back[0]) + 1
+        step = stamp_s[row - 1] - stamp_s[row]
+        raise InputError(
+            f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field,
+            hint="sort the rows by time if only their order is wrong",
+        )  # fmt: skip
+
+
+def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> BoolArray:
+    """Mask (N,) that keeps the last row of every stamp; repeated stamps are counted in `warnings`."""
+    keep = np.append(stamp_s[1:] != stamp_s[:-1], True)[: len(stamp_s)]
+    repeated = int(np.sum(~keep))
+    if repeated:
+        warnings.append(f"{path.name}: {repeated} rows with the stamp of the next row left out")
+    return np.asarray(keep, dtype=np.bool_)
+
+
+def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
+    """The recording with frames that have no odometry near them left out and all remarks counted.
+
+    Raises:
+        DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
+    """
+    source = recording.source
+    if len(recording.odometry) < 2:
+        raise DataError("the odometry needs at least two rows", path=source)
+    if len(recording.frames) == 0 or len(recording.detections) == 0:
+        raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections file")
+    _warn_of_gaps(recording.odometry, warnings)
+    recording = _without_far_frames(recording, warnings)
+    if len(recording.detections) == 0:
+        raise DataError("no landmark was seen while there was odometry", path=source)
+    _warn_of_repeats(recording.detections, warnings)
+    return replace(recording, warnings=tuple(warnings))
+
+
+def _warn_of_gaps(odometry: Odometry, warnings: list[str]) -> None:
+    pause = np.diff(odometry.stamp_s)
+    gaps = np.flatnonzero(pause > ODOMETRY_GAP_S)
+    if len(gaps):
+        start = odometry.stamp_s[0]
+        shown = ", ".join(f"{pause[i]:.1f} s from {odometry.stamp_s[i] - start:.1f} s" for i in gaps[:3])
+        more = ", ..." if len(gaps) > 3 else ""
+        warnings.append(f"odometry has {len(gaps)} gaps over {ODOMETRY_GAP_S:g} s: {shown}{more} after its start")
+
+
+def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
+    odometry, frames, detections = recording.odometry, recording.frames, recording.detections
+    first, last = odometry.stamp_s[0], odometry.stamp_s[-1]
+    keep = (frames.stamp_s >= first - ODOMETRY_GAP_S) & (frames.stamp_s <= last + ODOMETRY_GAP_S)
+    if keep.all():
+        return recording
+    if not keep.any():
+        raise DataError(
+            f"odometry ({first:.3f} to {last:.3f} s) and detections ({frames.stamp_s[0]:.3f} to "
+            f"{frames.stamp_s[-1]:.3f} s) do not overlap in time",
+            path=recording.source, hint="stamp both with the same clock, in seconds",
+        )  # fmt: skip
+    seen = keep[detections.frame]
+    new_frame = np.cumsum(keep) - 1
+    warnings.append(
+        f"{int(np.sum(~keep))} frames with {int(np.sum(~seen))} detections left out: "
+        f"more than {ODOMETRY_GAP_S:g} s before or after the odometry"
+    )
+    kept = select_detections(detections, seen)
+    kept = replace(kept, frame=np.asarray(new_frame[kept.frame], dtype=np.int64))
+    return replace(recording, frames=replace(frames, stamp_s=frames.stamp_s[keep]), detections=kept)
+
+
+def select_detections(detections: Detections, rows: BoolArray | IntArray) -> Detections:
+    """The given rows of the detections, in that order."""
+    return Detections(
+        frame=detections.frame[rows],
+        landmark_id=detections.landmark_id[rows],
+        range_m=detections.range_m[rows],
+        bearing_rad=detections.bearing_rad[rows],
+        class_id=detections.class_id[rows],
+        sigma_range_m=detections.sigma_range_m[rows],
+        sigma_bearing_rad=detections.sigma_bearing_rad[rows],
+        source_line=detections.source_line[rows],
+    )
+
+
+def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:
+    known = np.flatnonzero(detections.landmark_id != UNKNOWN)
+    pairs = np.stack([detections.frame[known], detections.landmark_id[known]], axis=1)
+    _, first = np.unique(pairs, axis=0, return_index=True)
+    repeats = np.setdiff1d(np.arange(len(known)), first)
+    if len(repeats):
+        row = known[repeats[0]]
+        warnings.append(
+            f"{len(repeats)} detections repeat a landmark within one frame, kept "
+            f"(first: landmark {detections.landmark_id[row]}, line {detections.source_line[row]})"
+        )

@@ -1,0 +1,143 @@
+"""A folder and a zip of it look the same to a reader: a `FileSet` of named byte strings."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from evermap.errors import InputError
+
+# What `zipfile` raises on damaged or encrypted archives, as found by corrupting them at random.
+_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
+
+
+@dataclass(frozen=True, slots=True)
+class FileSet:
+    """The files of one folder, on disk or inside a zip.
+
+    Attributes:
+        root: the folder or zip that the user named.
+        folder: the folder inside `root`, '' for the top.
+        members: file name -> path relative to `root`.
+        zipped: whether `root` is a zip.
+    """
+
+    root: Path
+    folder: str
+    members: dict[str, str]
+    zipped: bool
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.members
+
+    @property
+    def title(self) -> str:
+        """Name of the innermost folder, or of the zip without its ending."""
+        if self.folder:
+            return PurePosixPath(self.folder).name
+        return self.root.stem if self.zipped else self.root.resolve().name
+
+    def path_of(self, name: str) -> Path:
+        """Where `name` is or would be, for messages: a zip is shown as if it were a folder."""
+        return self.root / self.members.get(name, str(PurePosixPath(self.folder) / name))
+
+    def read(self, name: str) -> bytes:
+        """Content of a file.
+
+        Raises:
+            InputError: it is missing, unreadable, or damaged inside the zip.
+        """
+        if name not in self.members:
+            raise InputError("file is missing", path=self.path_of(name))
+        try:
+            if not self.zipped:
+                return self.path_of(name).read_bytes()
+            with zipfile.ZipFile(self.root) as archive:
+                return archive.read(self.members[name])
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
+        except (*_ZIP_ERRORS, KeyError) as error:
+            raise InputError(
+                f"damaged inside the zip: {error}", path=self.path_of(name), hint="fetch or pack the zip again"
+            ) from error
+
+
+def file_sets(path: str | Path) -> list[FileSet]:
+    """Every folder with files in it: of a zip all, of a folder itself and the folders directly below.
+
+    A plain file that is no zip gives an empty list.
+
+    Raises:
+        InputError: nothing is there, or the zip is damaged.
+    """
+    path = Path(path)
+    try:
+        if not path.exists():
+            raise InputError("no such file or folder", path=path, hint="check the path")
+        if path.is_dir():
+            return _folder_sets(path)
+        if path.suffix.lower() == ".zip" or zipfile.is_zipfile(path):
+            return _zip_sets(path)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
+    except ValueError as error:  # a name with a NUL byte
+        raise InputError(f"no usable file name: {error}") from error
+    return []
+
+
+def find_file_set(path: str | Path, wanted: Callable[[FileSet], bool]) -> FileSet | None:
+    """The outermost file set that `wanted` accepts; None where there is none.
+
+    Raises:
+        InputError: as `file_sets`, or two such folders lie side by side.
+    """
+    found = [files for files in file_sets(path) if wanted(files)]
+    if not found:
+        return None
+    depth = min(_depth(files) for files in found)
+    outermost = [files for files in found if _depth(files) == depth]
+    if len(outermost) > 1:
+        names = ", ".join(sorted(files.folder for files in outermost))
+        raise InputError(f"holds {len(outermost)} recordings: {names}", path=path, hint="give one of them")
+    return outermost[0]
+
+
+def _depth(files: FileSet) -> int:
+    return len(PurePosixPath(files.folder).parts)
+
+
+def _folder_sets(path: Path) -> list[FileSet]:
+    sets = []
+    for folder in [path, *sorted(child for child in path.iterdir() if child.is_dir())]:
+        inside = "" if folder == path else folder.name
+        try:
+            names = sorted(child.name for child in folder.iterdir() if child.is_file())
+        except OSError:
+            if folder == path:
+                raise
+            continue  # a locked subfolder is none of the user's recordings
+        members = {name: str(PurePosixPath(inside) / name) for name in names if not name.startswith(".")}
+        if members:
+            sets.append(FileSet(path, inside, members, zipped=False))
+    return sets
+
+
+def _zip_sets(path: Path) -> list[FileSet]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [info.filename for info in archive.infolist() if not info.is_dir()]
+    except _ZIP_ERRORS as error:
+        raise InputError(f"not a readable zip: {error}", path=path, hint="fetch or pack the zip again") from error
+    folders: dict[str, dict[str, str]] = {}
+    for name in names:
+        inner = PurePosixPath(name)
+        # macOS packs its resource forks beside the data under the same names
+        if "__MACOSX" in inner.parts or inner.name.startswith("."):
+            continue
+        folder = "" if str(inner.parent) == "." else str(inner.parent)
+        folders.setdefault(folder, {})[inner.name] = name
+    return [FileSet(path, folder, members, zipped=True) for folder, members in folders.items()]

@@ -1,0 +1,264 @@
+"""UTIAS Multi-Robot Cooperative Localization and Mapping (MRCLAM) recordings, as their authors publish them.
+
+Leung, Halpern, Barfoot, Liu: The UTIAS Multi-Robot Cooperative Localization and Mapping Dataset, IJRR 30(8), 2011.
+Read from the zip or its unpacked folder; only one robot at a time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from evermap import se2
+from evermap.errors import DataError, InputError
+from evermap.io.assemble import check_forward, finish_recording, last_of_equal
+from evermap.io.files import FileSet, find_file_set
+from evermap.io.quantities import (
+    ANGULAR_RADPS,
+    BEARING_RAD,
+    FORWARD_MPS,
+    RANGE_M,
+    STAMP_S,
+    THETA_RAD,
+    X_M,
+    Y_M,
+    Quantity,
+)
+from evermap.io.rows import Rows, parse_rows
+from evermap.types import (
+    UNKNOWN,
+    Clock,
+    Detections,
+    Frames,
+    IntArray,
+    Landmarks,
+    Odometry,
+    Recording,
+    RobotSightings,
+    Sensor,
+    Trajectory,
+)
+
+LAST_ROBOT_SUBJECT = 5
+"""Subjects 1 to 5 are robots, 6 to 20 landmarks, in all nine datasets."""
+
+CAMERA = Sensor(
+    range_min_m=0.5,
+    range_max_m=10.0,
+    bearing_min_rad=-0.65,
+    bearing_max_rad=0.65,
+    p_detect=0.4,
+    p_false=0.001,
+)
+"""The robots' forward camera. Rounded outwards from what all robots report (0.8 to 9.6 m, -0.59 to 0.57 rad); no truth
+is used. Of the barcodes in view it decodes less than half. Noise is left to be estimated from the recording."""
+
+_NAME = re.compile(r"Robot(\d{1,6})_(Odometry|Measurement)\.dat", re.ASCII)
+_SUBJECT = Quantity("subject", 1, 1e6, hint="subjects count from 1")
+_BARCODE = Quantity("barcode", 0, 1e6, hint="barcodes are whole numbers")
+_VARIANCE_HINT = "standard deviation in metres"
+
+
+def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
+    """One robot's part of an MRCLAM recording.
+
+    Args:
+        path: `MRCLAM_DatasetN.zip`, with a folder inside or not, or the unpacked folder.
+        robot: number from 1; None takes the lowest that has both odometry and measurements.
+
+    Returns:
+        Unix stamps; one frame for every distinct measurement stamp, also where only robots were seen; `frames.complete`
+        is False since the recordings do not log empty images. Ground truth where its files are there, in part or whole.
+
+    Raises:
+        InputError: a file that is needed is missing or malformed; the robot is not in the recording.
+        DataError: nothing to estimate from, for example no landmark was ever seen.
+    """
+    files = find_file_set(path, _is_mrclam)
+    if files is None:
+        raise InputError("no MRCLAM recording here", path=path, hint=MrclamReader.looks_for)
+    robot = _choose_robot(files, robot)
+    warnings: list[str] = []
+    odometry = _read_odometry(files, robot, warnings)
+    frames, detections, sightings = _read_measurements(files, robot, warnings)
+    name = files.title if files.title.startswith("MRCLAM") else f"MRCLAM {files.title}"
+    recording = Recording(
+        name=f"{name} robot {robot}",
+        odometry=odometry,
+        frames=frames,
+        detections=detections,
+        sensor=CAMERA,
+        truth=_read_truth(files, robot, warnings),
+        true_landmarks=_read_landmarks(files, warnings),
+        robot_sightings=sightings,
+        source=str(path),
+        clock=Clock.UNIX,
+    )
+    return finish_recording(recording, warnings=warnings)
+
+
+class MrclamReader:
+    """Reader of MRCLAM zips and folders."""
+
+    name = "mrclam"
+    looks_for = "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat"
+
+    def matches(self, path: Path) -> bool:
+        """Whether a file of a robot is there, at the top or one folder down."""
+        return find_file_set(path, _is_mrclam) is not None
+
+    def read(self, path: Path, robot: int | None) -> Recording:
+        """See `read_mrclam`."""
+        return read_mrclam(path, robot)
+
+    def robots(self, path: Path) -> tuple[int, ...]:
+        """Numbers of the robots that have both odometry and measurements."""
+        files = find_file_set(path, _is_mrclam)
+        return () if files is None else _complete_robots(files)
+
+
+def _is_mrclam(files: FileSet) -> bool:
+    return any(_NAME.fullmatch(name) for name in files.members)
+
+
+def _complete_robots(files: FileSet) -> tuple[int, ...]:
+    kinds = Counter(int(match[1]) for name in files.members if (match := _NAME.fullmatch(name)))
+    return tuple(sorted(robot for robot, count in kinds.items() if count == 2))
+
+
+def _choose_robot(files: FileSet, robot: int | None) -> int:
+    complete = _complete_robots(files)
+    numbers = ", ".join(map(str, complete)) or "none"
+    if robot is None:
+        if not complete:
+            raise InputError("no robot has both odometry and measurements", path=files.root / files.folder)
+        return complete[0]
+    if robot not in complete:
+        lacking = [kind for kind in ("Odometry", "Measurement") if f"Robot{robot}_{kind}.dat" not in files]
+        problem = f"robot {robot} has no {lacking[0].lower()} file" if len(lacking) == 1 else f"there is no robot {robot}"
+        raise InputError(problem, path=files.root / files.folder, hint=f"robots with both files: {numbers}")
+    return robot
+
+
+def _read_odometry(files: FileSet, robot: int, warnings: list[str]) -> Odometry:
+    name = f"Robot{robot}_Odometry.dat"
+    rows = _parse(files, name, (STAMP_S, FORWARD_MPS, ANGULAR_RADPS), warnings)
+    if len(rows) == 0:
+        raise DataError("holds no odometry", path=rows.path)
+    rows = _forward_in_time(rows, warnings)
+    return Odometry(
+        stamp_s=rows.column(0),
+        forward_mps=rows.column(1),
+        lateral_mps=np.zeros(len(rows)),
+        angular_radps=rows.column(2),
+        clock=Clock.UNIX,
+    )
+
+
+def _read_measurements(
+    files: FileSet, robot: int, warnings: list[str]
+) -> tuple[Frames, Detections, RobotSightings | None]:
+    name = f"Robot{robot}_Measurement.dat"
+    # the file's second column is headed 'Subject #' but holds barcodes
+    rows = _parse(files, name, (STAMP_S, _BARCODE, RANGE_M, BEARING_RAD), warnings)
+    if len(rows) == 0:
+        raise DataError("holds no measurement", path=rows.path)
+    check_forward(rows.column(0), path=rows.path, line=rows.line)
+    subject = _subjects(files, _whole(rows, 1, "barcode"), name, warnings)
+    stamps, frame = np.unique(rows.column(0), return_inverse=True)
+    landmark = np.flatnonzero(subject > LAST_ROBOT_SUBJECT)
+    other = np.flatnonzero((subject > 0) & (subject <= LAST_ROBOT_SUBJECT))
+    detections = Detections(
+        frame=np.asarray(frame[landmark], dtype=np.int64),
+        landmark_id=subject[landmark],
+        range_m=rows.column(2)[landmark],
+        bearing_rad=rows.column(3)[landmark],
+        class_id=np.full(len(landmark), UNKNOWN),
+        sigma_range_m=np.full(len(landmark), np.nan),
+        sigma_bearing_rad=np.full(len(landmark), np.nan),
+        source_line=rows.line[landmark],
+    )
+    sightings = RobotSightings(
+        stamp_s=rows.column(0)[other],
+        robot_id=subject[other],
+        range_m=rows.column(2)[other],
+        bearing_rad=rows.column(3)[other],
+        clock=Clock.UNIX,
+    )
+    if not len(landmark):
+        raise DataError("no landmark was seen in the whole recording", path=rows.path)
+    return Frames(stamps, complete=False, clock=Clock.UNIX), detections, sightings if len(other) else None
+
+
+def _subjects(files: FileSet, barcode: IntArray, name: str, warnings: list[str]) -> IntArray:
+    """Subject of every barcode, 0 where `Barcodes.dat` does not list it. Shape (M,)."""
+    rows = _parse(files, "Barcodes.dat", (_SUBJECT, _BARCODE), warnings)
+    listed_subject, listed_barcode = _whole(rows, 0, "subject"), _whole(rows, 1, "barcode")
+    for listed, field in ((listed_subject, "subject"), (listed_barcode, "barcode")):
+        _, first = np.unique(listed, return_index=True)
+        again = np.setdiff1d(np.arange(len(listed)), first)
+        if len(again):
+            row = int(again[0])
+            raise InputError(f"{listed[row]} is listed twice", path=rows.path, line=int(rows.line[row]), field=field)
+    subject_of = dict(zip(listed_barcode.tolist(), listed_subject.tolist(), strict=True))
+    subject = np.array([subject_of.get(code, 0) for code in barcode.tolist()], dtype=np.int64)
+    unknown = Counter(barcode[subject == 0].tolist())
+    if unknown:
+        codes = ", ".join(f"{code} ({count}x)" for code, count in sorted(unknown.items()))
+        warnings.append(f"{name}: {sum(unknown.values())} sightings of barcodes not in Barcodes.dat left out: {codes}")
+    return subject
+
+
+def _read_truth(files: FileSet, robot: int, warnings: list[str]) -> Trajectory | None:
+    name = f"Robot{robot}_Groundtruth.dat"
+    if name not in files:
+        return None
+    rows = _parse(files, name, (STAMP_S, X_M, Y_M, THETA_RAD), warnings)
+    if len(rows) == 0:
+        warnings.append(f"{name}: holds no pose, taken as missing")
+        return None
+    rows = _forward_in_time(rows, warnings)
+    pose = rows.values[:, 1:].copy()
+    pose[:, 2] = se2.wrap(pose[:, 2])
+    return Trajectory(rows.column(0), pose, np.zeros((len(rows), 3, 3)), frame="truth", clock=Clock.UNIX)
+
+
+def _read_landmarks(files: FileSet, warnings: list[str]) -> Landmarks | None:
+    name = "Landmark_Groundtruth.dat"
+    if name not in files:
+        return None
+    sigmas = tuple(Quantity(f"{axis}_std_m", 0.0, 1e6, hint=_VARIANCE_HINT) for axis in "xy")
+    rows = _parse(files, name, (_SUBJECT, X_M, Y_M, *sigmas), warnings)
+    if len(rows) == 0:
+        warnings.append(f"{name}: holds no landmark, taken as missing")
+        return None
+    ids = _whole(rows, 0, "subject")
+    _, first = np.unique(ids, return_index=True)
+    again = np.setdiff1d(np.arange(len(ids)), first)
+    if len(again):
+        row = int(again[0])
+        raise InputError(f"{ids[row]} is listed twice", path=rows.path, line=int(rows.line[row]), field="subject")
+    return Landmarks.at(ids, rows.values[:, 1:3], sigma_m=rows.values[:, 3:5], frame="truth")
+
+
+def _parse(files: FileSet, name: str, quantities: tuple[Quantity, ...], warnings: list[str]) -> Rows:
+    return parse_rows(files.read(name), files.path_of(name), quantities, warnings)
+
+
+def _forward_in_time(rows: Rows, warnings: list[str]) -> Rows:
+    stamp_s = rows.column(0)
+    check_forward(stamp_s, path=rows.path, line=rows.line)
+    keep = last_of_equal(stamp_s, path=rows.path, warnings=warnings)
+    return Rows(rows.path, rows.values[keep], rows.line[keep])
+
+
+def _whole(rows: Rows, column: int, field: str) -> IntArray:
+    values = rows.column(column)
+    fractions = np.flatnonzero(values != np.floor(values))
+    if len(fractions):
+        row = int(fractions[0])
+        raise InputError(f"{values[row]:g} is not a whole number", path=rows.path, line=int(rows.line[row]), field=field)
+    return np.asarray(values, dtype=np.int64)

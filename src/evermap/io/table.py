@@ -1,0 +1,266 @@
+"""Tables with named columns: CSV, Parquet and the properties of GeoJSON features, behind one `Table`."""
+
+from __future__ import annotations
+
+import csv
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.io.quantities import Quantity
+from evermap.io.text import decode_text, parse_float, quote
+from evermap.types import UNKNOWN, FloatArray, IntArray
+
+_LARGEST_ID = 2**53
+"""Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Columns by name, as cells of text or as numbers (nan where empty).
+
+    Attributes:
+        path: file it came from, for messages.
+        columns: name -> cells.
+        line: (R,) line numbers in the file; for Parquet the row, for GeoJSON the feature, counted from 1.
+    """
+
+    path: Path
+    columns: dict[str, Sequence[str] | FloatArray]
+    line: IntArray
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.columns
+
+    def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+        """Raises InputError unless all of `required` and nothing beside `required` and `optional` is there."""
+        known = [*required, *optional]
+        for name in self.columns:
+            if name not in known:
+                raise InputError(
+                    "unknown column", path=self.path, line=self._header_line(), field=name,
+                    hint=_nearest(name, [other for other in known if other not in self.columns], known),
+                )  # fmt: skip
+        for name in required:
+            if name not in self.columns:
+                has = ", ".join(self.columns) or "none"
+                raise InputError("missing column", path=self.path, line=self._header_line(), field=name,
+                                 hint=f"the file has {has}")  # fmt: skip
+
+    def has_any(self, names: Iterable[str]) -> bool:
+        """Whether at least one of the columns is there."""
+        return any(name in self.columns for name in names)
+
+    def numbers(self, quantity: Quantity) -> FloatArray:
+        """A numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
+        cells = self.columns[quantity.name]
+        if isinstance(cells, np.ndarray):
+            values: FloatArray = cells
+        else:
+            values = self._parse(quantity, cells)
+        quantity.check(values, path=self.path, line=self.line)
+        return values
+
+    def ids(self, name: str, *, optional: bool) -> IntArray:
+        """Whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
+
+        Raises:
+            InputError: a fraction, a negative number, or nothing where an id is needed.
+        """
+        values = self.numbers(Quantity(name, UNKNOWN, _LARGEST_ID, optional=True, hint="whole numbers from 0"))
+        absent = np.isnan(values) | (values == UNKNOWN)
+        whole = np.where(absent, float(UNKNOWN), values)
+        wrong = (whole != np.floor(whole)) | (absent if not optional else False)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            problem = "is empty" if absent[row] else f"{values[row]:g} is not a whole number"
+            raise InputError(problem, path=self.path, line=int(self.line[row]), field=name,
+                             hint="an id is a whole number from 0")  # fmt: skip
+        return whole.astype(np.int64)
+
+    def labels(self, name: str) -> list[str]:
+        """A column of names, '' where empty. Whole numbers stand for themselves as text."""
+        cells = self.columns[name]
+        if not isinstance(cells, np.ndarray):
+            return [cell.strip() for cell in cells]
+        return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
+
+    def _parse(self, quantity: Quantity, cells: Sequence[str]) -> FloatArray:
+        if not any("_" in cell for cell in cells):
+            try:
+                if quantity.optional:
+                    return np.array([float(cell) if cell.strip() else np.nan for cell in cells], dtype=np.float64)
+                return np.array([float(cell) for cell in cells], dtype=np.float64)
+            except ValueError:
+                pass
+        for cell, line in zip(cells, self.line.tolist(), strict=True):
+            if quantity.optional and not cell.strip():
+                continue
+            try:
+                parse_float(cell)
+            except ValueError:
+                problem = f"{quote(cell)} is not a number" if cell.strip() else "is empty"
+                raise InputError(problem, path=self.path, line=line, field=quantity.name) from None
+        raise AssertionError("one of the cells failed to parse a moment ago")
+
+    def _header_line(self) -> int | None:
+        return None if self.path.suffix != ".csv" else max(1, int(self.line[0]) - 1 if len(self.line) else 1)
+
+
+def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
+    """A CSV table: comma separated, the first line that is no comment names the columns, `#` starts a comment line.
+
+    A last line with too few cells, or without line end and with an empty or broken last cell, was cut off while it
+    was written: it is left out, and `warnings` gets a remark.
+
+    Raises:
+        InputError: no header, a repeated column name, a line with the wrong number of cells, bytes that are no text.
+    """
+    lines = decode_text(data, path).split("\n")
+    content = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"]
+    if not content:
+        raise InputError("is empty; the first line must name the columns", path=path)
+    names = _header(content[0][1], path, content[0][0])
+    rows: list[list[str]] = []
+    for number, line in content[1:]:
+        cells = _split(line, path, number)
+        if len(cells) == len(names) or (len(cells) == len(names) + 1 and not cells[-1].strip()):
+            rows.append(cells[: len(names)])
+        elif number == content[-1][0] and len(cells) < len(names):
+            warnings.append(f"{path.name}: 1 unfinished last line ({number}) left out")
+        else:
+            raise InputError(f"{len(cells)} cells instead of {len(names)} ({', '.join(names)})", path=path, line=number)
+    if rows and content[-1][0] == len(lines) and len(rows) == len(content) - 1 and _broken(rows[-1][-1], rows[:-1]):
+        warnings.append(f"{path.name}: 1 unfinished last line ({len(lines)}) left out")
+        rows.pop()
+    columns = zip(*rows, strict=True) if rows else [()] * len(names)
+    line_numbers = np.array([number for number, _ in content[1 : len(rows) + 1]], dtype=np.int64)
+    return Table(path, dict(zip(names, columns, strict=True)), line_numbers)
+
+
+def parse_parquet(data: bytes, path: Path) -> Table:
+    """A Parquet table of numbers and strings.
+
+    Raises:
+        InputError: not Parquet, damaged, a repeated column name, or a column of another type.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read()
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
+        first = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"not a readable Parquet file: {first}", path=path, hint="write it again") from error
+    columns: dict[str, Sequence[str] | FloatArray] = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if name in columns:
+            raise InputError("column appears twice", path=path, field=name)
+        columns[name] = _arrow_column(column, path, name)
+    return Table(path, columns, np.arange(1, table.num_rows + 1))
+
+
+def parquet_bytes(columns: dict[str, Any], metadata: dict[str, str] | None = None) -> bytes:
+    """A Parquet file of arrays and lists of text ('' becomes null), with checksums against later damage."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {
+        name: pa.array([cell or None for cell in cells], type=pa.string())
+        if isinstance(cells, list)
+        else pa.array(np.ascontiguousarray(cells))
+        for name, cells in columns.items()
+    }
+    table = pa.table(arrays).replace_schema_metadata(metadata or {})
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
+    return bytes(sink.getvalue().to_pybytes())
+
+
+def csv_text(columns: dict[str, Any], comment: str = "") -> str:
+    """A CSV file of arrays and lists of text; floats in the shortest form that reads back the same, nan as empty."""
+    head = "".join(f"# {line}\n" for line in comment.splitlines())
+    cells = [_csv_cells(column) for column in columns.values()]
+    body = "".join(",".join(row) + "\n" for row in zip(*cells, strict=True))
+    return f"{head}{','.join(columns)}\n{body}"
+
+
+def _csv_cells(column: Any) -> list[str]:
+    if isinstance(column, list):
+        return [_quoted(cell) for cell in column]
+    if column.dtype.kind == "i":
+        return ["" if value == UNKNOWN else str(value) for value in column.tolist()]
+    return ["" if value != value else repr(value) for value in column.tolist()]
+
+
+def _quoted(cell: str) -> str:
+    return '"' + cell.replace('"', '""') + '"' if any(c in cell for c in ',"#') else cell
+
+
+def _header(line: str, path: Path, number: int) -> list[str]:
+    names = [name.strip() for name in _split(line, path, number)]
+    while len(names) > 1 and not names[-1]:
+        names.pop()
+    if len(names) == 1 and any(mark in line for mark in ";\t"):
+        raise InputError("columns must be separated by commas", path=path, line=number, field=line.strip()[:40])
+    for name in names:
+        if not name or _is_number(name):
+            raise InputError(f"the first line must name the columns, found {quote(line.strip())}", path=path,
+                             line=number)  # fmt: skip
+        if names.count(name) > 1:
+            raise InputError("column appears twice", path=path, line=number, field=name)
+    return names
+
+
+def _split(line: str, path: Path, number: int) -> list[str]:
+    if '"' not in line:
+        return line.split(",")
+    try:
+        return next(csv.reader([line], strict=True))
+    except csv.Error as error:
+        raise InputError(f"quotation marks do not match ({error})", path=path, line=number) from None
+
+
+def _broken(cell: str, others: list[list[str]]) -> bool:
+    """Whether a cell is no number in a column that otherwise is one."""
+    return not _is_number(cell) and bool(others) and all(_is_number(row[-1]) for row in others[-8:])
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        parse_float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
+    import pyarrow as pa
+
+    kind = column.type
+    if pa.types.is_dictionary(kind):
+        kind = kind.value_type
+        column = column.cast(kind)
+    try:
+        if pa.types.is_string(kind) or pa.types.is_large_string(kind):
+            return [cell or "" for cell in column.to_pylist()]
+        if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind):
+            values = column.cast(pa.float64(), safe=False).to_numpy()
+            return np.array(values, dtype=np.float64)
+    except (pa.ArrowException, ValueError) as error:
+        raise InputError(f"damaged column: {str(error).splitlines()[0]}", path=path, field=name) from error
+    raise InputError(f"holds {kind}, not numbers", path=path, field=name, hint="cast the column to float64")
+
+
+def _nearest(name: str, unused: list[str], known: list[str]) -> str:
+    close = difflib.get_close_matches(name, unused, n=1, cutoff=0.4) or difflib.get_close_matches(name, known, n=1)
+    return f"{close[0]}" if close else f"one of {', '.join(known)}"

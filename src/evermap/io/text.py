@@ -1,0 +1,42 @@
+"""Bytes of a text file to lines, with any line end and with the line number of what is no text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from evermap.errors import InputError
+
+
+def decode_text(data: bytes, path: Path) -> str:
+    """UTF-8 text with `\\n` line ends; a byte order mark is dropped.
+
+    Raises:
+        InputError: the bytes are not text, with the line where that shows first.
+    """
+    nul = data.find(b"\0")
+    try:
+        text = data.decode("utf-8-sig")
+        first_bad = nul
+    except UnicodeDecodeError as error:
+        first_bad = error.start if nul < 0 else min(nul, error.start)
+    if first_bad >= 0:
+        line = data.count(b"\n", 0, first_bad) + 1
+        raise InputError("is not plain text (UTF-8)", path=path, line=line, hint="was the file damaged, or packed?")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def parse_float(cell: str) -> float:
+    """A number as people write it; unlike `float`, no digit grouping by underscores.
+
+    Raises:
+        ValueError: the cell holds none.
+    """
+    if "_" in cell:
+        raise ValueError(f"could not convert string to float: {cell!r}")
+    return float(cell)
+
+
+def quote(cell: str) -> str:
+    """A cell of the user's file for a message: short and printable."""
+    short = cell if len(cell) <= 24 else cell[:21] + "..."
+    return f"'{''.join(c if c.isprintable() else '?' for c in short)}'"
