@@ -1,0 +1,149 @@
+"""One look for all figures: colour-blind safe, 8 pt and larger, and at home on light and dark pages.
+
+Figures use matplotlib's object interface only, so no backend, display or global state is touched. Every colour has
+a role; in SVG for the report a role becomes a CSS variable, so that the page's theme decides what it looks like.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# Okabe and Ito (2008), told apart with every common kind of colour blindness
+INK = "#1b1f24"
+MUTED = "#636c76"
+GRID = "#d8dde3"
+SHADE = "#e9ecf0"
+PAPER = "#fffffe"
+ESTIMATE = "#0072b2"
+ESTIMATE_BAND = "#cfe3f1"
+ODOMETRY = "#e69f00"
+LANDMARK = "#009e73"
+ALERT = "#d55e00"
+ONLINE = "#cc79a7"
+
+CSS_ROLES = {
+    INK: "--ink",
+    MUTED: "--muted",
+    GRID: "--grid",
+    SHADE: "--shade",
+    PAPER: "--paper",
+    ESTIMATE: "--estimate",
+    ESTIMATE_BAND: "--estimate-band",
+    ODOMETRY: "--odometry",
+    LANDMARK: "--landmark",
+    ALERT: "--alert",
+    ONLINE: "--online",
+}
+
+_RC: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.labelsize": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 1.8,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    "savefig.facecolor": "none",
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.titlecolor": INK,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.2,
+    "lines.solid_joinstyle": "round",
+    "svg.fonttype": "path",
+    "svg.hashsalt": "evermap",
+    "path.simplify": True,
+    "path.simplify_threshold": 0.3,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class NamedFigure:
+    """A finished figure with its file name (no suffix), its title and the caption that explains it."""
+
+    name: str
+    figure: Figure
+    title: str
+    caption: str
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Matplotlib settings of this module while drawing, and only then."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(_RC):
+        yield
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """An empty figure with an Agg canvas and constrained layout. Call within `house_style`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def settle(figure: Figure) -> None:
+    """Computes the layout once, so that saving in several formats does not repeat it."""
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+
+
+def save_png(figure: Figure, path: Path, *, dpi: int = 160) -> None:
+    """Writes a PNG on white paper; the same figure gives the same bytes."""
+    with house_style():
+        figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
+
+
+def save_svg(figure: Figure, path: Path) -> None:
+    """Writes a stand-alone SVG on white paper; the same figure gives the same bytes."""
+    with house_style():
+        figure.savefig(path, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
+
+
+def inline_svg(figure: Figure, name: str) -> str:
+    """The figure as an `<svg>` element for an HTML page: no prolog, no address, ids prefixed by `name`, themed."""
+    buffer = io.StringIO()
+    with house_style():
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
+    text = text.replace("xlink:href", "href")
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = re.sub(r"url\(#", f"url(#{name}-", text)
+    text = re.sub(r'href="#', f'href="#{name}-', text)
+    for colour, role in CSS_ROLES.items():
+        text = text.replace(colour, f"var({role})")
+    # the page scales the drawing; the view box keeps its proportions
+    return re.sub(r'<svg height="[^"]*"', "<svg", re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1), count=1)

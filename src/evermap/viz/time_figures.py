@@ -1,0 +1,194 @@
+"""What happened over time: errors, innovation consistency and latency."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evermap.metrics.consistency import chi2_interval, running_mean
+from evermap.metrics.summary import Evaluation
+from evermap.types import FloatArray, Recording, SlamResult
+from evermap.viz.style import (
+    ALERT,
+    ESTIMATE,
+    ESTIMATE_BAND,
+    INK,
+    MUTED,
+    ODOMETRY,
+    ONLINE,
+    SHADE,
+    NamedFigure,
+    new_figure,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+BLIND_S = 5.0
+"""A gap between frames longer than this is shaded as a blind stretch."""
+
+_RASTER_FROM = 1500
+"""Clouds of more points than this are embedded as pixels, to keep vector files small."""
+
+
+def blind_stretches(stamp_s: FloatArray, longer_than_s: float = BLIND_S) -> FloatArray:
+    """(B, 2) start and end of the gaps between frames."""
+    gaps = np.flatnonzero(np.diff(stamp_s) > longer_than_s)
+    return np.stack([stamp_s[gaps], stamp_s[gaps + 1]], axis=1) if len(gaps) else np.zeros((0, 2))
+
+
+def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
+    """Position and heading error with the 2-sigma band; the band alone where there is no truth."""
+    figure = new_figure(7.2, 4.2)
+    above, below = figure.subplots(2, 1, sharex=True)
+    start_s = _start(recording)
+    poses = evaluation.poses
+    if poses is None:
+        stamps, covariance = result.trajectory.stamp_s, result.trajectory.covariance
+    else:
+        stamps, covariance = poses.stamp_s, poses.covariance
+    time = stamps - start_s
+    position_band = 2.0 * np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2))
+    heading_band = 2.0 * np.degrees(np.sqrt(covariance[:, 2, 2]))
+
+    blind = blind_stretches(recording.frames.stamp_s) - start_s
+    for axes in (above, below):
+        for k, (begin, end) in enumerate(blind):
+            axes.axvspan(begin, end, color=SHADE, lw=0, zorder=0, label=f"blind > {BLIND_S:g} s" if k == 0 else None)
+    above.fill_between(time, 0, position_band, color=ESTIMATE_BAND, lw=0, zorder=1, label="2σ expected")
+    below.fill_between(time, -heading_band, heading_band, color=ESTIMATE_BAND, lw=0, zorder=1)
+    top, side = _limit(position_band), _limit(heading_band)
+    if poses is not None:
+        online = evaluation.online
+        if online is not None:
+            causal = _with_breaks(online.stamp_s, online.position_error_m)
+            above.plot(
+                causal[0] - start_s, causal[1], color=ONLINE, lw=0.8, label=f"online (RMSE {online.rmse_m:.3f} m)"
+            )
+            causal = _with_breaks(online.stamp_s, np.degrees(online.heading_error_rad))
+            below.plot(causal[0] - start_s, causal[1], color=ONLINE, lw=0.8)
+        heading = np.degrees(poses.heading_error_rad)
+        above.plot(time, poses.position_error_m, color=ESTIMATE, lw=1.1, label=f"smoothed (RMSE {poses.rmse_m:.3f} m)")
+        below.plot(time, heading, color=ESTIMATE, lw=1.1)
+        below.axhline(0, color=MUTED, lw=0.7)
+        top = max(1.12 * poses.max_m, min(top, 3.0 * poses.max_m))
+        side = max(1.12 * float(np.max(np.abs(heading))), min(side, 3.0 * float(np.max(np.abs(heading)))))
+    above.set(ylim=(0, top or None), ylabel="position error [m]" if poses else "2σ of position [m]")
+    below.set(ylim=(-side, side) if side else None, ylabel="heading error [°]" if poses else "2σ of heading [°]")
+    below.set(xlabel="time since the first frame [s]")
+    _span(below, recording)
+    figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    return NamedFigure("errors", figure, "Error over time", _error_caption(evaluation, len(blind)))
+
+
+def draw_consistency(result: SlamResult) -> NamedFigure | None:
+    """NIS over time with its 95 % band and running mean, and its histogram against the chi-square density."""
+    finite = np.isfinite(result.innovations.nis)
+    if not np.any(finite):
+        return None
+    from scipy.stats import chi2
+
+    nis, stamps = result.innovations.nis[finite], result.innovations.stamp_s[finite]
+    inlier = result.innovations.p_inlier[finite] >= 0.5
+    figure = new_figure(7.2, 3.3)
+    left, right = figure.subplots(1, 2, width_ratios=(2.1, 1))
+    time = stamps - stamps[0]
+    low, high = chi2_interval(2)
+    left.axhspan(low, high, color=ESTIMATE_BAND, lw=0, zorder=0, label=f"95 % band, {low:.2f} to {high:.2f}")
+    style = {"lw": 0, "ms": 2.2, "mec": "none", "rasterized": len(nis) > _RASTER_FROM}
+    left.plot(time[inlier], nis[inlier], "o", color=ESTIMATE, alpha=0.35, label="detection", zorder=2, **style)
+    if not np.all(inlier):
+        left.plot(time[~inlier], nis[~inlier], "x", color=ALERT, ms=3.5, mew=0.9, lw=0, label="judged an outlier")
+    window = int(np.clip(np.count_nonzero(inlier) // 20, 10, 200))
+    smooth = running_mean(nis[inlier], window)
+    mean_low, mean_high = chi2_interval(2, window)
+    left.plot(*_with_breaks(time[inlier], smooth), color=INK, lw=1.3, label=f"running mean of {window}", zorder=4)
+    left.axhspan(mean_low, mean_high, color=ODOMETRY, alpha=0.35, lw=0, zorder=3, label="its 95 % band")
+    left.set_yscale("log")
+    left.set(xlabel="time since the first [s]", ylabel="NIS [1]", ylim=(max(nis.min(), 3e-3), max(nis.max(), 20) * 1.6))
+
+    edge = 14.0
+    kept = nis[inlier]
+    beyond = float(np.mean(kept > edge)) if len(kept) else 0.0
+    if len(kept):
+        counts, edges = np.histogram(kept, bins=np.linspace(0, edge, 29))
+        density = counts / len(kept) / np.diff(edges)
+        right.stairs(density, edges, fill=True, color=ESTIMATE, alpha=0.45, label="detections")
+    grid = np.linspace(0, edge, 200)
+    right.plot(grid, chi2.pdf(grid, 2), color=INK, lw=1.3, label="χ², 2 d.o.f.")
+    right.axvline(float(chi2.ppf(0.95, 2)), color=MUTED, lw=0.9, ls="--")
+    right.text(float(chi2.ppf(0.95, 2)) + 0.2, 0.93, "95 %", size=8, color=MUTED, transform=right.get_xaxis_transform())
+    right.set(xlabel="NIS [1]", ylabel="density [1]", xlim=(0, edge), ylim=(0, None))
+    right.legend(loc="center right")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=5, columnspacing=1.1)
+    caption = (
+        "Squared distance of every detection from its prediction, in standard deviations, before it was used."
+        " If the noise levels are honest the mean is 2 and 95 % stay below 5.99."
+    )
+    if len(kept):
+        caption += f" Here: mean {kept.mean():.2f}, {np.mean(kept <= chi2.ppf(0.95, 2)):.1%} below"
+        caption += f", {np.mean(~inlier):.1%} judged outliers" + (f", {beyond:.1%} beyond the axis." if beyond else ".")
+    return NamedFigure("consistency", figure, "Innovation consistency", caption)
+
+
+def draw_latency(recording: Recording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
+    """Processing time of every step, with the median, the 99th percentile and the time there was."""
+    count = min(len(result.step_s), len(recording.frames))
+    if count == 0:
+        return None
+    stamps, step_ms = recording.frames.stamp_s[:count], 1e3 * np.maximum(result.step_s[:count], 1e-7)
+    p50, p99 = np.percentile(step_ms, [50, 99])
+    figure = new_figure(7.2, 2.7)
+    axes = figure.add_subplot()
+    axes.plot(
+        stamps - stamps[0], step_ms, "o", color=ESTIMATE, ms=2, mec="none", alpha=0.4, rasterized=count > _RASTER_FROM
+    )
+    axes.set_yscale("log")
+    lines = [(p50, INK, f"median {p50:.2g} ms"), (p99, ALERT, f"99 % {p99:.2g} ms")]
+    if count > 1:
+        budget = 1e3 * float(np.median(np.diff(stamps)))
+        lines.append((budget, MUTED, f"frame interval {budget:.3g} ms"))
+    for level, colour, label in lines:
+        axes.axhline(level, color=colour, lw=1.1, ls="--" if colour == MUTED else "-", label=label)
+    axes.set(xlabel="time since the first frame [s]", ylabel="time a step [ms]")
+    _span(axes, recording)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    caption = "Wall-clock time from a frame's arrival to its pose, on one core."
+    if real_time_factor is not None:
+        caption += f" The whole recording took {real_time_factor:.0f} times less time than it lasted."
+    return NamedFigure("latency", figure, "Step latency", caption)
+
+
+def _start(recording: Recording) -> float:
+    return float(recording.frames.stamp_s[0]) if len(recording.frames) else 0.0
+
+
+def _span(axes: Axes, recording: Recording) -> None:
+    stamps = recording.frames.stamp_s
+    if len(stamps) > 1:
+        axes.set_xlim(0, float(stamps[-1] - stamps[0]))
+
+
+def _limit(band: FloatArray) -> float:
+    return 1.12 * float(np.max(band, initial=0.0))
+
+
+def _with_breaks(stamp_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A nan in every long gap, so that a line does not cross it."""
+    at = np.flatnonzero(np.diff(stamp_s) > BLIND_S) + 1
+    return np.insert(stamp_s, at, stamp_s[at] - 1e-3), np.insert(values, at, np.nan)
+
+
+def _error_caption(evaluation: Evaluation, blind: int) -> str:
+    poses = evaluation.poses
+    if poses is None:
+        return "Uncertainty relative to the first pose; the recording has no pose truth to compare with."
+    text = (
+        f"After SE(2) alignment: {poses.rmse_m:.3f} m and {poses.heading_rmse_deg:.2f}° RMSE,"
+        f" {poses.max_m:.2f} m at worst. The band is twice the standard deviation that the estimator reports, relative"
+        " to its first pose; alignment makes errors a little smaller than that."
+    )
+    if evaluation.online is not None:
+        text += " Online poses are those the robot knew at the time, scored where the sensor looked."
+    return text + (f" {blind} stretches without any frame are shaded." if blind > 1 else "")
