@@ -1,1 +1,74 @@
-"""evermap keeps landmark maps true while the world changes."""
+"""evermap keeps landmark maps true while the world changes.
+
+    import evermap as em
+
+    recording = em.read_recording("MRCLAM_Dataset6.zip", robot=1)
+    result = em.run_slam(recording)
+    print(result.landmarks.position_m)
+
+The names below are loaded when they are first used, so that importing the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from evermap.config import Config, load_config
+    from evermap.errors import EvermapError
+    from evermap.io import read_recording, write_native
+    from evermap.pipeline import run_slam
+    from evermap.runfolder import write_run
+    from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
+
+_HOME = {
+    "evermap.config": ("Config", "load_config"),
+    "evermap.errors": ("EvermapError",),
+    "evermap.io": ("read_recording", "write_native"),
+    "evermap.pipeline": ("run_slam",),
+    "evermap.runfolder": ("write_run",),
+    "evermap.types": (
+        "Detections",
+        "Frames",
+        "Landmarks",
+        "Odometry",
+        "Recording",
+        "Sensor",
+        "SlamResult",
+        "Trajectory",
+    ),
+}
+_MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
+
+__all__ = [
+    "Config",
+    "Detections",
+    "EvermapError",
+    "Frames",
+    "Landmarks",
+    "Odometry",
+    "Recording",
+    "Sensor",
+    "SlamResult",
+    "Trajectory",
+    "__version__",
+    "load_config",
+    "read_recording",
+    "run_slam",
+    "write_native",
+    "write_run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, from the module that defines it."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'evermap' has no attribute '{name}'")
+    return getattr(import_module(_MODULE_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

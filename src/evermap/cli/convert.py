@@ -1,0 +1,59 @@
+"""`evermap convert`: any recording that we can read, in the native format."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from evermap.cli.terminal import check_out_folder, print_json, say, warn
+
+
+class TableFormat(StrEnum):
+    """How tables are stored."""
+
+    CSV = "csv"
+    PARQUET = "parquet"
+
+
+def convert(
+    recording_path: Annotated[Path, typer.Argument(metavar="INPUT", help="Recording in any format that can be read.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write.")],
+    robot: Annotated[
+        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
+    ] = None,
+    table_format: Annotated[TableFormat, typer.Option("--format", help="Format of the tables.")] = TableFormat.CSV,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
+) -> None:
+    """Write any readable recording in the native format.
+
+    \b
+    Example:
+      evermap convert MRCLAM_Dataset6.zip robot1 --robot 1
+    """
+    from evermap.io import read_recording, write_native
+
+    check_out_folder(out, force)
+    recording = read_recording(recording_path, robot=robot)
+    write_native(recording, out, format=table_format.value)
+    for remark in recording.warnings:
+        warn(remark)
+    if as_json:
+        print_json(
+            {
+                "name": recording.name,
+                "out": str(out),
+                "odometry": len(recording.odometry),
+                "frames": len(recording.frames),
+                "detections": len(recording.detections),
+                "warnings": list(recording.warnings),
+            }
+        )
+    else:
+        say(
+            f"wrote {out}: {len(recording.odometry)} odometry rows, {len(recording.frames)} frames, "
+            f"{len(recording.detections)} detections"
+        )

@@ -1,0 +1,106 @@
+"""The `evermap` command: collects the verbs and turns every ending into one line and an exit code.
+
+Exit codes: 0 fine, 2 the user's mistake (one line: what, where, what to try), 1 a defect of ours, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import errno
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from evermap import __version__
+from evermap.cli import bench, convert, demo, reproduce, simulate, slam
+from evermap.cli.terminal import fail, say
+from evermap.errors import EvermapError
+
+EXIT_DEFECT = 1
+EXIT_USER = 2
+EXIT_INTERRUPTED = 130
+
+# The bases of what the command line library raises (it exports only the leaves).
+_UsageError: Any = typer.BadParameter.__mro__[1]
+_ClickException: Any = typer.BadParameter.__mro__[2]
+
+
+class Verbs(TyperGroup):
+    """The group of verbs; the one place where exceptions end."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Parse and run; a wrong command line is one line as any other mistake, not a paragraph."""
+        kwargs["standalone_mode"] = False
+        try:
+            sys.exit(super().main(*args, **kwargs))
+        except _ClickException as error:
+            if type(error).__name__ == "NoArgsIsHelpError":  # `evermap` alone: its message is the help
+                error.show()
+                sys.exit(EXIT_USER)
+            command = error.ctx.command_path if isinstance(error, _UsageError) and error.ctx else "evermap"
+            fail(f"{' '.join(error.format_message().split()).rstrip('.')} (try: {command} --help)")
+            sys.exit(EXIT_USER)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the verb; every exception that we cause or can explain becomes a line on stderr and an exit code."""
+        try:
+            return super().invoke(ctx)
+        except EvermapError as error:
+            fail(error.one_line())
+            raise typer.Exit(EXIT_USER) from None
+        except KeyboardInterrupt as stop:
+            say("interrupted: " + (str(stop) or "no result was written"))
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except (_ClickException, typer.Exit, typer.Abort):
+            raise
+        except Exception as error:
+            if isinstance(error, OSError) and error.errno == errno.EPIPE:  # `evermap ... | head`
+                raise
+            if ctx.params.get("debug"):
+                raise
+            fail(
+                f"a defect of evermap, not yours: {type(error).__name__}: {' '.join(str(error).split())} "
+                "(please report it with the output of: evermap --debug ...)"
+            )
+            raise typer.Exit(EXIT_DEFECT) from None
+
+
+app = typer.Typer(
+    cls=Verbs,
+    name="evermap",
+    help="Landmark maps that stay true while the world changes.",
+    epilog="Start with: evermap demo",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+app.command("demo")(demo.demo)
+app.command("slam")(slam.slam)
+app.command("convert")(convert.convert)
+app.command("simulate")(simulate.simulate)
+app.command("reproduce")(reproduce.reproduce)
+app.command("bench")(bench.bench)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"evermap {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a defect.")] = False,
+) -> None:
+    """Options of all verbs; they are read in `Verbs.invoke`."""
+
+
+def run() -> None:
+    """Entry point of the installed command."""
+    app(prog_name="evermap")

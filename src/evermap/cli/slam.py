@@ -1,0 +1,157 @@
+"""`evermap slam`: trajectory and landmark map of one recording."""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from evermap.cli.summary import show_run
+from evermap.cli.terminal import check_out_folder, progress_bar, say, warn
+from evermap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.types import Landmarks, Recording
+
+
+class SensorModel(StrEnum):
+    """How far readings are believed."""
+
+    CALIBRATED = "calibrated"
+    PLAIN = "plain"
+
+
+def slam(
+    recording_path: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False
+        ),
+    ] = None,
+    robot: Annotated[
+        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<recording>")
+    ] = None,
+    config_file: Annotated[
+        Path | None, typer.Option("--config", help="TOML file; see --show-config.", show_default=False)
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. slam.robust=false; repeatable."),
+    ] = None,
+    sensor_model: Annotated[
+        SensorModel | None,
+        typer.Option(help="Estimate sensor and odometry errors, or believe the readings.", show_default="calibrated"),
+    ] = None,
+    prior_map: Annotated[
+        str | None,
+        typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
+    ] = None,
+    prior_sigma: Annotated[
+        float, typer.Option(min=1e-6, help="Standard deviation of a prior map without sigmas of its own [m].")
+    ] = 0.02,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the run that is already in --out.")] = False,
+    init: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
+    ] = None,
+    show_config: Annotated[
+        bool, typer.Option("--show-config", help="Print the configuration in force as commented TOML and exit.")
+    ] = False,
+) -> None:
+    """Estimate where the robot was and where the landmarks are.
+
+    \b
+    Examples:
+      evermap slam --init my-recording
+      evermap slam my-recording --out out/mine
+      evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
+    """
+    if init is not None:
+        _write_template(init)
+        return
+    from evermap.config import load_config, to_toml
+
+    shortcuts = [] if sensor_model is None else [f"slam.sensor_model={sensor_model.value}"]
+    config = load_config(config_file, [*(settings or []), *shortcuts])
+    if show_config:
+        typer.echo(to_toml(config), nl=False)
+        return
+    if recording_path is None:
+        raise ConfigError(
+            "a recording is needed", field="INPUT", hint="a folder or zip; --init DIR shows what to put in"
+        )
+    from evermap.io import read_recording
+
+    if out is not None:
+        check_out_folder(out, force)
+    recording = read_recording(recording_path, robot=robot)
+    if out is None:
+        out = default_out(recording.name)
+        check_out_folder(out, force)
+    prior = None if prior_map is None else _prior_landmarks(prior_map, prior_sigma, recording)
+    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json)
+
+
+def run_and_write(
+    recording: Recording,
+    config: Config,
+    out: Path,
+    *,
+    prior: Landmarks | None = None,
+    realtime: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
+    from evermap.pipeline import run_slam
+    from evermap.runfolder import write_run
+
+    with progress_bar(recording.name) as progress:
+        result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)
+    summary = write_run(out, recording, result, config)
+    for remark in (*recording.warnings, *result.warnings):
+        warn(remark)
+    show_run(summary, out, as_json=as_json)
+    if result.interrupted:
+        raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
+
+
+def default_out(name: str) -> Path:
+    """`evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1'."""
+    return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-.") or "run")
+
+
+def _write_template(folder: Path) -> None:
+    from evermap.io import write_template
+
+    check_out_folder(folder, force=False)
+    write_template(folder)
+    say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
+
+
+def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> Landmarks:
+    from evermap.io import read_landmarks
+    from evermap.types import Landmarks
+
+    if prior_map != "truth":
+        return read_landmarks(Path(prior_map), default_sigma_m=sigma_m)
+    survey = recording.true_landmarks
+    if survey is None:
+        problem = "this recording has no surveyed landmarks"
+        raise ConfigError(problem, field="--prior-map", hint="a landmarks.csv of your own: --prior-map FILE")
+    return Landmarks.at(
+        survey.landmark_id,
+        survey.position_m,
+        sigma_m=sigma_m,
+        class_id=survey.class_id,
+        class_names=survey.class_names,
+        frame="prior_map",
+    )

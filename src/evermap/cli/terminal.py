@@ -1,0 +1,98 @@
+"""What the verbs share at the terminal: lines, tables and progress. Results go to stdout, everything else to stderr."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TextIO
+
+import typer
+
+from evermap.errors import ConfigError
+
+Progress = Callable[[float, float], None]
+"""Called with what is done and the total, in seconds of the recording."""
+
+
+def say(line: str) -> None:
+    """One line for the person at the terminal."""
+    typer.echo(f"evermap: {line}", err=True)
+
+
+def warn(line: str) -> None:
+    """A remark that does not stop the run."""
+    typer.secho(f"evermap: warning: {line}", err=True, fg="yellow", color=_colour(sys.stderr))
+
+
+def fail(line: str) -> None:
+    """The line with which a run ends; the caller chooses the exit code."""
+    typer.secho(f"evermap: error: {line}", err=True, fg="red", color=_colour(sys.stderr))
+
+
+def print_json(summary: Mapping[str, Any]) -> None:
+    """The summary for machines; strict JSON, so nan and infinity must have become null before."""
+    typer.echo(json.dumps(summary, indent=2, allow_nan=False))
+
+
+def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Two columns: framed on a terminal, aligned text when piped."""
+    if not sys.stdout.isatty():
+        width = max((len(name) for name, _ in rows), default=0)
+        typer.echo("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=False)
+    for name, value in rows:
+        table.add_row(name, value)
+    Console().print(table)
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[Progress | None]:
+    """A progress bar with the real-time factor on stderr; None, and silence, where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[speed]}"),
+    )
+    start = time.perf_counter()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(label, total=None, speed="")
+
+        def advance(done: float, total: float) -> None:
+            elapsed = time.perf_counter() - start
+            speed = f"{done / elapsed:.0f} x real time" if elapsed > 0.5 else ""
+            bars.update(task, completed=done, total=total, speed=speed)
+
+        yield advance
+
+
+def check_out_folder(out: Path, force: bool) -> None:
+    """Refuse, before any work is done, to mix a new run with what is already there.
+
+    Raises:
+        ConfigError: `out` is a file, or a folder that holds something and `force` is off.
+    """
+    if out.exists() and not out.is_dir():
+        raise ConfigError("is a file; results need a folder", path=out, field="--out")
+    if not force and out.is_dir() and any(out.iterdir()):
+        raise ConfigError("is not empty", path=out, field="--out", hint="another --out, or --force to replace it")
+
+
+def _colour(stream: TextIO) -> bool:
+    return stream.isatty() and "NO_COLOR" not in os.environ

@@ -1,0 +1,127 @@
+"""Imports go one way, and importing is cheap. The table below is also in docs/architecture.md, word by word."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from evermap import _HOME, __all__
+
+SOURCE = Path(__file__).resolve().parents[1] / "src" / "evermap"
+
+# part -> what it may import of ours, beside itself
+RULES = {
+    "errors": "",
+    "types": "",
+    "se2": "types",
+    "config": "errors types",
+    "survival": "errors types se2",
+    "sensing": "errors types se2",
+    "persistence": "errors types se2 survival sensing",
+    "tracking": "errors types se2 config survival sensing persistence",
+    "slam": "errors types se2 config survival sensing persistence",
+    "maps": "errors types se2 config survival sensing persistence",
+    "io": "errors types se2",
+    "sim": "errors types se2 survival sensing",
+    "metrics": "errors types se2 survival",
+    "viz": "errors types se2 survival metrics",
+    "pipeline": "errors types se2 config survival sensing persistence tracking slam maps",
+    "runfolder": "errors types se2 config io metrics viz",
+    "server": "errors types se2 config survival sensing persistence maps pipeline",
+    "experiments": "errors types se2 config survival sensing persistence sim io metrics viz pipeline runfolder",
+    "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
+    "cli": "errors types config io sim metrics viz maps pipeline runfolder server experiments demo",
+}
+
+# loaded by the functions that need them, never by starting up
+HEAVY = ("numba", "gtsam", "matplotlib", "scipy", "pyarrow", "pandas", "evo", "rerun", "pydantic", "rich", "numpy")
+# what one may import of the core without loading any of these
+LAZY_EVERYWHERE = ("numba", "gtsam", "matplotlib", "pyarrow", "pandas", "evo", "rerun")
+
+
+def part_of(path: Path) -> str:
+    """'slam' for src/evermap/slam/graph.py, 'types' for src/evermap/types.py."""
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def imported_parts(path: Path) -> set[str]:
+    """Parts of evermap that a module imports anywhere, inside functions and for type checking too."""
+    package = ["evermap", *path.relative_to(SOURCE).parts[:-1]]
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            names |= {f"{module}.{alias.name}" for alias in node.names} if module == "evermap" else {module}
+    return {name.split(".")[1] for name in names if name.startswith("evermap.")} - {"__version__"}
+
+
+MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.parent != SOURCE or not path.name.startswith("__"))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_module_imports_only_what_its_part_may(path: Path) -> None:
+    part = part_of(path)
+    assert part in RULES, f"'{part}' has no row in the table of import rules"
+    forbidden = imported_parts(path) - set(RULES[part].split()) - {part}
+    assert not forbidden, f"evermap.{part} may not import {', '.join(sorted(forbidden))}"
+
+
+def test_rules_have_no_cycle() -> None:
+    left = {part: set(allowed.split()) for part, allowed in RULES.items()}
+    while left:
+        free = {part for part, needs in left.items() if not needs & left.keys()}
+        assert free, f"cycle among {sorted(left)}"
+        left = {part: needs for part, needs in left.items() if part not in free}
+
+
+def test_meeting_rules_of_the_core() -> None:
+    for part in ("tracking", "slam", "maps"):
+        assert not set(RULES[part].split()) & {"tracking", "slam", "maps"}, "they meet in pipeline"
+    outside = {"viz", "cli", "server", "runfolder", "experiments", "demo"}
+    for part in ("survival", "sensing", "persistence", "tracking", "slam", "maps", "pipeline"):
+        assert not set(RULES[part].split()) & outside, f"the core ({part}) knows nothing of its users"
+
+
+def test_architecture_page_shows_the_same_table() -> None:
+    page = (SOURCE.parents[1] / "docs" / "architecture.md").read_text(encoding="utf-8")
+    cells = [
+        [cell.strip(" `") for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| `")
+    ]
+    shown = {row[0]: set(row[1].replace("`", "").split()) - {"–"} for row in cells if row[0] in RULES}
+    assert shown == {part: set(allowed.split()) for part, allowed in RULES.items()}
+
+
+def loaded_after(statement: str) -> set[str]:
+    """Top-level modules in a fresh interpreter after a statement."""
+    code = f"{statement}\nimport sys\nprint(*sorted({{name.split('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=SOURCE.parent)
+    return set(done.stdout.split())
+
+
+@pytest.mark.parametrize("module", ["evermap", "evermap.cli.main"])
+def test_starting_up_loads_nothing_heavy(module: str) -> None:
+    assert not loaded_after(f"import {module}") & set(HEAVY)
+
+
+@pytest.mark.parametrize(
+    "part", ["types", "errors", "se2", "config", "io", "sim", "metrics", "viz", "pipeline", "runfolder", "slam", "demo"]
+)
+def test_importing_a_part_loads_no_plot_backend_or_compiler(part: str) -> None:
+    assert not loaded_after(f"import evermap.{part}") & set(LAZY_EVERYWHERE)
+
+
+def test_public_names_are_real() -> None:
+    import evermap
+
+    for name in __all__:
+        assert getattr(evermap, name) is not None
+    assert sorted(__all__) == sorted(["__version__", *(name for names in _HOME.values() for name in names)])
+    with pytest.raises(AttributeError, match="no_such_name"):
+        evermap.no_such_name  # noqa: B018
