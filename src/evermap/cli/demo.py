@@ -23,9 +23,9 @@ def demo(
     Example:
       evermap demo --out out/demo
     """
+    check_out_folder(out, force)
     from evermap.demo import run_demo
 
-    check_out_folder(out, force)
     with progress_bar("simulated building") as progress:
         summary = run_demo(out, seed=seed, progress=progress)
     show_run(summary, out, as_json=as_json)

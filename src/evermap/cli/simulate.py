@@ -1,12 +1,72 @@
-"""`evermap simulate`: recordings of a building in which things move, with the truth."""
+"""`evermap simulate`: recordings of a building in which things come and go, with the whole truth beside them."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evermap.cli.terminal import check_out_folder, print_json, say
 
-def simulate(out: Annotated[Path, typer.Argument()]) -> None:
-    """x"""
+if TYPE_CHECKING:
+    from evermap.sim import BuildingSimulation
+
+EVENTS_FILE = "changes_truth.jsonl"
+
+
+def simulate(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder to write; one folder a session is made in it.")],
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same recordings.")] = 0,
+    days: Annotated[int, typer.Option(min=1, help="Days that the patrols span.")] = 6,
+    sessions_per_day: Annotated[int, typer.Option(min=1, help="Patrols a day.")] = 1,
+    patrol_s: Annotated[float, typer.Option(help="Length of a patrol [s].")] = 150.0,
+    change_rate: Annotated[float, typer.Option(min=0.0, help="How often things change; 0 is a static world.")] = 1.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
+) -> None:
+    """Record patrols of a simulated building.
+
+    Every session is a folder in the native format with its true trajectory and landmarks; what changed and when is
+    in changes_truth.jsonl.
+
+    \b
+    Example:
+      evermap simulate building --days 3 --seed 1
+      evermap slam building/day00_session00
+    """
+    from evermap.io import write_native
+    from evermap.sim import BuildingConfig, simulate_building
+
+    check_out_folder(out, force)
+    config = BuildingConfig(days=days, sessions_per_day=sessions_per_day, patrol_s=patrol_s, change_rate=change_rate)
+    building = simulate_building(config, seed=seed)
+    names = session_names(building)
+    for name, recording in zip(names, building.sessions, strict=True):
+        write_native(recording, out / name)
+    _write_events(building, out / EVENTS_FILE)
+    if as_json:
+        print_json({"out": str(out), "sessions": names, "changes": len(building.events), "seed": seed})
+    else:
+        say(
+            f"wrote {len(names)} sessions and {len(building.events)} changes to {out}; "
+            f"next: evermap slam {out / names[0]}"
+        )
+
+
+def session_names(building: BuildingSimulation) -> list[str]:
+    """'day00_session00' and so on, in order of time."""
+    names, count = [], dict.fromkeys((truth.day for truth in building.truths), 0)
+    for truth in building.truths:
+        names.append(f"day{truth.day:02d}_session{count[truth.day]:02d}")
+        count[truth.day] += 1
+    return names
+
+
+def _write_events(building: BuildingSimulation, path: Path) -> None:
+    """One JSON object a line, in order of time."""
+    from evermap.io.atomic import write_atomic
+
+    write_atomic(path, "".join(json.dumps(asdict(event)) + "\n" for event in building.events))

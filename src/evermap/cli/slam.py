@@ -138,11 +138,11 @@ def _write_template(folder: Path) -> None:
 
 
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> Landmarks:
-    from evermap.io import read_landmarks
+    from evermap.io import read_prior_map
     from evermap.types import Landmarks
 
     if prior_map != "truth":
-        return read_landmarks(Path(prior_map), default_sigma_m=sigma_m)
+        return read_prior_map(prior_map, sigma_m=sigma_m)
     survey = recording.true_landmarks
     if survey is None:
         problem = "this recording has no surveyed landmarks"
