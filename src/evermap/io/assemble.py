@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from evermap import se2
 from evermap.errors import DataError, InputError
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
 
@@ -20,10 +21,19 @@ def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str
     if len(back):
         row = int(back[0]) + 1
         step = stamp_s[row - 1] - stamp_s[row]
-        raise InputError(
-            f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field,
-            hint="sort the rows by time if only their order is wrong",
-        )  # fmt: skip
+        hint = "sort the rows by time if only their order is wrong"
+        raise InputError(f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field, hint=hint)
+
+
+def repeats(values: IntArray) -> IntArray:
+    """Rows that are equal to an earlier one. Shape (N,) or (N, K) -> (number of repeats,)."""
+    _, first = np.unique(values, axis=0, return_index=True)
+    return np.setdiff1d(np.arange(len(values)), first)
+
+
+def wrap_far(angle_rad: FloatArray) -> FloatArray:
+    """Angles beyond half a turn wrapped to (-pi, pi]; the others keep every bit, so that files read back the same."""
+    return np.where(np.abs(angle_rad) <= np.pi, angle_rad, se2.wrap(angle_rad))
 
 
 def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> BoolArray:
@@ -71,11 +81,9 @@ def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
     if keep.all():
         return recording
     if not keep.any():
-        raise DataError(
-            f"odometry ({first:.3f} to {last:.3f} s) and detections ({frames.stamp_s[0]:.3f} to "
-            f"{frames.stamp_s[-1]:.3f} s) do not overlap in time",
-            path=recording.source, hint="stamp both with the same clock, in seconds",
-        )  # fmt: skip
+        looked = f"{frames.stamp_s[0]:.3f} to {frames.stamp_s[-1]:.3f} s"
+        problem = f"odometry ({first:.3f} to {last:.3f} s) and detections ({looked}) do not overlap in time"
+        raise DataError(problem, path=recording.source, hint="stamp both with the same clock, in seconds")
     seen = keep[detections.frame]
     new_frame = np.cumsum(keep) - 1
     warnings.append(
@@ -104,11 +112,10 @@ def select_detections(detections: Detections, rows: BoolArray | IntArray) -> Det
 def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:
     known = np.flatnonzero(detections.landmark_id != UNKNOWN)
     pairs = np.stack([detections.frame[known], detections.landmark_id[known]], axis=1)
-    _, first = np.unique(pairs, axis=0, return_index=True)
-    repeats = np.setdiff1d(np.arange(len(known)), first)
-    if len(repeats):
-        row = known[repeats[0]]
+    again = repeats(pairs)
+    if len(again):
+        row = known[again[0]]
         warnings.append(
-            f"{len(repeats)} detections repeat a landmark within one frame, kept "
+            f"{len(again)} detections repeat a landmark within one frame, kept "
             f"(first: landmark {detections.landmark_id[row]}, line {detections.source_line[row]})"
         )

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError, InputError
-from evermap.io.assemble import check_forward, finish_recording, last_of_equal
+from evermap.io.assemble import check_forward, finish_recording, last_of_equal, repeats, wrap_far
 from evermap.io.files import FileSet, find_file_set
 from evermap.io.quantities import (
     ANGULAR_RADPS,
@@ -138,7 +138,8 @@ def _choose_robot(files: FileSet, robot: int | None) -> int:
         return complete[0]
     if robot not in complete:
         lacking = [kind for kind in ("Odometry", "Measurement") if f"Robot{robot}_{kind}.dat" not in files]
-        problem = f"robot {robot} has no {lacking[0].lower()} file" if len(lacking) == 1 else f"there is no robot {robot}"
+        only_one = len(lacking) == 1
+        problem = f"robot {robot} has no {lacking[0].lower()} file" if only_one else f"there is no robot {robot}"
         raise InputError(problem, path=files.root / files.folder, hint=f"robots with both files: {numbers}")
     return robot
 
@@ -175,7 +176,7 @@ def _read_measurements(
         frame=np.asarray(frame[landmark], dtype=np.int64),
         landmark_id=subject[landmark],
         range_m=rows.column(2)[landmark],
-        bearing_rad=rows.column(3)[landmark],
+        bearing_rad=wrap_far(rows.column(3))[landmark],
         class_id=np.full(len(landmark), UNKNOWN),
         sigma_range_m=np.full(len(landmark), np.nan),
         sigma_bearing_rad=np.full(len(landmark), np.nan),
@@ -185,7 +186,7 @@ def _read_measurements(
         stamp_s=rows.column(0)[other],
         robot_id=subject[other],
         range_m=rows.column(2)[other],
-        bearing_rad=rows.column(3)[other],
+        bearing_rad=wrap_far(rows.column(3))[other],
         clock=Clock.UNIX,
     )
     if not len(landmark):
@@ -198,11 +199,7 @@ def _subjects(files: FileSet, barcode: IntArray, name: str, warnings: list[str])
     rows = _parse(files, "Barcodes.dat", (_SUBJECT, _BARCODE), warnings)
     listed_subject, listed_barcode = _whole(rows, 0, "subject"), _whole(rows, 1, "barcode")
     for listed, field in ((listed_subject, "subject"), (listed_barcode, "barcode")):
-        _, first = np.unique(listed, return_index=True)
-        again = np.setdiff1d(np.arange(len(listed)), first)
-        if len(again):
-            row = int(again[0])
-            raise InputError(f"{listed[row]} is listed twice", path=rows.path, line=int(rows.line[row]), field=field)
+        _refuse_repeats(rows, listed, field)
     subject_of = dict(zip(listed_barcode.tolist(), listed_subject.tolist(), strict=True))
     subject = np.array([subject_of.get(code, 0) for code in barcode.tolist()], dtype=np.int64)
     unknown = Counter(barcode[subject == 0].tolist())
@@ -222,7 +219,7 @@ def _read_truth(files: FileSet, robot: int, warnings: list[str]) -> Trajectory |
         return None
     rows = _forward_in_time(rows, warnings)
     pose = rows.values[:, 1:].copy()
-    pose[:, 2] = se2.wrap(pose[:, 2])
+    pose[:, 2] = wrap_far(pose[:, 2])
     return Trajectory(rows.column(0), pose, np.zeros((len(rows), 3, 3)), frame="truth", clock=Clock.UNIX)
 
 
@@ -236,12 +233,9 @@ def _read_landmarks(files: FileSet, warnings: list[str]) -> Landmarks | None:
         warnings.append(f"{name}: holds no landmark, taken as missing")
         return None
     ids = _whole(rows, 0, "subject")
-    _, first = np.unique(ids, return_index=True)
-    again = np.setdiff1d(np.arange(len(ids)), first)
-    if len(again):
-        row = int(again[0])
-        raise InputError(f"{ids[row]} is listed twice", path=rows.path, line=int(rows.line[row]), field="subject")
-    return Landmarks.at(ids, rows.values[:, 1:3], sigma_m=rows.values[:, 3:5], frame="truth")
+    _refuse_repeats(rows, ids, "subject")
+    surveyed = Landmarks.at(ids, rows.values[:, 1:3], sigma_m=rows.values[:, 3:5], frame="truth")
+    return replace(surveyed, clock=Clock.UNIX)
 
 
 def _parse(files: FileSet, name: str, quantities: tuple[Quantity, ...], warnings: list[str]) -> Rows:
@@ -255,10 +249,17 @@ def _forward_in_time(rows: Rows, warnings: list[str]) -> Rows:
     return Rows(rows.path, rows.values[keep], rows.line[keep])
 
 
+def _refuse_repeats(rows: Rows, numbers: IntArray, field: str) -> None:
+    again = repeats(numbers)
+    if len(again):
+        row = int(again[0])
+        raise rows.error(f"{numbers[row]} is listed twice", row=row, field=field)
+
+
 def _whole(rows: Rows, column: int, field: str) -> IntArray:
     values = rows.column(column)
     fractions = np.flatnonzero(values != np.floor(values))
     if len(fractions):
         row = int(fractions[0])
-        raise InputError(f"{values[row]:g} is not a whole number", path=rows.path, line=int(rows.line[row]), field=field)
+        raise rows.error(f"{values[row]:g} is not a whole number", row=row, field=field)
     return np.asarray(values, dtype=np.int64)

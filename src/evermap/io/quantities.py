@@ -44,8 +44,8 @@ class Quantity:
         bad = np.flatnonzero(~fine & ~absent)
         if len(bad):
             row = int(bad[0])
-            raise InputError(self._complaint(float(values[row])), path=path, line=int(line[row]), field=self.name,
-                             hint=self.hint or None)  # fmt: skip
+            problem = self._complaint(float(values[row]))
+            raise InputError(problem, path=path, line=int(line[row]), field=self.name, hint=self.hint or None)
 
     def _complaint(self, value: float) -> str:
         if not np.isfinite(value):

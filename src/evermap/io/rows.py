@@ -34,6 +34,10 @@ class Rows:
     def __len__(self) -> int:
         return len(self.values)
 
+    def error(self, problem: str, *, row: int, field: str | None = None, hint: str | None = None) -> InputError:
+        """An error that names file, line and column."""
+        return InputError(problem, path=self.path, line=int(self.line[row]), field=field, hint=hint)
+
     def column(self, index: int) -> FloatArray:
         """One column, contiguous. Shape (R,)."""
         return np.ascontiguousarray(self.values[:, index])

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import csv
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,13 @@ class Table:
         path: file it came from, for messages.
         columns: name -> cells.
         line: (R,) line numbers in the file; for Parquet the row, for GeoJSON the feature, counted from 1.
+        header_line: where the names of the columns stand, None where that is no line of text.
     """
 
     path: Path
-    columns: dict[str, Sequence[str] | FloatArray]
+    columns: Mapping[str, Sequence[str] | FloatArray]
     line: IntArray
+    header_line: int | None = None
 
     def __len__(self) -> int:
         return len(self.line)
@@ -40,20 +43,22 @@ class Table:
     def __contains__(self, name: str) -> bool:
         return name in self.columns
 
+    def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
+        """An error that names file, line and column; `row` None blames the header."""
+        line = self.header_line if row is None else int(self.line[row])
+        return InputError(problem, path=self.path, line=line, field=field, hint=hint)
+
     def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
         """Raises InputError unless all of `required` and nothing beside `required` and `optional` is there."""
         known = [*required, *optional]
         for name in self.columns:
             if name not in known:
-                raise InputError(
-                    "unknown column", path=self.path, line=self._header_line(), field=name,
-                    hint=_nearest(name, [other for other in known if other not in self.columns], known),
-                )  # fmt: skip
+                hint = _nearest(name, [other for other in known if other not in self.columns], known)
+                raise self.error("unknown column", row=None, field=name, hint=hint)
         for name in required:
             if name not in self.columns:
                 has = ", ".join(self.columns) or "none"
-                raise InputError("missing column", path=self.path, line=self._header_line(), field=name,
-                                 hint=f"the file has {has}")  # fmt: skip
+                raise self.error("missing column", row=None, field=name, hint=f"the file has {has}")
 
     def has_any(self, names: Iterable[str]) -> bool:
         """Whether at least one of the columns is there."""
@@ -82,14 +87,16 @@ class Table:
         if wrong.any():
             row = int(np.argmax(wrong))
             problem = "is empty" if absent[row] else f"{values[row]:g} is not a whole number"
-            raise InputError(problem, path=self.path, line=int(self.line[row]), field=name,
-                             hint="an id is a whole number from 0")  # fmt: skip
+            raise self.error(problem, row=row, field=name, hint="an id is a whole number from 0")
         return whole.astype(np.int64)
 
     def labels(self, name: str) -> list[str]:
         """A column of names, '' where empty. Whole numbers stand for themselves as text."""
         cells = self.columns[name]
         if not isinstance(cells, np.ndarray):
+            broken = [row for row, cell in enumerate(cells) if not cell.isprintable()]
+            if broken:
+                raise self.error("holds a character that cannot be printed", row=broken[0], field=name)
             return [cell.strip() for cell in cells]
         return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
 
@@ -101,18 +108,15 @@ class Table:
                 return np.array([float(cell) for cell in cells], dtype=np.float64)
             except ValueError:
                 pass
-        for cell, line in zip(cells, self.line.tolist(), strict=True):
+        for row, cell in enumerate(cells):
             if quantity.optional and not cell.strip():
                 continue
             try:
                 parse_float(cell)
             except ValueError:
                 problem = f"{quote(cell)} is not a number" if cell.strip() else "is empty"
-                raise InputError(problem, path=self.path, line=line, field=quantity.name) from None
+                raise self.error(problem, row=row, field=quantity.name) from None
         raise AssertionError("one of the cells failed to parse a moment ago")
-
-    def _header_line(self) -> int | None:
-        return None if self.path.suffix != ".csv" else max(1, int(self.line[0]) - 1 if len(self.line) else 1)
 
 
 def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
@@ -143,7 +147,7 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
         rows.pop()
     columns = zip(*rows, strict=True) if rows else [()] * len(names)
     line_numbers = np.array([number for number, _ in content[1 : len(rows) + 1]], dtype=np.int64)
-    return Table(path, dict(zip(names, columns, strict=True)), line_numbers)
+    return Table(path, dict(zip(names, columns, strict=True)), line_numbers, content[0][0])
 
 
 def parse_parquet(data: bytes, path: Path) -> Table:
@@ -199,7 +203,7 @@ def _csv_cells(column: Any) -> list[str]:
         return [_quoted(cell) for cell in column]
     if column.dtype.kind == "i":
         return ["" if value == UNKNOWN else str(value) for value in column.tolist()]
-    return ["" if value != value else repr(value) for value in column.tolist()]
+    return ["" if isnan(value) else repr(value) for value in column.tolist()]
 
 
 def _quoted(cell: str) -> str:
@@ -214,8 +218,8 @@ def _header(line: str, path: Path, number: int) -> list[str]:
         raise InputError("columns must be separated by commas", path=path, line=number, field=line.strip()[:40])
     for name in names:
         if not name or _is_number(name):
-            raise InputError(f"the first line must name the columns, found {quote(line.strip())}", path=path,
-                             line=number)  # fmt: skip
+            problem = f"the first line must name the columns, found {quote(line.strip())}"
+            raise InputError(problem, path=path, line=number)
         if names.count(name) > 1:
             raise InputError("column appears twice", path=path, line=number, field=name)
     return names

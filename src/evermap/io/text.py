@@ -8,7 +8,7 @@ from evermap.errors import InputError
 
 
 def decode_text(data: bytes, path: Path) -> str:
-    """UTF-8 text with `\\n` line ends; a byte order mark is dropped.
+    """UTF-8 text with newlines as line ends, whatever they were; a byte order mark is dropped.
 
     Raises:
         InputError: the bytes are not text, with the line where that shows first.

@@ -1,0 +1,30 @@
+"""Readers and writers: recordings, maps and trajectories in files. `docs/formats.md` describes every format."""
+
+from __future__ import annotations
+
+from evermap.io.geojson import write_map_geojson
+from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_parquet
+from evermap.io.mrclam import read_mrclam
+from evermap.io.native import read_native
+from evermap.io.native_write import write_native
+from evermap.io.registry import READERS, Reader, list_robots, read_recording, reader_for
+from evermap.io.template import write_template
+from evermap.io.tum import read_tum, write_tum
+
+__all__ = [
+    "READERS",
+    "Reader",
+    "list_robots",
+    "read_landmarks",
+    "read_mrclam",
+    "read_native",
+    "read_prior_map",
+    "read_recording",
+    "read_tum",
+    "reader_for",
+    "write_map_geojson",
+    "write_map_parquet",
+    "write_native",
+    "write_template",
+    "write_tum",
+]

@@ -1,0 +1,278 @@
+"""Maps in files: prior maps read from CSV, Parquet or GeoJSON, maps written as Parquet and read back the same."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import DataError, InputError
+from evermap.io.assemble import repeats
+from evermap.io.atomic import write_atomic
+from evermap.io.quantities import STAMP_S, X_M, Y_M, Quantity
+from evermap.io.table import Table, parquet_bytes, parse_csv, parse_parquet
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
+
+MAP_SCHEMA_VERSION = 1
+
+COVARIANCE_COLUMNS = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
+_REQUIRED = ("landmark_id", "x_m", "y_m")
+_OPTIONAL = (
+    "sigma_m", *COVARIANCE_COLUMNS, "class_id", "p_exists", "n_hits", "n_misses", "first_seen_s", "last_seen_s",
+)  # fmt: skip
+_MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "map.geojson")
+
+_SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
+_P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
+
+
+def read_prior_map(path: str | Path, sigma_m: float = 0.02) -> Landmarks:
+    """Landmark positions to start from, for `--prior-map FILE`. Their frame becomes 'prior_map'.
+
+    Args:
+        path: CSV, Parquet or GeoJSON with `landmark_id, x_m, y_m` and optionally `sigma_m` or all of `cov_xx_m2,
+            cov_xy_m2, cov_yy_m2`, `class_id`, and the other columns of `map.parquet`; or a run or recording folder
+            that has such a file.
+        sigma_m: standard deviation of positions for which the file gives none.
+
+    Raises:
+        InputError: the file is missing or malformed, or `sigma_m` is not positive.
+        DataError: it holds no landmark.
+    """
+    if not (np.isfinite(sigma_m) and sigma_m > 0):
+        raise InputError(f"sigma of the prior map must be a positive number of metres, not {sigma_m}")
+    landmarks = read_landmarks(path, sigma_m=sigma_m)
+    if len(landmarks) == 0:
+        raise DataError("the map holds no landmark", path=path)
+    return replace(landmarks, frame="prior_map")
+
+
+def read_landmarks(path: str | Path, *, sigma_m: float = 0.0) -> Landmarks:
+    """A map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
+    path = _map_file(Path(path))
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
+    ending = path.suffix.lower()
+    warnings: list[str] = []
+    about: dict[str, Any] = {}
+    if ending == ".csv":
+        table = parse_csv(data, path, warnings)
+        if warnings:
+            # a session may do without its last reading, but a map without its last landmark is another map
+            raise InputError("the last line is unfinished", path=path, hint="complete or remove it")
+    elif ending in (".parquet", ".pq"):
+        table, about = parse_parquet(data, path), parquet_about(data, path)
+    elif ending in (".geojson", ".json"):
+        from evermap.io.geojson import parse_geojson
+
+        table, about = parse_geojson(data, path)
+    else:
+        raise InputError(f"no map format ends in '{ending}'", path=path, hint=".csv, .parquet or .geojson")
+    return landmarks_from_table(
+        table,
+        sigma_m=sigma_m,
+        class_names=tuple(about["class_names"]) if "class_names" in about else None,
+        frame=about.get("frame", "truth"),
+        clock=Clock(about.get("clock", Clock.RECORDING)),
+    )
+
+
+def landmarks_from_table(
+    table: Table,
+    *,
+    sigma_m: float,
+    class_names: tuple[str, ...] | None = None,
+    frame: str = "truth",
+    clock: Clock = Clock.RECORDING,
+) -> Landmarks:
+    """Landmarks of a table with the columns of `docs/formats.md`, sorted by id.
+
+    Raises:
+        InputError: a column or value is not what it must be, or an id appears twice.
+    """
+    table.expect(_REQUIRED, _OPTIONAL)
+    ids = table.ids("landmark_id", optional=False)
+    again = repeats(ids)
+    if len(again):
+        row = int(again[0])
+        raise table.error(f"landmark {ids[row]} is listed twice", row=row, field="landmark_id")
+    count = len(ids)
+    if class_names is None:
+        class_names = distinct_labels(table)
+    never = np.full(count, np.nan)
+    order = np.argsort(ids)
+    landmarks = Landmarks(
+        landmark_id=ids,
+        position_m=np.stack([table.numbers(X_M), table.numbers(Y_M)], axis=1),
+        covariance_m2=_covariance(table, sigma_m),
+        class_id=class_ids(table, class_names),
+        p_exists=table.numbers(_P_EXISTS) if "p_exists" in table else np.ones(count),
+        n_hits=table.ids("n_hits", optional=False) if "n_hits" in table else np.zeros(count, dtype=np.int64),
+        n_misses=table.ids("n_misses", optional=False) if "n_misses" in table else np.zeros(count, dtype=np.int64),
+        first_seen_s=table.numbers(_seen("first_seen_s")) if "first_seen_s" in table else never,
+        last_seen_s=table.numbers(_seen("last_seen_s")) if "last_seen_s" in table else never,
+        class_names=class_names,
+        frame=frame,
+        clock=clock,
+    )
+    return sort_landmarks(landmarks, order)
+
+
+def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
+    """Writes a map as Parquet, one row a landmark, columns as in `docs/formats.md`. Returns the path.
+
+    `read_landmarks` gives back equal arrays.
+    """
+    metadata = {"evermap": json.dumps(about_map(landmarks))}
+    return write_atomic(path, parquet_bytes(map_columns(landmarks), metadata))
+
+
+def map_columns(landmarks: Landmarks) -> dict[str, Any]:
+    """All columns of a map, in the order of `docs/formats.md`; class ids as labels."""
+    return {
+        **survey_columns(landmarks),
+        "class_id": labels_of(landmarks.class_id, landmarks.class_names),
+        "p_exists": landmarks.p_exists,
+        "n_hits": landmarks.n_hits,
+        "n_misses": landmarks.n_misses,
+        "first_seen_s": landmarks.first_seen_s,
+        "last_seen_s": landmarks.last_seen_s,
+    }
+
+
+def survey_columns(landmarks: Landmarks) -> dict[str, Any]:
+    """Ids, positions and covariances."""
+    return {
+        "landmark_id": landmarks.landmark_id,
+        "x_m": landmarks.position_m[:, 0],
+        "y_m": landmarks.position_m[:, 1],
+        "cov_xx_m2": landmarks.covariance_m2[:, 0, 0],
+        "cov_xy_m2": landmarks.covariance_m2[:, 0, 1],
+        "cov_yy_m2": landmarks.covariance_m2[:, 1, 1],
+    }
+
+
+def about_map(landmarks: Landmarks) -> dict[str, Any]:
+    """What the columns cannot say: version, frame, clock and the order of the classes."""
+    return {
+        "schema_version": MAP_SCHEMA_VERSION,
+        "frame": landmarks.frame,
+        "clock": landmarks.clock.value,
+        "class_names": list(landmarks.class_names),
+    }
+
+
+def checked_about(about: Any, path: Path) -> dict[str, Any]:
+    """`about_map` as read from a file.
+
+    Raises:
+        InputError: it is not what evermap writes.
+    """
+    names = about.get("class_names", []) if isinstance(about, dict) else None
+    if (
+        names is None
+        or not isinstance(names, list)
+        or not all(isinstance(name, str) for name in names)
+        or not isinstance(about.get("frame", ""), str)
+        or about.get("clock", Clock.RECORDING.value) not in list(Clock)
+    ):
+        raise InputError("damaged description of the map", path=path, field="evermap", hint="remove it")
+    if about.get("schema_version", MAP_SCHEMA_VERSION) != MAP_SCHEMA_VERSION:
+        problem = f"map of schema version {about['schema_version']}, this evermap reads {MAP_SCHEMA_VERSION}"
+        raise InputError(problem, path=path, field="evermap", hint="a newer evermap")
+    return dict(about)
+
+
+def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
+    """The description that `write_map_parquet` leaves in a file; empty for files made by others."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    metadata = pq.read_schema(pa.BufferReader(data)).metadata or {}
+    if b"evermap" not in metadata:
+        return {}
+    try:
+        about = json.loads(metadata[b"evermap"])
+    except (ValueError, RecursionError):
+        about = None
+    return checked_about(about, path)
+
+
+def labels_of(class_id: IntArray, class_names: Sequence[str]) -> list[str]:
+    """Names of classes, '' for `UNKNOWN`; a class without a name is called by its number."""
+    names = dict(enumerate(class_names))
+    return ["" if number == UNKNOWN else names.get(number, str(number)) for number in class_id.tolist()]
+
+
+def distinct_labels(*tables: Table | None) -> tuple[str, ...]:
+    """All class labels of the tables, sorted."""
+    labels = {label for table in tables if table is not None and "class_id" in table
+              for label in table.labels("class_id")}  # fmt: skip
+    return tuple(sorted(labels - {""}))
+
+
+def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
+    """Rows of `class_names` for the column `class_id`, `UNKNOWN` where it is empty or missing. Shape (R,).
+
+    Raises:
+        InputError: a label is not among the names.
+    """
+    if "class_id" not in table:
+        return np.full(len(table), UNKNOWN, dtype=np.int64)
+    number_of = {"": UNKNOWN, **{name: number for number, name in enumerate(class_names)}}
+    labels = table.labels("class_id")
+    for row, label in enumerate(labels):
+        if label not in number_of:
+            hint = "one of " + ", ".join(class_names)
+            raise table.error(f"class '{label}' is not among the class names", row=row, field="class_id", hint=hint)
+    return np.array([number_of[label] for label in labels], dtype=np.int64)
+
+
+def sort_landmarks(landmarks: Landmarks, order: IntArray) -> Landmarks:
+    """The given rows of a map, in that order."""
+    rows = ("landmark_id", "position_m", "covariance_m2", "class_id", "p_exists", "n_hits", "n_misses",
+            "first_seen_s", "last_seen_s")  # fmt: skip
+    return replace(landmarks, **{name: getattr(landmarks, name)[order] for name in rows})
+
+
+def _covariance(table: Table, sigma_m: float) -> FloatArray:
+    covariance = np.zeros((len(table), 2, 2))
+    if table.has_any(COVARIANCE_COLUMNS):
+        if "sigma_m" in table:
+            problem = "both sigma_m and cov_* columns are given"
+            raise table.error(problem, row=None, field="sigma_m", hint="keep one of them")
+        table.expect((*_REQUIRED, *COVARIANCE_COLUMNS), _OPTIONAL)
+        xx, xy, yy = (table.numbers(Quantity(name, -1e12, 1e12)) for name in COVARIANCE_COLUMNS)
+        # estimates of well-known landmarks may miss being positive by rounding
+        wrong = np.flatnonzero((xx < 0) | (yy < 0) | (xy**2 > xx * yy * (1 + 1e-6) + 1e-30))
+        if len(wrong):
+            problem = "is no covariance: not positive semidefinite"
+            raise table.error(problem, row=int(wrong[0]), field="cov_xx_m2")
+        covariance[:, 0, 0], covariance[:, 1, 1] = xx, yy
+        covariance[:, 0, 1] = covariance[:, 1, 0] = xy
+        return covariance
+    sigma = table.numbers(_SIGMA_M) if "sigma_m" in table else np.full(len(table), np.nan)
+    sigma = np.where(np.isnan(sigma), sigma_m, sigma)
+    covariance[:, 0, 0] = covariance[:, 1, 1] = sigma**2
+    return covariance
+
+
+def _seen(name: str) -> Quantity:
+    return Quantity(name, STAMP_S.low, STAMP_S.high, optional=True, hint=STAMP_S.hint)
+
+
+def _map_file(path: Path) -> Path:
+    if not path.exists():
+        raise InputError("no such map", path=path, hint="check the path")
+    if not path.is_dir():
+        return path
+    for name in _MAP_FILES:
+        if (path / name).is_file():
+            return path / name
+    raise InputError(f"no map in this folder: looked for {', '.join(_MAP_FILES)}", path=path)

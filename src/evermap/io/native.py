@@ -1,0 +1,317 @@
+"""The native recording: a folder of CSV or Parquet tables and a `sensor.toml`, as `docs/formats.md` lays down."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from evermap import se2
+from evermap.errors import DataError, InputError
+from evermap.io import quantities as q
+from evermap.io.assemble import check_forward, finish_recording, last_of_equal, wrap_far
+from evermap.io.files import FileSet, find_file_set
+from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.sensor_toml import Settings, parse_sensor_toml
+from evermap.io.table import Table, parse_csv, parse_parquet
+from evermap.types import (
+    Clock,
+    Detections,
+    FloatArray,
+    Frames,
+    IntArray,
+    Odometry,
+    Recording,
+    RobotSightings,
+    Trajectory,
+)
+
+SAME_STAMP_S: float = 1e-6
+"""Stamps closer than this are the same instant when detections are put into frames."""
+
+TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings")
+ENDINGS = (".csv", ".parquet")
+SENSOR_FILE = "sensor.toml"
+
+_VELOCITIES = ("forward_mps", "angular_radps")
+_INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
+_POLAR = ("range_m", "bearing_rad")
+_CARTESIAN = ("x_m", "y_m")
+_POLAR_SIGMAS = ("sigma_range_m", "sigma_bearing_rad")
+_ROUND_SIGMAS = ("sigma_m", "sigma")
+
+
+def read_native(path: str | Path, robot: int | None = None) -> Recording:
+    """A recording in the plain native format.
+
+    Args:
+        path: folder, or zip of a folder, with `odometry` and `detections` as `.csv` or `.parquet`, and optionally
+            `frames`, `truth`, `landmarks`, `robot_sightings` and `sensor.toml`.
+        robot: must be None; a native recording is of one robot.
+
+    Returns:
+        Odometry as body velocities: increments become the constant twist that makes them (SE(2) logarithm). Frames from
+        `frames`, else one for every distinct detection stamp with `complete=False`.
+
+    Raises:
+        InputError: a file or value is malformed, with its line; or stamps contradict each other.
+        DataError: nothing to estimate from, for example no landmark was ever seen.
+    """
+    files = find_file_set(path, is_native)
+    if files is None:
+        raise InputError("no native recording here", path=path, hint=NativeReader.looks_for)
+    if robot is not None:
+        problem = f"there is no robot {robot}: a native recording is of one robot"
+        raise InputError(problem, path=path, hint="leave the robot out")
+    warnings: list[str] = []
+    _warn_of_similar_names(files, warnings)
+    settings = _read_settings(files, warnings)
+    tables = {name: _read_table(files, name, warnings) for name in TABLES}
+    odometry_table, detection_table = tables["odometry"], tables["detections"]
+    for name, table in (("odometry", odometry_table), ("detections", detection_table)):
+        if table is None:
+            raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=f"{name}.csv or .parquet")
+    assert odometry_table is not None
+    assert detection_table is not None
+    clock = settings.clock
+    class_names = settings.class_names
+    if class_names is None:
+        class_names = distinct_labels(detection_table, tables["landmarks"])
+    odometry = _odometry(odometry_table, clock, warnings)
+    frames, detections = _detections(detection_table, tables["frames"], class_names, settings, warnings)
+    landmarks = tables["landmarks"]
+    recording = Recording(
+        name=settings.name or files.title,
+        odometry=odometry,
+        frames=frames,
+        detections=detections,
+        sensor=settings.sensor,
+        truth=_truth(tables["truth"], clock, warnings),
+        true_landmarks=None
+        if landmarks is None or not len(landmarks)
+        else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock),
+        robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
+        class_names=class_names,
+        source=str(path),
+        clock=clock,
+    )
+    return finish_recording(recording, warnings=warnings)
+
+
+class NativeReader:
+    """Reader of native folders and zips of them."""
+
+    name = "native"
+    looks_for = "folder or zip with odometry.csv and detections.csv (or .parquet)"
+
+    def matches(self, path: Path) -> bool:
+        """Whether odometry or detections are there, at the top or one folder down."""
+        return find_file_set(path, is_native) is not None
+
+    def read(self, path: Path, robot: int | None) -> Recording:
+        """See `read_native`."""
+        return read_native(path, robot)
+
+    def robots(self, path: Path) -> tuple[int, ...]:  # noqa: ARG002 (the protocol's signature)
+        """None: a native recording is of one robot, without a number."""
+        return ()
+
+
+def is_native(files: FileSet) -> bool:
+    """Whether a file set holds odometry or detections under their native names."""
+    return any(f"{name}{ending}" in files for name in ("odometry", "detections") for ending in ENDINGS)
+
+
+def _read_settings(files: FileSet, warnings: list[str]) -> Settings:
+    if SENSOR_FILE not in files:
+        warnings.append(f"no {SENSOR_FILE}: the sensor is taken to see all around, at the robot's centre")
+        return Settings()
+    return parse_sensor_toml(files.read(SENSOR_FILE), files.path_of(SENSOR_FILE))
+
+
+def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
+    present = [f"{name}{ending}" for ending in ENDINGS if f"{name}{ending}" in files]
+    if not present:
+        return None
+    if len(present) == 2:
+        raise InputError(f"lies beside {present[1]}", path=files.path_of(present[0]), hint="remove one of them")
+    file = present[0]
+    data, path = files.read(file), files.path_of(file)
+    return parse_csv(data, path, warnings) if file.endswith(".csv") else parse_parquet(data, path)
+
+
+def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
+    given = _one_form(table, _VELOCITIES, _INCREMENTS)
+    if given is _VELOCITIES:
+        table.expect(("stamp_s", *_VELOCITIES), ("lateral_mps",))
+    else:
+        table.expect(("stamp_s", *_INCREMENTS))
+    if len(table) == 0:
+        raise DataError("holds no odometry", path=table.path)
+    stamp_s = _forward_stamps(table)
+    if given is _VELOCITIES:
+        keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+        lateral = table.numbers(q.LATERAL_MPS) if "lateral_mps" in table else np.zeros(len(table))
+        return Odometry(
+            stamp_s=stamp_s[keep],
+            forward_mps=table.numbers(q.FORWARD_MPS)[keep],
+            lateral_mps=lateral[keep],
+            angular_radps=table.numbers(q.ANGULAR_RADPS)[keep],
+            clock=clock,
+        )
+    increments = np.stack([table.numbers(quantity) for quantity in (q.DX_M, q.DY_M, q.DTHETA_RAD)], axis=1)
+    return _from_increments(stamp_s, increments, table, clock, warnings)
+
+
+def _from_increments(
+    stamp_s: FloatArray, increments: FloatArray, table: Table, clock: Clock, warnings: list[str]
+) -> Odometry:
+    """Body velocities that hold from one stamp to the next and move by the increment given at the next."""
+    if np.any(increments[0] != 0.0):
+        warnings.append(f"{table.path.name}: the first increment is left out, since its start is not known")
+    step = np.diff(stamp_s)
+    twice = np.flatnonzero(step == 0.0)
+    if len(twice):
+        # unlike of a velocity, neither of two increments can be dropped without losing motion
+        row, problem = int(twice[0]) + 1, "two increments with the same stamp"
+        raise table.error(problem, row=row, field="stamp_s", hint="compose them into one row")
+    if len(stamp_s) < 2:
+        raise DataError("increments need at least two rows", path=table.path)
+    twist = se2.log(increments[1:]) / step[:, None]
+    # the last row only says where the last increment ends; the robot is taken to go on as before
+    velocity = np.ascontiguousarray(np.vstack([twist, twist[-1:]]).T)
+    return Odometry(stamp_s, velocity[0], velocity[1], velocity[2], clock=clock)
+
+
+def _detections(
+    table: Table, frame_table: Table | None, class_names: tuple[str, ...], settings: Settings, warnings: list[str]
+) -> tuple[Frames, Detections]:
+    given = _one_form(table, _POLAR, _CARTESIAN)
+    table.expect(("stamp_s", "landmark_id", *given), ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS))
+    stamp_s = _forward_stamps(table)
+    complete = settings.frames_complete if settings.frames_complete is not None else frame_table is not None
+    if frame_table is None:
+        frame_stamp_s = _distinct(stamp_s)
+    else:
+        frame_table.expect(("stamp_s",))
+        frame_stamp_s = _distinct(_forward_stamps(frame_table))
+        merged = len(frame_table) - len(frame_stamp_s)
+        if merged:
+            warnings.append(f"{frame_table.path.name}: {merged} rows repeat the stamp before and are left out")
+    range_m, bearing_rad = _polar(table) if given is _POLAR else _polar_of_cartesian(table)
+    sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
+    detections = Detections(
+        frame=_match_frames(stamp_s, frame_stamp_s, table, frame_table),
+        landmark_id=table.ids("landmark_id", optional=True),
+        range_m=range_m,
+        bearing_rad=bearing_rad,
+        class_id=class_ids(table, class_names),
+        sigma_range_m=sigma_range_m,
+        sigma_bearing_rad=sigma_bearing_rad,
+        source_line=np.asarray(table.line, dtype=np.int64),
+    )
+    return Frames(frame_stamp_s, complete=complete, clock=settings.clock), detections
+
+
+def _polar(table: Table) -> tuple[FloatArray, FloatArray]:
+    return table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
+
+
+def _polar_of_cartesian(table: Table) -> tuple[FloatArray, FloatArray]:
+    x, y = table.numbers(q.X_M), table.numbers(q.Y_M)
+    range_m = np.hypot(x, y)
+    replace(q.RANGE_M, name="x_m, y_m", high=np.inf).check(range_m, path=table.path, line=table.line)
+    return range_m, np.arctan2(y, x)
+
+
+def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    round_names = [name for name in _ROUND_SIGMAS if name in table]
+    polar_names = [name for name in _POLAR_SIGMAS if name in table]
+    if len(round_names) + bool(polar_names) > 1:
+        other = (*polar_names, *round_names[1:])[0]
+        problem = f"{round_names[0]} and {other} are both given"
+        raise table.error(problem, row=None, field=round_names[0], hint="keep one of them")
+    if round_names:
+        # a position known equally well in all directions: to first order sigma along the ray, sigma / range across it
+        sigma = table.numbers(replace(q.SIGMA_RANGE_M, name=round_names[0]))
+        return sigma, sigma / range_m
+    unknown = np.full(len(table), np.nan)
+    return (
+        table.numbers(q.SIGMA_RANGE_M) if "sigma_range_m" in table else unknown,
+        table.numbers(q.SIGMA_BEARING_RAD) if "sigma_bearing_rad" in table else unknown.copy(),
+    )
+
+
+def _match_frames(stamp_s: FloatArray, frame_stamp_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
+    """Frame of every detection. Shape (M,)."""
+    if len(frame_stamp_s) == 0:
+        nearest = np.zeros(len(stamp_s), dtype=np.int64)
+        apart = np.full(len(stamp_s), np.inf)
+    else:
+        after = np.searchsorted(frame_stamp_s, stamp_s).clip(1, max(1, len(frame_stamp_s) - 1))
+        pair = np.stack([after - 1, after.clip(0, len(frame_stamp_s) - 1)])
+        distance = np.abs(frame_stamp_s[pair] - stamp_s)
+        nearest = np.where(distance[0] <= distance[1], pair[0], pair[1]).astype(np.int64)
+        apart = distance.min(axis=0)
+    lost = np.flatnonzero(apart > SAME_STAMP_S)
+    if len(lost):
+        row = int(lost[0])
+        # without a table of frames the frames are made of these very stamps
+        assert frame_table is not None
+        near = f"; the nearest is {float(frame_stamp_s[nearest[row]])!r}" if len(frame_stamp_s) else ""
+        file = frame_table.path.name
+        problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
+        hint = f"list every instant at which the sensor looked, or leave {file} out"
+        raise table.error(problem, row=row, field="stamp_s", hint=hint)
+    return nearest
+
+
+def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
+    if table is None:
+        return None
+    table.expect(("stamp_s", "x_m", "y_m", "theta_rad"))
+    if len(table) == 0:
+        warnings.append(f"{table.path.name}: holds no pose, taken as missing")
+        return None
+    stamp_s = _forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    heading = wrap_far(table.numbers(q.THETA_RAD))
+    pose = np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)[keep]
+    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 3, 3)), frame="truth", clock=clock)
+
+
+def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None:
+    if table is None or len(table) == 0:
+        return None
+    table.expect(("stamp_s", "robot_id", *_POLAR))
+    range_m, bearing_rad = _polar(table)
+    return RobotSightings(_forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
+
+
+def _one_form(table: Table, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
+    """Which of two ways to say the same a table uses."""
+    if table.has_any(first) and table.has_any(second):
+        raise table.error(f"mixes {', '.join(first)} with {', '.join(second)}", row=None, hint="keep one form")
+    return second if table.has_any(second) else first
+
+
+def _forward_stamps(table: Table) -> FloatArray:
+    stamp_s = table.numbers(q.STAMP_S)
+    check_forward(stamp_s, path=table.path, line=table.line)
+    return stamp_s
+
+
+def _distinct(stamp_s: FloatArray) -> FloatArray:
+    """Sorted stamps without those within `SAME_STAMP_S` of the one before."""
+    return stamp_s[np.diff(stamp_s, prepend=-np.inf) > SAME_STAMP_S]
+
+
+def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:
+    """A misspelt optional file would be missed in silence."""
+    known = [f"{name}{ending}" for name in TABLES for ending in ENDINGS] + [SENSOR_FILE]
+    for name in files.members:
+        close = difflib.get_close_matches(name, known, n=1, cutoff=0.85)
+        if name not in known and close:
+            warnings.append(f"file {name} is not read; did you mean {close[0]}?")

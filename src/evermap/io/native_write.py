@@ -1,0 +1,120 @@
+"""Writes any recording in the native format, so that `read_native` gives back equal arrays."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from evermap.errors import ConfigError
+from evermap.io.atomic import staged_folder
+from evermap.io.landmarks import labels_of, survey_columns
+from evermap.io.native import ENDINGS, SENSOR_FILE, TABLES
+from evermap.io.sensor_toml import Settings, sensor_toml
+from evermap.io.table import csv_text, parquet_bytes
+from evermap.types import UNKNOWN, Recording
+
+
+def write_native(
+    recording: Recording,
+    folder: str | Path,
+    format: Literal["csv", "parquet"] = "csv",  # noqa: A002 (the word that callers expect)
+    *,
+    overwrite: bool = False,
+) -> Path:
+    """Writes a recording as a native folder and returns the folder.
+
+    Odometry is written as velocities, detections as range and bearing. What is derived from files is not written:
+    `source`, `warnings` and the line numbers of detections.
+
+    Args:
+        recording: what to write.
+        folder: is created; must not exist, be empty, or with `overwrite` hold nothing but a native recording.
+        format: 'csv' or 'parquet'.
+        overwrite: whether an older native recording may be replaced.
+
+    Raises:
+        ConfigError: `format` is neither 'csv' nor 'parquet'.
+        InputError: the folder holds something else, or cannot be written; nothing is changed then.
+    """
+    if format not in ("csv", "parquet"):
+        raise ConfigError(f"there is no native format '{format}'", field="format", hint="csv or parquet")
+    ours = {f"{name}{ending}" for name in TABLES for ending in ENDINGS} | {SENSOR_FILE}
+    with staged_folder(folder, replaceable=(lambda child: child.name in ours) if overwrite else None) as staging:
+        (staging / SENSOR_FILE).write_text(sensor_toml(_settings(recording)), encoding="utf-8")
+        for name, columns in native_tables(recording).items():
+            if format == "csv":
+                (staging / f"{name}.csv").write_text(csv_text(columns), encoding="utf-8", newline="\n")
+            else:
+                (staging / f"{name}.parquet").write_bytes(parquet_bytes(columns))
+    return Path(folder)
+
+
+def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
+    """Columns of every table that the recording has something for: arrays, or lists of text."""
+    odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
+    tables: dict[str, dict[str, Any]] = {
+        "odometry": {
+            "stamp_s": odometry.stamp_s,
+            "forward_mps": odometry.forward_mps,
+            "lateral_mps": odometry.lateral_mps,
+            "angular_radps": odometry.angular_radps,
+        },
+        "detections": {
+            "stamp_s": recording.frames.stamp_s[detections.frame],
+            "landmark_id": detections.landmark_id,
+            "range_m": detections.range_m,
+            "bearing_rad": detections.bearing_rad,
+        },
+        "frames": {"stamp_s": recording.frames.stamp_s},
+    }
+    if np.any(detections.class_id != UNKNOWN):
+        tables["detections"]["class_id"] = labels_of(detections.class_id, names)
+    for name in ("sigma_range_m", "sigma_bearing_rad"):
+        sigma = getattr(detections, name)
+        if not np.all(np.isnan(sigma)):
+            tables["detections"][name] = sigma
+    if recording.truth is not None:
+        pose = recording.truth.pose_world_robot
+        tables["truth"] = {
+            "stamp_s": recording.truth.stamp_s,
+            "x_m": pose[:, 0],
+            "y_m": pose[:, 1],
+            "theta_rad": pose[:, 2],
+        }
+    if recording.true_landmarks is not None:
+        landmarks = recording.true_landmarks
+        tables["landmarks"] = survey_columns(landmarks)
+        if np.any(landmarks.class_id != UNKNOWN):
+            tables["landmarks"]["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or names)
+    if recording.robot_sightings is not None:
+        sightings = recording.robot_sightings
+        tables["robot_sightings"] = {
+            "stamp_s": sightings.stamp_s,
+            "robot_id": sightings.robot_id,
+            "range_m": sightings.range_m,
+            "bearing_rad": sightings.bearing_rad,
+        }
+    return tables
+
+
+def _settings(recording: Recording) -> Settings:
+    return Settings(
+        name=recording.name,
+        clock=recording.clock,
+        frames_complete=recording.frames.complete,
+        class_names=_class_names(recording),
+        sensor=recording.sensor,
+    )
+
+
+def _class_names(recording: Recording) -> tuple[str, ...]:
+    """The recording's classes, those without a name called by their number, and those only on true landmarks."""
+    landmarks = recording.true_landmarks
+    largest = int(recording.detections.class_id.max(initial=UNKNOWN))
+    if landmarks is not None and not landmarks.class_names:
+        largest = max(largest, int(landmarks.class_id.max(initial=UNKNOWN)))
+    names = [*recording.class_names, *(str(number) for number in range(len(recording.class_names), largest + 1))]
+    extra = [] if landmarks is None else [name for name in landmarks.class_names if name not in names]
+    return (*names, *extra)

@@ -1,0 +1,81 @@
+"""Which reader understands a path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Protocol
+
+from evermap.errors import InputError
+from evermap.io.files import file_sets
+from evermap.io.mrclam import MrclamReader
+from evermap.io.native import NativeReader
+from evermap.types import Recording
+
+
+class Reader(Protocol):
+    """One format of recordings.
+
+    Attributes:
+        name: short name, e.g. 'mrclam'.
+        looks_for: the files by which the format is known, for messages.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def looks_for(self) -> str: ...
+
+    def matches(self, path: Path) -> bool:
+        """Whether the path looks like this format. Reads names, not contents."""
+        ...
+
+    def read(self, path: Path, robot: int | None) -> Recording:
+        """The recording of one robot; None for the format's default."""
+        ...
+
+    def robots(self, path: Path) -> tuple[int, ...]:
+        """Robots that can be asked for; empty where the format does not number them."""
+        ...
+
+
+READERS: tuple[Reader, ...] = (MrclamReader(), NativeReader())
+"""All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
+
+
+def reader_for(path: str | Path) -> Reader:
+    """The first reader that recognises the path.
+
+    Raises:
+        InputError: nothing is there, a zip is damaged, or no reader recognises it; the message says what is looked for.
+    """
+    path = Path(path)
+    found = file_sets(path)
+    for reader in READERS:
+        if reader.matches(path):
+            return reader
+    if path.is_file() and not found:
+        raise InputError("a single file is no recording", path=path, hint=f"its folder {path.parent}, or a zip of it")
+    names = sorted(name for files in found for name in files.members)
+    holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
+    wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)
+    raise InputError(f"no recording found, it holds {holds}; looked for {wanted}", path=path)
+
+
+def read_recording(path: str | Path, robot: int | None = None) -> Recording:
+    """Reads a recording of any known format.
+
+    Args:
+        path: folder, zip or file.
+        robot: number of the robot where the format has several; None for its first complete one.
+
+    Raises:
+        InputError: missing, malformed or of an unknown format.
+        DataError: well-formed, but nothing can be estimated from it.
+    """
+    return reader_for(path).read(Path(path), robot)
+
+
+def list_robots(path: str | Path) -> tuple[int, ...]:
+    """Robots of a recording that can be read, in ascending order; empty where they have no numbers."""
+    return reader_for(path).robots(Path(path))

@@ -1,0 +1,209 @@
+"""`sensor.toml` of a native recording: the sensor's limits, noise and mounting, and what the stamps count."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from dataclasses import dataclass, field
+from math import inf, pi
+from pathlib import Path
+from typing import Any
+
+from evermap.errors import InputError
+from evermap.io.text import decode_text
+from evermap.types import Clock, Sensor
+
+FORMAT_VERSION = 1
+
+_LIMITS: dict[str, dict[str, tuple[float, float]]] = {
+    "limits": {
+        "range_min_m": (0.0, 1e6),
+        "range_max_m": (0.0, inf),
+        "bearing_min_rad": (-2 * pi, 2 * pi),
+        "bearing_max_rad": (-2 * pi, 2 * pi),
+    },
+    "noise": {"sigma_range_m": (1e-9, 1e6), "sigma_bearing_rad": (1e-9, 1e3)},
+    "mount": {"x_m": (-1e3, 1e3), "y_m": (-1e3, 1e3), "theta_rad": (-2 * pi, 2 * pi)},
+    "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
+}
+_RECORDING = ("format_version", "name", "clock", "frames_complete", "class_names")
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Content of `sensor.toml`; None where the file says nothing."""
+
+    name: str | None = None
+    clock: Clock = Clock.RECORDING
+    frames_complete: bool | None = None
+    class_names: tuple[str, ...] | None = None
+    sensor: Sensor = field(default_factory=Sensor)
+
+
+def parse_sensor_toml(data: bytes, path: Path) -> Settings:
+    """Settings of a recording; every section and key may be left out.
+
+    Raises:
+        InputError: not TOML, an unknown section or key, a value of the wrong type or out of its limits.
+    """
+    text = decode_text(data, path)
+    try:
+        document = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        line = re.search(r"at line (\d+)", str(error))
+        raise InputError(f"not valid TOML: {error}", path=path, line=int(line[1]) if line else None) from None
+    reader = _Reader(document, text, path)
+    reader.expect(("recording", *_LIMITS), document, section=None)
+    values: dict[str, float] = {}
+    for section, keys in _LIMITS.items():
+        content = reader.section(section, tuple(keys))
+        for key, (low, high) in keys.items():
+            if key in content:
+                values[f"{section}.{key}"] = reader.number(section, key, content[key], low, high)
+    return reader.recording(_sensor(values, reader))
+
+
+def sensor_toml(settings: Settings) -> str:
+    """The text of a `sensor.toml` that reads back as `settings`."""
+    sensor = settings.sensor
+    sections: dict[str, dict[str, Any]] = {
+        "recording": {
+            "format_version": FORMAT_VERSION,
+            "name": settings.name,
+            "clock": settings.clock.value,
+            "frames_complete": settings.frames_complete,
+            "class_names": settings.class_names or None,
+        },
+        "limits": {
+            "range_min_m": sensor.range_min_m,
+            "range_max_m": sensor.range_max_m,
+            "bearing_min_rad": sensor.bearing_min_rad,
+            "bearing_max_rad": sensor.bearing_max_rad,
+        },
+        "noise": {"sigma_range_m": sensor.sigma_range_m, "sigma_bearing_rad": sensor.sigma_bearing_rad},
+        "mount": dict(zip(("x_m", "y_m", "theta_rad"), sensor.mount_robot_sensor, strict=True)),
+        "detection": {"p_detect": sensor.p_detect, "p_false": sensor.p_false},
+    }
+    blocks = []
+    for name, content in sections.items():
+        lines = [f"{key} = {_toml_value(value)}" for key, value in content.items() if value is not None]
+        if lines:
+            blocks.append("\n".join([f"[{name}]", *lines]) + "\n")
+    return "\n".join(blocks)
+
+
+def _sensor(values: dict[str, float], reader: _Reader) -> Sensor:
+    default = Sensor()
+    sensor = Sensor(
+        range_min_m=values.get("limits.range_min_m", default.range_min_m),
+        range_max_m=values.get("limits.range_max_m", default.range_max_m),
+        bearing_min_rad=values.get("limits.bearing_min_rad", default.bearing_min_rad),
+        bearing_max_rad=values.get("limits.bearing_max_rad", default.bearing_max_rad),
+        sigma_range_m=values.get("noise.sigma_range_m"),
+        sigma_bearing_rad=values.get("noise.sigma_bearing_rad"),
+        p_detect=values.get("detection.p_detect", default.p_detect),
+        p_false=values.get("detection.p_false", default.p_false),
+        mount_robot_sensor=(
+            values.get("mount.x_m", 0.0),
+            values.get("mount.y_m", 0.0),
+            values.get("mount.theta_rad", 0.0),
+        ),
+    )
+    if sensor.range_min_m >= sensor.range_max_m:
+        raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
+    if sensor.bearing_min_rad >= sensor.bearing_max_rad:
+        raise reader.error("limits", "bearing_max_rad", "must be greater than bearing_min_rad")
+    return sensor
+
+
+class _Reader:
+    """Checked access to a parsed document, with line numbers for the messages."""
+
+    def __init__(self, document: dict[str, Any], text: str, path: Path) -> None:
+        self.document, self.text, self.path = document, text, path
+
+    def error(self, section: str | None, key: str, problem: str, hint: str | None = None) -> InputError:
+        name = f"{section}.{key}" if section else key
+        return InputError(problem, path=self.path, line=self._line(section, key), field=name, hint=hint)
+
+    def expect(self, known: tuple[str, ...], content: dict[str, Any], section: str | None) -> None:
+        for key in content:
+            if key not in known:
+                close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
+                hint = close[0] if close else "one of " + ", ".join(known)
+                raise self.error(section, key, "unknown key" if section else "unknown section or key", hint)
+
+    def section(self, name: str, known: tuple[str, ...]) -> dict[str, Any]:
+        content = self.document.get(name, {})
+        if not isinstance(content, dict):
+            raise self.error(None, name, "must be a section", hint=f"[{name}]")
+        self.expect(known, content, name)
+        return content
+
+    def number(self, section: str, key: str, value: Any, low: float, high: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(section, key, f"must be a number, not {type(value).__name__}")
+        try:
+            number = float(value)
+        except OverflowError:
+            number = inf
+        if not low <= number <= high:  # also refuses nan
+            hint = "angles in radians" if key.endswith("_rad") else None
+            raise self.error(section, key, f"{number:g} is outside [{low:g}, {high:g}]", hint)
+        return number
+
+    def recording(self, sensor: Sensor) -> Settings:
+        content = self.section("recording", _RECORDING)
+        types: dict[str, type] = {
+            "format_version": int, "name": str, "clock": str, "frames_complete": bool, "class_names": list,
+        }  # fmt: skip
+        for key, value in content.items():
+            if not isinstance(value, types[key]):
+                raise self.error("recording", key, f"must be a {types[key].__name__}, not {type(value).__name__}")
+        if content.get("format_version", FORMAT_VERSION) != FORMAT_VERSION:
+            problem = f"{content['format_version']} is not a version this evermap reads, which is {FORMAT_VERSION}"
+            raise self.error("recording", "format_version", problem, hint="a newer evermap")
+        clock = content.get("clock", Clock.RECORDING.value)
+        if clock not in list(Clock):
+            raise self.error("recording", "clock", f"no clock '{clock}'", hint="one of " + ", ".join(Clock))
+        names = content.get("class_names")
+        if names is not None and not all(isinstance(name, str) and name.strip() == name and name for name in names):
+            raise self.error("recording", "class_names", "must be a list of names")
+        if names is not None and len(set(names)) != len(names):
+            raise self.error("recording", "class_names", "a name appears twice")
+        return Settings(
+            name=content.get("name"),
+            clock=Clock(clock),
+            frames_complete=content.get("frames_complete"),
+            class_names=None if names is None else tuple(names),
+            sensor=sensor,
+        )
+
+    def _line(self, section: str | None, key: str) -> int | None:
+        """Line of `key = ...` or `[key]`; None where the document is written in another style."""
+        current: str | None = None
+        for number, line in enumerate(self.text.split("\n"), 1):
+            if match := re.match(r"\s*\[\s*([\w-]+)\s*\]", line):
+                current = match[1]
+                if section is None and current == key:
+                    return number
+            elif current == section and re.match(rf"\s*\"?{re.escape(key)}\"?\s*=", line):
+                return number
+        return None
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _toml_text(value)
+    if isinstance(value, tuple):
+        return f"[{', '.join(_toml_text(item) for item in value)}]"
+    return repr(float(value)) if isinstance(value, float) else repr(int(value))
+
+
+def _toml_text(value: str) -> str:
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    printable = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" if ord(c) < 0x10000 else "?" for c in escaped)
+    return f'"{printable}"'

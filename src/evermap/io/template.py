@@ -1,0 +1,139 @@
+"""A small, complete example of the native format for `evermap slam --init`: a robot circles past three landmarks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap import se2
+from evermap.io.atomic import staged_folder
+from evermap.io.table import csv_text
+from evermap.types import FloatArray
+
+_SPEED_MPS = 0.5
+_TURN_RADPS = 2.0 * np.pi / 20.0  # one round in 20 s
+_MOUNT = (0.2, 0.0, 0.0)
+_RANGE_MAX_M = 6.0
+_BEARING_MAX_RAD = 2.2
+_SIGMA_RANGE_M = 0.03
+_SIGMA_BEARING_RAD = 0.02
+_P_DETECT = 0.9
+_LANDMARK_ID = (1, 2, 3)
+_LANDMARK_M = np.array([[2.5, -0.6], [2.2, 3.6], [-2.3, 2.0]])
+_CLASSES = ("pillar", "door", "pillar")
+
+_SENSOR_TOML = """\
+# A recording for evermap: this folder. Replace the example rows by your own; docs/formats.md explains everything.
+# Every section and every key of this file may be left out.
+
+[recording]
+format_version = 1
+name = "template"
+clock = "recording"        # what stamps count: "recording" (from any start), "unix", or "local_wall"
+frames_complete = true     # false where the recording leaves out instants at which nothing was seen
+
+[limits]                   # what the sensor can see, in its own frame: x ahead, y to the left
+range_min_m = 0.1
+range_max_m = 6.0
+bearing_min_rad = -2.2     # counter-clockwise is positive
+bearing_max_rad = 2.2
+
+[noise]                    # standard deviations; leave them out where unknown, they are estimated
+sigma_range_m = 0.03
+sigma_bearing_rad = 0.02
+
+[mount]                    # where the sensor sits on the robot: x ahead, y to the left, turned counter-clockwise
+x_m = 0.2
+y_m = 0.0
+theta_rad = 0.0
+
+[detection]
+p_detect = 0.9             # probability that a landmark in view is detected
+p_false = 0.001            # probability of a false detection in a frame
+"""
+
+_COMMENTS = {
+    "odometry": """\
+Needed. Velocities of the robot; each row holds until the next stamp. Lines that start with '#' are comments.
+Optional: lateral_mps, to the left. Instead of velocities: stamp_s,dx_m,dy_m,dtheta_rad, the motion since the row
+before, in the robot's frame at that row.""",
+    "detections": """\
+Needed. What the sensor saw. An empty landmark_id means: seen, but not recognised.
+Instead of range_m,bearing_rad: x_m,y_m in the sensor's frame. Optional: class_id (any name), and standard deviations
+of single detections: sigma_range_m,sigma_bearing_rad or sigma_m.""",
+    "frames": """\
+Optional, but worth having: every instant at which the sensor looked, also when it saw nothing.""",
+    "truth": """\
+Optional: the robot's true poses, used only to say how large the errors are.""",
+    "landmarks": """\
+Optional: the landmarks' true positions, for errors or with '--prior-map truth'. More columns: sigma_m, class_id.""",
+}
+
+
+def write_template(folder: str | Path) -> Path:
+    """Writes a commented, complete recording of 20 s that can be localised as it is; the same bytes every time.
+
+    Raises:
+        InputError: the folder exists and is not empty, or cannot be written.
+    """
+    with staged_folder(folder) as staging:
+        (staging / "sensor.toml").write_text(_SENSOR_TOML, encoding="utf-8", newline="\n")
+        for name, columns in _tables().items():
+            text = csv_text(columns, comment=_COMMENTS[name])
+            (staging / f"{name}.csv").write_text(text, encoding="utf-8", newline="\n")
+    return Path(folder)
+
+
+def _tables() -> dict[str, dict[str, Any]]:
+    random = np.random.default_rng(7)
+    odometry_s = np.arange(0.0, 20.01, 0.1).round(3)
+    frame_s = np.arange(0.0, 20.01, 0.5).round(3)
+    truth_s = np.arange(0.0, 20.01, 1.0).round(3)
+    truth = _pose_at(truth_s)
+    count = len(odometry_s)
+    return {
+        "odometry": {
+            "stamp_s": odometry_s,
+            "forward_mps": (_SPEED_MPS + 0.02 * random.standard_normal(count)).round(3),
+            "angular_radps": (_TURN_RADPS + 0.02 * random.standard_normal(count)).round(3),
+        },
+        "detections": _detections(frame_s, random),
+        "frames": {"stamp_s": frame_s},
+        "truth": {
+            "stamp_s": truth_s,
+            "x_m": truth[:, 0].round(4),
+            "y_m": truth[:, 1].round(4),
+            "theta_rad": truth[:, 2].round(4),
+        },
+        "landmarks": {
+            "landmark_id": np.array(_LANDMARK_ID),
+            "x_m": _LANDMARK_M[:, 0],
+            "y_m": _LANDMARK_M[:, 1],
+            "class_id": list(_CLASSES),
+        },
+    }
+
+
+def _pose_at(stamp_s: FloatArray) -> FloatArray:
+    """The drive: a circle from the origin, counter-clockwise. Shape (N, 3)."""
+    return se2.exp(stamp_s[:, None] * np.array([_SPEED_MPS, 0.0, _TURN_RADPS]))
+
+
+def _detections(frame_s: FloatArray, random: np.random.Generator) -> dict[str, Any]:
+    pose_world_sensor = se2.compose(_pose_at(frame_s), np.array(_MOUNT))
+    world = np.broadcast_to(_LANDMARK_M, (len(frame_s), 3, 2))
+    offset = world - pose_world_sensor[:, None, :2]
+    range_m = np.hypot(offset[..., 0], offset[..., 1])
+    bearing_rad = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - pose_world_sensor[:, None, 2])
+    in_view = (range_m < _RANGE_MAX_M) & (np.abs(bearing_rad) < _BEARING_MAX_RAD)
+    frame, landmark = np.nonzero(in_view & (random.random(range_m.shape) < _P_DETECT))
+    noise = random.standard_normal((2, len(frame)))
+    return {
+        "stamp_s": frame_s[frame],
+        "landmark_id": np.array(_LANDMARK_ID)[landmark],
+        "range_m": (range_m[frame, landmark] + _SIGMA_RANGE_M * noise[0]).round(3),
+        "bearing_rad": (bearing_rad[frame, landmark] + _SIGMA_BEARING_RAD * noise[1]).round(4),
+        "class_id": [_CLASSES[index] for index in landmark.tolist()],
+    }
