@@ -29,6 +29,7 @@ class Evaluation:
         landmarks_anchored: after the alignment that makes the first pose exact (for NEES).
         landmarks_own: after the landmarks' own alignment.
         nis: innovation consistency.
+        rate_hz: how densely truth was sampled.
     """
 
     poses: PoseErrors | None
@@ -38,22 +39,24 @@ class Evaluation:
     landmarks_anchored: LandmarkErrors | None
     landmarks_own: LandmarkErrors | None
     nis: NisSummary
+    rate_hz: float = RATE_HZ
 
 
-def compare_with_truth(recording: Recording, result: SlamResult) -> Evaluation:
-    """All comparisons that the recording's truth allows. Deterministic."""
+def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> Evaluation:
+    """All comparisons that the recording's truth allows, poses at `rate_hz`. Deterministic."""
     poses = online = dead_reckoning = landmarks = anchored = own = None
     if recording.truth is not None:
-        poses = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=RATE_HZ)
-        online = evaluate_trajectory(result.online, recording.truth, rate_hz=RATE_HZ, max_gap_s=ONLINE_MAX_GAP_S)
-        dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=RATE_HZ)
+        poses = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=rate_hz)
+        online = evaluate_trajectory(result.online, recording.truth, rate_hz=rate_hz, max_gap_s=ONLINE_MAX_GAP_S)
+        dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=rate_hz)
     if recording.true_landmarks is not None:
         own = evaluate_landmarks(result.landmarks, recording.true_landmarks, None)
         if poses is not None:
             landmarks = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_estimate)
             if poses.pose_truth_anchor is not None:
                 anchored = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_anchor)
-    return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, summarise_nis(result.innovations))
+    nis = summarise_nis(result.innovations)
+    return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, rate_hz)
 
 
 def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
@@ -96,16 +99,16 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def evaluate(recording: Recording, result: SlamResult) -> dict[str, Any]:
-    """`metrics_dict(compare_with_truth(recording, result))`: what the run is worth, ready for JSON."""
-    return metrics_dict(compare_with_truth(recording, result))
+def evaluate(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> dict[str, Any]:
+    """`metrics_dict(compare_with_truth(...))`: what the run is worth, ready for JSON."""
+    return metrics_dict(compare_with_truth(recording, result, rate_hz=rate_hz))
 
 
 def _alignment(evaluation: Evaluation) -> dict[str, Any]:
     """How estimates were brought into the frame of the truth, and how much truth was scored."""
     out: dict[str, Any] = {
         "purpose": "evaluation only; nothing of it flows back into the estimate",
-        "rate_hz": RATE_HZ,
+        "rate_hz": evaluation.rate_hz,
         "method": None,
         "pose_truth_estimate": None,
         "pose_truth_dead_reckoning": None,

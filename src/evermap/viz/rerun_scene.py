@@ -1,0 +1,274 @@
+"""A rerun recording of a run: the map growing along the timeline `stamp_s`.
+
+Needs rerun-sdk (extra `evermap[rerun]`). Whole columns are sent at once, thinned to what can be seen, so that an
+hour of driving takes a second to write and a few megabytes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evermap import se2
+from evermap.errors import MissingExtraError
+from evermap.metrics.consistency import chi2_interval
+from evermap.metrics.summary import Evaluation, compare_with_truth
+from evermap.types import FloatArray, IntArray, Recording, SlamResult, Trajectory
+from evermap.viz.style import ALERT, ESTIMATE, LANDMARK, MUTED, ODOMETRY
+
+TIMELINE = "stamp_s"
+_MAX_STEPS = 3000
+_MAX_LANDMARK_ENTITIES = 250
+_ELLIPSE_CORNERS = 33
+
+Float32Array = NDArray[np.float32]
+
+
+def write_scene(
+    recording: Recording, result: SlamResult, path: str | Path, *, evaluation: Evaluation | None = None
+) -> Path:
+    """Writes `path` (.rrd): robot, path so far, landmarks as they appear, rays of detections, truth, NIS and latency.
+
+    Everything is in the frame of the truth where there is one, else in the map's. Time is the recording's own,
+    in seconds on the timeline `stamp_s`.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        hint = "pip install 'evermap[rerun]'"
+        raise MissingExtraError("a rerun scene needs rerun-sdk, which is not installed", hint=hint) from error
+
+    path = Path(path)
+    evaluation = evaluation or compare_with_truth(recording, result)
+    pose_truth_map = np.zeros(3) if evaluation.poses is None else evaluation.poses.pose_truth_estimate
+    stream = rr.RecordingStream("evermap", recording_id=recording.name or "run", send_properties=False)
+    stream.save(path, default_blueprint=_blueprint(recording, result, pose_truth_map))
+    stream.send_recording_name(recording.name)
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    _send_truth(stream, recording, evaluation)
+    _send_odometry(stream, result, evaluation)
+    _send_robot(stream, result.trajectory, pose_truth_map)
+    _send_landmarks(stream, result, pose_truth_map)
+    _send_rays(stream, recording, result, pose_truth_map)
+    _send_numbers(stream, recording, result, evaluation)
+    stream.flush()
+    stream.disconnect()
+    return path
+
+
+def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatArray) -> Any:
+    import rerun.blueprint as rrb
+
+    positions = se2.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :2]
+    centre = positions.mean(axis=0) if len(positions) else np.zeros(2)
+    reach = float(np.max(np.ptp(positions, axis=0))) if len(positions) else 10.0
+    so_far = rrb.VisibleTimeRange(
+        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+    )
+    scene = rrb.Spatial3DView(
+        name=recording.name,
+        origin="world",
+        overrides={"world/path": rrb.VisibleTimeRanges(so_far)},
+        eye_controls=rrb.EyeControls3D(
+            position=[centre[0], centre[1] - 0.6 * reach, 1.1 * reach + 1.0],
+            look_target=[*centre, 0.0],
+            eye_up=[0.0, 0.0, 1.0],
+        ),
+        line_grid=rrb.LineGrid3D(spacing=1.0),
+    )
+    plots = [rrb.TimeSeriesView(name="NIS, log10 (95 % band)", origin="nis")]
+    if recording.truth is not None:
+        plots.append(rrb.TimeSeriesView(name="error against truth [m]", origin="error"))
+    plots.append(rrb.TimeSeriesView(name="step [ms]", origin="latency"))
+    return rrb.Blueprint(
+        rrb.Horizontal(scene, rrb.Vertical(*plots), column_shares=[5, 3]),
+        rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+    )
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
+
+
+def _time(stamp_s: FloatArray) -> Any:
+    import rerun as rr
+
+    return rr.TimeColumn(TIMELINE, duration=stamp_s)
+
+
+def _thin(count: int, limit: int = _MAX_STEPS) -> IntArray:
+    """Rows of a long sequence that are kept, ends included."""
+    return (
+        np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64)) if count else np.zeros(0, int)
+    )
+
+
+def _flat(points: FloatArray, height_m: float = 0.0) -> Float32Array:
+    """Points (N, 2) on a horizontal plane."""
+    return np.column_stack([points, np.full(len(points), height_m)]).astype(np.float32)
+
+
+def _send_truth(stream: Any, recording: Recording, evaluation: Evaluation) -> None:
+    import rerun as rr
+
+    if recording.truth is not None and evaluation.poses is not None:
+        rows = _thin(len(recording.truth))
+        line = _flat(recording.truth.pose_world_robot[rows, :2], -0.01)
+        stream.log("world/truth/path", rr.LineStrips3D([line], colors=_rgb(MUTED), radii=0.012), static=True)
+    if recording.true_landmarks is not None and evaluation.poses is not None:
+        points = _flat(recording.true_landmarks.position_m)
+        size = np.full((len(points), 3), [0.07, 0.07, 0.002])
+        boxes = rr.Boxes3D(centers=points, half_sizes=size, colors=_rgb(MUTED))
+        stream.log("world/truth/landmarks", boxes, static=True)
+
+
+def _send_odometry(stream: Any, result: SlamResult, evaluation: Evaluation) -> None:
+    import rerun as rr
+
+    if len(result.dead_reckoning) == 0:
+        return
+    aligned = evaluation.dead_reckoning
+    pose = np.zeros(3) if aligned is None else aligned.pose_truth_estimate
+    rows = _thin(len(result.dead_reckoning))
+    line = se2.compose(pose, result.dead_reckoning.pose_world_robot[rows])[:, :2]
+    strip = rr.LineStrips3D([_flat(line, -0.02)], colors=_rgb(ODOMETRY), radii=0.006)
+    stream.log("world/odometry_alone", strip, static=True)
+
+
+def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray) -> None:
+    """The robot's pose, and the path as one short piece a step that stays visible afterwards."""
+    import rerun as rr
+
+    if len(trajectory) == 0:
+        return
+    rows = _thin(len(trajectory))
+    poses = se2.compose(pose_truth_map, trajectory.pose_world_robot[rows])
+    stamps, half = trajectory.stamp_s[rows], 0.5 * poses[:, 2]
+    quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
+    places = rr.Transform3D.columns(translation=_flat(poses[:, :2]), quaternion=quaternion)
+    stream.send_columns("world/robot", [_time(stamps)], places)
+    body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=_rgb(ESTIMATE), fill_mode="solid")
+    heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=_rgb(ESTIMATE), radii=0.02)
+    stream.log("world/robot/body", body, static=True)
+    stream.log("world/robot/heading", heading, static=True)
+    if len(rows) > 1:
+        points = _flat(poses[:, :2], 0.01)
+        pieces = np.stack([points[:-1], points[1:]], axis=1)
+        columns = rr.LineStrips3D.columns(strips=pieces)
+        stream.send_columns("world/path", [_time(stamps[1:])], columns)
+        stream.log("world/path", rr.LineStrips3D.from_fields(colors=_rgb(ESTIMATE), radii=0.012), static=True)
+
+
+def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -> None:
+    """Final positions with 2-sigma ellipses, each from when it was first seen; large maps in groups by that time."""
+    import rerun as rr
+
+    landmarks = result.landmarks
+    if len(landmarks) == 0:
+        return
+    start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
+    first_s = np.where(np.isfinite(landmarks.first_seen_s), landmarks.first_seen_s, start_s)
+    points = _flat(se2.transform(pose_truth_map, landmarks.position_m))
+    ellipses = _ellipses(points, landmarks.covariance_m2, float(pose_truth_map[2]))
+    order = np.argsort(first_s, kind="stable")
+    for group in np.array_split(order, min(len(order), _MAX_LANDMARK_ENTITIES)):
+        names = landmarks.landmark_id[group].astype(str).tolist()
+        entity = f"world/landmarks/{names[0]}" + (f"_and_{len(names) - 1}_more" if len(names) > 1 else "")
+        stream.set_time(TIMELINE, duration=float(first_s[group].max()))
+        marks = rr.Points3D(
+            points[group], colors=_rgb(LANDMARK), radii=0.05, labels=names, show_labels=len(order) <= 60
+        )
+        stream.log(entity, marks)
+        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=_rgb(LANDMARK), radii=0.008))
+    stream.reset_time()
+
+
+def _ellipses(points: Float32Array, covariance: FloatArray, turn_rad: float) -> Float32Array:
+    """2-sigma outlines (L, corners, 3) on the floor."""
+    variance, axis = np.linalg.eigh(covariance)
+    root = axis * np.sqrt(np.maximum(variance, 0.0))[:, None, :]
+    angle = np.linspace(0, 2 * np.pi, _ELLIPSE_CORNERS)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    outline = np.swapaxes(2.0 * se2.rotation(turn_rad) @ root @ circle, 1, 2)
+    flat = np.concatenate([outline, np.zeros((*outline.shape[:2], 1))], axis=2)
+    return np.asarray(points[:, None, :] + flat, dtype=np.float32)
+
+
+def _send_rays(stream: Any, recording: Recording, result: SlamResult, pose_truth_map: FloatArray) -> None:
+    """Each frame's detections as rays from the sensor to where they put their landmark; raw readings."""
+    import rerun as rr
+
+    frames, detections = recording.frames, recording.detections
+    if len(result.trajectory) == 0 or len(frames) == 0:
+        return
+    kept = _thin(len(frames))
+    within = (frames.stamp_s[kept] >= result.trajectory.stamp_s[0]) & (
+        frames.stamp_s[kept] <= result.trajectory.stamp_s[-1]
+    )
+    kept = kept[within]
+    nearest = np.clip(np.searchsorted(result.trajectory.stamp_s, frames.stamp_s[kept]), 0, len(result.trajectory) - 1)
+    sensor = se2.compose(
+        se2.compose(pose_truth_map, result.trajectory.pose_world_robot[nearest]),
+        np.asarray(recording.sensor.mount_robot_sensor),
+    )
+    row_of = np.full(len(frames), -1)
+    row_of[kept] = np.arange(len(kept))
+    used = np.flatnonzero((row_of[detections.frame] >= 0) & np.isfinite(detections.range_m))
+    row = row_of[detections.frame[used]]
+    bearing = detections.bearing_rad[used]
+    ends = detections.range_m[used, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    rays = np.stack([_flat(sensor[row, :2], 0.1), _flat(se2.transform(sensor[row], ends), 0.05)], axis=1)
+    counts = np.bincount(row, minlength=len(kept))
+    columns = rr.LineStrips3D.columns(strips=rays).partition(lengths=counts)
+    stream.send_columns("world/detections", [_time(frames.stamp_s[kept])], columns)
+    stream.log("world/detections", rr.LineStrips3D.from_fields(colors=_rgb(ALERT), radii=0.006), static=True)
+
+
+def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluation: Evaluation) -> None:
+    """NIS with its band, latency and, with truth, the position error with its 2-sigma band."""
+    import rerun as rr
+
+    innovations = result.innovations
+    finite = np.flatnonzero(np.isfinite(innovations.nis) & (innovations.nis > 0))
+    if len(finite):
+        rows = finite[_thin(len(finite))]
+        _plot(
+            stream, "nis/detection", innovations.stamp_s[rows], np.log10(innovations.nis[rows]), ESTIMATE, points=True
+        )
+        ends = innovations.stamp_s[rows[[0, -1]]]
+        for name, level in zip(("low", "high"), chi2_interval(2), strict=True):
+            _plot(stream, f"nis/{name}", ends, np.full(2, np.log10(level)), MUTED)
+    count = min(len(result.step_s), len(recording.frames))
+    if count:
+        rows = _thin(count)
+        _plot(stream, "latency/step_ms", recording.frames.stamp_s[rows], 1e3 * result.step_s[rows], ESTIMATE)
+    poses = evaluation.poses
+    if poses is not None:
+        rows = _thin(len(poses.stamp_s))
+        band = 2.0 * np.sqrt(np.trace(poses.covariance[rows, :2, :2], axis1=1, axis2=2))
+        _plot(stream, "error/position_m", poses.stamp_s[rows], poses.position_error_m[rows], ESTIMATE)
+        _plot(stream, "error/two_sigma_m", poses.stamp_s[rows], band, MUTED)
+    stream.log("about", rr.TextDocument(f"{recording.name}\n\nsource: {recording.source}"), static=True)
+
+
+def _plot(
+    stream: Any, entity: str, stamp_s: FloatArray, values: FloatArray, colour: str, *, points: bool = False
+) -> None:
+    import rerun as rr
+
+    look = (
+        rr.SeriesPoints(colors=_rgb(colour), marker_sizes=1.5)
+        if points
+        else rr.SeriesLines(colors=_rgb(colour), widths=1.5)
+    )
+    stream.log(entity, look, static=True)
+    stream.send_columns(entity, [_time(stamp_s)], rr.Scalars.columns(scalars=values))
