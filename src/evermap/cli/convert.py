@@ -38,7 +38,7 @@ def convert(
 
     check_out_folder(out, force)
     recording = read_recording(recording_path, robot=robot)
-    write_native(recording, out, format=table_format.value)
+    write_native(recording, out, table_format.value, overwrite=force)
     for remark in recording.warnings:
         warn(remark)
     if as_json:

@@ -45,7 +45,7 @@ def simulate(
     building = simulate_building(config, seed=seed)
     names = session_names(building)
     for name, recording in zip(names, building.sessions, strict=True):
-        write_native(recording, out / name)
+        write_native(recording, out / name, overwrite=force)
     _write_events(building, out / EVENTS_FILE)
     if as_json:
         print_json({"out": str(out), "sessions": names, "changes": len(building.events), "seed": seed})

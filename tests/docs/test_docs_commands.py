@@ -1,0 +1,116 @@
+"""What the documents tell people to type works, and what they link to is there.
+
+Every fenced `console` block (lines that start with `$ `) and every `python` block of a page runs, in order, in one
+fresh folder a page. A comment on the line above a block changes that:
+
+    <!-- not run: why -->           the block is skipped
+    <!-- needs: SOME.zip -->        runs only where that recording is on this machine; it is put into the folder
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGES = [REPOSITORY / "README.md", REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+TIMEOUT_S = 300
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block: its language, the comment above it, and what is to run."""
+
+    line: int
+    language: str
+    note: str
+    text: str
+
+    @property
+    def skipped(self) -> bool:
+        return self.note.startswith("not run:")
+
+    @property
+    def needs(self) -> str | None:
+        return self.note.partition("needs:")[2].strip() or None
+
+    def command(self) -> list[str]:
+        if self.language == "python":
+            return [sys.executable, "-c", self.text]
+        joined = self.text.replace("\\\n", " ")
+        script = "\n".join(line[2:] for line in joined.splitlines() if line.startswith("$ "))
+        return ["bash", "-euo", "pipefail", "-c", script]
+
+
+def blocks(page: Path) -> Iterator[Block]:
+    """The runnable blocks of a page."""
+    lines = page.read_text(encoding="utf-8").splitlines()
+    start = None
+    for number, line in enumerate(lines):
+        if start is None and line.startswith("```"):
+            start = number
+        elif start is not None and line.strip() == "```":
+            language = lines[start][3:].strip()
+            note = re.fullmatch(r"<!--\s*(.*?)\s*-->", lines[start - 1].strip()) if start else None
+            if language in ("console", "python"):
+                yield Block(start + 1, language, note[1] if note else "", "\n".join(lines[start + 1 : number]))
+            start = None
+    assert start is None, f"{page}:{(start or 0) + 1}: block without an end"
+
+
+def environment() -> dict[str, str]:
+    """As after activating the environment that runs the tests: `evermap` and `python` are those of this checkout."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    source = os.pathsep.join(filter(None, [str(REPOSITORY / "src"), os.environ.get("PYTHONPATH", "")]))
+    return {**os.environ, "PATH": path, "PYTHONPATH": source, "MPLBACKEND": "agg", "NO_COLOR": "1"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_what_a_page_tells_to_type_works(page: Path, tmp_path: Path) -> None:
+    recordings = {path.name: path for path in (REPOSITORY.parent / "shared" / "data").rglob("*") if path.is_file()}
+    for block in blocks(page):
+        if block.skipped:
+            continue
+        if block.needs is not None:
+            if block.needs not in recordings:
+                continue
+            if not (tmp_path / block.needs).exists():
+                (tmp_path / block.needs).symlink_to(recordings[block.needs])
+        done = subprocess.run(
+            block.command(),
+            cwd=tmp_path,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_S,
+            check=False,
+        )
+        where = f"{page.relative_to(REPOSITORY)}:{block.line}"
+        assert done.returncode == 0, f"{where}: exit {done.returncode}\n{block.text}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_links_of_a_page_lead_somewhere(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    targets = re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'(?:src|href)="([^"]+)"', text)
+    for target in targets:
+        if not re.match(r"[a-z]+:|#", target):
+            assert (page.parent / target.partition("#")[0]).exists(), f"{page.name}: broken link {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_shell_blocks_are_ones_that_run(page: Path) -> None:
+    """`bash` and `sh` blocks would never be tried; commands belong into `console` blocks."""
+    fences = re.findall(r"^```(\w+)", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert not {"bash", "sh", "shell", "zsh"} & set(fences)
+    for block in blocks(page):
+        if block.language == "console":
+            assert any(line.startswith("$ ") for line in block.text.splitlines()), f"line {block.line}: no command"
