@@ -43,7 +43,11 @@ def _card(label: str, value: float | None, form: str, unit: str, meaning: str) -
 def _gain(value: float | None, odometry: float | None, form: str) -> str:
     if value is None or odometry is None:
         return "Against truth, after aligning the whole path to it."
-    return f"Odometry alone is {form.format(odometry)} off: {odometry / max(value, 1e-9):.0f} times as much."
+    ratio = odometry / max(value, 1e-9)
+    times = (
+        "no worse" if ratio < 1.05 else f"{ratio:.1f} times as much" if ratio < 9.95 else f"{ratio:.0f} times as much"
+    )
+    return f"Odometry alone is {form.format(odometry)} off: {times}."
 
 
 def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
@@ -60,7 +64,7 @@ def _latency(timing: Mapping[str, Any]) -> str:
     if timing["step_p99_ms"] is None:
         return "Duration of the recording over the time it took."
     p50, p99 = timing["step_p50_ms"], timing["step_p99_ms"]
-    return f"99 % of the steps were done within {p99:.1f} ms, half within {p50:.1f} ms."
+    return f"99% of the steps were done within {p99:.1f} ms, half within {p50:.1f} ms."
 
 
 def _nis(metrics: Mapping[str, Any]) -> str:
@@ -71,4 +75,4 @@ def _nis(metrics: Mapping[str, Any]) -> str:
         verdict = "errors are smaller than it believes"
     else:
         verdict = "its uncertainties are about right"
-    return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95 % bound."
+    return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."

@@ -35,7 +35,7 @@ pre { background:var(--card); border:1px solid var(--grid); border-radius:.5rem;
 .kicker { color:var(--estimate); font-weight:600; font-size:.8rem; letter-spacing:.09em; text-transform:uppercase;
   margin:0 0 .4rem }
 .lead { color:var(--muted); margin:0 0 1.6rem }
-.cards { display:grid; grid-template-columns:repeat(auto-fit,minmax(13.5rem,1fr)); gap:.85rem; padding:0; margin:0 }
+.cards { display:grid; grid-template-columns:repeat(auto-fit,minmax(17rem,1fr)); gap:.85rem; padding:0; margin:0 }
 .card { background:var(--card); border:1px solid var(--grid); border-radius:.7rem; padding:.9rem 1.05rem 1rem }
 .card dt { color:var(--muted); font-size:.83rem }
 .card dd { margin:0 }

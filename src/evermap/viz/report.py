@@ -171,7 +171,7 @@ def _consistency(summary: Mapping[str, Any]) -> str:
         ("NIS, mean of the inliers", _cell(metrics["nis_mean"]), "2"),
         ("NIS, mean of all", _cell(metrics["nis_mean_all"]), "2 without outliers"),
         ("NIS, median of all", _cell(metrics["nis_median"]), "1.39"),
-        ("NIS, share below the 95 % bound", _cell(metrics["nis_in_band_share"], "{:.1%}"), "95 %"),
+        ("NIS, share below the 95% bound", _cell(metrics["nis_in_band_share"], "{:.1%}"), "95%"),
         ("NIS, correlation between a landmark's successive values", _cell(metrics["nis_lag1_autocorrelation"]), "0"),
         ("detections judged outliers", _cell(metrics["outlier_share"], "{:.2%}"), ""),
         ("NEES of positions, aligned", _cell(metrics["pose_nees_mean"]), "below 2: alignment removes error"),

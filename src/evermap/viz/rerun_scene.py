@@ -82,7 +82,7 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
         ),
         line_grid=rrb.LineGrid3D(spacing=1.0),
     )
-    plots = [rrb.TimeSeriesView(name="NIS, log10 (95 % band)", origin="nis")]
+    plots = [rrb.TimeSeriesView(name="NIS, log10 (95% band)", origin="nis")]
     if recording.truth is not None:
         plots.append(rrb.TimeSeriesView(name="error against truth [m]", origin="error"))
     plots.append(rrb.TimeSeriesView(name="step [ms]", origin="latency"))

@@ -83,7 +83,7 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
 
 
 def draw_consistency(result: SlamResult) -> NamedFigure | None:
-    """NIS over time with its 95 % band and running mean, and its histogram against the chi-square density."""
+    """NIS over time with its 95% band and running mean, and its histogram against the chi-square density."""
     finite = np.isfinite(result.innovations.nis)
     if not np.any(finite):
         return None
@@ -95,7 +95,7 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     left, right = figure.subplots(1, 2, width_ratios=(2.1, 1))
     time = stamps - stamps[0]
     low, high = chi2_interval(2)
-    left.axhspan(low, high, color=ESTIMATE_BAND, lw=0, zorder=0, label=f"95 % band, {low:.2f} to {high:.2f}")
+    left.axhspan(low, high, color=ESTIMATE_BAND, lw=0, zorder=0, label=f"95% band, {low:.2f} to {high:.2f}")
     style = {"lw": 0, "ms": 2.2, "mec": "none", "rasterized": len(nis) > _RASTER_FROM}
     left.plot(time[inlier], nis[inlier], "o", color=ESTIMATE, alpha=0.35, label="detection", zorder=2, **style)
     if not np.all(inlier):
@@ -104,7 +104,7 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     smooth = running_mean(nis[inlier], window)
     mean_low, mean_high = chi2_interval(2, window)
     left.plot(*_with_breaks(time[inlier], smooth), color=INK, lw=1.3, label=f"running mean of {window}", zorder=4)
-    left.axhspan(mean_low, mean_high, color=ODOMETRY, alpha=0.35, lw=0, zorder=3, label="its 95 % band")
+    left.axhspan(mean_low, mean_high, color=ODOMETRY, alpha=0.35, lw=0, zorder=3, label="its 95% band")
     left.set_yscale("log")
     left.set(xlabel="time since the first [s]", ylabel="NIS [1]", ylim=(max(nis.min(), 3e-3), max(nis.max(), 20) * 1.6))
 
@@ -118,13 +118,13 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     grid = np.linspace(0, edge, 200)
     right.plot(grid, chi2.pdf(grid, 2), color=INK, lw=1.3, label="χ², 2 d.o.f.")
     right.axvline(float(chi2.ppf(0.95, 2)), color=MUTED, lw=0.9, ls="--")
-    right.text(float(chi2.ppf(0.95, 2)) + 0.2, 0.93, "95 %", size=8, color=MUTED, transform=right.get_xaxis_transform())
+    right.text(float(chi2.ppf(0.95, 2)) + 0.2, 0.93, "95%", size=8, color=MUTED, transform=right.get_xaxis_transform())
     right.set(xlabel="NIS [1]", ylabel="density [1]", xlim=(0, edge), ylim=(0, None))
     right.legend(loc="center right")
     figure.legend(*left.get_legend_handles_labels(), loc="outside upper left", ncols=5, columnspacing=1.1)
     caption = (
         "Squared distance of every detection from its prediction, in standard deviations, before it was used."
-        " If the noise levels are honest the mean is 2 and 95 % stay below 5.99."
+        " If the noise levels are honest the mean is 2 and 95% stay below 5.99."
     )
     if len(kept):
         caption += f" Here: mean {kept.mean():.2f}, {np.mean(kept <= chi2.ppf(0.95, 2)):.1%} below"
@@ -145,7 +145,7 @@ def draw_latency(recording: Recording, result: SlamResult, real_time_factor: flo
         stamps - stamps[0], step_ms, "o", color=ESTIMATE, ms=2, mec="none", alpha=0.4, rasterized=count > _RASTER_FROM
     )
     axes.set_yscale("log")
-    lines = [(p50, INK, f"median {p50:.2g} ms"), (p99, ALERT, f"99 % {p99:.2g} ms")]
+    lines = [(p50, INK, f"median {p50:.2g} ms"), (p99, ALERT, f"99% {p99:.2g} ms")]
     if count > 1:
         budget = 1e3 * float(np.median(np.diff(stamps)))
         lines.append((budget, MUTED, f"frame interval {budget:.3g} ms"))

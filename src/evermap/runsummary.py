@@ -1,0 +1,184 @@
+"""`summary.json`: what a run was, what it found and what it cost, as plain values with stable keys.
+
+Everything outside of `timing` and `versions` is a function of the inputs and the seed alone.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from evermap import __version__
+from evermap.types import ParameterEstimate, Recording, SlamResult
+
+SUMMARY_SCHEMA_VERSION = "1"
+
+_FRAME_MEANING = {
+    "first_pose": "the robot's first pose: origin where it stood, x ahead of it, y to its left; metres",
+    "prior_map": "the frame of the map that was given; metres",
+    "truth": "the frame of the recording's own reference; metres",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RunInfo:
+    """What the result itself cannot say about a run.
+
+    Attributes:
+        command: the command line, '' if there was none.
+        seeds: every seed by name.
+        processing_s: wall time spent on estimating, without waiting for a live recording and without writing the
+            outputs; None takes the sum of the steps.
+        total_s: wall time of everything so far; None if not measured.
+        peak_memory_mb: of the process; None asks the operating system.
+    """
+
+    command: str = ""
+    seeds: Mapping[str, int] = field(default_factory=dict)
+    processing_s: float | None = None
+    total_s: float | None = None
+    peak_memory_mb: float | None = None
+
+
+def summary_dict(
+    recording: Recording,
+    result: SlamResult,
+    metrics: Mapping[str, Any],
+    *,
+    config: Any,
+    info: RunInfo,
+    timing: Mapping[str, Any],
+    outputs: Sequence[str],
+    warnings: Sequence[str] = (),
+) -> dict[str, Any]:
+    """The content of `summary.json`. Pure; no key is ever missing.
+
+    Args:
+        recording: what was processed.
+        result: what came out.
+        metrics: `metrics_dict(...)`.
+        config: configuration as JSON values.
+        info: command and seeds.
+        timing: `timing_dict(...)`.
+        outputs: names of all files of the run folder.
+        warnings: remarks beyond those of the recording and the result.
+    """
+    frame = result.trajectory.frame
+    return {
+        "schema_version": SUMMARY_SCHEMA_VERSION,
+        "evermap": __version__,
+        "versions": versions(),
+        "command": info.command,
+        "config": config,
+        "seeds": dict(info.seeds),
+        "source": recording.source,
+        "recording": {"name": recording.name, "source": recording.source, "clock": recording.clock.value},
+        "frames": {
+            "world": f"{frame}: {_FRAME_MEANING.get(frame, 'as named; metres')}",
+            "robot": "x forward, y left, angles counter-clockwise; pose covariances are in this frame",
+            "map": f"{result.landmarks.frame}: {_FRAME_MEANING.get(result.landmarks.frame, 'as named; metres')}",
+            "clock": f"{recording.clock.value}; seconds",
+        },
+        "metrics": dict(metrics),
+        "timing": dict(timing),
+        "counts": _counts(recording, result),
+        "parameters": [_parameter(parameter) for parameter in result.parameters],
+        "warnings": [*recording.warnings, *result.warnings, *warnings],
+        "outputs": list(outputs),
+        "interrupted": bool(result.interrupted),
+    }
+
+
+def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict[str, Any]:
+    """What the run cost: real-time factor, step latencies [ms], total [s] and peak memory [MB]. Not reproducible."""
+    step_ms = 1e3 * result.step_s
+    p50, p99 = np.percentile(step_ms, [50, 99]) if len(step_ms) else (None, None)
+    processing_s = float(np.sum(result.step_s)) if info.processing_s is None else info.processing_s
+    lasted_s = _processed_s(recording, result)
+    memory_mb = peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb
+    return {
+        "real_time_factor": lasted_s / processing_s if processing_s > 0 and lasted_s > 0 else None,
+        "processing_s": processing_s,
+        "total_s": info.total_s,
+        "step_p50_ms": _number(p50),
+        "step_p99_ms": _number(p99),
+        "step_max_ms": _number(step_ms.max()) if len(step_ms) else None,
+        "peak_memory_mb": _number(memory_mb),
+        "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what the numbers depend on."""
+    found = {"python": platform.python_version()}
+    for name in ("numpy", "scipy", "gtsam", "numba", "evo", "pyarrow", "matplotlib"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def peak_memory_mb() -> float | None:
+    """Largest resident size of this process so far [MB]; None where the system does not tell."""
+    try:
+        import resource
+        import sys
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+
+
+def _processed_s(recording: Recording, result: SlamResult) -> float:
+    """Duration of the part that was processed."""
+    stamps = recording.frames.stamp_s
+    if result.interrupted:
+        stamps = stamps[: len(result.step_s)]
+    return float(stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0
+
+
+def _counts(recording: Recording, result: SlamResult) -> dict[str, Any]:
+    sightings = recording.robot_sightings
+    return {
+        "duration_s": _processed_s(recording, result),
+        "odometry_rows": len(recording.odometry),
+        "frames": len(recording.frames),
+        "frames_processed": len(result.step_s),
+        "detections": len(recording.detections),
+        "detections_with_prediction": len(result.innovations),
+        "misses": len(result.misses),
+        "poses": len(result.trajectory),
+        "landmarks": len(result.landmarks),
+        "true_landmarks": None if recording.true_landmarks is None else len(recording.true_landmarks),
+        "truth_poses": None if recording.truth is None else len(recording.truth),
+        "robot_sightings": 0 if sightings is None else len(sightings),
+    }
+
+
+def _parameter(parameter: ParameterEstimate) -> dict[str, Any]:
+    return {
+        "name": parameter.name,
+        "value": _number(parameter.value),
+        "sigma": _number(parameter.sigma),
+        "prior_mean": _number(parameter.prior_mean),
+        "prior_sigma": _number(parameter.prior_sigma),
+        "unit": parameter.unit,
+        "fixed": bool(parameter.fixed),
+        "meaning": parameter.meaning,
+    }
+
+
+def _number(value: Any) -> float | None:
+    """A JSON number: a finite float, or None."""
+    if value is None:
+        return None
+    number = float(value)
+    return number if math.isfinite(number) else None
