@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from evermap.cli.terminal import check_out_folder, print_json, progress_bar, say
+from evermap.cli.terminal import print_json, progress_bar, say
 
 
 class Experiment(StrEnum):
@@ -26,7 +26,9 @@ def reproduce(
         Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<experiment>")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the results that are already in --out.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace --out even if it holds other things than results.")
+    ] = False,
 ) -> None:
     """Compute a table of the documents again.
 
@@ -35,9 +37,10 @@ def reproduce(
       evermap reproduce mrclam --data ~/recordings/mrclam
     """
     from evermap.experiments import mrclam
+    from evermap.runfolder import check_replaceable
 
     target = out or Path("evermap-out") / experiment.value
-    check_out_folder(target, force)
+    check_replaceable(target, force=force)
     with progress_bar(experiment.value) as progress:
         table = mrclam.reproduce(data, target, progress=progress)
     if as_json:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evermap.cli.summary import show_run
-from evermap.cli.terminal import check_out_folder, progress_bar, say, warn
+from evermap.cli.terminal import command_line, progress_bar, say, warn
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -58,7 +59,9 @@ def slam(
     ] = 0.02,
     realtime: Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace the run that is already in --out.")] = False,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
+    ] = False,
     init: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
@@ -90,15 +93,16 @@ def slam(
             "a recording is needed", field="INPUT", hint="a folder or zip; --init DIR shows what to put in"
         )
     from evermap.io import read_recording
+    from evermap.runfolder import check_replaceable
 
-    if out is not None:
-        check_out_folder(out, force)
+    if out is not None:  # better now than after the run
+        check_replaceable(out, force=force)
     recording = read_recording(recording_path, robot=robot)
     if out is None:
         out = default_out(recording.name)
-        check_out_folder(out, force)
+        check_replaceable(out, force=force)
     prior = None if prior_map is None else _prior_landmarks(prior_map, prior_sigma, recording)
-    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json)
+    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force)
 
 
 def run_and_write(
@@ -109,15 +113,24 @@ def run_and_write(
     prior: Landmarks | None = None,
     realtime: bool = False,
     as_json: bool = False,
+    force: bool = False,
 ) -> None:
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
-    from evermap.runfolder import write_run
+    from evermap.runfolder import RunInfo, write_run
 
+    start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)
-    summary = write_run(out, recording, result, config)
-    for remark in (*recording.warnings, *result.warnings):
+    elapsed_s = time.perf_counter() - start
+    info = RunInfo(
+        command=command_line(),
+        seeds={"slam": config.slam.seed},
+        processing_s=None if realtime else elapsed_s,  # at the recording's pace most of it is waiting
+        total_s=elapsed_s,
+    )
+    summary = write_run(out, recording, result, config, info=info, force=force)
+    for remark in summary["warnings"]:
         warn(remark)
     show_run(summary, out, as_json=as_json)
     if result.interrupted:
@@ -132,7 +145,6 @@ def default_out(name: str) -> Path:
 def _write_template(folder: Path) -> None:
     from evermap.io import write_template
 
-    check_out_folder(folder, force=False)
     write_template(folder)
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
 

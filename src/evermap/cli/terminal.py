@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -82,16 +83,21 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
         yield advance
 
 
+def command_line() -> str:
+    """What was typed, for the summary."""
+    return shlex.join(["evermap", *sys.argv[1:]])
+
+
 def check_out_folder(out: Path, force: bool) -> None:
-    """Refuse, before any work is done, to mix a new run with what is already there.
+    """Refuse, before any work is done, to mix new recordings with what is already there.
 
     Raises:
         ConfigError: `out` is a file, or a folder that holds something and `force` is off.
     """
     if out.exists() and not out.is_dir():
-        raise ConfigError("is a file; results need a folder", path=out, field="--out")
+        raise ConfigError("is a file; a folder is needed", path=out)
     if not force and out.is_dir() and any(out.iterdir()):
-        raise ConfigError("is not empty", path=out, field="--out", hint="another --out, or --force to replace it")
+        raise ConfigError("is not empty", path=out, hint="another folder, or --force to write into it")
 
 
 def _colour(stream: TextIO) -> bool:
