@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from evermap.errors import ConfigError
-from evermap.metrics.run_summary import SUMMARY_SCHEMA_VERSION, RunInfo, summary_dict, timing_dict
+from evermap.runsummary import SUMMARY_SCHEMA_VERSION, RunInfo, summary_dict, timing_dict
 from evermap.types import Innovations, Recording, SlamResult
 
 if TYPE_CHECKING:
