@@ -22,7 +22,7 @@ class DriveConfig:
         speed_mps, turn_radps: largest forward and angular speed.
         acceleration_mps2, turn_acceleration_radps2: bounds of their changes.
         lateral_acceleration_mps2: bound in curves, slows the robot there.
-        lookahead_m: distance of the point on the route that is steered to.
+        lookahead_m: distance of the point on the route that is steered to, at least 0.35 s of driving.
         slip_m: white sideways slip, metres per square root of a second; odometry does not see it.
     """
 

@@ -111,7 +111,9 @@ def _speed_limits(route: FloatArray, config: DriveConfig) -> FloatArray:
         before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0], before[:, 0] * after[:, 0] + before[:, 1] * after[:, 1]
     )
     curvature = np.maximum(np.abs(turn) / (span * ROUTE_STEP_M), 1e-9)
-    limit = np.minimum(config.speed_mps, np.sqrt(config.lateral_acceleration_mps2 / curvature))
+    # besides the bound in curves: the turn rate of a curve must be reached within 20 cm of it
+    grip = min(config.lateral_acceleration_mps2, 0.2 * config.turn_acceleration_radps2)
+    limit = np.minimum(config.speed_mps, np.sqrt(grip / curvature))
     square = (np.minimum(limit, 0.8 * config.turn_radps / curvature) ** 2).tolist()
     gain = 2 * 0.7 * config.acceleration_mps2 * ROUTE_STEP_M
     for i in range(2 * len(square) - 2, -1, -1):  # twice around, because the route is closed
@@ -140,7 +142,6 @@ def drive(route: FloatArray, config: DriveConfig, start_s: float, duration_s: fl
 
     rest = math.ceil(REST_S * config.truth_hz)
     behind = round(config.lookahead_m / ROUTE_STEP_M)
-    look2 = config.lookahead_m**2
     forward_step, turn_step = config.acceleration_mps2 * dt, config.turn_acceleration_radps2 * dt
     x, y, theta = (float(value) for value in start)
     v = w = 0.0
@@ -151,6 +152,7 @@ def drive(route: FloatArray, config: DriveConfig, start_s: float, duration_s: fl
         pose[step] = x, y, theta
         if step < rest:
             continue
+        look2 = max(config.lookahead_m, 0.35 * v) ** 2  # pure pursuit sways if it looks ahead less than that
         dx, dy = xs[target] - x, ys[target] - y
         while dx * dx + dy * dy < look2:
             target = (target + 1) % len(xs)
