@@ -6,6 +6,7 @@ older good run stays until a new good run is there. A folder that holds anything
 
 from __future__ import annotations
 
+import errno
 import json
 import secrets
 import shutil
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 SUMMARY = "summary.json"
 _IGNORED = {".DS_Store", "Thumbs.db"}
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT}
 
 
 class RunFolder:
@@ -61,7 +63,9 @@ class RunFolder:
                 self._swap_in()
         finally:
             shutil.rmtree(self._partial, ignore_errors=True)
-        if isinstance(error, OSError) and error.filename is not None and str(self._partial) in str(error.filename):
+        if isinstance(error, OSError) and (
+            error.errno in _DISK_FULL or str(error.filename or "").startswith(str(self._partial))
+        ):
             raise _cannot_write(self.out, error) from error
 
     def path(self, name: str) -> Path:

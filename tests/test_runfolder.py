@@ -1,0 +1,253 @@
+"""The run folder is whole or not there, and its numbers are reproducible."""
+
+import dataclasses
+import errno
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from evermap import runfolder
+from evermap.config import load_config
+from evermap.errors import ConfigError, MissingExtraError
+from evermap.io.tum import read_tum
+from evermap.runfolder import RunFolder, RunInfo, check_replaceable, write_run
+from evermap.runsummary import summary_dict, timing_dict
+
+sys.path.insert(0, str(Path(__file__).parent / "metrics"))
+
+INFO = RunInfo(command="evermap slam x", seeds={"slam": 0}, processing_s=2.0, total_s=3.0, peak_memory_mb=100.0)
+
+
+@pytest.fixture(scope="module")
+def run():
+    from synthetic_run import make_run
+
+    return make_run(duration_s=120.0)
+
+
+@pytest.fixture(scope="module")
+def written(run, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs") / "deep" / "first"
+    return out, write_run(out, *run, load_config(), info=INFO)
+
+
+def quick(out, run, **options):
+    return write_run(out, *run, info=INFO, figures=False, report=False, scene=False, **options)
+
+
+def leftovers(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+def test_everything_that_is_listed_is_there_and_nothing_else(written):
+    out, summary = written
+    there = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
+    assert there == summary["outputs"]
+    assert {
+        "summary.json",
+        "trajectory.tum",
+        "online.tum",
+        "map.parquet",
+        "map.geojson",
+        "changes.jsonl",
+        "innovations.parquet",
+        "report.html",
+        "figures/map.png",
+        "figures/errors.svg",
+    } <= set(there)
+    assert leftovers(out.parent) == []
+    assert json.loads((out / "summary.json").read_text()) == summary
+
+
+def test_summary_has_its_contract(written, run):
+    _, summary = written
+    assert summary["schema_version"] == "1"
+    assert summary["metrics"]["pose_rmse_m"] > 0
+    assert summary["timing"]["real_time_factor"] == pytest.approx(np.ptp(run[0].frames.stamp_s) / 2.0)
+    assert summary["timing"]["step_p99_ms"] == pytest.approx(1e3 * np.percentile(run[1].step_s, 99))
+    assert summary["timing"]["peak_memory_mb"] == 100.0
+    assert summary["counts"]["robot_sightings"] == 5
+    assert summary["counts"]["frames"] == len(run[0].frames)
+    assert summary["config"]["slam"]["robust"] is True
+    assert summary["interrupted"] is False
+    assert summary["warnings"][:2] == ["3 detections of unknown barcodes dropped", "12 detections treated as outliers"]
+    assert summary["frames"]["world"].startswith("first_pose")
+    fixed = next(p for p in summary["parameters"] if p["name"] == "mount_x_m")
+    assert fixed["fixed"] is True
+    assert fixed["prior_sigma"] is None
+
+
+def test_files_hold_the_estimate(written, run):
+    out, _ = written
+    poses = read_tum(out / "trajectory.tum").pose_world_robot
+    np.testing.assert_allclose(poses, run[1].trajectory.pose_world_robot, atol=1e-9)
+    innovations = pq.read_table(out / "innovations.parquet")
+    np.testing.assert_array_equal(innovations["nis"].to_numpy(), run[1].innovations.nis)
+    np.testing.assert_array_equal(innovations["landmark_id"].to_numpy(), run[1].innovations.landmark_id)
+    assert json.loads((out / "map.geojson").read_text())["type"] == "FeatureCollection"
+
+
+def test_the_same_run_gives_the_same_bytes_but_for_time(written, run, tmp_path):
+    out, _ = written
+    slower = RunInfo(command=INFO.command, seeds=INFO.seeds, processing_s=9.0)
+    write_run(tmp_path / "second", *run, load_config(), info=slower)
+    volatile = {"summary.json", "report.html", "scene.rrd", "figures/latency.png", "figures/latency.svg"}
+    for path in out.rglob("*"):
+        name = path.relative_to(out).as_posix()
+        if path.is_file() and name not in volatile:
+            assert path.read_bytes() == (tmp_path / "second" / name).read_bytes(), name
+
+    def without_time(folder):
+        summary = json.loads((folder / "summary.json").read_text())
+        del summary["timing"], summary["versions"]
+        return runfolder.summary_text(summary)
+
+    assert without_time(out) == without_time(tmp_path / "second")
+
+
+def test_a_failure_in_the_middle_leaves_the_old_run_untouched(run, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    quick(out, run)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    def fail(*_):
+        raise RuntimeError("power cut")
+
+    monkeypatch.setattr(runfolder, "_write_innovations", fail)
+    with pytest.raises(RuntimeError, match="power cut"):
+        quick(out, run)
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, OSError])
+def test_an_interrupt_while_writing_leaves_nothing_half_done(stop, tmp_path):
+    out = tmp_path / "run"
+
+    def write_half():
+        with RunFolder(out) as folder:
+            folder.path("figures/map.png").write_bytes(b"half")
+            raise stop
+
+    with pytest.raises(stop):
+        write_half()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_old_run_comes_back_if_the_new_one_cannot_take_its_place(run, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    quick(out, run)
+    rename = Path.rename
+
+    def refuse(self, target):
+        if ".partial-" in self.name:
+            raise PermissionError(13, "Permission denied", str(self))
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(ConfigError, match="cannot be written"):
+        quick(out, run)
+    assert (out / "summary.json").is_file()
+    assert leftovers(tmp_path) == []
+
+
+def test_a_new_run_replaces_the_old_one_completely(run, tmp_path):
+    out = tmp_path / "run"
+    write_run(out, *run, figures=True, report=False, scene=False)
+    quick(out, run)
+    assert not (out / "figures").exists()
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(ConfigError, match=r"notes\.txt.*--force"):
+        quick(out, run)
+    assert (out / "notes.txt").read_text() == "mine"
+    quick(out, run, force=True)
+    assert not (out / "notes.txt").exists()
+
+
+def test_only_run_folders_and_empty_ones_are_replaced(tmp_path, monkeypatch):
+    check_replaceable(tmp_path / "new")
+    (tmp_path / "empty").mkdir()
+    check_replaceable(tmp_path / "empty")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.tex").write_text("x")
+    with pytest.raises(ConfigError, match=r"chapter\.tex"):
+        check_replaceable(tmp_path / "thesis")
+    check_replaceable(tmp_path / "thesis", force=True)
+    with pytest.raises(ConfigError, match="is a file"):
+        check_replaceable(tmp_path / "thesis" / "chapter.tex", force=True)
+    (tmp_path / "thesis" / "summary.json").write_text('{"outputs": ["chapter.tex"]}')  # somebody else's summary
+    with pytest.raises(ConfigError, match="no evermap run"):
+        check_replaceable(tmp_path / "thesis")
+    monkeypatch.chdir(tmp_path / "thesis")
+    for danger in (".", "..", "/", "~"):
+        with pytest.raises(ConfigError, match="working or home"):
+            check_replaceable(danger, force=True)
+
+
+def test_an_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(ConfigError, match="cannot be written"):
+        RunFolder(tmp_path / "file" / "run").__enter__()
+
+
+def test_a_full_disk_is_one_line(run, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(runfolder, "_write_innovations", full)
+    with pytest.raises(ConfigError, match="No space left"):
+        quick(tmp_path / "run", run)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_symbolic_links_are_followed(run, tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    quick(tmp_path / "link", run)
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "summary.json").is_file()
+
+
+def test_without_rerun_the_default_scene_is_a_remark_and_a_wanted_one_an_error(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    summary = write_run(tmp_path / "run", *run, figures=False, report=False)
+    assert "scene.rrd" not in summary["outputs"]
+    assert any("evermap[rerun]" in warning for warning in summary["warnings"])
+    with pytest.raises(MissingExtraError):
+        write_run(tmp_path / "run", *run, figures=False, report=False, scene=True)
+    assert (tmp_path / "run" / "summary.json").is_file()
+
+
+def test_configuration_switches_outputs_off_and_sets_the_rate(run, tmp_path):
+    config = load_config(
+        None,
+        ["output.figures=false", "output.report=false", "output.rerun=false", "output.score_rate_hz=1.0"],
+    )
+    summary = write_run(tmp_path / "run", *run, config)
+    assert summary["metrics"]["alignment"]["rate_hz"] == 1.0
+    assert not [name for name in summary["outputs"] if name.endswith((".png", ".html", ".rrd"))]
+
+
+def test_changes_are_written_a_line_each(run, tmp_path):
+    quick(
+        tmp_path / "run", run, changes=[{"landmark_id": 3, "change": "vanished"}, {"landmark_id": 6, "change": "moved"}]
+    )
+    lines = (tmp_path / "run" / "changes.jsonl").read_text().splitlines()
+    assert [json.loads(line)["landmark_id"] for line in lines] == [3, 6]
+
+
+def test_summary_of_an_interrupted_run_counts_what_was_done(run):
+    recording, result = run
+    part = dataclasses.replace(result, interrupted=True, step_s=result.step_s[:101])
+    info = RunInfo(processing_s=1.0)
+    summary = summary_dict(
+        recording, part, {}, config={}, info=info, timing=timing_dict(recording, part, info), outputs=[]
+    )
+    assert summary["interrupted"] is True
+    assert summary["counts"]["frames_processed"] == 101
+    expected = recording.frames.stamp_s[100] - recording.frames.stamp_s[0]
+    assert summary["timing"]["real_time_factor"] == pytest.approx(expected)
