@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from evermap.errors import InputError
+from evermap.io.text import reason
 
 # What `zipfile` raises on damaged or encrypted archives, as found by corrupting them at random.
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
@@ -62,7 +63,7 @@ class FileSet:
             raise InputError(f"cannot be read: {error.strerror or error}", path=self.path_of(name)) from error
         except (*_ZIP_ERRORS, KeyError) as error:
             raise InputError(
-                f"damaged inside the zip: {error}", path=self.path_of(name), hint="fetch or pack the zip again"
+                f"damaged inside the zip: {reason(error)}", path=self.path_of(name), hint="fetch or pack the zip again"
             ) from error
 
 
@@ -85,7 +86,7 @@ def file_sets(path: str | Path) -> list[FileSet]:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     except ValueError as error:  # a name with a NUL byte
-        raise InputError(f"no usable file name: {error}") from error
+        raise InputError(f"no usable file name: {reason(error)}") from error
     return []
 
 
@@ -131,7 +132,9 @@ def _zip_sets(path: Path) -> list[FileSet]:
         with zipfile.ZipFile(path) as archive:
             names = [info.filename for info in archive.infolist() if not info.is_dir()]
     except _ZIP_ERRORS as error:
-        raise InputError(f"not a readable zip: {error}", path=path, hint="fetch or pack the zip again") from error
+        raise InputError(
+            f"not a readable zip: {reason(error)}", path=path, hint="fetch or pack the zip again"
+        ) from error
     folders: dict[str, dict[str, str]] = {}
     for name in names:
         inner = PurePosixPath(name)

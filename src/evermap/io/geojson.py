@@ -16,7 +16,7 @@ from evermap.errors import InputError
 from evermap.io.atomic import write_atomic
 from evermap.io.landmarks import about_map, checked_about, map_columns
 from evermap.io.table import Table
-from evermap.io.text import decode_text
+from evermap.io.text import decode_text, reason
 from evermap.types import FloatArray, Landmarks
 
 _CORNERS = 36
@@ -77,7 +77,7 @@ def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
     except json.JSONDecodeError as error:
         raise InputError(f"not valid JSON: {error.msg}", path=path, line=error.lineno) from None
     except (ValueError, RecursionError) as error:
-        raise InputError(f"not valid JSON: {error}", path=path) from None
+        raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError("no GeoJSON feature collection", path=path, field="features")
     if "evermap" not in document:

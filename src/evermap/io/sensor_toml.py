@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from evermap.errors import InputError
-from evermap.io.text import decode_text
+from evermap.io.text import decode_text, reason
 from evermap.types import Clock, Sensor
 
 FORMAT_VERSION = 1
@@ -52,7 +52,7 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         line = re.search(r"at line (\d+)", str(error))
-        raise InputError(f"not valid TOML: {error}", path=path, line=int(line[1]) if line else None) from None
+        raise InputError(f"not valid TOML: {reason(error)}", path=path, line=int(line[1]) if line else None) from None
     reader = _Reader(document, text, path)
     reader.expect(("recording", *_LIMITS), document, section=None)
     values: dict[str, float] = {}

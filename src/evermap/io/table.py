@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.io.quantities import Quantity
-from evermap.io.text import decode_text, parse_float, quote
+from evermap.io.text import decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 _LARGEST_ID = 2**53
@@ -54,7 +54,7 @@ class Table:
         for name in self.columns:
             if name not in known:
                 hint = _nearest(name, [other for other in known if other not in self.columns], known)
-                raise self.error("unknown column", row=None, field=name, hint=hint)
+                raise self.error("unknown column", row=None, field=name[:40], hint=hint)
         for name in required:
             if name not in self.columns:
                 has = ", ".join(self.columns) or "none"
@@ -163,8 +163,7 @@ def parse_parquet(data: bytes, path: Path) -> Table:
         table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read()
         table.validate(full=True)
     except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"not a readable Parquet file: {first}", path=path, hint="write it again") from error
+        raise InputError(f"not a readable Parquet file: {reason(error)}", path=path, hint="write it again") from error
     columns: dict[str, Sequence[str] | FloatArray] = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         if name in columns:
@@ -261,7 +260,7 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
             values = column.cast(pa.float64(), safe=False).to_numpy()
             return np.array(values, dtype=np.float64)
     except (pa.ArrowException, ValueError) as error:
-        raise InputError(f"damaged column: {str(error).splitlines()[0]}", path=path, field=name) from error
+        raise InputError(f"damaged column: {reason(error)}", path=path, field=name) from error
     raise InputError(f"holds {kind}, not numbers", path=path, field=name, hint="cast the column to float64")
 
 

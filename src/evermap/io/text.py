@@ -36,6 +36,13 @@ def parse_float(cell: str) -> float:
     return float(cell)
 
 
+def reason(error: BaseException) -> str:
+    """What a library has to say about a file, in a short printable line."""
+    first = (str(error).splitlines() or [""])[0] or type(error).__name__
+    short = first if len(first) <= 120 else first[:117] + "..."
+    return "".join(c if c.isprintable() else "?" for c in short)
+
+
 def quote(cell: str) -> str:
     """A cell of the user's file for a message: short and printable."""
     short = cell if len(cell) <= 24 else cell[:21] + "..."

@@ -1,0 +1,134 @@
+"""Small recordings made here, so that the tests need nobody's data."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap.types import Recording
+
+Files = dict[str, str]
+
+_COMMENT = "# UTIAS Multi-Robot Cooperative Localization and Mapping Dataset\n# made up for a test\n"
+
+
+@pytest.fixture
+def mrclam() -> Files:
+    """Two robots, three landmarks, a stranger's barcode, two landmarks in one frame, a sighting of the other robot."""
+    odometry = "".join(f"{1000 + 0.1 * i:.3f} \t  0.100 \t {0.01 * (i % 5):6.3f} \n" for i in range(50))
+    truth = "".join(f"{1001 + 0.01 * i:.3f} \t {0.01 * i:.8f} \t -0.50000000 \t 3.10000000 \n" for i in range(100))
+    return {
+        "Barcodes.dat": _COMMENT + "  1 \t  5 \n  2 \t 14 \n  6 \t 63 \n  7 \t 25 \n  8 \t  7 \n",
+        "Landmark_Groundtruth.dat": _COMMENT
+        + "  6 \t 1.0 \t -2.0 \t 0.0001 \t 0.0002 \n  7 \t 3.0 \t 0.5 \t 0.0003 \t 0.0004 \n"
+        + "  8 \t -1.0 \t 2.5 \t 0.0005 \t 0.0006 \n",
+        "Robot1_Odometry.dat": _COMMENT + odometry,
+        "Robot1_Measurement.dat": _COMMENT
+        + "1000.500 \t 63 \t 2.100 \t -0.250 \n1000.500 \t 25 \t 3.000 \t 0.100 \n"
+        + "1001.250 \t 14 \t 1.500 \t 0.300 \n1002.000 \t 99 \t 4.000 \t 0.000 \n"
+        + "1002.000 \t  7 \t 4.200 \t 0.010 \n1003.125 \t 63 \t 1.900 \t -0.400 \n",
+        "Robot1_Groundtruth.dat": _COMMENT + truth,
+        "Robot2_Odometry.dat": _COMMENT + odometry,
+        "Robot2_Measurement.dat": _COMMENT + "1001.000 \t 7 \t 2.000 \t 0.000 \n",
+        "Robot3_Measurement.dat": _COMMENT + "1001.000 \t 7 \t 2.000 \t 0.000 \n",
+    }
+
+
+@pytest.fixture
+def native() -> Files:
+    """Every native file, with every optional column of the polar form."""
+    return {
+        "odometry.csv": "stamp_s,forward_mps,lateral_mps,angular_radps\n"
+        + "".join(f"{0.1 * i:.1f},0.5,0.01,{0.02 * (i % 3)}\n" for i in range(40)),
+        "detections.csv": "# seen by a laser\n"
+        "stamp_s,landmark_id,range_m,bearing_rad,class_id,sigma_range_m,sigma_bearing_rad\n"
+        "0.5,7,2.5,-0.3,door,0.02,0.01\n0.5,8,3.5,0.3,,,\n1.0,,1.5,0.2,pillar,,\n2.0,7,1.9,-0.5,door,0.03,\n",
+        "frames.csv": "stamp_s\n0.0\n0.5\n1.0\n1.5\n2.0\n2.5\n",
+        "truth.csv": "stamp_s,x_m,y_m,theta_rad\n0,0,0,0\n1,0.5,0,0.02\n2,1,0.02,7\n",
+        "landmarks.csv": "landmark_id,x_m,y_m,sigma_m,class_id\n8,3.3,1.0,0.01,\n7,2.4,-0.7,,door\n",
+        "robot_sightings.csv": "stamp_s,robot_id,range_m,bearing_rad\n1.5,2,3.0,0.1\n",
+        "sensor.toml": '[recording]\nname = "hall"\nclock = "unix"\n\n[limits]\nrange_min_m = 0.1\nrange_max_m = 8\n'
+        "bearing_min_rad = -2.0\nbearing_max_rad = 2.0\n\n[noise]\nsigma_range_m = 0.02\nsigma_bearing_rad = 0.01\n\n"
+        "[mount]\nx_m = 0.2\ny_m = -0.05\ntheta_rad = 0.1\n\n[detection]\np_detect = 0.8\np_false = 0.002\n",
+    }
+
+
+@pytest.fixture
+def lay_out(tmp_path: Path) -> Callable[..., Path]:
+    """`lay_out(files, zipped=..., inside=...)` writes files into a folder or zip, `inside` a folder of it."""
+
+    def write(files: dict[str, str] | dict[str, bytes], *, zipped: bool = False, inside: str = "") -> Path:
+        content = {name: text.encode() if isinstance(text, str) else text for name, text in files.items()}
+        root = tmp_path / ("MRCLAM_Test.zip" if zipped else "MRCLAM_Test")
+        if zipped:
+            with zipfile.ZipFile(root, "w", zipfile.ZIP_DEFLATED) as archive:
+                for name, data in content.items():
+                    archive.writestr(f"{inside}/{name}" if inside else name, data)
+        else:
+            (root / inside).mkdir(parents=True, exist_ok=True)
+            for name, data in content.items():
+                (root / inside / name).write_bytes(data)
+        return root
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def assert_same() -> Callable[..., None]:
+    """`assert_same(a, b, but={...})`: every array and value equal, bit by bit, except fields named in `but`."""
+    return _assert_same
+
+
+def _assert_same(one: Any, other: Any, but: frozenset[str] = frozenset(), where: str = "") -> None:
+    assert type(one) is type(other), where
+    if is_dataclass(one):
+        for field in fields(one):
+            if field.name not in but:
+                _assert_same(getattr(one, field.name), getattr(other, field.name), but, f"{where}.{field.name}")
+    elif isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype, where
+        np.testing.assert_array_equal(one, other, err_msg=where, strict=True)
+    else:
+        assert one == other, where
+
+
+@pytest.fixture(scope="session")
+def check_recording() -> Callable[[Recording], None]:
+    """`check_recording(recording)` asserts all that `types` promises of a recording."""
+    return _check_recording
+
+
+def _check_recording(recording: Recording) -> None:
+    odometry, frames, detections = recording.odometry, recording.frames, recording.detections
+    for holder in (odometry, frames, recording.truth):
+        if holder is not None:
+            assert np.all(np.diff(holder.stamp_s) > 0)
+            assert holder.clock == recording.clock
+    for holder in (odometry, frames, detections, recording.truth, recording.true_landmarks, recording.robot_sightings):
+        if holder is None:
+            continue
+        for field in fields(holder):
+            array = getattr(holder, field.name)
+            if isinstance(array, np.ndarray):
+                assert array.flags.c_contiguous, field.name
+                assert array.dtype in (np.float64, np.int64), field.name
+                assert len(array) == len(holder), field.name
+                may_be_nan = field.name in ("sigma_range_m", "sigma_bearing_rad", "first_seen_s", "last_seen_s")
+                assert may_be_nan or np.all(np.isfinite(array)), field.name
+    assert len(odometry) >= 2
+    assert len(detections) >= 1
+    assert np.all(np.diff(detections.frame) >= 0)
+    assert detections.frame.min() >= 0
+    assert detections.frame.max() < len(frames)
+    assert np.all(detections.range_m > 0)
+    assert np.all(np.abs(detections.bearing_rad) <= np.pi)
+    assert np.all(detections.landmark_id >= -1)
+    assert np.all((detections.class_id >= -1) & (detections.class_id < max(1, len(recording.class_names))))
+    if recording.true_landmarks is not None:
+        assert np.all(np.diff(recording.true_landmarks.landmark_id) > 0)

@@ -1,0 +1,93 @@
+"""The template is a recording as it is, and one that a robot can be localised with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from evermap.errors import InputError
+from evermap.io import read_recording, write_template
+from evermap.types import Recording
+
+
+def test_the_template_reads_without_remarks(tmp_path: Path, check_recording: Callable) -> None:
+    recording = read_recording(write_template(tmp_path / "mine"))
+    check_recording(recording)
+    assert recording.warnings == ()
+    assert recording.sensor.mount_robot_sensor == (0.2, 0.0, 0.0)
+    assert recording.class_names == ("door", "pillar")
+    assert 19.9 < recording.odometry.stamp_s[-1] < 20.1
+    assert len(np.unique(recording.detections.landmark_id)) == 3
+
+
+def test_the_template_is_the_same_every_time_and_commented(tmp_path: Path) -> None:
+    one, other = write_template(tmp_path / "one"), write_template(tmp_path / "other")
+    names = sorted(path.name for path in one.iterdir())
+    assert names == ["detections.csv", "frames.csv", "landmarks.csv", "odometry.csv", "sensor.toml", "truth.csv"]
+    for name in names:
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+        assert (one / name).read_text().startswith("# ")
+    with pytest.raises(InputError, match="not empty"):
+        write_template(one)
+
+
+def wrapped(angle: np.ndarray) -> np.ndarray:
+    return np.angle(np.exp(1j * angle))
+
+
+def dead_reckoning(recording: Recording) -> np.ndarray:
+    """Odometry in steps of 1 ms; poses at the frames."""
+    odometry, frames = recording.odometry, recording.frames.stamp_s
+    fine = np.arange(0.0, frames[-1], 0.001)
+    row = np.searchsorted(odometry.stamp_s, fine + 1e-9) - 1
+    heading = np.concatenate([[0.0], np.cumsum(odometry.angular_radps[row] * 0.001)])
+    step = odometry.forward_mps[row] * 0.001
+    x = np.concatenate([[0.0], np.cumsum(step * np.cos(heading[:-1]))])
+    y = np.concatenate([[0.0], np.cumsum(step * np.sin(heading[:-1]))])
+    at = np.round(frames / 0.001).astype(int)
+    return np.stack([x[at], y[at], heading[at]], axis=1)
+
+
+def test_the_template_localises(tmp_path: Path) -> None:
+    """A least squares solution without any code of ours is closer to the truth than odometry, and so is its map."""
+    recording = read_recording(write_template(tmp_path / "mine"))
+    seen, start = recording.detections, dead_reckoning(recording)
+    count, landmark = len(start), seen.landmark_id - 1
+    mount_x = recording.sensor.mount_robot_sensor[0]
+    turn = np.diff(start[:, 2])
+    cos, sin = np.cos(start[:-1, 2]), np.sin(start[:-1, 2])
+    dx, dy = np.diff(start[:, 0]), np.diff(start[:, 1])
+    ahead, left = cos * dx + sin * dy, -sin * dx + cos * dy
+
+    def residuals(state: np.ndarray) -> np.ndarray:
+        pose = np.vstack([np.zeros(3), state[: 3 * count - 3].reshape(-1, 3)])
+        position = state[3 * count - 3 :].reshape(3, 2)
+        cos, sin = np.cos(pose[:-1, 2]), np.sin(pose[:-1, 2])
+        dx, dy = np.diff(pose[:, 0]), np.diff(pose[:, 1])
+        motion = [cos * dx + sin * dy - ahead, -sin * dx + cos * dy - left, wrapped(np.diff(pose[:, 2]) - turn)]
+        at = pose[seen.frame]
+        offset = position[landmark] - at[:, :2] - mount_x * np.stack([np.cos(at[:, 2]), np.sin(at[:, 2])], axis=1)
+        range_error = np.hypot(offset[:, 0], offset[:, 1]) - seen.range_m
+        bearing_error = wrapped(np.arctan2(offset[:, 1], offset[:, 0]) - at[:, 2] - seen.bearing_rad)
+        return np.concatenate([np.concatenate(motion) / 0.02, range_error / 0.03, bearing_error / 0.02])
+
+    first = [int(np.argmax(landmark == number)) for number in range(3)]
+    at, angle = start[seen.frame[first]], start[seen.frame[first], 2] + seen.bearing_rad[first]
+    guess = at[:, :2] + seen.range_m[first, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    solution = least_squares(residuals, np.concatenate([start[1:].ravel(), guess.ravel()]), method="lm").x
+    pose = np.vstack([np.zeros(3), solution[: 3 * count - 3].reshape(-1, 3)])
+
+    assert recording.truth is not None
+    assert recording.true_landmarks is not None
+    rows = np.searchsorted(recording.frames.stamp_s, recording.truth.stamp_s)
+    truth = recording.truth.pose_world_robot[:, :2]
+    error = np.sqrt(np.mean(np.sum((pose[rows, :2] - truth) ** 2, axis=1)))
+    odometry_error = np.sqrt(np.mean(np.sum((start[rows, :2] - truth) ** 2, axis=1)))
+    map_error = np.abs(solution[3 * count - 3 :].reshape(3, 2) - recording.true_landmarks.position_m).max()
+    assert error < 0.05
+    assert error < odometry_error
+    assert map_error < 0.1
