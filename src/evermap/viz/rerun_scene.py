@@ -82,10 +82,14 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
         ),
         line_grid=rrb.LineGrid3D(spacing=1.0),
     )
-    plots = [rrb.TimeSeriesView(name="NIS, log10 (95% band)", origin="nis")]
-    if recording.truth is not None:
-        plots.append(rrb.TimeSeriesView(name="error against truth [m]", origin="error"))
-    plots.append(rrb.TimeSeriesView(name="step [ms]", origin="latency"))
+    whole = None
+    if len(recording.frames):
+        ends = [rrb.TimeRangeBoundary.absolute(seconds=float(recording.frames.stamp_s[k])) for k in (0, -1)]
+        whole = rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
+    shown = {"nis": "NIS, log10 (95% band)", "error": "error against truth [m]", "latency": "step [ms]"}
+    if recording.truth is None:
+        del shown["error"]
+    plots = [rrb.TimeSeriesView(name=title, origin=origin, axis_x=whole) for origin, title in shown.items()]
     return rrb.Blueprint(
         rrb.Horizontal(scene, rrb.Vertical(*plots), column_shares=[5, 3]),
         rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
