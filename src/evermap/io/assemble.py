@@ -9,6 +9,8 @@ import numpy as np
 
 from evermap import se2
 from evermap.errors import DataError, InputError
+from evermap.io.quantities import STAMP_S
+from evermap.io.table import Table
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
 
 ODOMETRY_GAP_S: float = 10.0
@@ -23,6 +25,13 @@ def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str
         step = stamp_s[row - 1] - stamp_s[row]
         hint = "sort the rows by time if only their order is wrong"
         raise InputError(f"time runs backwards by {step:.6g} s", path=path, line=int(line[row]), field=field, hint=hint)
+
+
+def forward_stamps(table: Table) -> FloatArray:
+    """The column `stamp_s`, checked not to run backwards. Shape (R,)."""
+    stamp_s = table.numbers(STAMP_S)
+    check_forward(stamp_s, path=table.path, line=table.line)
+    return stamp_s
 
 
 def repeats(values: IntArray) -> IntArray:

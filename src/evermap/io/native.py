@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +10,20 @@ import numpy as np
 from evermap import se2
 from evermap.errors import DataError, InputError
 from evermap.io import quantities as q
-from evermap.io.assemble import check_forward, finish_recording, last_of_equal, wrap_far
+from evermap.io.assemble import finish_recording, forward_stamps, last_of_equal, wrap_far
 from evermap.io.files import FileSet, find_file_set
-from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.landmarks import distinct_labels, landmarks_from_table
+from evermap.io.native_detections import POLAR, frames_and_detections, polar
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import Table, parse_csv, parse_parquet
 from evermap.types import (
     Clock,
-    Detections,
     FloatArray,
-    Frames,
-    IntArray,
     Odometry,
     Recording,
     RobotSightings,
     Trajectory,
 )
-
-SAME_STAMP_S: float = 1e-6
-"""Stamps closer than this are the same instant when detections are put into frames."""
 
 TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings")
 ENDINGS = (".csv", ".parquet")
@@ -37,10 +31,6 @@ SENSOR_FILE = "sensor.toml"
 
 _VELOCITIES = ("forward_mps", "angular_radps")
 _INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
-_POLAR = ("range_m", "bearing_rad")
-_CARTESIAN = ("x_m", "y_m")
-_POLAR_SIGMAS = ("sigma_range_m", "sigma_bearing_rad")
-_ROUND_SIGMAS = ("sigma_m", "sigma")
 
 
 def read_native(path: str | Path, robot: int | None = None) -> Recording:
@@ -80,7 +70,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
     if class_names is None:
         class_names = distinct_labels(detection_table, tables["landmarks"])
     odometry = _odometry(odometry_table, clock, warnings)
-    frames, detections = _detections(detection_table, tables["frames"], class_names, settings, warnings)
+    frames, detections = frames_and_detections(detection_table, tables["frames"], class_names, settings, warnings)
     landmarks = tables["landmarks"]
     recording = Recording(
         name=settings.name or files.title,
@@ -143,14 +133,14 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
 
 
 def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
-    given = _one_form(table, _VELOCITIES, _INCREMENTS)
+    given = table.one_form(_VELOCITIES, _INCREMENTS)
     if given is _VELOCITIES:
         table.expect(("stamp_s", *_VELOCITIES), ("lateral_mps",))
     else:
         table.expect(("stamp_s", *_INCREMENTS))
     if len(table) == 0:
         raise DataError("holds no odometry", path=table.path)
-    stamp_s = _forward_stamps(table)
+    stamp_s = forward_stamps(table)
     if given is _VELOCITIES:
         keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
         lateral = table.numbers(q.LATERAL_MPS) if "lateral_mps" in table else np.zeros(len(table))
@@ -185,89 +175,6 @@ def _from_increments(
     return Odometry(stamp_s, velocity[0], velocity[1], velocity[2], clock=clock)
 
 
-def _detections(
-    table: Table, frame_table: Table | None, class_names: tuple[str, ...], settings: Settings, warnings: list[str]
-) -> tuple[Frames, Detections]:
-    given = _one_form(table, _POLAR, _CARTESIAN)
-    table.expect(("stamp_s", "landmark_id", *given), ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS))
-    stamp_s = _forward_stamps(table)
-    complete = settings.frames_complete if settings.frames_complete is not None else frame_table is not None
-    if frame_table is None:
-        frame_stamp_s = _distinct(stamp_s)
-    else:
-        frame_table.expect(("stamp_s",))
-        frame_stamp_s = _distinct(_forward_stamps(frame_table))
-        merged = len(frame_table) - len(frame_stamp_s)
-        if merged:
-            warnings.append(f"{frame_table.path.name}: {merged} rows repeat the stamp before and are left out")
-    range_m, bearing_rad = _polar(table) if given is _POLAR else _polar_of_cartesian(table)
-    sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
-    detections = Detections(
-        frame=_match_frames(stamp_s, frame_stamp_s, table, frame_table),
-        landmark_id=table.ids("landmark_id", optional=True),
-        range_m=range_m,
-        bearing_rad=bearing_rad,
-        class_id=class_ids(table, class_names),
-        sigma_range_m=sigma_range_m,
-        sigma_bearing_rad=sigma_bearing_rad,
-        source_line=np.asarray(table.line, dtype=np.int64),
-    )
-    return Frames(frame_stamp_s, complete=complete, clock=settings.clock), detections
-
-
-def _polar(table: Table) -> tuple[FloatArray, FloatArray]:
-    return table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
-
-
-def _polar_of_cartesian(table: Table) -> tuple[FloatArray, FloatArray]:
-    x, y = table.numbers(q.X_M), table.numbers(q.Y_M)
-    range_m = np.hypot(x, y)
-    replace(q.RANGE_M, name="x_m, y_m", high=np.inf).check(range_m, path=table.path, line=table.line)
-    return range_m, np.arctan2(y, x)
-
-
-def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    round_names = [name for name in _ROUND_SIGMAS if name in table]
-    polar_names = [name for name in _POLAR_SIGMAS if name in table]
-    if len(round_names) + bool(polar_names) > 1:
-        other = (*polar_names, *round_names[1:])[0]
-        problem = f"{round_names[0]} and {other} are both given"
-        raise table.error(problem, row=None, field=round_names[0], hint="keep one of them")
-    if round_names:
-        # a position known equally well in all directions: to first order sigma along the ray, sigma / range across it
-        sigma = table.numbers(replace(q.SIGMA_RANGE_M, name=round_names[0]))
-        return sigma, sigma / range_m
-    unknown = np.full(len(table), np.nan)
-    return (
-        table.numbers(q.SIGMA_RANGE_M) if "sigma_range_m" in table else unknown,
-        table.numbers(q.SIGMA_BEARING_RAD) if "sigma_bearing_rad" in table else unknown.copy(),
-    )
-
-
-def _match_frames(stamp_s: FloatArray, frame_stamp_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
-    """Frame of every detection. Shape (M,)."""
-    if len(frame_stamp_s) == 0:
-        nearest = np.zeros(len(stamp_s), dtype=np.int64)
-        apart = np.full(len(stamp_s), np.inf)
-    else:
-        after = np.searchsorted(frame_stamp_s, stamp_s).clip(1, max(1, len(frame_stamp_s) - 1))
-        pair = np.stack([after - 1, after.clip(0, len(frame_stamp_s) - 1)])
-        distance = np.abs(frame_stamp_s[pair] - stamp_s)
-        nearest = np.where(distance[0] <= distance[1], pair[0], pair[1]).astype(np.int64)
-        apart = distance.min(axis=0)
-    lost = np.flatnonzero(apart > SAME_STAMP_S)
-    if len(lost):
-        row = int(lost[0])
-        # without a table of frames the frames are made of these very stamps
-        assert frame_table is not None
-        near = f"; the nearest is {float(frame_stamp_s[nearest[row]])!r}" if len(frame_stamp_s) else ""
-        file = frame_table.path.name
-        problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
-        hint = f"list every instant at which the sensor looked, or leave {file} out"
-        raise table.error(problem, row=row, field="stamp_s", hint=hint)
-    return nearest
-
-
 def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
     if table is None:
         return None
@@ -275,7 +182,7 @@ def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory
     if len(table) == 0:
         warnings.append(f"{table.path.name}: holds no pose, taken as missing")
         return None
-    stamp_s = _forward_stamps(table)
+    stamp_s = forward_stamps(table)
     keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
     heading = wrap_far(table.numbers(q.THETA_RAD))
     pose = np.stack([table.numbers(q.X_M), table.numbers(q.Y_M), heading], axis=1)[keep]
@@ -285,27 +192,9 @@ def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory
 def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None:
     if table is None or len(table) == 0:
         return None
-    table.expect(("stamp_s", "robot_id", *_POLAR))
-    range_m, bearing_rad = _polar(table)
-    return RobotSightings(_forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
-
-
-def _one_form(table: Table, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
-    """Which of two ways to say the same a table uses."""
-    if table.has_any(first) and table.has_any(second):
-        raise table.error(f"mixes {', '.join(first)} with {', '.join(second)}", row=None, hint="keep one form")
-    return second if table.has_any(second) else first
-
-
-def _forward_stamps(table: Table) -> FloatArray:
-    stamp_s = table.numbers(q.STAMP_S)
-    check_forward(stamp_s, path=table.path, line=table.line)
-    return stamp_s
-
-
-def _distinct(stamp_s: FloatArray) -> FloatArray:
-    """Sorted stamps without those within `SAME_STAMP_S` of the one before."""
-    return stamp_s[np.diff(stamp_s, prepend=-np.inf) > SAME_STAMP_S]
+    table.expect(("stamp_s", "robot_id", *POLAR))
+    range_m, bearing_rad = polar(table)
+    return RobotSightings(forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
 
 
 def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:

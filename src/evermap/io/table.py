@@ -60,6 +60,13 @@ class Table:
                 has = ", ".join(self.columns) or "none"
                 raise self.error("missing column", row=None, field=name, hint=f"the file has {has}")
 
+    def one_form(self, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
+        """Which of two ways to say the same the table uses; raises InputError where it mixes them."""
+        if self.has_any(first) and self.has_any(second):
+            problem = f"mixes {', '.join(first)} with {', '.join(second)}"
+            raise self.error(problem, row=None, hint="keep one form")
+        return second if self.has_any(second) else first
+
     def has_any(self, names: Iterable[str]) -> bool:
         """Whether at least one of the columns is there."""
         return any(name in self.columns for name in names)

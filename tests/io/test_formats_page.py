@@ -1,0 +1,52 @@
+"""The page about formats tells the truth: its example is a recording, and its columns are those of the files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from evermap.io import read_recording, write_map_parquet
+from evermap.io.sensor_toml import Settings, parse_sensor_toml
+from evermap.types import Landmarks
+
+
+def page(repository: Path) -> str:
+    return (repository / "docs" / "formats.md").read_text(encoding="utf-8")
+
+
+def test_the_complete_example_is_a_recording(repository: Path, tmp_path: Path, check_recording: Callable) -> None:
+    section = page(repository).split("### A complete example")[1].split("\n### ")[0]
+    files = dict(re.findall(r"`(\w+\.\w+)`[^`]*```\w+\n(.*?)```", section, re.DOTALL))
+    assert set(files) == {"odometry.csv", "detections.csv", "frames.csv", "sensor.toml"}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    recording = read_recording(tmp_path)
+    check_recording(recording)
+    assert recording.warnings == ()
+    assert recording.frames.complete
+    assert recording.class_names == ("door", "pillar")
+    assert recording.sensor.mount_robot_sensor == (0.2, 0.0, 0.0)
+    np.testing.assert_array_equal(recording.detections.frame, [0, 0, 2, 4, 4])
+
+
+def test_the_defaults_of_the_sensor_file_are_those_of_the_program(repository: Path) -> None:
+    text = re.search(r"```toml\n(\[recording\].*?)```", page(repository), re.DOTALL)
+    assert text is not None
+    settings = parse_sensor_toml(text[1].encode(), Path("sensor.toml"))
+    default = Settings()
+    assert settings.clock == default.clock
+    for name in ("range_min_m", "range_max_m", "bearing_min_rad", "bearing_max_rad", "p_detect", "p_false",
+                 "mount_robot_sensor"):  # fmt: skip
+        assert getattr(settings.sensor, name) == getattr(default.sensor, name), name
+
+
+def test_all_map_columns_are_listed(repository: Path, tmp_path: Path) -> None:
+    section = page(repository).split("## Maps")[1].split("\n## ")[0]
+    rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
+    listed = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    written = pq.read_table(write_map_parquet(Landmarks.at([1], [[0, 0]]), tmp_path / "map.parquet")).column_names
+    assert listed == written
