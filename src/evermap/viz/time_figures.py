@@ -79,7 +79,8 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
     below.set(xlabel="time since the first frame [s]")
     _span(below, recording)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4)
-    return NamedFigure("errors", figure, "Error over time", _error_caption(evaluation, len(blind)))
+    title = "Error over time" if poses else "Uncertainty over time"
+    return NamedFigure("errors", figure, title, _error_caption(evaluation, len(blind)))
 
 
 def draw_consistency(result: SlamResult) -> NamedFigure | None:
@@ -97,7 +98,9 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     low, high = chi2_interval(2)
     left.axhspan(low, high, color=ESTIMATE_BAND, lw=0, zorder=0, label=f"95% band, {low:.2f} to {high:.2f}")
     style = {"lw": 0, "ms": 2.2, "mec": "none", "rasterized": len(nis) > _RASTER_FROM}
-    left.plot(time[inlier], nis[inlier], "o", color=ESTIMATE, alpha=0.35, label="detection", zorder=2, **style)
+    faint = float(np.clip(700.0 / len(nis), 0.06, 0.35))
+    left.plot(time[inlier], nis[inlier], "o", color=ESTIMATE, alpha=faint, zorder=2, **style)
+    left.plot([], [], "o", color=ESTIMATE, alpha=0.6, ms=3, mec="none", lw=0, label="detection")
     if not np.all(inlier):
         left.plot(time[~inlier], nis[~inlier], "x", color=ALERT, ms=3.5, mew=0.9, lw=0, label="judged an outlier")
     window = int(np.clip(np.count_nonzero(inlier) // 20, 10, 200))
