@@ -111,7 +111,7 @@ def test_zip_folder_and_line_ends_make_no_difference(
     assert recording.robot_sightings is not None
     np.testing.assert_array_equal(recording.robot_sightings.robot_id, [2])
     assert len(recording.warnings) == 1
-    assert "1 sightings of barcodes not in Barcodes.dat left out: 99 (1x)" in recording.warnings[0]
+    assert "1 sighting of barcodes not in Barcodes.dat left out: 99 (1x)" in recording.warnings[0]
 
 
 def test_the_default_robot_is_the_first_with_both_files(mrclam: Files, lay_out: Callable) -> None:
@@ -233,11 +233,11 @@ def test_survived_with_counted_warnings(mrclam: Files, lay_out: Callable, check_
     recording = read_recording(lay_out(mrclam))
     check_recording(recording)
     remarks = "\n".join(recording.warnings)
-    assert "Robot1_Odometry.dat: 1 rows with the stamp of the next row left out" in remarks
+    assert "Robot1_Odometry.dat: 1 row with the stamp of the next row left out" in remarks
     assert recording.odometry.forward_mps[-2] == 0.7
-    assert "odometry has 1 gaps over 10 s: 15.1 s from 4.9 s after its start" in remarks
-    assert "1 frames with 1 detections left out: more than 10 s before or after the odometry" in remarks
-    assert "1 detections repeat a landmark within one frame, kept (first: landmark 6, line 9)" in remarks
+    assert "odometry has 1 gap over 10 s: 15.1 s from 4.9 s after its start" in remarks
+    assert "1 frame with 1 detection left out: more than 10 s before or after the odometry" in remarks
+    assert "1 detection of a landmark that the same frame has already, kept (first: landmark 6, line 9)" in remarks
     np.testing.assert_array_equal(recording.frames.stamp_s, [1000.5, 1001.25, 1002.0, 1003.125, 1003.2])
     np.testing.assert_array_equal(recording.detections.frame, [0, 0, 2, 3, 3, 4])
 

@@ -74,6 +74,20 @@ def test_two_files_are_enough(native: Files, lay_out: Callable, check_recording:
     assert any("no sensor.toml" in remark for remark in recording.warnings)
 
 
+@pytest.mark.parametrize("with_frames", [True, False])
+def test_stamps_closer_than_a_microsecond_are_one_frame(native: Files, lay_out: Callable, with_frames: bool) -> None:
+    stamps = [0.5, 0.5000008, 0.5000016, 0.5000024, 1.0]
+    rows = "".join(f"{stamp!r},{row},2.0,0.1\n" for row, stamp in enumerate(stamps))
+    native["detections.csv"] = "stamp_s,landmark_id,range_m,bearing_rad\n" + rows
+    native["frames.csv"] = "stamp_s\n0.2\n" + "".join(f"{stamp + 3e-7!r}\n" for stamp in stamps)
+    if not with_frames:
+        del native["frames.csv"]
+    recording = read_recording(lay_out(native))
+    assert len(recording.frames) == 2 + with_frames
+    np.testing.assert_array_equal(recording.detections.frame - with_frames, [0, 0, 0, 0, 1])
+    assert recording.frames.complete == with_frames
+
+
 def test_cartesian_detections(native: Files, lay_out: Callable) -> None:
     native["detections.csv"] = "stamp_s,landmark_id,x_m,y_m,sigma_m\n0.5,1,3,4,0.1\n1.0,2,-1,0,\n1.5,3,0,-2,0.2\n"
     seen = read_recording(lay_out(native)).detections
@@ -347,12 +361,12 @@ def test_survived_with_counted_warnings(native: Files, lay_out: Callable, check_
     remarks = "\n".join(recording.warnings)
     assert "odometry.csv: 1 unfinished last line (44) left out" in remarks
     assert "detections.csv: 1 unfinished last line (8) left out" in remarks
-    assert "odometry.csv: 1 rows with the stamp of the next row left out" in remarks
-    assert "truth.csv: 1 rows with the stamp of the next row left out" in remarks
-    assert "frames.csv: 1 rows repeat the stamp before" in remarks
-    assert "odometry has 1 gaps over 10 s: 26.1 s from 3.9 s after its start" in remarks
-    assert "1 frames with 0 detections left out" in remarks
-    assert "1 detections repeat a landmark within one frame, kept (first: landmark 7, line 7)" in remarks
+    assert "odometry.csv: 1 row with the stamp of the next row left out" in remarks
+    assert "truth.csv: 1 row with the stamp of the next row left out" in remarks
+    assert "frames.csv: 1 row with the stamp of the row before left out" in remarks
+    assert "odometry has 1 gap over 10 s: 26.1 s from 3.9 s after its start" in remarks
+    assert "1 frame with 0 detections left out" in remarks
+    assert "1 detection of a landmark that the same frame has already, kept (first: landmark 7, line 7)" in remarks
     assert "file frame.csv is not read; did you mean frames.csv?" in remarks
     assert recording.odometry.forward_mps[-2] == 0.9
 

@@ -11,6 +11,7 @@ from evermap import se2
 from evermap.errors import DataError, InputError
 from evermap.io.quantities import STAMP_S
 from evermap.io.table import Table
+from evermap.io.text import counted
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
 
 ODOMETRY_GAP_S: float = 10.0
@@ -50,7 +51,7 @@ def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> Bo
     keep = np.append(stamp_s[1:] != stamp_s[:-1], True)[: len(stamp_s)]
     repeated = int(np.sum(~keep))
     if repeated:
-        warnings.append(f"{path.name}: {repeated} rows with the stamp of the next row left out")
+        warnings.append(f"{path.name}: {counted(repeated, 'row')} with the stamp of the next row left out")
     return np.asarray(keep, dtype=np.bool_)
 
 
@@ -80,7 +81,9 @@ def _warn_of_gaps(odometry: Odometry, warnings: list[str]) -> None:
         start = odometry.stamp_s[0]
         shown = ", ".join(f"{pause[i]:.1f} s from {odometry.stamp_s[i] - start:.1f} s" for i in gaps[:3])
         more = ", ..." if len(gaps) > 3 else ""
-        warnings.append(f"odometry has {len(gaps)} gaps over {ODOMETRY_GAP_S:g} s: {shown}{more} after its start")
+        warnings.append(
+            f"odometry has {counted(len(gaps), 'gap')} over {ODOMETRY_GAP_S:g} s: {shown}{more} after its start"
+        )
 
 
 def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
@@ -96,7 +99,7 @@ def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
     seen = keep[detections.frame]
     new_frame = np.cumsum(keep) - 1
     warnings.append(
-        f"{int(np.sum(~keep))} frames with {int(np.sum(~seen))} detections left out: "
+        f"{counted(int(np.sum(~keep)), 'frame')} with {counted(int(np.sum(~seen)), 'detection')} left out: "
         f"more than {ODOMETRY_GAP_S:g} s before or after the odometry"
     )
     kept = select_detections(detections, seen)
@@ -125,6 +128,6 @@ def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:
     if len(again):
         row = known[again[0]]
         warnings.append(
-            f"{len(again)} detections repeat a landmark within one frame, kept "
+            f"{counted(len(again), 'detection')} of a landmark that the same frame has already, kept "
             f"(first: landmark {detections.landmark_id[row]}, line {detections.source_line[row]})"
         )

@@ -28,6 +28,7 @@ from evermap.io.quantities import (
     Quantity,
 )
 from evermap.io.rows import Rows, parse_rows
+from evermap.io.text import counted
 from evermap.types import (
     UNKNOWN,
     Clock,
@@ -205,7 +206,8 @@ def _subjects(files: FileSet, barcode: IntArray, name: str, warnings: list[str])
     unknown = Counter(barcode[subject == 0].tolist())
     if unknown:
         codes = ", ".join(f"{code} ({count}x)" for code, count in sorted(unknown.items()))
-        warnings.append(f"{name}: {sum(unknown.values())} sightings of barcodes not in Barcodes.dat left out: {codes}")
+        sightings = counted(sum(unknown.values()), "sighting")
+        warnings.append(f"{name}: {sightings} of barcodes not in Barcodes.dat left out: {codes}")
     return subject
 
 

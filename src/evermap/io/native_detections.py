@@ -11,6 +11,7 @@ from evermap.io.assemble import forward_stamps, wrap_far
 from evermap.io.landmarks import class_ids
 from evermap.io.sensor_toml import Settings
 from evermap.io.table import Table
+from evermap.io.text import counted
 from evermap.types import Detections, FloatArray, Frames, IntArray
 
 SAME_STAMP_S: float = 1e-6
@@ -41,18 +42,19 @@ def frames_and_detections(
     table.expect(("stamp_s", "landmark_id", *given), ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS))
     stamp_s = forward_stamps(table)
     complete = settings.frames_complete if settings.frames_complete is not None else frame_table is not None
-    if frame_table is None:
-        frame_stamp_s = _distinct(stamp_s)
-    else:
+    looked_s = stamp_s
+    if frame_table is not None:
         frame_table.expect(("stamp_s",))
-        frame_stamp_s = _distinct(forward_stamps(frame_table))
-        merged = len(frame_table) - len(frame_stamp_s)
-        if merged:
-            warnings.append(f"{frame_table.path.name}: {merged} rows repeat the stamp before and are left out")
+        looked_s = forward_stamps(frame_table)
+    is_first = np.diff(looked_s, prepend=-np.inf) > SAME_STAMP_S
+    if frame_table is not None and not is_first.all():
+        merged = counted(int(np.sum(~is_first)), "row")
+        warnings.append(f"{frame_table.path.name}: {merged} with the stamp of the row before left out")
+    frame_of_look = np.cumsum(is_first) - 1
     range_m, bearing_rad = polar(table) if given is POLAR else _polar_of_cartesian(table)
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
-        frame=_match_frames(stamp_s, frame_stamp_s, table, frame_table),
+        frame=frame_of_look[_nearest_look(stamp_s, looked_s, table, frame_table)],
         landmark_id=table.ids("landmark_id", optional=True),
         range_m=range_m,
         bearing_rad=bearing_rad,
@@ -61,7 +63,7 @@ def frames_and_detections(
         sigma_bearing_rad=sigma_bearing_rad,
         source_line=np.asarray(table.line, dtype=np.int64),
     )
-    return Frames(frame_stamp_s, complete=complete, clock=settings.clock), detections
+    return Frames(looked_s[is_first], complete=complete, clock=settings.clock), detections
 
 
 def polar(table: Table) -> tuple[FloatArray, FloatArray]:
@@ -94,30 +96,21 @@ def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _match_frames(stamp_s: FloatArray, frame_stamp_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
-    """Frame of every detection. Shape (M,)."""
-    if len(frame_stamp_s) == 0:
-        nearest = np.zeros(len(stamp_s), dtype=np.int64)
-        apart = np.full(len(stamp_s), np.inf)
-    else:
-        after = np.searchsorted(frame_stamp_s, stamp_s).clip(1, max(1, len(frame_stamp_s) - 1))
-        pair = np.stack([after - 1, after.clip(0, len(frame_stamp_s) - 1)])
-        distance = np.abs(frame_stamp_s[pair] - stamp_s)
-        nearest = np.where(distance[0] <= distance[1], pair[0], pair[1]).astype(np.int64)
-        apart = distance.min(axis=0)
-    lost = np.flatnonzero(apart > SAME_STAMP_S)
-    if len(lost):
-        row = int(lost[0])
-        # without a table of frames the frames are made of these very stamps
-        assert frame_table is not None
-        near = f"; the nearest is {float(frame_stamp_s[nearest[row]])!r}" if len(frame_stamp_s) else ""
-        file = frame_table.path.name
+def _nearest_look(stamp_s: FloatArray, looked_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
+    """Row of `looked_s` at which each detection was made. Shape (M,).
+
+    Raises:
+        InputError: none of them is within `SAME_STAMP_S` of a detection.
+    """
+    padded_s = np.concatenate([[-np.inf], looked_s, [np.inf]])
+    after = np.searchsorted(looked_s, stamp_s) + 1
+    before_is_nearer = stamp_s - padded_s[after - 1] < padded_s[after] - stamp_s
+    nearest = np.where(before_is_nearer, after - 1, after)
+    lost = np.flatnonzero(np.abs(padded_s[nearest] - stamp_s) > SAME_STAMP_S)
+    if len(lost) and frame_table is not None:  # without frames, the detections' own stamps were the looks
+        row, file = int(lost[0]), frame_table.path.name
+        near = f"; the nearest is {float(padded_s[nearest[row]])!r}" if len(looked_s) else ""
         problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
         hint = f"list every instant at which the sensor looked, or leave {file} out"
         raise table.error(problem, row=row, field="stamp_s", hint=hint)
-    return nearest
-
-
-def _distinct(stamp_s: FloatArray) -> FloatArray:
-    """Sorted stamps without those within `SAME_STAMP_S` of the one before."""
-    return stamp_s[np.diff(stamp_s, prepend=-np.inf) > SAME_STAMP_S]
+    return np.asarray(nearest - 1, dtype=np.int64)

@@ -36,6 +36,11 @@ def parse_float(cell: str) -> float:
     return float(cell)
 
 
+def counted(count: int, noun: str) -> str:
+    """'1 row', '2 rows'."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
 def reason(error: BaseException) -> str:
     """What a library has to say about a file, in a short printable line."""
     first = (str(error).splitlines() or [""])[0] or type(error).__name__
