@@ -50,6 +50,15 @@ class SlamConfig(Section):
         description="'calibrated' estimates sensor and odometry errors with the map, 'plain' believes all readings",
     )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
+    outlier_log_odds: float = Field(
+        default=7.0,
+        gt=0,
+        le=50,
+        description="an outlier is as likely as an inlier at a squared normalised residual of twice this",
+    )
+    estimate_noise: bool = Field(
+        default=True, description="learn noise levels from the recording; off: keep the nominal ones"
+    )
     seed: int = Field(default=0, ge=0, description="seed of everything random")
     calibration: CalibrationConfig = Field(
         default_factory=CalibrationConfig, description="which calibration states are estimated"

@@ -1,0 +1,155 @@
+"""From a recording to a trajectory and a map: the main job, told in the order in which it happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from evermap import se2
+from evermap.errors import DataError
+from evermap.types import UNKNOWN, FloatArray, Landmarks, Recording, SlamResult
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.slam.calibration import CalibrationPrior
+    from evermap.slam.problem import Noise
+    from evermap.slam.session import Prepared
+    from evermap.slam.streaming import StreamingSlam
+
+Progress = Callable[[float, float], None]
+"""Called with seconds of the recording that are done, and seconds in all."""
+
+
+def run_slam(
+    recording: Recording,
+    config: Config | None = None,
+    *,
+    prior_map: Landmarks | None = None,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> SlamResult:
+    """Estimate trajectory, landmarks, calibration and noise of one recording.
+
+    Args:
+        recording: what a reader returned; its truth is not looked at.
+        config: settings; None for the defaults.
+        prior_map: landmarks to localise in, with covariances; None maps from scratch in the frame of the first pose.
+        realtime: process at the recording's pace.
+        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+
+    Raises:
+        DataError: nothing can be estimated, for example because no landmark was ever seen.
+        ConfigError: settings that contradict each other or the recording.
+        NumericalError: no finite optimum.
+    """
+    from evermap.config import Config
+    from evermap.slam.session import prepare
+
+    config = config or Config()
+    recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    prepared = prepare(recording, prior_map)
+    prior, noise = _beliefs(recording, config)
+    slam = _estimator(prepared, prior, noise, config)
+    step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
+    return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
+
+
+def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, Noise]:
+    """What is believed of sensors and noise before the first frame."""
+    from evermap.slam.calibration import CalibrationPrior
+    from evermap.slam.noise import START
+
+    settings = config.slam
+    prior = CalibrationPrior.from_settings(
+        calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix
+    )
+    sensor = recording.sensor
+    nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
+    detection = np.array([default if given is None else given for given, default in zip(nominal, START.detection)])
+    return prior, replace(START, detection=detection, outlier_log_odds=settings.outlier_log_odds)
+
+
+def _estimator(prepared: Prepared, prior: CalibrationPrior, noise: Noise, config: Config) -> StreamingSlam:
+    from evermap.slam.streaming import StreamingSlam
+
+    return StreamingSlam(
+        prepared.problem,
+        noise,
+        prior,
+        prior_map=prepared.prior_map,
+        robust=config.slam.robust,
+        estimate_noise=config.slam.estimate_noise,
+    )
+
+
+def _feed(
+    slam: StreamingSlam, prepared: Prepared, *, realtime: bool, progress: Progress | None
+) -> tuple[FloatArray, bool]:
+    """Frame after frame through the estimator; returns seconds a frame and whether it was interrupted."""
+    stamps = prepared.problem.stamp_s
+    step_s = np.zeros(len(stamps))
+    began = time.perf_counter()
+    done = 0
+    try:
+        for row, stamp in enumerate(stamps):
+            if realtime:
+                time.sleep(max(0.0, (stamp - stamps[0]) - (time.perf_counter() - began)))
+            start = time.perf_counter()
+            slam.step()
+            step_s[row] = time.perf_counter() - start
+            done = row + 1
+            if progress is not None:
+                progress(float(stamp - stamps[0]), float(stamps[-1] - stamps[0]))
+    except KeyboardInterrupt:
+        if done < 2:
+            raise
+        return step_s[:done], True
+    return step_s, False
+
+
+def _conclude(
+    recording: Recording,
+    prepared: Prepared,
+    slam: StreamingSlam,
+    prior: CalibrationPrior,
+    step_s: FloatArray,
+    *,
+    interrupted: bool,
+) -> SlamResult:
+    """Smooth, bridge the blind stretches, count the misses, and put all of it into plain arrays."""
+    from evermap.sensing.visibility import find_misses
+    from evermap.slam import session
+
+    outcome = slam.finish()
+    frame = "prior_map" if outcome.aligned else "first_pose"
+    trajectory = session.trajectory(prepared, outcome, recording, frame)
+    landmarks = session.landmarks(prepared, outcome, recording, frame)
+    rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9)
+    poses = se2.between(np.zeros(3), trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)])
+    misses = find_misses(rows, poses, recording.detections, landmarks, recording.frames.stamp_s, recording.sensor)
+    landmarks = session.with_misses(landmarks, misses)
+    warnings = list(prepared.warnings)
+    if prepared.prior_map is not None and not outcome.aligned:
+        warnings.append("too few landmarks of the prior map were seen: the map is in the frame of the first pose")
+    if interrupted:
+        done_s, all_s = (float(np.ptp(s)) for s in (trajectory.stamp_s, recording.frames.stamp_s))
+        warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
+    return SlamResult(
+        trajectory=trajectory,
+        online=session.online(prepared, slam, recording, frame),
+        landmarks=landmarks,
+        parameters=session.parameters(outcome, prior),
+        innovations=session.innovations(prepared, slam, outcome, recording),
+        misses=misses,
+        step_s=step_s,
+        dead_reckoning=session.dead_reckoning(prepared, trajectory),
+        warnings=tuple(warnings),
+        interrupted=interrupted,
+    )
+
+
+__all__ = ["UNKNOWN", "DataError", "Progress", "run_slam"]

@@ -1,0 +1,1 @@
+"""What a sensor should see: probability of detection."""

@@ -1,0 +1,84 @@
+"""Which landmarks a sensor should have seen, and with what probability: the other half of a detection is a miss."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.special import ndtr
+
+from evermap import se2
+from evermap.types import Detections, FloatArray, Landmarks, Misses, Sensor
+
+RANGE_MARGIN_M = 0.2
+BEARING_MARGIN_RAD = 0.05
+"""Softness of the field of view's edge, where pose and map errors decide."""
+WORTH_A_MISS = 0.5
+"""Share of the sensor's detection probability below which not seeing a landmark is no miss."""
+
+
+def detection_probability(pose_world_robot: FloatArray, position_m: FloatArray, sensor: Sensor) -> FloatArray:
+    """P(detect | it is there) of every landmark from every pose.
+
+    The limits of range and bearing are smoothed by normal distribution functions (`P_D0 P(r < r_max) P(|b| < b_max)`,
+    Nielsen 2024 section 7.2, with both limits of each).
+
+    Args:
+        pose_world_robot: (F, 3); position_m: (L, 2) in the same frame.
+
+    Returns:
+        (F, L) probabilities.
+    """
+    pose = se2.compose(pose_world_robot, np.asarray(sensor.mount_robot_sensor))
+    offset = position_m[None, :, :] - pose[:, None, :2]
+    range_m = np.hypot(offset[..., 0], offset[..., 1])
+    bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - pose[:, None, 2])
+    inside = _within(range_m, sensor.range_min_m, sensor.range_max_m, RANGE_MARGIN_M)
+    if sensor.bearing_max_rad - sensor.bearing_min_rad < 2 * math.pi - 1e-6:
+        inside *= _within(bearing, sensor.bearing_min_rad, sensor.bearing_max_rad, BEARING_MARGIN_RAD)
+    return sensor.p_detect * inside
+
+
+def find_misses(
+    frame: FloatArray,
+    pose_world_robot: FloatArray,
+    detections: Detections,
+    landmarks: Landmarks,
+    frame_stamp_s: FloatArray,
+    sensor: Sensor,
+) -> Misses:
+    """Landmarks that should have been detected and were not, from the first time on that each was seen.
+
+    Args:
+        frame: (F,) rows of frames that have a pose.
+        pose_world_robot: (F, 3) poses at those frames.
+        frame_stamp_s: stamps of all frames.
+    """
+    rows: list[FloatArray] = []
+    ids: list[FloatArray] = []
+    probabilities: list[FloatArray] = []
+    column = {int(identity): k for k, identity in enumerate(landmarks.landmark_id)}
+    seen_column = np.array([column.get(int(i), -1) for i in detections.landmark_id], dtype=np.int64)
+    chunk = max(1, 2_000_000 // max(len(landmarks), 1))
+    for start in range(0, len(frame), chunk):
+        part = frame[start : start + chunk].astype(np.int64)
+        p = detection_probability(pose_world_robot[start : start + chunk], landmarks.position_m, sensor)
+        expected = p >= WORTH_A_MISS * sensor.p_detect
+        expected &= frame_stamp_s[part][:, None] > landmarks.first_seen_s[None, :]
+        hit = np.isin(detections.frame, part) & (seen_column >= 0)
+        expected[np.searchsorted(part, detections.frame[hit]), seen_column[hit]] = False
+        missed_frame, missed_column = np.nonzero(expected)
+        rows.append(part[missed_frame])
+        ids.append(landmarks.landmark_id[missed_column])
+        probabilities.append(p[missed_frame, missed_column])
+    if not rows:
+        return Misses(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+    return Misses(
+        np.concatenate(rows).astype(np.int64), np.concatenate(ids).astype(np.int64), np.concatenate(probabilities)
+    )
+
+
+def _within(value: FloatArray, low: float, high: float, margin: float) -> FloatArray:
+    """Probability that a value known to `margin` lies between two limits."""
+    above = ndtr((value - low) / margin) if low > -math.inf else np.ones_like(value)
+    return above * (ndtr((high - value) / margin) if high < math.inf else 1.0)

@@ -1,0 +1,331 @@
+"""Batch smoothing: Gauss-Newton whose normal equations are a chain of poses with a border.
+
+Poses are tied to their neighbours by odometry, and all of them to the few landmarks and calibration states. Eliminating
+the chain first costs `O(N G^2)` for N poses and G shared numbers, and the way back gives every covariance that noise
+estimation, gating and error ellipses need, without forming an inverse of the whole.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import DataError, NumericalError
+from evermap.slam.kernels import (
+    detection_residual,
+    inlier_weight,
+    integrate_odometry,
+    kernel,
+    odometry_residual,
+    outlier_loss,
+    wrapped,
+)
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.types import FloatArray
+
+MEMORY_LIMIT_GB = 4.0
+HELD = 1e-9
+"""Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
+
+Normal = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float, FloatArray]
+
+
+@kernel
+def _add(target: FloatArray, a: FloatArray, b: FloatArray, weight: FloatArray) -> None:
+    """target += a' weight b, for small matrices without temporaries."""
+    for i in range(a.shape[1]):
+        for k in range(weight.shape[0]):
+            scaled = 0.0
+            for m in range(weight.shape[0]):
+                scaled += a[m, i] * weight[m, k]
+            for j in range(b.shape[1]):
+                target[i, j] += scaled * b[k, j]
+
+
+@kernel
+def assemble(
+    pose: FloatArray,
+    landmark: FloatArray,
+    states: FloatArray,
+    stamp: FloatArray,
+    odometry_stamp: FloatArray,
+    velocity: FloatArray,
+    unknown: FloatArray,
+    pose_row: Any,
+    landmark_row: Any,
+    reading: FloatArray,
+    sigma: FloatArray,
+    variance: FloatArray,
+    mount: FloatArray,
+    prior_mean: FloatArray,
+    prior_sigma: FloatArray,
+    free: Any,
+    start: FloatArray,
+    start_information: float,
+    landmark_mean: FloatArray,
+    landmark_information: FloatArray,
+    log_odds: float,
+    heavy: bool,
+) -> Normal:
+    """Normal equations: chain diagonal, chain off-diagonal, border, corner, two right sides; cost; inlier weights."""
+    n, count = len(pose), len(landmark)
+    shared = 2 * count + 9
+    at_states, at_motion = 2 * count, 2 * count + 5
+    diagonal = np.zeros((n, 3, 3))
+    off = np.zeros((n, 3, 3))
+    border = np.zeros((n, 3, shared))
+    corner = np.zeros((shared, shared))
+    right_pose = np.zeros((n, 3))
+    right_shared = np.zeros(shared)
+    weights = np.zeros(len(pose_row))
+    cost = 0.0
+
+    increment, motion, noise, covariance = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
+    e, j1, j2 = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(n - 1):
+        integrate_odometry(
+            odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, increment, motion, noise, covariance
+        )
+        for kind in range(len(variance)):
+            covariance += variance[kind] * noise[kind]
+        information = np.linalg.inv(covariance)
+        odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
+        for k in range(4):
+            for axis in range(3):
+                motion[axis, k] = -motion[axis, k] if free[5 + k] else 0.0
+        _add(diagonal[i], j1, j1, information)
+        _add(diagonal[i + 1], j2, j2, information)
+        _add(off[i], j2, j1, information)
+        _add(border[i, :, at_motion:], j1, motion, information)
+        _add(border[i + 1, :, at_motion:], j2, motion, information)
+        _add(corner[at_motion:, at_motion:], motion, motion, information)
+        pull = information @ e
+        cost += 0.5 * (e @ pull)
+        right_pose[i] -= j1.T @ pull
+        right_pose[i + 1] -= j2.T @ pull
+        right_shared[at_motion:] -= motion.T @ pull
+
+    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    information2 = np.zeros((2, 2))
+    for m in range(len(pose_row)):
+        i, j = pose_row[m], 2 * landmark_row[m]
+        detection_residual(
+            pose[i], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], z, jx, jl, jc
+        )
+        for k in range(5):
+            if not free[k]:
+                jc[:, k] = 0.0
+        squared = (z[0] / sigma[m, 0]) ** 2 + (z[1] / sigma[m, 1]) ** 2
+        weight = inlier_weight(squared, log_odds, heavy)
+        weights[m] = weight
+        cost += outlier_loss(squared, log_odds, heavy)
+        information2[0, 0] = weight / sigma[m, 0] ** 2
+        information2[1, 1] = weight / sigma[m, 1] ** 2
+        _add(diagonal[i], jx, jx, information2)
+        _add(border[i, :, j : j + 2], jx, jl, information2)
+        _add(border[i, :, at_states:at_motion], jx, jc, information2)
+        _add(corner[j : j + 2, j : j + 2], jl, jl, information2)
+        _add(corner[j : j + 2, at_states:at_motion], jl, jc, information2)
+        _add(corner[at_states:at_motion, j : j + 2], jc, jl, information2)
+        _add(corner[at_states:at_motion, at_states:at_motion], jc, jc, information2)
+        pull2 = information2 @ z
+        right_pose[i] -= jx.T @ pull2
+        right_shared[j : j + 2] -= jl.T @ pull2
+        right_shared[at_states:at_motion] -= jc.T @ pull2
+
+    for k in range(9):
+        precision = 1.0 / prior_sigma[k] ** 2
+        d = states[k] - prior_mean[k]
+        corner[at_states + k, at_states + k] += precision
+        right_shared[at_states + k] -= precision * d
+        cost += 0.5 * precision * d * d
+    for j in range(count):
+        block = landmark_information[j]
+        d2 = landmark[j] - landmark_mean[j]
+        pull2 = block @ d2
+        corner[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] += block
+        corner[2 * j, 2 * j] += HELD
+        corner[2 * j + 1, 2 * j + 1] += HELD
+        right_shared[2 * j : 2 * j + 2] -= pull2
+        cost += 0.5 * (d2 @ pull2)
+    # the first pose is held at `start`, in its own frame
+    c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
+    dx, dy, dt = pose[0, 0] - start[0], pose[0, 1] - start[1], wrapped(pose[0, 2] - start[2])
+    for k in range(3):
+        diagonal[0, k, k] += start_information
+    right_pose[0, 0] -= start_information * (c * dx + s * dy)
+    right_pose[0, 1] -= start_information * (-s * dx + c * dy)
+    right_pose[0, 2] -= start_information * dt
+    cost += 0.5 * start_information * (dx * dx + dy * dy + dt * dt)
+    return diagonal, off, border, corner, right_pose, right_shared, cost, weights
+
+
+@kernel
+def solve(
+    diagonal: FloatArray,
+    off: FloatArray,
+    border: FloatArray,
+    corner: FloatArray,
+    right_pose: FloatArray,
+    right_shared: FloatArray,
+    damping: float,
+    covariances: bool,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Steps of poses and shared numbers; with `covariances`, also the four arrays of `Marginals` (else empty).
+
+    Eliminates pose after pose (block Cholesky of the chain), solves the border's Schur complement, and returns along
+    the chain. Overwrites its arguments.
+    """
+    n, shared = len(diagonal), len(corner)
+    inverse = np.zeros((n, 3, 3))
+    gain = np.zeros((n, 3, shared))
+    for k in range(shared):
+        corner[k, k] *= 1.0 + damping
+    for i in range(n):
+        for k in range(3):
+            diagonal[i, k, k] *= 1.0 + damping
+        if i > 0:
+            factor = off[i - 1] @ inverse[i - 1]
+            diagonal[i] -= factor @ off[i - 1].T
+            border[i] -= factor @ border[i - 1]
+            right_pose[i] -= factor @ right_pose[i - 1]
+        inverse[i] = np.linalg.inv(diagonal[i])
+        gain[i] = inverse[i] @ border[i]
+    flat_border, flat_gain = border.reshape(3 * n, shared), gain.reshape(3 * n, shared)
+    schur = corner - flat_border.T @ flat_gain
+    rest = right_shared - flat_gain.T @ right_pose.reshape(3 * n)
+    step_shared = np.linalg.solve(schur, rest)
+    step_pose = np.zeros((n, 3))
+    for i in range(n - 1, -1, -1):
+        right = right_pose[i].copy()
+        if i < n - 1:
+            right -= off[i].T @ step_pose[i + 1]
+        step_pose[i] = inverse[i] @ right - gain[i] @ step_shared
+    if not covariances:
+        empty2, empty3 = np.zeros((0, 0)), np.zeros((0, 3, 3))
+        return step_pose, step_shared, empty3, empty3, np.zeros((0, 3, 0)), empty2
+    cov_shared = np.linalg.inv(schur)
+    cov_pose = np.zeros((n, 3, 3))
+    cov_next = np.zeros((n, 3, 3))
+    cross = (flat_gain @ cov_shared).reshape(n, 3, shared)
+    for i in range(n - 1, -1, -1):
+        cross[i] = -cross[i]
+        cov_pose[i] = inverse[i] - cross[i] @ gain[i].T
+        if i < n - 1:
+            back = inverse[i] @ off[i].T
+            cross[i] -= back @ cross[i + 1]
+            cov_next[i] = -back @ cov_pose[i + 1] - gain[i] @ cross[i + 1].T
+            cov_pose[i] = inverse[i] - cov_next[i] @ back.T - cross[i] @ gain[i].T
+    return step_pose, step_shared, cov_pose, cov_next, cross, cov_shared
+
+
+class Smoother:
+    """Optimum and covariances of one `Problem` at given noise.
+
+    Raises:
+        DataError: more poses times landmarks than fit into memory.
+        NumericalError: no finite optimum.
+    """
+
+    def __init__(self, problem: Problem, noise: Noise, *, heavy: bool = False, robust: bool = True) -> None:
+        self.problem = problem
+        self.noise = noise
+        self._heavy = heavy
+        self._log_odds = noise.outlier_log_odds if robust else np.inf
+        self._robust = robust
+        size_gb = 5e-8 * len(problem.stamp_s) * (len(problem.landmark_mean) * 2 + 9)
+        if size_gb > MEMORY_LIMIT_GB:
+            raise DataError(
+                f"{len(problem.stamp_s)} poses with {len(problem.landmark_mean)} landmarks need {size_gb:.0f} GB",
+                hint="split the recording into sessions",
+            )
+
+    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-7) -> Estimate:
+        """Damped Gauss-Newton from `start` until no step moves anything by more than `tolerance` (m or rad)."""
+        estimate = start
+        normal = self._normal(estimate)
+        damping = 0.0
+        for _ in range(iterations):
+            step_pose, step_shared = self._step(normal, damping)
+            trial = _moved(estimate, step_pose, step_shared)
+            following = self._normal(trial)
+            if np.isfinite(following[6]) and following[6] <= normal[6] * (1 + 1e-12) + 1e-12:
+                estimate, normal = trial, following
+                damping = 0.0 if damping < 1e-6 else damping / 10.0
+                if max(np.abs(step_pose).max(), np.abs(step_shared).max()) < tolerance:
+                    break
+            else:
+                damping = max(1e-6, 10.0 * damping)
+                if damping > 1e6:
+                    break
+        if not np.isfinite(normal[6]):
+            raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
+        return estimate
+
+    def cost(self, estimate: Estimate) -> float:
+        """Negative log posterior up to a constant."""
+        return float(self._normal(estimate)[6])
+
+    def inlier_probability(self, estimate: Estimate) -> FloatArray:
+        """(M,) probability of every detection to be no outlier, given the estimate."""
+        return self._normal(estimate)[7]
+
+    def marginals(self, estimate: Estimate) -> Marginals:
+        """Covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero."""
+        normal = self._normal(estimate)
+        known = np.append(np.repeat(estimate.known, 2), np.ones(9, dtype=bool))
+        _, _, pose, consecutive, cross, shared = solve(*(part.copy() for part in normal[:6]), 0.0, True)
+        if known.all():
+            return Marginals(pose, consecutive, cross, shared)
+        whole = np.zeros((len(known), len(known)))
+        whole[np.ix_(known, known)] = shared
+        whole_cross = np.zeros((len(pose), 3, len(known)))
+        whole_cross[:, :, known] = cross
+        return Marginals(pose, consecutive, whole_cross, whole)
+
+    def _step(self, normal: Normal, damping: float) -> tuple[FloatArray, FloatArray]:
+        step_pose, step_shared, *_ = solve(*(part.copy() for part in normal[:6]), damping, False)
+        return step_pose, step_shared
+
+    def _normal(self, estimate: Estimate) -> Normal:
+        problem, noise = self.problem, self.noise
+        known = estimate.known
+        rank = np.cumsum(known) - 1
+        parts: Normal = assemble(
+            estimate.pose,
+            estimate.landmark[known],
+            estimate.states,
+            problem.stamp_s,
+            problem.drive.stamp_s,
+            problem.drive.velocity,
+            problem.drive.unknown,
+            problem.pose_row,
+            rank[problem.landmark_row],
+            problem.reading,
+            noise.of_detections(problem.sigma_given),
+            noise.odometry**2,
+            problem.mount,
+            problem.prior.mean,
+            problem.prior.sigma,
+            problem.prior.free,
+            np.zeros(3),
+            problem.start_information,
+            problem.landmark_mean[known],
+            problem.landmark_information[known],
+            self._log_odds,
+            self._heavy and self._robust,
+        )
+        return parts
+
+
+def _moved(estimate: Estimate, step_pose: FloatArray, step_shared: FloatArray) -> Estimate:
+    """The estimate after a step: poses on the right, the rest added."""
+    c, s = np.cos(estimate.pose[:, 2]), np.sin(estimate.pose[:, 2])
+    pose = estimate.pose.copy()
+    pose[:, 0] += c * step_pose[:, 0] - s * step_pose[:, 1]
+    pose[:, 1] += s * step_pose[:, 0] + c * step_pose[:, 1]
+    pose[:, 2] += step_pose[:, 2]
+    landmark = estimate.landmark.copy()
+    landmark[estimate.known] += step_shared[:-9].reshape(-1, 2)
+    return Estimate(pose, landmark, estimate.states + step_shared[-9:])

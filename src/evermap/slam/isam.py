@@ -1,0 +1,250 @@
+"""Incremental smoothing with iSAM2 (Kaess et al. 2012) through gtsam: one pose and one factor a frame.
+
+The factor of a frame ties its pose to the one before by odometry, to the landmarks it saw, and both to the calibration
+states. It whitens itself, because the odometry's noise depends on the states, and down-weights outliers at every
+relinearisation (iteratively reweighted least squares).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from evermap import se2
+from evermap.slam.frame_factor import whitened_detections, whitened_odometry
+from evermap.slam.kernels import detection_residual, integrate_odometry
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.types import FloatArray, IntArray
+
+STATES_KEY = gtsam.symbol("c", 0)
+RELINEARIZE_SKIP = 10
+RELINEARIZE_THRESHOLD = 0.1
+"""How far (m, rad, or 1) a value may drift from where it was linearised; the batch smoother takes out the rest."""
+
+
+def _pose_key(row: int) -> int:
+    return int(gtsam.symbol("x", row))
+
+
+def _landmark_key(row: int) -> int:
+    return int(gtsam.symbol("l", row))
+
+
+class IncrementalSmoother:
+    """iSAM2 over the first poses of a `Problem`; pose after pose is added with `add`.
+
+    Args:
+        problem: the measurements; rows beyond those added are not looked at.
+        noise: standard deviations.
+        robust: down-weight outliers (Cauchy, which never lets go of what may be right after all).
+    """
+
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
+        self._problem = problem
+        self._robust = robust
+        self._noise = noise
+        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._isam = gtsam.ISAM2(_parameters())
+        self._n_poses = 0
+        self._known: set[int] = set()
+
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem | None = None) -> None:
+        """Throw the tree away and build it anew at `estimate`, with other noise or other priors."""
+        self._problem = problem or self._problem
+        self._noise = noise
+        self._isam = gtsam.ISAM2(_parameters())
+        self._n_poses = len(estimate.pose)
+        self._known = set()
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._insert_priors(graph, values, estimate.states)
+        for row in range(self._n_poses):
+            self._insert_frame(graph, values, row, estimate.pose[row], estimate.landmark)
+        self._isam.update(graph, values)
+
+    def add(self, row: int, pose: FloatArray, landmark: FloatArray) -> None:
+        """Add pose `row` with its odometry and detections, and update the tree.
+
+        Args:
+            pose: (3,) predicted pose, where it is linearised first.
+            landmark: (L, 2) positions of landmarks, used for those that are seen for the first time.
+        """
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if row == 0:
+            self._insert_priors(graph, values, self._problem.prior.mean)
+        self._insert_frame(graph, values, row, pose, landmark)
+        self._isam.update(graph, values)
+        self._n_poses = row + 1
+
+    def last_pose(self) -> FloatArray:
+        """(3,) the newest pose."""
+        pose = self._isam.calculateEstimatePose2(_pose_key(self._n_poses - 1))
+        return np.array([pose.x(), pose.y(), pose.theta()])
+
+    def states(self) -> FloatArray:
+        """(9,) calibration states."""
+        return np.asarray(self._isam.calculateEstimateVector(STATES_KEY))
+
+    def landmark(self, row: int) -> FloatArray:
+        """(2,) position of one landmark; nan where it is not in the graph."""
+        if row not in self._known:
+            return np.full(2, np.nan)
+        return np.asarray(self._isam.calculateEstimatePoint2(_landmark_key(row)))
+
+    def estimate(self) -> Estimate:
+        """Values of all that is in the graph."""
+        values = self._isam.calculateBestEstimate()
+        return _from_values(values, self._n_poses, len(self._problem.landmark_mean), self._known)
+
+    def innovations(
+        self, row: int, increment: FloatArray, motion: FloatArray, covariance: FloatArray, detections: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """What the next frame's detections of known landmarks say before they are used.
+
+        Args:
+            row: the pose that is about to be added, at least 1.
+            increment, motion, covariance: odometry since the pose before, with its Jacobian by the states and noise.
+            detections: (k,) rows of the problem's detections, of landmarks in the graph.
+
+        Returns:
+            (k,) squared Mahalanobis distances with `S = H P H' + R`, and (3, 3) covariance of the predicted pose.
+        """
+        problem = self._problem
+        landmarks = [int(x) for x in dict.fromkeys(problem.landmark_row[detections].tolist())]
+        keys = [_pose_key(row - 1), STATES_KEY, *map(_landmark_key, landmarks)]
+        joint = np.asarray(self._isam.jointMarginalCovariance(gtsam.KeyVector(keys)).fullMatrix())
+        offset = {landmark: 12 + 2 * k for k, landmark in enumerate(landmarks)}
+        states = self.states()
+        pose = se2.compose(self.last_pose(), increment)
+        # the new pose in terms of the old one and the states
+        carry = np.zeros((3, len(joint)))
+        carry[:, :3] = se2.adjoint(se2.inverse(increment))
+        carry[:, 8:12] = motion
+        pose_covariance = carry @ joint @ carry.T + covariance
+        nis = np.empty(len(detections))
+        sigma = self._noise.of_detections(problem.sigma_given[detections])
+        e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+        for k, m in enumerate(detections):
+            landmark = int(problem.landmark_row[m])
+            at = self.landmark(landmark)
+            detection_residual(pose, at, states, problem.mount, *problem.reading[m], e, jx, jl, jc)
+            h = jx @ carry
+            h[:, 3:8] += jc * problem.prior.free[:5]
+            h[:, offset[landmark] : offset[landmark] + 2] += jl
+            s = h @ joint @ h.T + jx @ covariance @ jx.T + np.diag(sigma[k] ** 2)
+            nis[k] = e @ np.linalg.solve(s, e)
+        return nis, pose_covariance
+
+    def _insert_priors(self, graph: Any, values: Any, states: FloatArray) -> None:
+        problem = self._problem
+        prior = problem.prior
+        graph.add(gtsam.PriorFactorVector(STATES_KEY, prior.mean, gtsam.noiseModel.Diagonal.Sigmas(prior.sigma)))
+        values.insert(STATES_KEY, states)
+        if problem.start_information > 0.0:
+            held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
+            graph.add(gtsam.PriorFactorPose2(_pose_key(0), gtsam.Pose2(0.0, 0.0, 0.0), held))
+
+    def _insert_frame(self, graph: Any, values: Any, row: int, pose: FloatArray, landmark: FloatArray) -> None:
+        problem = self._problem
+        values.insert(_pose_key(row), gtsam.Pose2(*pose))
+        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        for j in dict.fromkeys(problem.landmark_row[detections].tolist()):
+            if j in self._known:
+                continue
+            self._known.add(j)
+            values.insert(_landmark_key(j), landmark[j])
+            information = problem.landmark_information[j]
+            if information.any():
+                noise = gtsam.noiseModel.Gaussian.Information(information)
+                graph.add(gtsam.PriorFactorPoint2(_landmark_key(j), problem.landmark_mean[j], noise))
+        if row > 0 or len(detections):
+            graph.add(frame_factor(problem, self._noise, row, detections, heavy=self._robust))
+
+
+def frame_factor(problem: Problem, noise: Noise, row: int, detections: IntArray, *, heavy: bool) -> Any:
+    """The gtsam factor of one frame: odometry since the pose before (none for row 0) and its detections."""
+    landmarks = list(dict.fromkeys(problem.landmark_row[detections].tolist()))
+    keys = [STATES_KEY, _pose_key(row), *map(_landmark_key, landmarks)]
+    if row > 0:
+        keys.append(_pose_key(row - 1))
+    size = 2 * len(detections) + (3 if row > 0 else 0)
+    error = _frame_error(problem, noise, row, detections, landmarks, heavy)
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
+
+
+def _frame_error(
+    problem: Problem, noise: Noise, row: int, detections: IntArray, landmarks: list[int], heavy: bool
+) -> Callable[[Any, Any, Any], FloatArray]:
+    """Whitened residual of a frame and its Jacobians by states, pose, landmarks and the pose before."""
+    column = np.array([landmarks.index(int(j)) for j in problem.landmark_row[detections]], dtype=np.int64)
+    reading = problem.reading[detections]
+    sigma = noise.of_detections(problem.sigma_given[detections])
+    variance = noise.odometry**2
+    n_rows = 2 * len(detections)
+    size = n_rows + (3 if row > 0 else 0)
+    landmark_keys = [_landmark_key(j) for j in landmarks]
+    key, key_before = _pose_key(row), _pose_key(row - 1) if row > 0 else None
+    drive, stamp, free, mount = problem.drive, problem.stamp_s, problem.prior.free, problem.mount
+
+    def error(this: Any, values: Any, jacobians: Any) -> FloatArray:
+        states = values.atVector(STATES_KEY)
+        at = values.atPose2(key)
+        pose = np.array([at.x(), at.y(), at.theta()])
+        points = np.array([values.atPoint2(k) for k in landmark_keys]).reshape(-1, 2)
+        residual = np.zeros(size)
+        by_states, by_pose = np.zeros((size, 9)), np.zeros((size, 3))
+        by_points = np.zeros((len(landmarks), size, 2))
+        whitened_detections(
+            pose, points, states, mount, reading, sigma, column, free, heavy, residual, by_pose, by_points, by_states
+        )
+        by_before = None
+        if key_before is not None:
+            at = values.atPose2(key_before)
+            before = np.array([at.x(), at.y(), at.theta()])
+            by_before = np.zeros((size, 3))
+            whitened_odometry(
+                before,
+                pose,
+                states,
+                drive.stamp_s,
+                drive.velocity,
+                drive.unknown,
+                stamp[row - 1],
+                stamp[row],
+                variance,
+                free,
+                residual[n_rows:],
+                by_before[n_rows:],
+                by_pose[n_rows:],
+                by_states[n_rows:],
+            )
+        if jacobians is not None:
+            jacobians[0] = by_states
+            jacobians[1] = by_pose
+            for k in range(len(landmarks)):
+                jacobians[2 + k] = by_points[k]
+            if by_before is not None:
+                jacobians[2 + len(landmarks)] = by_before
+        return residual
+
+    return error
+
+
+def _from_values(values: Any, n_poses: int, n_landmarks: int, known: set[int]) -> Estimate:
+    pose = np.empty((n_poses, 3))
+    for row in range(n_poses):
+        at = values.atPose2(_pose_key(row))
+        pose[row] = at.x(), at.y(), at.theta()
+    landmark = np.full((n_landmarks, 2), np.nan)
+    for j in known:
+        landmark[j] = values.atPoint2(_landmark_key(j))
+    return Estimate(pose, landmark, np.asarray(values.atVector(STATES_KEY)))
+
+
+def _parameters() -> Any:
+    parameters = gtsam.ISAM2Params()
+    parameters.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
+    parameters.relinearizeSkip = RELINEARIZE_SKIP
+    return parameters

@@ -1,0 +1,206 @@
+"""Noise levels from the recording itself: restricted maximum likelihood of variance components.
+
+At the optimum a residual is smaller than the noise that made it, by what the fit absorbed. The stationary point of the
+marginal likelihood (Laplace approximation, poses, landmarks and calibration integrated out) sets for every component
+`k` with unit covariance `P_k` and information `W`
+
+    sigma_k^2 <- sigma_k^2  sum e' W P_k W e  /  sum tr(W P_k) - tr(W P_k W V),
+
+with `V = J Sigma J'` the part of the residual's covariance that the estimate's own uncertainty explains (Patterson and
+Thompson 1971; the multiplicative form keeps variances positive). Truth is never used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from evermap.slam.kernels import detection_residual, integrate_odometry, kernel, odometry_residual
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.types import FloatArray
+
+START = Noise(
+    detection=np.array([0.1, 0.02]),
+    odometry=np.array([0.05, 0.05, 0.03, 0.01, 0.05]),
+    outlier_log_odds=7.0,
+)
+"""Deliberately wide: too much noise converges from far away, too little locks the first mistake in."""
+PSEUDO_COUNT = 10.0
+"""Weight of the start values, in residuals: matters only for the shortest recordings."""
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseFit:
+    """New noise levels and how many independent residuals stand behind each.
+
+    Attributes:
+        noise: the levels.
+        detection_count: (2,); odometry_count: (5,): effective numbers of residuals.
+    """
+
+    noise: Noise
+    detection_count: FloatArray
+    odometry_count: FloatArray
+
+    def relative_sigma(self) -> tuple[FloatArray, FloatArray]:
+        """Standard deviations of the levels, relative to them: detections (2,), odometry (5,)."""
+        return 1.0 / np.sqrt(2.0 * self.detection_count), 1.0 / np.sqrt(2.0 * self.odometry_count)
+
+
+def refine_noise(
+    problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise = START
+) -> NoiseFit:
+    """One step towards the restricted-likelihood noise levels.
+
+    Args:
+        marginals: covariances at `estimate`, made with `noise`.
+        weights: (M,) inlier probabilities.
+        start: levels that `PSEUDO_COUNT` imaginary residuals vouch for.
+    """
+    free = problem.prior.free
+    squares, counts = _detection_sums(
+        estimate.pose,
+        estimate.landmark,
+        estimate.states,
+        problem.pose_row,
+        problem.landmark_row,
+        problem.reading,
+        noise.of_detections(problem.sigma_given),
+        np.isfinite(problem.sigma_given),
+        problem.mount,
+        free,
+        weights,
+        marginals.pose,
+        marginals.pose_shared,
+        marginals.shared,
+    )
+    detection = np.sqrt((squares + PSEUDO_COUNT * start.detection**2) / (counts + PSEUDO_COUNT))
+    pulls, chances = _odometry_sums(
+        estimate.pose,
+        estimate.states,
+        problem.stamp_s,
+        problem.drive.stamp_s,
+        problem.drive.velocity,
+        problem.drive.unknown,
+        noise.odometry**2,
+        free,
+        marginals.pose,
+        marginals.consecutive,
+        marginals.pose_shared,
+        marginals.shared,
+    )
+    # tr(W P_k) is a count only after multiplying by the variance
+    count = np.maximum(noise.odometry**2 * chances, 0.0)
+    squares_odometry = noise.odometry**4 * pulls
+    odometry = np.sqrt((squares_odometry + PSEUDO_COUNT * start.odometry**2) / (count + PSEUDO_COUNT))
+    return NoiseFit(
+        Noise(detection, odometry, noise.outlier_log_odds),
+        counts + PSEUDO_COUNT,
+        count + PSEUDO_COUNT,
+    )
+
+
+@kernel
+def _detection_sums(
+    pose: FloatArray,
+    landmark: FloatArray,
+    states: FloatArray,
+    pose_row: Any,
+    landmark_row: Any,
+    reading: FloatArray,
+    sigma: FloatArray,
+    given: Any,
+    mount: FloatArray,
+    free: Any,
+    weights: FloatArray,
+    cov_pose: FloatArray,
+    cov_cross: FloatArray,
+    cov_shared: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted squares of residuals and their effective number, range and bearing apart."""
+    at_states = len(cov_shared) - 9
+    squares, counts = np.zeros(2), np.zeros(2)
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    rows = np.zeros(7, dtype=np.int64)
+    j = np.zeros((2, 10))
+    cov = np.zeros((10, 10))
+    for m in range(len(pose_row)):
+        i = pose_row[m]
+        detection_residual(
+            pose[i], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc
+        )
+        rows[0], rows[1] = 2 * landmark_row[m], 2 * landmark_row[m] + 1
+        for k in range(5):
+            rows[2 + k] = at_states + k
+            if not free[k]:
+                jc[:, k] = 0.0
+        j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
+        cov[:3, :3] = cov_pose[i]
+        for a in range(7):
+            for b in range(3):
+                cov[3 + a, b] = cov[b, 3 + a] = cov_cross[i, b, rows[a]]
+            for b in range(7):
+                cov[3 + a, 3 + b] = cov_shared[rows[a], rows[b]]
+        explained = j @ cov @ j.T
+        w = weights[m]
+        for k in range(2):
+            if not given[m, k]:
+                squares[k] += w * e[k] * e[k]
+                counts[k] += w * max(1.0 - w * explained[k, k] / sigma[m, k] ** 2, 0.0)
+    return squares, counts
+
+
+@kernel
+def _odometry_sums(
+    pose: FloatArray,
+    states: FloatArray,
+    stamp: FloatArray,
+    odometry_stamp: FloatArray,
+    velocity: FloatArray,
+    unknown: FloatArray,
+    variance: FloatArray,
+    free: Any,
+    cov_pose: FloatArray,
+    cov_next: FloatArray,
+    cov_cross: FloatArray,
+    cov_shared: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """`sum e' W P_k W e` and `sum tr(W P_k) - tr(W P_k W V)` of every odometry noise component."""
+    kinds = len(variance)
+    shared = len(cov_shared)
+    pulls, chances = np.zeros(kinds), np.zeros(kinds)
+    increment, motion, noise, floor = np.zeros(3), np.zeros((3, 4)), np.zeros((kinds, 3, 3)), np.zeros((3, 3))
+    e, j1, j2 = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    j, cov = np.zeros((3, 10)), np.zeros((10, 10))
+    cov[6:, 6:] = cov_shared[shared - 4 :, shared - 4 :]
+    for i in range(len(pose) - 1):
+        integrate_odometry(
+            odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, increment, motion, noise, floor
+        )
+        covariance = floor.copy()
+        for k in range(kinds):
+            covariance += variance[k] * noise[k]
+        information = np.linalg.inv(covariance)
+        odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
+        j[:, :3], j[:, 3:6] = j1, j2
+        for k in range(4):
+            for axis in range(3):
+                j[axis, 6 + k] = -motion[axis, k] if free[5 + k] else 0.0
+        cov[:3, :3], cov[3:6, 3:6] = cov_pose[i], cov_pose[i + 1]
+        cov[:3, 3:6], cov[3:6, :3] = cov_next[i], cov_next[i].T
+        for a in range(3):
+            for b in range(4):
+                cov[a, 6 + b] = cov[6 + b, a] = cov_cross[i, a, shared - 4 + b]
+                cov[3 + a, 6 + b] = cov[6 + b, 3 + a] = cov_cross[i + 1, a, shared - 4 + b]
+        explained = j @ cov @ j.T
+        pull = information @ e
+        # W - W V W: what the residual still is allowed to be
+        left = information - information @ explained @ information
+        for k in range(kinds):
+            pulls[k] += pull @ noise[k] @ pull
+            for a in range(3):
+                for b in range(3):
+                    chances[k] += left[a, b] * noise[k, b, a]
+    return pulls, chances

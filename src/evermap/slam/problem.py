@@ -1,0 +1,153 @@
+"""What is known, what is sought, and how noisy: the three nouns that the estimators of this package exchange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.slam.calibration import CalibrationPrior
+from evermap.types import BoolArray, FloatArray, IntArray
+
+SILENCE_S = 1.0
+"""Odometry that says nothing for longer than this is not believed to go on as before."""
+SILENT_VARIANCE = 0.25
+"""Variance per second, (m^2 or rad^2) / s, while the odometry is silent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Odometry prepared for integration.
+
+    Attributes:
+        stamp_s: (n,) strictly increasing.
+        velocity: (n, 3) forward, lateral, turn; row i holds until stamp i + 1.
+        unknown: (n,) extra variance per second, where the odometry was silent.
+    """
+
+    stamp_s: FloatArray
+    velocity: FloatArray
+    unknown: FloatArray
+
+    @classmethod
+    def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:
+        """Velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'."""
+        silent = np.flatnonzero(np.diff(stamp_s) > SILENCE_S)
+        at = silent + 1
+        stamps = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
+        unknown = np.insert(np.zeros(len(stamp_s)), at, SILENT_VARIANCE)
+        velocities = np.insert(velocity, at, 0.0, axis=0)
+        # after the last row nothing is known either
+        stamps = np.append(stamps, stamps[-1] + 0.5 * SILENCE_S)
+        return cls(stamps, np.vstack([velocities, np.zeros(3)]), np.append(unknown, SILENT_VARIANCE))
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Everything measured and believed beforehand.
+
+    Attributes:
+        stamp_s: (N,) instants of the poses, on the clock of `drive`.
+        drive: the odometry.
+        pose_row, landmark_row: (M,) which pose saw which landmark; sorted by pose.
+        reading: (M, 2) range [m] and bearing [rad] as reported.
+        sigma_given: (M, 2) standard deviations that came with a detection, nan where none did.
+        mount: (3,) pose of the sensor on the robot.
+        prior: of the calibration states, as the graph shall use it.
+        start_information: weight [1/m^2, 1/rad^2] with which the first pose is held at the start value.
+        landmark_mean: (L, 2) prior positions, zeros where there is none.
+        landmark_information: (L, 2, 2) inverse prior covariances, zeros where there is none.
+    """
+
+    stamp_s: FloatArray
+    drive: Drive
+    pose_row: IntArray
+    landmark_row: IntArray
+    reading: FloatArray
+    sigma_given: FloatArray
+    mount: FloatArray
+    prior: CalibrationPrior
+    start_information: float
+    landmark_mean: FloatArray
+    landmark_information: FloatArray
+
+    def until(self, n_poses: int) -> Problem:
+        """The problem as it stood after `n_poses` poses; landmarks keep their rows."""
+        stop = int(np.searchsorted(self.pose_row, n_poses))
+        return replace(
+            self,
+            stamp_s=self.stamp_s[:n_poses],
+            pose_row=self.pose_row[:stop],
+            landmark_row=self.landmark_row[:stop],
+            reading=self.reading[:stop],
+            sigma_given=self.sigma_given[:stop],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Values of everything sought.
+
+    Attributes:
+        pose: (N, 3) poses in the world.
+        landmark: (L, 2) positions; nan where never seen.
+        states: (9,) calibration states.
+    """
+
+    pose: FloatArray
+    landmark: FloatArray
+    states: FloatArray
+
+    @property
+    def known(self) -> BoolArray:
+        """(L,) landmarks that have a position."""
+        known: BoolArray = np.isfinite(self.landmark[:, 0])
+        return known
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations.
+
+    Attributes:
+        detection: (2,) range [m] and bearing [rad].
+        odometry: (5,) in the order of `kernels.NOISE_NAMES`.
+        outlier_log_odds: half the squared normalised residual at which an outlier is as likely as an inlier.
+    """
+
+    detection: FloatArray
+    odometry: FloatArray
+    outlier_log_odds: float
+
+    def of_detections(self, sigma_given: FloatArray) -> FloatArray:
+        """(M, 2) standard deviation of every detection: its own where it came with one."""
+        return np.where(np.isfinite(sigma_given), sigma_given, self.detection)
+
+
+@dataclass(frozen=True, slots=True)
+class Marginals:
+    """Covariances at an optimum. `G = 2 L + 9`: all landmarks, then the calibration states.
+
+    Attributes:
+        pose: (N, 3, 3).
+        consecutive: (N, 3, 3) of pose i with pose i + 1; the last is zero.
+        pose_shared: (N, 3, G) of poses with landmarks and states.
+        shared: (G, G).
+    """
+
+    pose: FloatArray
+    consecutive: FloatArray
+    pose_shared: FloatArray
+    shared: FloatArray
+
+    @property
+    def landmark(self) -> FloatArray:
+        """(L, 2, 2) covariance of every landmark."""
+        count = (len(self.shared) - 9) // 2
+        rows = np.arange(count)
+        return self.shared[: 2 * count, : 2 * count].reshape(count, 2, count, 2)[rows, :, rows, :]
+
+    @property
+    def states(self) -> FloatArray:
+        """(9, 9) covariance of the calibration states."""
+        return self.shared[-9:, -9:]

@@ -1,0 +1,292 @@
+"""Landmark SLAM of one recording, frame after frame.
+
+Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental smoother.
+Whenever the number of poses has doubled, the batch smoother takes stock: it finds the optimum of all so far,
+re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap import se2
+from evermap.slam.arrow import Smoother
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.isam import IncrementalSmoother
+from evermap.slam.kernels import integrate_odometry
+from evermap.slam.noise import NoiseFit, refine_noise
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.types import BoolArray, FloatArray, IntArray
+
+FIRST_STOCK = 40
+"""Poses before the batch smoother takes stock for the first time."""
+MIN_ALIGN_LANDMARKS = 3
+MIN_ALIGN_SPREAD_M = 1.0
+"""Landmarks of a prior map that must have been seen, and how far apart, before the robot is placed in it."""
+FINAL_ROUNDS = 12
+NOISE_CONVERGED = 0.01
+"""Relative change of every noise level below which the final rounds stop."""
+
+
+@dataclass(frozen=True, slots=True)
+class PriorMap:
+    """A map to localise in, in rows of the problem's landmarks: mean (L, 2), information (L, 2, 2), given (L,)."""
+
+    mean: FloatArray
+    information: FloatArray
+    given: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """All that a finished session knows, in the metres and the frame of the map.
+
+    Attributes:
+        estimate, marginals: smoothed values and covariances, scale uncertainty included.
+        problem: with the start and priors that the optimum belongs to, in the graph's metres.
+        graph_estimate, graph_marginals: the same as the graph holds them, before the scale was divided.
+        noise: levels and how well they are known.
+        inlier: (M,) probability of every detection to be no outlier.
+        scale: factor from the graph's metres to metres; log_scale_sigma: its uncertainty.
+        aligned: True if the frame is that of the prior map.
+    """
+
+    estimate: Estimate
+    states_covariance: FloatArray
+    problem: Problem
+    graph_estimate: Estimate
+    graph_marginals: Marginals
+    noise: NoiseFit
+    inlier: FloatArray
+    scale: float
+    log_scale_sigma: float
+    aligned: bool
+
+
+class StreamingSlam:
+    """Feed poses in order with `step`, then `finish`.
+
+    Args:
+        problem: the measurements; nothing beyond the current row is looked at (but odometry up to the delay).
+        noise: where the noise levels start.
+        prior: calibration priors as the user means them.
+        prior_map: where to localise; None maps from scratch.
+        robust: explain outliers instead of believing every identity.
+        estimate_noise: learn noise levels from the recording, else keep `noise`.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        noise: Noise,
+        prior: CalibrationPrior,
+        *,
+        prior_map: PriorMap | None = None,
+        robust: bool = True,
+        estimate_noise: bool = True,
+    ) -> None:
+        self._prior = prior
+        self._prior_map = prior_map
+        self._problem = replace(problem, prior=prior.without_scale())
+        self._start_noise = self._noise = noise
+        self._robust = robust
+        self._estimate_noise = estimate_noise
+        self._graph = IncrementalSmoother(self._problem, noise, robust=robust)
+        self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
+        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._n_poses = 0
+        self._next_stock = FIRST_STOCK
+        self._scale = 1.0
+        self._aligned = False
+        self._increment, self._motion = np.zeros(3), np.zeros((3, 4))
+        self._odometry_noise, self._odometry_covariance = np.zeros((5, 3, 3)), np.zeros((3, 3))
+        self.online_pose = np.full((len(problem.stamp_s), 3), np.nan)
+        """(N, 3) causal poses, as soon as each frame was processed."""
+        self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
+        """(N, 3, 3) their predicted covariance, before the frame's detections were used."""
+        self.nis = np.full(len(problem.pose_row), np.nan)
+        """(M,) squared Mahalanobis distance of every innovation; nan where the landmark was new."""
+
+    def step(self) -> None:
+        """Process the next pose: predict, compare, add, and take stock when it is time."""
+        row = self._n_poses
+        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        states = self._graph.states() if row > 0 else self._problem.prior.mean
+        predicted = self._predict(row, states)
+        self._compare(row, detections)
+        self._meet_new_landmarks(predicted, states, detections)
+        self._graph.add(row, predicted, self._landmark)
+        self._n_poses += 1
+        if self._n_poses == self._next_stock:
+            self._take_stock()
+            self._next_stock *= 2
+        if self._prior_map is not None and not self._aligned and self._can_align():
+            self._enter_map()
+        self.online_pose[row] = self._graph.last_pose() * [self._scale, self._scale, 1.0]
+
+    def finish(self) -> Outcome:
+        """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
+        if self._prior_map is not None and not self._aligned and self._can_align(final=True):
+            self._enter_map()
+        problem = self._problem.until(self._n_poses)
+        estimate = self._graph.estimate()
+        noise, fit = self._noise, None
+        for round_ in range(FINAL_ROUNDS):
+            heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
+            smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
+            estimate = smoother.optimum(estimate)
+            marginals = smoother.marginals(estimate)
+            before, fit = (
+                noise,
+                refine_noise(
+                    problem, estimate, marginals, smoother.inlier_probability(estimate), noise, self._start_noise
+                ),
+            )
+            if not self._estimate_noise:
+                if not heavy:
+                    break
+                continue
+            noise = fit.noise
+            if not heavy and _settled(before, noise):
+                break
+        assert fit is not None
+        smoother = Smoother(problem, noise, robust=self._robust)
+        estimate = smoother.optimum(estimate)
+        marginals = smoother.marginals(estimate)
+        return self._divided(problem, estimate, marginals, replace(fit, noise=noise), smoother)
+
+    def _predict(self, row: int, states: FloatArray) -> FloatArray:
+        """The next pose by odometry; what it knows of its uncertainty stays in the buffers for `_compare`."""
+        if row == 0:
+            return np.zeros(3)
+        drive, stamp = self._problem.drive, self._problem.stamp_s
+        integrate_odometry(
+            drive.stamp_s,
+            drive.velocity,
+            drive.unknown,
+            stamp[row - 1],
+            stamp[row],
+            states,
+            self._increment,
+            self._motion,
+            self._odometry_noise,
+            self._odometry_covariance,
+        )
+        self._odometry_covariance += np.tensordot(self._noise.odometry**2, self._odometry_noise, 1)
+        return se2.compose(self._graph.last_pose(), self._increment)
+
+    def _compare(self, row: int, detections: IntArray) -> None:
+        known = detections[np.isfinite(self._landmark[self._problem.landmark_row[detections], 0])]
+        if row == 0 or len(known) == 0:
+            self.online_covariance[row] = self._odometry_covariance
+            return
+        motion = self._motion * self._problem.prior.free[5:]
+        self.nis[known], self.online_covariance[row] = self._graph.innovations(
+            row, self._increment, motion, self._odometry_covariance, known
+        )
+
+    def _meet_new_landmarks(self, pose: FloatArray, states: FloatArray, detections: IntArray) -> None:
+        """Where a landmark that is seen for the first time must be, by this one sighting."""
+        for m in detections:
+            j = self._problem.landmark_row[m]
+            if np.isfinite(self._landmark[j, 0]):
+                continue
+            reported_range, reported_bearing = self._problem.reading[m]
+            b = reported_bearing - states[4]
+            r = (reported_range - states[0]) / (1.0 + states[1] + states[2] * b + states[3] * b * b)
+            sensor = se2.compose(pose, self._problem.mount)
+            self._landmark[j] = se2.transform(sensor, np.array([r * np.cos(b), r * np.sin(b)]))
+
+    def _take_stock(self) -> None:
+        """Optimum and noise levels of everything so far, then a new tree around them."""
+        problem = self._problem.until(self._n_poses)
+        smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
+        estimate = smoother.optimum(self._graph.estimate(), iterations=10, tolerance=1e-4)
+        if self._estimate_noise:
+            marginals = smoother.marginals(estimate)
+            weights = smoother.inlier_probability(estimate)
+            fit = refine_noise(problem, estimate, marginals, weights, self._noise, self._start_noise)
+            self._noise = fit.noise
+        self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
+        self._restart(estimate)
+
+    def _restart(self, estimate: Estimate) -> None:
+        self._landmark = estimate.landmark
+        self._graph.restart(estimate, self._noise, self._problem)
+
+    def _can_align(self, *, final: bool = False) -> bool:
+        """Enough landmarks of the prior map seen to know where in it the robot is; two must do at the end."""
+        assert self._prior_map is not None
+        both = self._prior_map.given & np.isfinite(self._landmark[:, 0])
+        if both.sum() < (2 if final else MIN_ALIGN_LANDMARKS):
+            return False
+        at = self._prior_map.mean[both]
+        return bool(np.ptp(at, axis=0).max() >= MIN_ALIGN_SPREAD_M)
+
+    def _enter_map(self) -> None:
+        """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
+        prior_map = self._prior_map
+        assert prior_map is not None
+        estimate = self._graph.estimate()
+        both = prior_map.given & estimate.known
+        pose_map_world = _rigid(estimate.landmark[both], prior_map.mean[both])
+        self._aligned, self._scale = True, 1.0
+        self._problem = replace(
+            self._problem,
+            prior=self._prior,
+            start_information=0.0,
+            landmark_mean=np.where(prior_map.given[:, None], prior_map.mean, 0.0),
+            landmark_information=prior_map.information,
+        )
+        moved = Estimate(
+            se2.compose(pose_map_world, estimate.pose),
+            se2.transform(pose_map_world, estimate.landmark),
+            estimate.states,
+        )
+        done = self._n_poses
+        self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
+        self._landmark = moved.landmark
+        self._restart(moved)
+        self._take_stock()
+
+    def _divided(
+        self, problem: Problem, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
+    ) -> Outcome:
+        if self._aligned:
+            states, covariance, scale, log_sigma = estimate.states, marginals.states.copy(), 1.0, 0.0
+        else:
+            states, covariance, scale, log_sigma = self._prior.split_scale(estimate.states, marginals.states)
+        stretched = Estimate(
+            estimate.pose * [scale, scale, 1.0],
+            estimate.landmark * scale,
+            states,
+        )
+        return Outcome(
+            estimate=stretched,
+            states_covariance=covariance,
+            problem=problem,
+            graph_estimate=estimate,
+            graph_marginals=marginals,
+            noise=fit,
+            inlier=smoother.inlier_probability(estimate),
+            scale=scale,
+            log_scale_sigma=log_sigma,
+            aligned=self._aligned,
+        )
+
+
+def _settled(before: Noise, after: Noise) -> bool:
+    """True where no noise level changed by more than `NOISE_CONVERGED` of itself."""
+    old = np.concatenate([before.detection, before.odometry])
+    new = np.concatenate([after.detection, after.odometry])
+    return bool(np.all(np.abs(new / old - 1.0) < NOISE_CONVERGED))
+
+
+def _rigid(source: FloatArray, target: FloatArray) -> FloatArray:
+    """(3,) rotation and translation that brings points (k, 2) onto others, least squares."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    shift = target.mean(axis=0) - se2.rotation(theta) @ source.mean(axis=0)
+    return np.array([shift[0], shift[1], theta])
