@@ -62,7 +62,7 @@ class DataError(EvermapError):
 
 
 class NumericalError(EvermapError):
-    """The estimator failed on this input: no finite optimum, singular system, observation impossible under the model."""
+    """The estimator failed on this input: no finite optimum, singular system, impossible observation."""
 
 
 class MissingExtraError(EvermapError):

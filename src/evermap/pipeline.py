@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap import se2
-from evermap.errors import DataError
-from evermap.types import UNKNOWN, FloatArray, Landmarks, Recording, SlamResult
+from evermap.types import FloatArray, Landmarks, Recording, SlamResult
 
 if TYPE_CHECKING:
     from evermap.config import Config
@@ -69,7 +67,9 @@ def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, No
     )
     sensor = recording.sensor
     nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
-    detection = np.array([default if given is None else given for given, default in zip(nominal, START.detection)])
+    detection = np.array(
+        [default if given is None else given for given, default in zip(nominal, START.detection, strict=True)]
+    )
     return prior, replace(START, detection=detection, outlier_log_odds=settings.outlier_log_odds)
 
 
@@ -128,8 +128,8 @@ def _conclude(
     frame = "prior_map" if outcome.aligned else "first_pose"
     trajectory = session.trajectory(prepared, outcome, recording, frame)
     landmarks = session.landmarks(prepared, outcome, recording, frame)
-    rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9)
-    poses = se2.between(np.zeros(3), trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)])
+    rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9).astype(np.int64)
+    poses = trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)]
     misses = find_misses(rows, poses, recording.detections, landmarks, recording.frames.stamp_s, recording.sensor)
     landmarks = session.with_misses(landmarks, misses)
     warnings = list(prepared.warnings)
@@ -150,6 +150,3 @@ def _conclude(
         warnings=tuple(warnings),
         interrupted=interrupted,
     )
-
-
-__all__ = ["UNKNOWN", "DataError", "Progress", "run_slam"]

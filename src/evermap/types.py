@@ -4,9 +4,9 @@ Conventions that hold everywhere:
 
 * units are seconds, metres and radians, and stand in the name (`stamp_s`, `range_m`, `bearing_rad`);
 * frames stand in the name: `pose_world_robot` maps robot coordinates to world coordinates and is `(x, y, theta)`;
-* covariances of poses are in the robot's own frame (right perturbation: `pose * exp(xi)`, `xi = (forward, left, turn)`);
+* covariances of poses are in the robot's own frame (right perturbation `pose * exp(xi)`, `xi = (forward, left, turn)`);
 * every stamp says its clock; arrays are C-contiguous float64 or int64; unknown ids are `UNKNOWN` (-1);
-* what was *not* seen is data: `Frames` lists every instant at which the sensor looked, `Misses` what it should have seen.
+* what was *not* seen is data: `Frames` lists every instant at which the sensor looked, `Misses` what it missed.
 """
 
 from __future__ import annotations

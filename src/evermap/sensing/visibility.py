@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from evermap import se2
-from evermap.types import Detections, FloatArray, Landmarks, Misses, Sensor
+from evermap.types import Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
 
 RANGE_MARGIN_M = 0.2
 BEARING_MARGIN_RAD = 0.05
@@ -24,7 +24,9 @@ def detection_probability(pose_world_robot: FloatArray, position_m: FloatArray, 
     Nielsen 2024 section 7.2, with both limits of each).
 
     Args:
-        pose_world_robot: (F, 3); position_m: (L, 2) in the same frame.
+        pose_world_robot: (F, 3) poses.
+        position_m: (L, 2) landmarks, in the same frame.
+        sensor: limits, mounting and detection probability.
 
     Returns:
         (F, L) probabilities.
@@ -40,7 +42,7 @@ def detection_probability(pose_world_robot: FloatArray, position_m: FloatArray, 
 
 
 def find_misses(
-    frame: FloatArray,
+    frame: IntArray,
     pose_world_robot: FloatArray,
     detections: Detections,
     landmarks: Landmarks,
@@ -52,23 +54,26 @@ def find_misses(
     Args:
         frame: (F,) rows of frames that have a pose.
         pose_world_robot: (F, 3) poses at those frames.
+        detections: what was seen.
+        landmarks: what is there to be seen.
         frame_stamp_s: stamps of all frames.
+        sensor: limits, mounting and detection probability.
     """
-    rows: list[FloatArray] = []
-    ids: list[FloatArray] = []
+    rows: list[IntArray] = []
+    ids: list[IntArray] = []
     probabilities: list[FloatArray] = []
     column = {int(identity): k for k, identity in enumerate(landmarks.landmark_id)}
     seen_column = np.array([column.get(int(i), -1) for i in detections.landmark_id], dtype=np.int64)
     chunk = max(1, 2_000_000 // max(len(landmarks), 1))
     for start in range(0, len(frame), chunk):
-        part = frame[start : start + chunk].astype(np.int64)
+        part = frame[start : start + chunk]
         p = detection_probability(pose_world_robot[start : start + chunk], landmarks.position_m, sensor)
         expected = p >= WORTH_A_MISS * sensor.p_detect
         expected &= frame_stamp_s[part][:, None] > landmarks.first_seen_s[None, :]
         hit = np.isin(detections.frame, part) & (seen_column >= 0)
         expected[np.searchsorted(part, detections.frame[hit]), seen_column[hit]] = False
         missed_frame, missed_column = np.nonzero(expected)
-        rows.append(part[missed_frame])
+        rows.append(part[missed_frame].astype(np.int64))
         ids.append(landmarks.landmark_id[missed_column])
         probabilities.append(p[missed_frame, missed_column])
     if not rows:

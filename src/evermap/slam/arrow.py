@@ -7,7 +7,7 @@ estimation, gating and error ellipses need, without forming an inverse of the wh
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from evermap.slam.kernels import (
     detection_residual,
     inlier_weight,
     integrate_odometry,
+    inverse_of,
     kernel,
     odometry_residual,
     outlier_loss,
@@ -28,12 +29,42 @@ MEMORY_LIMIT_GB = 4.0
 HELD = 1e-9
 """Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
 
-Normal = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, float, FloatArray]
+
+class Normal(NamedTuple):
+    """Normal equations of the chain (`diagonal`, `off`) with its border and corner.
+
+    Attributes:
+        diagonal, off: (N, 3, 3) information of pose i, and of pose i + 1 with pose i.
+        border: (N, 3, G) of poses with landmarks and states; corner: (G, G) of those.
+        right_pose: (N, 3), right_shared: (G,) right sides.
+        cost: negative log posterior up to a constant.
+        weights: (M,) inlier probability of every detection.
+    """
+
+    diagonal: FloatArray
+    off: FloatArray
+    border: FloatArray
+    corner: FloatArray
+    right_pose: FloatArray
+    right_shared: FloatArray
+    cost: float
+    weights: FloatArray
+
+
+class Solution(NamedTuple):
+    """Steps of poses (N, 3) and shared numbers (G,), and the covariances of `Marginals` (empty if not wanted)."""
+
+    pose: FloatArray
+    shared: FloatArray
+    cov_pose: FloatArray
+    cov_next: FloatArray
+    cov_cross: FloatArray
+    cov_shared: FloatArray
 
 
 @kernel
 def _add(target: FloatArray, a: FloatArray, b: FloatArray, weight: FloatArray) -> None:
-    """target += a' weight b, for small matrices without temporaries."""
+    """Target += a' weight b, for small matrices without temporaries."""
     for i in range(a.shape[1]):
         for k in range(weight.shape[0]):
             scaled = 0.0
@@ -68,7 +99,7 @@ def assemble(
     log_odds: float,
     heavy: bool,
 ) -> Normal:
-    """Normal equations: chain diagonal, chain off-diagonal, border, corner, two right sides; cost; inlier weights."""
+    """Linearise everything at the given values; the arguments are the fields of `Estimate`, `Problem` and `Noise`."""
     n, count = len(pose), len(landmark)
     shared = 2 * count + 9
     at_states, at_motion = 2 * count, 2 * count + 5
@@ -89,7 +120,7 @@ def assemble(
         )
         for kind in range(len(variance)):
             covariance += variance[kind] * noise[kind]
-        information = np.linalg.inv(covariance)
+        information = inverse_of(covariance)
         odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
         for k in range(4):
             for axis in range(3):
@@ -101,7 +132,7 @@ def assemble(
         _add(border[i + 1, :, at_motion:], j2, motion, information)
         _add(corner[at_motion:, at_motion:], motion, motion, information)
         pull = information @ e
-        cost += 0.5 * (e @ pull)
+        cost += 0.5 * np.dot(e, pull)
         right_pose[i] -= j1.T @ pull
         right_pose[i + 1] -= j2.T @ pull
         right_shared[at_motion:] -= motion.T @ pull
@@ -136,19 +167,19 @@ def assemble(
 
     for k in range(9):
         precision = 1.0 / prior_sigma[k] ** 2
-        d = states[k] - prior_mean[k]
+        off_mean = states[k] - prior_mean[k]
         corner[at_states + k, at_states + k] += precision
-        right_shared[at_states + k] -= precision * d
-        cost += 0.5 * precision * d * d
+        right_shared[at_states + k] -= precision * off_mean
+        cost += 0.5 * precision * off_mean * off_mean
     for j in range(count):
         block = landmark_information[j]
-        d2 = landmark[j] - landmark_mean[j]
-        pull2 = block @ d2
+        moved = landmark[j] - landmark_mean[j]
+        pull2 = block @ moved
         corner[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] += block
         corner[2 * j, 2 * j] += HELD
         corner[2 * j + 1, 2 * j + 1] += HELD
         right_shared[2 * j : 2 * j + 2] -= pull2
-        cost += 0.5 * (d2 @ pull2)
+        cost += 0.5 * np.dot(moved, pull2)
     # the first pose is held at `start`, in its own frame
     c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
     dx, dy, dt = pose[0, 0] - start[0], pose[0, 1] - start[1], wrapped(pose[0, 2] - start[2])
@@ -158,25 +189,18 @@ def assemble(
     right_pose[0, 1] -= start_information * (-s * dx + c * dy)
     right_pose[0, 2] -= start_information * dt
     cost += 0.5 * start_information * (dx * dx + dy * dy + dt * dt)
-    return diagonal, off, border, corner, right_pose, right_shared, cost, weights
+    return Normal(diagonal, off, border, corner, right_pose, right_shared, cost, weights)
 
 
 @kernel
-def solve(
-    diagonal: FloatArray,
-    off: FloatArray,
-    border: FloatArray,
-    corner: FloatArray,
-    right_pose: FloatArray,
-    right_shared: FloatArray,
-    damping: float,
-    covariances: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Steps of poses and shared numbers; with `covariances`, also the four arrays of `Marginals` (else empty).
+def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
+    """Newton step (Levenberg-Marquardt with `damping`) and, if wanted, covariances.
 
     Eliminates pose after pose (block Cholesky of the chain), solves the border's Schur complement, and returns along
-    the chain. Overwrites its arguments.
+    the chain.
     """
+    diagonal, off, border = normal.diagonal.copy(), normal.off, normal.border.copy()
+    corner, right_pose, right_shared = normal.corner.copy(), normal.right_pose.copy(), normal.right_shared
     n, shared = len(diagonal), len(corner)
     inverse = np.zeros((n, 3, 3))
     gain = np.zeros((n, 3, shared))
@@ -190,12 +214,12 @@ def solve(
             diagonal[i] -= factor @ off[i - 1].T
             border[i] -= factor @ border[i - 1]
             right_pose[i] -= factor @ right_pose[i - 1]
-        inverse[i] = np.linalg.inv(diagonal[i])
+        inverse[i] = inverse_of(diagonal[i])
         gain[i] = inverse[i] @ border[i]
     flat_border, flat_gain = border.reshape(3 * n, shared), gain.reshape(3 * n, shared)
-    schur = corner - flat_border.T @ flat_gain
+    schur: FloatArray = corner - flat_border.T @ flat_gain
     rest = right_shared - flat_gain.T @ right_pose.reshape(3 * n)
-    step_shared = np.linalg.solve(schur, rest)
+    step_shared: Any = np.linalg.solve(schur, rest)
     step_pose = np.zeros((n, 3))
     for i in range(n - 1, -1, -1):
         right = right_pose[i].copy()
@@ -204,8 +228,8 @@ def solve(
         step_pose[i] = inverse[i] @ right - gain[i] @ step_shared
     if not covariances:
         empty2, empty3 = np.zeros((0, 0)), np.zeros((0, 3, 3))
-        return step_pose, step_shared, empty3, empty3, np.zeros((0, 3, 0)), empty2
-    cov_shared = np.linalg.inv(schur)
+        return Solution(step_pose, step_shared, empty3, empty3, empty3, empty2)
+    cov_shared = inverse_of(schur)
     cov_pose = np.zeros((n, 3, 3))
     cov_next = np.zeros((n, 3, 3))
     cross = (flat_gain @ cov_shared).reshape(n, 3, shared)
@@ -217,7 +241,7 @@ def solve(
             cross[i] -= back @ cross[i + 1]
             cov_next[i] = -back @ cov_pose[i + 1] - gain[i] @ cross[i + 1].T
             cov_pose[i] = inverse[i] - cov_next[i] @ back.T - cross[i] @ gain[i].T
-    return step_pose, step_shared, cov_pose, cov_next, cross, cov_shared
+    return Solution(step_pose, step_shared, cov_pose, cov_next, cross, cov_shared)
 
 
 class Smoother:
@@ -247,46 +271,39 @@ class Smoother:
         normal = self._normal(estimate)
         damping = 0.0
         for _ in range(iterations):
-            step_pose, step_shared = self._step(normal, damping)
-            trial = _moved(estimate, step_pose, step_shared)
+            step = solve(normal, damping, False)
+            trial = _moved(estimate, step.pose, step.shared)
             following = self._normal(trial)
-            if np.isfinite(following[6]) and following[6] <= normal[6] * (1 + 1e-12) + 1e-12:
+            if np.isfinite(following.cost) and following.cost <= normal.cost * (1 + 1e-12) + 1e-12:
                 estimate, normal = trial, following
                 damping = 0.0 if damping < 1e-6 else damping / 10.0
-                if max(np.abs(step_pose).max(), np.abs(step_shared).max()) < tolerance:
+                if max(np.abs(step.pose).max(), np.abs(step.shared).max()) < tolerance:
                     break
             else:
                 damping = max(1e-6, 10.0 * damping)
                 if damping > 1e6:
                     break
-        if not np.isfinite(normal[6]):
+        if not np.isfinite(normal.cost):
             raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
         return estimate
 
     def cost(self, estimate: Estimate) -> float:
         """Negative log posterior up to a constant."""
-        return float(self._normal(estimate)[6])
+        return float(self._normal(estimate).cost)
 
     def inlier_probability(self, estimate: Estimate) -> FloatArray:
         """(M,) probability of every detection to be no outlier, given the estimate."""
-        return self._normal(estimate)[7]
+        return self._normal(estimate).weights
 
     def marginals(self, estimate: Estimate) -> Marginals:
         """Covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero."""
-        normal = self._normal(estimate)
         known = np.append(np.repeat(estimate.known, 2), np.ones(9, dtype=bool))
-        _, _, pose, consecutive, cross, shared = solve(*(part.copy() for part in normal[:6]), 0.0, True)
-        if known.all():
-            return Marginals(pose, consecutive, cross, shared)
-        whole = np.zeros((len(known), len(known)))
-        whole[np.ix_(known, known)] = shared
-        whole_cross = np.zeros((len(pose), 3, len(known)))
-        whole_cross[:, :, known] = cross
-        return Marginals(pose, consecutive, whole_cross, whole)
-
-    def _step(self, normal: Normal, damping: float) -> tuple[FloatArray, FloatArray]:
-        step_pose, step_shared, *_ = solve(*(part.copy() for part in normal[:6]), damping, False)
-        return step_pose, step_shared
+        solved = solve(self._normal(estimate), 0.0, True)
+        shared = np.zeros((len(known), len(known)))
+        shared[np.ix_(known, known)] = solved.cov_shared
+        cross = np.zeros((len(estimate.pose), 3, len(known)))
+        cross[:, :, known] = solved.cov_cross
+        return Marginals(solved.cov_pose, solved.cov_next, cross, shared)
 
     def _normal(self, estimate: Estimate) -> Normal:
         problem, noise = self.problem, self.noise

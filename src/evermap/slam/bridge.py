@@ -30,9 +30,13 @@ def bridged(
 
     Args:
         stamp_s: (K,) where poses are wanted; before the first and after the last pose it is dead reckoning.
-        pose_stamp_s: (N,) instants of `pose` (N, 3), `covariance` (N, 3, 3) and `consecutive` (N, 3, 3), the
-            covariance of pose i with pose i + 1.
-        states: (9,) calibration states; noise: odometry noise.
+        pose_stamp_s: (N,) instants of the smoothed poses.
+        pose: (N, 3) smoothed poses.
+        covariance: (N, 3, 3) of each.
+        consecutive: (N, 3, 3) of pose i with pose i + 1.
+        drive: odometry.
+        states: (9,) calibration states.
+        noise: odometry noise.
 
     Returns:
         (K, 3) poses and (K, 3, 3) covariances in the robot's frame.

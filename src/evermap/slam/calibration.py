@@ -1,8 +1,8 @@
 """Calibration states: what the sensors do to the truth, and how much of it one believes beforehand.
 
-The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and bearing `b`; `a3 = -1/2` is a camera that
-reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
-instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w` (MATH.md section 5).
+The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and bearing `b`; `a3 = -1/2` is a camera
+that reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
+instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`.
 
 All nine states form one vector, in the order of `SPECS`. Priors are weak and the same for every robot; they say what a
 decent camera, laser or wheel encoder does out of the box and were not fitted to any recording.

@@ -15,7 +15,7 @@ import numpy as np
 
 from evermap import se2
 from evermap.slam.frame_factor import whitened_detections, whitened_odometry
-from evermap.slam.kernels import detection_residual, integrate_odometry
+from evermap.slam.kernels import detection_residual
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
@@ -68,7 +68,8 @@ class IncrementalSmoother:
         """Add pose `row` with its odometry and detections, and update the tree.
 
         Args:
-            pose: (3,) predicted pose, where it is linearised first.
+            row: the pose to add, one more than the last.
+            pose: (3,) its prediction, where it is linearised first.
             landmark: (L, 2) positions of landmarks, used for those that are seen for the first time.
         """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -105,7 +106,9 @@ class IncrementalSmoother:
 
         Args:
             row: the pose that is about to be added, at least 1.
-            increment, motion, covariance: odometry since the pose before, with its Jacobian by the states and noise.
+            increment: (3,) odometry since the pose before.
+            motion: (3, 4) its Jacobian by delay, scales and slip.
+            covariance: (3, 3) its noise.
             detections: (k,) rows of the problem's detections, of landmarks in the graph.
 
         Returns:
@@ -129,7 +132,8 @@ class IncrementalSmoother:
         for k, m in enumerate(detections):
             landmark = int(problem.landmark_row[m])
             at = self.landmark(landmark)
-            detection_residual(pose, at, states, problem.mount, *problem.reading[m], e, jx, jl, jc)
+            range_m, bearing_rad = problem.reading[m]
+            detection_residual(pose, at, states, problem.mount, range_m, bearing_rad, e, jx, jl, jc)
             h = jx @ carry
             h[:, 3:8] += jc * problem.prior.free[:5]
             h[:, offset[landmark] : offset[landmark] + 2] += jl
@@ -188,7 +192,7 @@ def _frame_error(
     key, key_before = _pose_key(row), _pose_key(row - 1) if row > 0 else None
     drive, stamp, free, mount = problem.drive, problem.stamp_s, problem.prior.free, problem.mount
 
-    def error(this: Any, values: Any, jacobians: Any) -> FloatArray:
+    def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
         states = values.atVector(STATES_KEY)
         at = values.atPose2(key)
         pose = np.array([at.x(), at.y(), at.theta()])

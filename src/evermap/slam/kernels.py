@@ -7,7 +7,9 @@ detections and `increment^-1 * between(pose, next)` for odometry. Calibration st
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
@@ -31,13 +33,25 @@ MAX_STEP_S = 0.1
 _AXIS = np.array([0, 0, 1, 2, 2])  # forward, lateral, turn
 _DRIVER = np.array([1, 2, 1, 0, 2])  # time, distance, angle
 
-kernel: Any = njit(cache=True, error_model="numpy", fastmath=False)
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile a function at its first call, and keep the machine code beside the source."""
+    return cast("_Function", njit(cache=True, error_model="numpy")(function))
+
+
+@kernel
+def inverse_of(matrix: FloatArray) -> FloatArray:
+    """Inverse of a small matrix, row after row in memory as all others."""
+    inverted: Any = np.linalg.inv(matrix)
+    return np.ascontiguousarray(inverted)
 
 
 @kernel
 def wrapped(angle: float) -> float:
     """`angle` in [-pi, pi)."""
-    return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @kernel
@@ -59,7 +73,8 @@ def integrate_odometry(
         stamp: (N,) odometry stamps; row i of `velocity` holds from stamp i to stamp i + 1.
         velocity: (N, 3) reported forward, lateral, turn.
         unknown: (N,) extra noise variance per second where the odometry is silent.
-        start, stop: the instants, on the detections' clock.
+        start: first instant, on the detections' clock.
+        stop: second instant.
         states: (9,) calibration states.
         increment: (3,) out, pose at `stop` seen from `start`.
         jacobian: (3, 4) out, right perturbation of the increment by delay, forward scale, turn scale, slip.
@@ -237,14 +252,15 @@ def inlier_weight(squared: float, log_odds: float, heavy: bool) -> float:
     """
     if heavy:
         return 1.0 / (1.0 + squared / 9.0)
-    return 1.0 / (1.0 + np.exp(min(0.5 * squared - log_odds, 700.0)))
+    return 1.0 / (1.0 + math.exp(min(0.5 * squared - log_odds, 700.0)))
 
 
 @kernel
 def outlier_loss(squared: float, log_odds: float, heavy: bool) -> float:
-    """Negative log likelihood that `inlier_weight` is the derivative of (twice, by `squared`)."""
+    """Negative log likelihood, 0 at 0; `inlier_weight` is twice its derivative by `squared`."""
     if heavy:
-        return 4.5 * np.log1p(squared / 9.0)
+        return 4.5 * math.log1p(squared / 9.0)
     # -log(exp(-s/2) + exp(-log_odds)) without overflow, 0 at s = 0
     d = 0.5 * squared - log_odds
-    return 0.5 * squared - (np.log1p(np.exp(d)) if d < 0 else d + np.log1p(np.exp(-d))) + np.log1p(np.exp(-log_odds))
+    log_sum = math.log1p(math.exp(d)) if d < 0 else d + math.log1p(math.exp(-d))
+    return 0.5 * squared - log_sum + math.log1p(math.exp(-log_odds))

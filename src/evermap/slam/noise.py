@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, integrate_odometry, kernel, odometry_residual
+from evermap.slam.kernels import detection_residual, integrate_odometry, inverse_of, kernel, odometry_residual
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
@@ -55,8 +55,11 @@ def refine_noise(
     """One step towards the restricted-likelihood noise levels.
 
     Args:
+        problem: the measurements.
+        estimate: the optimum under `noise`.
         marginals: covariances at `estimate`, made with `noise`.
         weights: (M,) inlier probabilities.
+        noise: levels so far.
         start: levels that `PSEUDO_COUNT` imaginary residuals vouch for.
     """
     free = problem.prior.free
@@ -182,7 +185,7 @@ def _odometry_sums(
         covariance = floor.copy()
         for k in range(kinds):
             covariance += variance[k] * noise[k]
-        information = np.linalg.inv(covariance)
+        information = inverse_of(covariance)
         odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
         j[:, :3], j[:, 3:6] = j1, j2
         for k in range(4):

@@ -23,7 +23,6 @@ from evermap.types import (
     Misses,
     ParameterEstimate,
     Recording,
-    SlamResult,
     Trajectory,
 )
 
@@ -63,12 +62,14 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepare
         DataError: fewer than two frames with a landmark of known identity.
     """
     odometry, detections = recording.odometry, recording.detections
+    if len(odometry) == 0:
+        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
     stamps = recording.frames.stamp_s
     warnings = []
     anonymous = detections.landmark_id == UNKNOWN
     if anonymous.any():
         warnings.append(f"{int(anonymous.sum())} detections without identity not used")
-    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1]) if len(odometry) else stamps != stamps
+    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1])
     outside = ~anonymous & ~moving[detections.frame]
     if outside.any():
         warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
@@ -244,7 +245,7 @@ def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> Flo
     """All frames up to the last one processed, with long steps divided."""
     last = start_s + outcome.problem.stamp_s[-1]
     stamps = recording.frames.stamp_s
-    stamps = stamps[(stamps <= last + 1e-9) | (len(outcome.problem.stamp_s) == 0)]
+    stamps = stamps[stamps <= last + 1e-9]
     steps = np.diff(stamps)
     pieces = np.maximum(np.ceil(steps / TRAJECTORY_STEP_S - 1e-9), 1).astype(np.int64)
     offsets = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -263,6 +264,3 @@ def _in_metres(pose: FloatArray, covariance: FloatArray, outcome: Outcome) -> tu
     away = np.zeros((len(pose), 3))
     away[:, :2] = se2.transform(se2.inverse(pose * [0.0, 0.0, 1.0]), pose[:, :2])
     return pose, covariance + outcome.log_scale_sigma**2 * away[:, :, None] * away[:, None, :]
-
-
-__all__ = ["Prepared", "SlamResult", "prepare"]
