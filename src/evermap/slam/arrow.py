@@ -26,6 +26,8 @@ from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
 MEMORY_LIMIT_GB = 4.0
+COST_SLACK = 0.5
+"""Nats by which the cost may rise in a step: weights change with calibration states and residuals, which is no harm."""
 HELD = 1e-9
 """Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
 
@@ -265,7 +267,7 @@ class Smoother:
                 hint="split the recording into sessions",
             )
 
-    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-7) -> Estimate:
+    def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
         """Damped Gauss-Newton from `start` until no step moves anything by more than `tolerance` (m or rad)."""
         estimate = start
         normal = self._normal(estimate)
@@ -274,7 +276,7 @@ class Smoother:
             step = solve(normal, damping, False)
             trial = _moved(estimate, step.pose, step.shared)
             following = self._normal(trial)
-            if np.isfinite(following.cost) and following.cost <= normal.cost * (1 + 1e-12) + 1e-12:
+            if np.isfinite(following.cost) and following.cost <= normal.cost + COST_SLACK:
                 estimate, normal = trial, following
                 damping = 0.0 if damping < 1e-6 else damping / 10.0
                 if max(np.abs(step.pose).max(), np.abs(step.shared).max()) < tolerance:

@@ -8,10 +8,11 @@ that swells in the middle.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from evermap import se2
-from evermap.slam.kernels import integrate_odometry, kernel, wrapped
+from evermap.slam.kernels import integrate_odometry, inverse_of, kernel, wrapped
 from evermap.slam.problem import Drive, Noise
 from evermap.types import FloatArray
 
@@ -41,39 +42,21 @@ def bridged(
     Returns:
         (K, 3) poses and (K, 3, 3) covariances in the robot's frame.
     """
-    n = len(pose_stamp_s)
-    segment = np.clip(np.searchsorted(pose_stamp_s, stamp_s, side="right") - 1, -1, n - 1)
-    out = np.empty((len(stamp_s), 3))
-    spread = np.empty((len(stamp_s), 3, 3))
-    increment, noise_increment = np.empty((2, 3)), np.empty((2, 3, 3))
-    variance = noise.odometry**2
-    for k, i in enumerate(segment):
-        before = i >= 0
-        after = i < n - 1
-        if before:
-            _odometry(drive, pose_stamp_s[i], stamp_s[k], states, variance, increment[0], noise_increment[0])
-        if after:
-            _odometry(drive, stamp_s[k], pose_stamp_s[i + 1], states, variance, increment[1], noise_increment[1])
-        if before and after:
-            forward = se2.compose(pose[i], increment[0])
-            closing = se2.between(se2.compose(forward, increment[1]), pose[i + 1])
-            to_end = se2.adjoint(se2.inverse(increment[1]))
-            total = to_end @ noise_increment[0] @ to_end.T + noise_increment[1]
-            gain = noise_increment[0] @ to_end.T @ np.linalg.inv(total)
-            out[k] = se2.compose(forward, gain @ closing)
-            # perturbations of the two ends, carried to this instant
-            from_start = se2.adjoint(se2.inverse(increment[0]))
-            ends = np.hstack([from_start - gain @ to_end @ from_start, gain])
-            joint = np.block([[covariance[i], consecutive[i]], [consecutive[i].T, covariance[i + 1]]])
-            spread[k] = ends @ joint @ ends.T + noise_increment[0] - gain @ to_end @ noise_increment[0]
-        elif before:
-            out[k] = se2.compose(pose[i], increment[0])
-            carry = se2.adjoint(se2.inverse(increment[0]))
-            spread[k] = carry @ covariance[i] @ carry.T + noise_increment[0]
-        else:
-            out[k] = se2.compose(pose[0], se2.inverse(increment[1]))
-            carry = se2.adjoint(increment[1])
-            spread[k] = carry @ (covariance[0] + noise_increment[1]) @ carry.T
+    out, spread = np.empty((len(stamp_s), 3)), np.empty((len(stamp_s), 3, 3))
+    _bridge(
+        stamp_s,
+        pose_stamp_s,
+        pose,
+        covariance,
+        consecutive,
+        drive.stamp_s,
+        drive.velocity,
+        drive.unknown,
+        states,
+        noise.odometry**2,
+        out,
+        spread,
+    )
     return out, 0.5 * (spread + spread.transpose(0, 2, 1))
 
 
@@ -113,18 +96,77 @@ def _reckon(
             spread[i] += variance[kind] * noise[kind]
 
 
-def _odometry(
-    drive: Drive,
-    start_s: float,
-    stop_s: float,
+@kernel
+def _bridge(
+    stamp: FloatArray,
+    pose_stamp: FloatArray,
+    pose: FloatArray,
+    covariance: FloatArray,
+    consecutive: FloatArray,
+    odometry_stamp: FloatArray,
+    velocity: FloatArray,
+    unknown: FloatArray,
     states: FloatArray,
     variance: FloatArray,
-    increment: FloatArray,
-    covariance: FloatArray,
+    out: FloatArray,
+    spread: FloatArray,
 ) -> None:
-    """Increment and its covariance between two instants, written into the last two arguments."""
-    motion, noise = np.empty((3, 4)), np.empty((len(variance), 3, 3))
-    integrate_odometry(
-        drive.stamp_s, drive.velocity, drive.unknown, start_s, stop_s, states, increment, motion, noise, covariance
-    )
-    covariance += np.tensordot(variance, noise, 1)
+    n = len(pose_stamp)
+    motion, noise, floor = np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
+    increment, collected = np.zeros((2, 3)), np.zeros((2, 3, 3))
+    joint = np.zeros((6, 6))
+    ends = np.zeros((3, 6))
+    for k in range(len(stamp)):
+        i = min(np.searchsorted(pose_stamp, stamp[k], side="right") - 1, n - 1)
+        for side in range(2):  # from the pose before, and to the pose after
+            if (side == 0 and i < 0) or (side == 1 and i >= n - 1):
+                continue
+            begin = pose_stamp[i] if side == 0 else stamp[k]
+            end = stamp[k] if side == 0 else pose_stamp[i + 1]
+            integrate_odometry(
+                odometry_stamp, velocity, unknown, begin, end, states, increment[side], motion, noise, floor
+            )
+            collected[side] = floor
+            for kind in range(len(variance)):
+                collected[side] += variance[kind] * noise[kind]
+        if i < 0:  # dead reckoning backwards from the first pose
+            out[k] = _composed(pose[0], _inverted(increment[1]))
+            carry = _adjoint(increment[1])
+            spread[k] = carry @ (covariance[0] + collected[1]) @ carry.T
+            continue
+        forward = _composed(pose[i], increment[0])
+        from_start = _adjoint(_inverted(increment[0]))
+        if i >= n - 1:
+            out[k] = forward
+            spread[k] = from_start @ covariance[i] @ from_start.T + collected[0]
+            continue
+        closing = _composed(_inverted(_composed(forward, increment[1])), pose[i + 1])
+        closing[2] = wrapped(closing[2])
+        to_end = _adjoint(_inverted(increment[1]))
+        share = collected[0] @ to_end.T
+        gain = share @ inverse_of(to_end @ share + collected[1])
+        out[k] = _composed(forward, gain @ closing)
+        # perturbations of the two ends, carried to this instant
+        ends[:, :3] = from_start - gain @ to_end @ from_start
+        ends[:, 3:] = gain
+        joint[:3, :3], joint[3:, 3:] = covariance[i], covariance[i + 1]
+        joint[:3, 3:], joint[3:, :3] = consecutive[i], consecutive[i].T
+        spread[k] = ends @ joint @ ends.T + collected[0] - gain @ share.T
+
+
+@kernel
+def _composed(a: FloatArray, b: FloatArray) -> FloatArray:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
+
+
+@kernel
+def _inverted(a: FloatArray) -> FloatArray:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
+
+
+@kernel
+def _adjoint(a: FloatArray) -> FloatArray:
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])

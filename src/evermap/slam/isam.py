@@ -50,6 +50,7 @@ class IncrementalSmoother:
         self._isam = gtsam.ISAM2(_parameters())
         self._n_poses = 0
         self._known: set[int] = set()
+        self._last_pose = np.zeros(3)
 
     def restart(self, estimate: Estimate, noise: Noise, problem: Problem | None = None) -> None:
         """Throw the tree away and build it anew at `estimate`, with other noise or other priors."""
@@ -63,6 +64,7 @@ class IncrementalSmoother:
         for row in range(self._n_poses):
             self._insert_frame(graph, values, row, estimate.pose[row], estimate.landmark)
         self._isam.update(graph, values)
+        self._last_pose = self._newest_pose()
 
     def add(self, row: int, pose: FloatArray, landmark: FloatArray) -> None:
         """Add pose `row` with its odometry and detections, and update the tree.
@@ -78,9 +80,13 @@ class IncrementalSmoother:
         self._insert_frame(graph, values, row, pose, landmark)
         self._isam.update(graph, values)
         self._n_poses = row + 1
+        self._last_pose = self._newest_pose()
 
     def last_pose(self) -> FloatArray:
         """(3,) the newest pose."""
+        return self._last_pose
+
+    def _newest_pose(self) -> FloatArray:
         pose = self._isam.calculateEstimatePose2(_pose_key(self._n_poses - 1))
         return np.array([pose.x(), pose.y(), pose.theta()])
 

@@ -136,7 +136,7 @@ class StreamingSlam:
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
             smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
-            estimate = smoother.optimum(estimate)
+            estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
             marginals = smoother.marginals(estimate)
             before, fit = (
                 noise,
