@@ -328,7 +328,7 @@ class Smoother:
             problem.prior.mean,
             problem.prior.sigma,
             problem.prior.free,
-            np.zeros(3),
+            problem.start_pose,
             problem.start_information,
             problem.landmark_mean[known],
             problem.landmark_information[known],

@@ -152,9 +152,8 @@ class IncrementalSmoother:
         prior = problem.prior
         graph.add(gtsam.PriorFactorVector(STATES_KEY, prior.mean, gtsam.noiseModel.Diagonal.Sigmas(prior.sigma)))
         values.insert(STATES_KEY, states)
-        if problem.start_information > 0.0:
-            held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
-            graph.add(gtsam.PriorFactorPose2(_pose_key(0), gtsam.Pose2(0.0, 0.0, 0.0), held))
+        held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
+        graph.add(gtsam.PriorFactorPose2(_pose_key(0), gtsam.Pose2(*problem.start_pose), held))
 
     def _insert_frame(self, graph: Any, values: Any, row: int, pose: FloatArray, landmark: FloatArray) -> None:
         problem = self._problem
@@ -257,4 +256,7 @@ def _parameters() -> Any:
     parameters = gtsam.ISAM2Params()
     parameters.setRelinearizeThreshold(RELINEARIZE_THRESHOLD)
     parameters.relinearizeSkip = RELINEARIZE_SKIP
+    # Cholesky takes a clique for indeterminate whose pivots span more than 2^12: a millisecond's odometry beside a
+    # calibration state does, and is none the worse for it
+    parameters.setFactorization("QR")
     return parameters

@@ -54,7 +54,8 @@ class Problem:
         sigma_given: (M, 2) standard deviations that came with a detection, nan where none did.
         mount: (3,) pose of the sensor on the robot.
         prior: of the calibration states, as the graph shall use it.
-        start_information: weight [1/m^2, 1/rad^2] with which the first pose is held at the start value.
+        start_pose: (3,) where the first pose is held.
+        start_information: how firmly, [1/m^2] and [1/rad^2].
         landmark_mean: (L, 2) prior positions, zeros where there is none.
         landmark_information: (L, 2, 2) inverse prior covariances, zeros where there is none.
     """
@@ -67,6 +68,7 @@ class Problem:
     sigma_given: FloatArray
     mount: FloatArray
     prior: CalibrationPrior
+    start_pose: FloatArray
     start_information: float
     landmark_mean: FloatArray
     landmark_information: FloatArray

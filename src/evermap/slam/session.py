@@ -92,6 +92,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepare
         sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
         mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
         prior=CalibrationPrior.from_settings(calibrated=False, fix={}),
+        start_pose=np.zeros(3),
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
         landmark_information=np.zeros((len(landmark_id), 2, 2)),

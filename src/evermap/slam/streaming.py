@@ -25,6 +25,8 @@ FIRST_STOCK = 40
 MIN_ALIGN_LANDMARKS = 3
 MIN_ALIGN_SPREAD_M = 1.0
 """Landmarks of a prior map that must have been seen, and how far apart, before the robot is placed in it."""
+ALIGNED_INFORMATION = 1e-2
+"""Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
 FINAL_ROUNDS = 12
 NOISE_CONVERGED = 0.01
 """Relative change of every noise level below which the final rounds stop."""
@@ -232,18 +234,19 @@ class StreamingSlam:
         estimate = self._graph.estimate()
         both = prior_map.given & estimate.known
         pose_map_world = _rigid(estimate.landmark[both], prior_map.mean[both])
-        self._aligned, self._scale = True, 1.0
-        self._problem = replace(
-            self._problem,
-            prior=self._prior,
-            start_information=0.0,
-            landmark_mean=np.where(prior_map.given[:, None], prior_map.mean, 0.0),
-            landmark_information=prior_map.information,
-        )
         moved = Estimate(
             se2.compose(pose_map_world, estimate.pose),
             se2.transform(pose_map_world, estimate.landmark),
             estimate.states,
+        )
+        self._aligned, self._scale = True, 1.0
+        self._problem = replace(
+            self._problem,
+            prior=self._prior,
+            start_pose=moved.pose[0],
+            start_information=ALIGNED_INFORMATION,
+            landmark_mean=np.where(prior_map.given[:, None], prior_map.mean, 0.0),
+            landmark_information=prior_map.information,
         )
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
