@@ -22,7 +22,7 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same recordings.")] = 0,
     days: Annotated[int, typer.Option(min=1, help="Days that the patrols span.")] = 6,
     sessions_per_day: Annotated[int, typer.Option(min=1, help="Patrols a day.")] = 1,
-    patrol_s: Annotated[float, typer.Option(help="Length of a patrol [s].")] = 150.0,
+    patrol_s: Annotated[float, typer.Option(help="Length of a patrol [s]; 165 is about one lap.")] = 165.0,
     change_rate: Annotated[float, typer.Option(min=0.0, help="How often things change; 0 is a static world.")] = 1.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
