@@ -33,7 +33,8 @@ RULES = {
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence sim io metrics viz pipeline runfolder",
+    "experiments": "errors types se2 config survival sensing persistence slam sim io metrics viz pipeline "
+    "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
     "cli": "errors types config io sim metrics viz maps pipeline runfolder server experiments demo",
 }
