@@ -1,0 +1,234 @@
+"""The batch smoother against dense solvers of the same cost, which share none of its code."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from dense import DensePosterior
+from problems import QUIET, World, default_prior, make_world
+
+from evermap import se2
+from evermap.errors import DataError
+from evermap.slam.arrow import Smoother
+from evermap.slam.problem import Estimate
+
+
+SMALL = 0.05
+"""Parts of a standard deviation: the derivative by the odometry's increment is exact for vanishing residuals only."""
+
+
+def with_unknown_landmark(world: World) -> World:
+    """A sixth landmark that nobody saw, in a row between the others."""
+    problem = world.problem
+    row = np.where(problem.landmark_row >= 2, problem.landmark_row + 1, problem.landmark_row)
+    problem = replace(
+        problem,
+        landmark_row=row,
+        landmark_mean=np.insert(problem.landmark_mean, 2, 0.0, axis=0),
+        landmark_information=np.insert(problem.landmark_information, 2, 0.0, axis=0),
+    )
+    truth = replace(world.truth, landmark=np.insert(world.truth.landmark, 2, np.nan, axis=0))
+    return World(problem, world.noise, truth)
+
+
+def with_duplicates(world: World) -> World:
+    """Every fifth detection comes twice in its frame, a little different."""
+    problem = world.problem
+    again = np.arange(0, len(problem.pose_row), 5)
+    rows = np.insert(np.arange(len(problem.pose_row)), again, again)
+    reading = problem.reading[rows] + 0.01 * np.sin(np.arange(2 * len(rows))).reshape(-1, 2)
+    problem = replace(
+        problem,
+        pose_row=problem.pose_row[rows],
+        landmark_row=problem.landmark_row[rows],
+        reading=reading,
+        sigma_given=problem.sigma_given[rows],
+    )
+    return World(problem, world.noise, world.truth)
+
+
+def with_own_sigmas(world: World) -> World:
+    """Some detections say how good their range, their bearing or both are."""
+    sigma = np.full((len(world.problem.reading), 2), np.nan)
+    sigma[::3, 0], sigma[::2, 1] = 0.2, 0.05
+    return World(replace(world.problem, sigma_given=sigma), world.noise, world.truth)
+
+
+def elsewhere(world: World) -> World:
+    """In a map, the first pose anywhere and hardly held."""
+    pose_map_world = np.array([30.0, -12.0, 2.9])
+    problem, truth = world.problem, world.truth
+    turn = se2.rotation(pose_map_world[2])
+    moved = Estimate(
+        se2.compose(pose_map_world, truth.pose), se2.transform(pose_map_world, truth.landmark), truth.states
+    )
+    given = problem.landmark_information.any(axis=(1, 2))
+    problem = replace(
+        problem,
+        start_pose=moved.pose[0],
+        start_information=1e-2,
+        landmark_mean=np.where(given[:, None], se2.transform(pose_map_world, problem.landmark_mean), 0.0),
+        landmark_information=turn @ problem.landmark_information @ turn.T,
+    )
+    return World(problem, world.noise, moved)
+
+
+CASES = {
+    "free": lambda: make_world(1),
+    "outliers": lambda: make_world(2, p_outlier=0.1),
+    "map": lambda: elsewhere(make_world(3, n_mapped=3)),
+    "fixed states": lambda: make_world(
+        4, prior=default_prior(odometry_delay_s=0.1, range_bias_m=0.02, range_slope=0.0)
+    ),
+    "plain": lambda: make_world(5, prior=replace(default_prior(), free=np.zeros(9, dtype=bool))),
+    "never seen": lambda: with_unknown_landmark(make_world(6)),
+    "duplicates": lambda: with_duplicates(make_world(7)),
+    "own sigmas": lambda: with_own_sigmas(make_world(8, p_outlier=0.05)),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def solved(request):
+    """A world, its smoother and the optimum."""
+    world = CASES[request.param]()
+    start = world.near_truth(np.random.default_rng(0))
+    smoother = Smoother(world.problem, world.noise)
+    near = Smoother(world.problem, world.noise, heavy=True).optimum(start)
+    return world, smoother, smoother.optimum(near, tolerance=1e-9)
+
+
+@pytest.fixture(scope="module")
+def dense(solved):
+    world, _, optimum = solved
+    posterior = DensePosterior(world.problem, world.noise, optimum)
+    return posterior, *posterior.linearised()
+
+
+def flat_step(a: Estimate, b: Estimate) -> np.ndarray:
+    """From a to b, poses in their own frame; zero for unknown landmarks."""
+    parts = se2.log(se2.between(a.pose, b.pose)), np.nan_to_num(b.landmark - a.landmark), b.states - a.states
+    return np.concatenate([part.ravel() for part in parts])
+
+
+def test_cost_and_weights_are_those_written_down_in_the_test(solved, dense):
+    _, smoother, optimum = solved
+    posterior, *_ = dense
+    assert smoother.cost(optimum) == pytest.approx(posterior.cost(), rel=1e-9)
+    assert smoother.inlier_probability(optimum) == pytest.approx(posterior.weights(optimum), abs=1e-9)
+
+
+def test_nothing_is_left_to_step_at_the_optimum(solved, dense):
+    _, _, optimum = solved
+    _, covariance, step = dense
+    sigma = np.sqrt(np.diag(covariance))
+    assert np.abs(step / np.where(sigma > 0, sigma, 1.0)).max() < SMALL
+    assert np.abs(step[: 3 * len(optimum.pose)]).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["free", "outliers", "map"])
+def test_optimum_is_that_of_scipys_least_squares(name):
+    world = CASES[name]()
+    start = world.near_truth(np.random.default_rng(0))
+    smoother = Smoother(world.problem, world.noise)
+    found = smoother.optimum(Smoother(world.problem, world.noise, heavy=True).optimum(start))
+    posterior = DensePosterior(world.problem, world.noise, found)
+    step = flat_step(found, posterior.optimum())
+    sigma = np.sqrt(np.diag(posterior.linearised()[0]))
+    assert np.abs(step / np.where(sigma > 0, sigma, 1.0)).max() < SMALL
+    assert np.abs(step[: 3 * len(found.pose)]).max() < 1e-3
+
+
+def test_all_marginals_are_blocks_of_the_dense_inverse(solved, dense):
+    _, smoother, optimum = solved
+    _, covariance, _ = dense
+    marginals = smoother.marginals(optimum)
+    n, g = len(optimum.pose), 2 * len(optimum.landmark) + 9
+    sigma = np.sqrt(np.diag(covariance))
+    sigma[sigma == 0.0] = 1.0
+    pose_rows, shared = np.arange(3 * n).reshape(n, 3), np.arange(3 * n, 3 * n + g)
+
+    def compare(found, rows, columns):
+        """As parts of the standard deviations."""
+        assert found.shape == (len(rows), len(columns))
+        gap = found - covariance[np.ix_(rows, columns)]
+        assert np.abs(gap / np.outer(sigma[rows], sigma[columns])).max() < SMALL
+
+    compare(marginals.shared, shared, shared)
+    for i in range(n):
+        compare(marginals.pose[i], pose_rows[i], pose_rows[i])
+        compare(marginals.pose_shared[i], pose_rows[i], shared)
+        if i < n - 1:
+            compare(marginals.consecutive[i], pose_rows[i], pose_rows[i + 1])
+    assert not marginals.consecutive[-1].any()
+    # the views into them
+    at = 3 * n + 2 * np.arange(len(optimum.landmark))
+    for j, k in enumerate(at):
+        compare(marginals.landmark[j], [k, k + 1], [k, k + 1])
+    compare(marginals.states, shared[-9:], shared[-9:])
+
+
+def test_fixed_states_stay():
+    world = CASES["fixed states"]()
+    prior = world.problem.prior
+    found = Smoother(world.problem, world.noise).optimum(world.near_truth(np.random.default_rng(0)))
+    assert found.states[~prior.free] == pytest.approx(prior.mean[~prior.free], abs=0.0)
+    assert np.all(found.states[prior.free] != prior.mean[prior.free])
+
+
+def test_exact_measurements_give_the_exact_truth():
+    """Priors told the truth, no noise: the optimum is where everything came from."""
+    states = np.array([0.05, 0.02, 0.1, -0.4, 0.03, 0.25, 0.95, 1.08, 0.03])
+    prior = replace(default_prior(), mean=states)
+    world = make_world(11, noisy=0.0, states=states, prior=prior)
+    found = Smoother(world.problem, world.noise).optimum(world.near_truth(np.random.default_rng(3), by=0.05))
+    assert found.pose == pytest.approx(world.truth.pose, abs=1e-7)
+    assert found.landmark == pytest.approx(world.truth.landmark, abs=1e-7)
+    assert found.states == pytest.approx(states, abs=1e-7)
+    assert Smoother(world.problem, world.noise).cost(found) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_optimum_does_not_depend_on_where_it_starts():
+    world = make_world(12)
+    smoother = Smoother(world.problem, world.noise, robust=False)
+    rng = np.random.default_rng(5)
+    first, second = (smoother.optimum(world.near_truth(rng, by=0.15), tolerance=1e-9) for _ in range(2))
+    assert np.abs(flat_step(first, second)).max() < 1e-6
+
+
+def test_without_robustness_one_outlier_drags_the_map():
+    world = make_world(13, p_outlier=0.08)
+    start = world.near_truth(np.random.default_rng(0))
+    error = {}
+    for robust in (True, False):
+        near = Smoother(world.problem, world.noise, heavy=True, robust=robust).optimum(start)
+        found = Smoother(world.problem, world.noise, robust=robust).optimum(near)
+        error[robust] = np.sqrt(((found.landmark - world.truth.landmark) ** 2).sum(axis=1).mean())
+    assert error[False] > 2 * error[True]
+
+
+def test_weights_find_the_outliers():
+    world = make_world(14, n_poses=40, p_outlier=0.1)
+    residual = DensePosterior(world.problem, world.noise, world.truth).detection_residuals(world.truth)
+    wrong = (residual**2).sum(axis=1) > 100.0
+    start = world.near_truth(np.random.default_rng(0))
+    near = Smoother(world.problem, world.noise, heavy=True).optimum(start)
+    smoother = Smoother(world.problem, world.noise)
+    p = smoother.inlier_probability(smoother.optimum(near))
+    assert wrong.sum() > 5
+    assert np.all(p[wrong] < 0.5)
+    assert np.mean(p[~wrong] > 0.5) > 0.99
+
+
+def test_problems_that_fit_into_no_memory_are_refused():
+    world = make_world(15)
+    many = 400_000
+    problem = replace(
+        world.problem,
+        stamp_s=np.arange(many, dtype=float),
+        landmark_mean=np.zeros((200, 2)),
+        landmark_information=np.zeros((200, 2, 2)),
+    )
+    with pytest.raises(DataError, match="400000 poses with 200 landmarks"):
+        Smoother(problem, QUIET)
