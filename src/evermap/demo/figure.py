@@ -34,12 +34,12 @@ _RC: Any = {
 
 
 def draw_demo(study: Study) -> NamedFigure:
-    """The hero figure, 1600 x 800 pixels at 160 dpi."""
+    """The hero figure, 1600 x 768 pixels at 160 dpi."""
     import matplotlib as mpl
 
     with house_style(), mpl.rc_context(_RC):
-        figure = new_figure(10.0, 5.0)
-        plan, errors = figure.subplots(1, 2, width_ratios=(1.42, 1.0))
+        figure = new_figure(10.0, 4.8)
+        plan, errors = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
         _draw_building(plan, study)
         _draw_errors(errors, study)
         settle(figure)
@@ -85,7 +85,7 @@ def _draw_building(axes: Axes, study: Study) -> None:
         colour, shape = _CLASS_LOOK[row % len(_CLASS_LOOK)]
         points = now.position_m[now.class_id == row]
         axes.plot(*points.T, shape, color=colour, ms=5.6, mec=PAPER, mew=0.5, zorder=7, label=name, ls="none")
-    axes.plot([], [], color=ALERT, marker=">", ms=5, lw=1.2, label="moved")
+    axes.plot([], [], color=ALERT, marker=">", ms=5, lw=1.2, label="moved (hollow: from)")
     axes.plot([], [], "x", color=ALERT, ms=7, mew=2.0, label="vanished")
     axes.set_aspect("equal")
     axes.set_axis_off()
@@ -102,6 +102,8 @@ def _at(landmarks: Landmarks, ids: IntArray) -> FloatArray:
 
 def _draw_errors(axes: Axes, study: Study) -> None:
     """Error of every session: changing building, unchanging one, and no memory at all."""
+    from matplotlib.ticker import MaxNLocator
+
     days = np.array([truth.day + 1 for truth in study.changed.truths])
     looks = {
         "changed": (ALERT, "-", "o", "things change"),
@@ -114,12 +116,14 @@ def _draw_errors(axes: Axes, study: Study) -> None:
             axes.fill_between(days, low_cm, high_cm, color=colour, alpha=0.16, lw=0)
         axes.plot(days, rmse_cm, ls=dash, marker=marker, color=colour, lw=2.2, ms=6.5, label=label)
     axes.set_ylim(bottom=0.0)
+    axes.yaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
     axes.set_xlim(days[0] - 0.25, days[-1] + 0.25)
-    axes.set_xticks(days)
-    axes.set_xlabel("day")
+    changed = [len(now.moved) + len(now.vanished) for now in drifts(study)]
+    axes.set_xticks(days, [f"{day}\n{count}" for day, count in zip(days, changed, strict=True)])
+    axes.set_xlabel("day · landmarks moved or gone")
     axes.set_ylabel("position error [cm]")
     axes.set_title("Living with the map of day 1")
-    axes.legend(loc="upper left")
+    axes.legend(loc="upper left", borderaxespad=0.2)
 
 
 def _spread(visits: tuple[Visit, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:

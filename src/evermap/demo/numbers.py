@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.demo.study import SERIES, Study, Visit
-from evermap.types import BoolArray, IntArray, Landmarks
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
 MOVED_M = 0.05
 """Farther from its old place than this, a landmark has moved."""
@@ -22,10 +22,12 @@ class Drift:
 
     Attributes:
         stayed, moved, vanished, appeared: ids of landmarks; `vanished` were there at first and are not any more.
+        displacement_m: how far each of `moved` is from its first place.
     """
 
     stayed: IntArray
     moved: IntArray
+    displacement_m: FloatArray
     vanished: IntArray
     appeared: IntArray
 
@@ -37,6 +39,7 @@ def drift(then: Landmarks, now: Landmarks) -> Drift:
     return Drift(
         stayed=ids[gap_m <= MOVED_M],
         moved=ids[gap_m > MOVED_M],
+        displacement_m=gap_m[gap_m > MOVED_M],
         vanished=np.setdiff1d(then.landmark_id, ids),
         appeared=np.setdiff1d(now.landmark_id, ids),
     )
@@ -93,16 +96,26 @@ def _errors(visit: Visit) -> dict[str, float | None]:
 
 
 def _changes(study: Study, k: int, now: Drift) -> dict[str, float | int | None]:
-    """What has changed since the map was made, and what the estimator made of it in session `k`."""
+    """What has changed since the map was made, and what the estimator made of it in session `k`.
+
+    A moved landmark is 'believed' if most of its detections were, else 'rejected'; not every one was seen.
+    """
     innovations = study.visits["changed"][k].result.innovations
     rejected = innovations.p_inlier < 0.5
     of_moved = np.isin(innovations.landmark_id, now.moved)
     of_stayed = np.isin(innovations.landmark_id, now.stayed)
+    seen = np.isin(now.moved, innovations.landmark_id)
+    far = now.displacement_m[seen]
+    doubt = np.array([np.mean(rejected[innovations.landmark_id == name]) for name in now.moved[seen]])
     return {
         "landmarks_mapped_then": len(now.stayed) + len(now.moved) + len(now.vanished),
         "moved": len(now.moved),
         "vanished": len(now.vanished),
         "appeared": len(now.appeared),
+        "moved_believed": int(np.count_nonzero(doubt < 0.5)),
+        "moved_rejected": int(np.count_nonzero(doubt >= 0.5)),
+        "believed_displacement_m": _median(far[doubt < 0.5]),
+        "rejected_displacement_m": _median(far[doubt >= 0.5]),
         "moved_detection_share": _share(of_moved),
         "moved_rejected_share": _share(rejected[of_moved]),
         "stayed_rejected_share": _share(rejected[of_stayed]),
@@ -111,3 +124,7 @@ def _changes(study: Study, k: int, now: Drift) -> dict[str, float | int | None]:
 
 def _share(which: BoolArray) -> float | None:
     return float(np.mean(which)) if len(which) else None
+
+
+def _median(values: FloatArray) -> float | None:
+    return float(np.median(values)) if len(values) else None

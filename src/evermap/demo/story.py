@@ -62,16 +62,23 @@ def _what_it_costs(sessions: list[Mapping[str, Any]]) -> str:
 
 
 def _why(sessions: list[Mapping[str, Any]]) -> str:
-    last = sessions[-1]
-    moved, stayed = last["changes"]["moved_rejected_share"], last["changes"]["stayed_rejected_share"]
-    if moved is None or stayed is None:
+    """What became of the moved landmarks: the robust kernel is all that stands between the old map and the robot."""
+    day, changes = sessions[-1]["day"], sessions[-1]["changes"]
+    believed, rejected = changes["moved_believed"], changes["moved_rejected"]
+    text = f"Of the moved landmarks that were seen on day {day}, "
+    if rejected:
+        text += (
+            f"{rejected} (by {changes['rejected_displacement_m']:.1f} m, median) are too far from their old place to be"
+            " believed: the robust kernel rejects their detections, and the robot has to do without them."
+        )
+    if believed:
+        text += (" " if rejected else "") + (
+            f"{believed} (by {changes['believed_displacement_m']:.1f} m) are {'still ' if rejected else ''}near enough"
+            " to pass for a mistake of the map: the estimate compromises, and is drawn off with them."
+        )
+    if not (believed or rejected):
         return ""
-    return (
-        f"The robust kernel is all that stands between the old map and the robot. On day {last['day']} it rejected"
-        f" {moved:.0%} of the detections of moved landmarks, and with them {stayed:.0%} of those that stayed; what it"
-        " does not reject pulls the robot to a place where it is not. It also starts from zero every day: it judges"
-        " detections, and learns nothing about the map."
-    )
+    return f"{text} And it starts from zero every day: it judges detections, but learns nothing about the map."
 
 
 def _table(sessions: list[Mapping[str, Any]]) -> str:
