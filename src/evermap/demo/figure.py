@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 # Okabe and Ito's colours once more; shapes tell the classes apart where colours don't
 _CLASS_LOOK = (
-    ("#000000", "s"),
+    (INK, "s"),
     ("#e69f00", "D"),
     ("#009e73", "^"),
     ("#0072b2", "o"),

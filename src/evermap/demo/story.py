@@ -53,8 +53,8 @@ def _what_it_costs(sessions: list[Mapping[str, Any]]) -> str:
         return "There is too little truth to say what that costs."
     mine, other = sum(changed) / len(changed), sum(unchanged) / len(unchanged)
     text = (
-        f"On the day it was made the map is good to {100 * first['changed']['pose_rmse_m']:.1f} cm. On the later days"
-        f" the position error is {100 * mine:.1f} cm on average, up to {100 * max(changed):.1f} cm, where things"
+        f"On the day the map is made the position error is {100 * first['changed']['pose_rmse_m']:.1f} cm. On the later"
+        f" days it is {100 * mine:.1f} cm on average, up to {100 * max(changed):.1f} cm, where things"
         f" change, and {100 * other:.1f} cm where nothing does"
     )
     ratio = mine / other
