@@ -28,7 +28,7 @@ def demo(
         bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
     ] = False,
 ) -> None:
-    """Map a simulated building, and see what the map is worth when things move.
+    """Map a simulated building in which things come and go.
 
     A robot maps the building on day 1 and patrols it on five more days, believing that map; once while things come
     and go, once while nothing changes. Open report.html in the folder for the story.
