@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from evermap.errors import DataError, NumericalError
 from evermap.slam.kernels import (
@@ -246,6 +247,29 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
     return Solution(step_pose, step_shared, cov_pose, cov_next, cross, cov_shared)
 
 
+@kernel
+def eliminate_chain(normal: Normal) -> tuple[FloatArray, FloatArray]:
+    """Information (3 + G, 3 + G) and right side (3 + G,) that are left for the last pose and the shared numbers."""
+    n, shared = len(normal.diagonal), len(normal.corner)
+    corner, right_shared = normal.corner.copy(), normal.right_shared.copy()
+    block, border, right = normal.diagonal[0].copy(), normal.border[0].copy(), normal.right_pose[0].copy()
+    for i in range(n - 1):
+        inverse = inverse_of(block)
+        gain = inverse @ border
+        corner -= border.T @ gain
+        right_shared -= gain.T @ right
+        factor = normal.off[i] @ inverse
+        block = normal.diagonal[i + 1] - factor @ normal.off[i].T
+        right = normal.right_pose[i + 1] - factor @ right
+        border = normal.border[i + 1] - factor @ border
+    information = np.zeros((3 + shared, 3 + shared))
+    information[:3, :3] = block
+    information[:3, 3:] = border
+    information[3:, :3] = border.T
+    information[3:, 3:] = corner
+    return information, np.concatenate((right, right_shared))
+
+
 class Smoother:
     """Optimum and covariances of one `Problem` at given noise.
 
@@ -306,6 +330,17 @@ class Smoother:
         cross = np.zeros((len(estimate.pose), 3, len(known)))
         cross[:, :, known] = solved.cov_cross
         return Marginals(solved.cov_pose, solved.cov_next, cross, shared)
+
+    def summary(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+        """What the problem says about its last pose, its known landmarks and the states, linearised at `estimate`.
+
+        Returns:
+            `R` upper triangular (n, n) and `d` (n,), n = 3 + 2 known landmarks + 9: the cost of a step `x` is
+            `|R x - d|^2 / 2` up to a constant.
+        """
+        information, right = eliminate_chain(self._normal(estimate))
+        root: FloatArray = cholesky(information, lower=False)
+        return root, solve_triangular(root, right, trans="T")
 
     def _normal(self, estimate: Estimate) -> Normal:
         problem, noise = self.problem, self.noise

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 
 from evermap import se2
+from evermap.slam.arrow import Smoother
 from evermap.slam.frame_factor import whitened_detections, whitened_odometry
 from evermap.slam.kernels import detection_residual
 from evermap.slam.problem import Estimate, Noise, Problem
@@ -48,20 +49,28 @@ class IncrementalSmoother:
         self._noise = noise
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._isam = gtsam.ISAM2(_parameters())
-        self._n_poses = 0
+        self._n_poses = self._first_pose = 0
         self._known: set[int] = set()
         self._last_pose = np.zeros(3)
 
-    def restart(self, estimate: Estimate, noise: Noise, problem: Problem | None = None) -> None:
-        """Throw the tree away and build it anew at `estimate`, with other noise or other priors."""
-        self._problem = problem or self._problem
-        self._noise = noise
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, *, keep: int) -> None:
+        """Throw the tree away and build it anew at `estimate`, with other noise or other priors.
+
+        Only the last `keep` poses go into the new tree; what the others say about them, about the landmarks and the
+        states becomes one linear factor, so that a step costs what the map costs, whatever the age of the recording.
+        """
+        self._problem, self._noise = problem, noise
         self._isam = gtsam.ISAM2(_parameters())
         self._n_poses = len(estimate.pose)
+        self._first_pose = max(self._n_poses - keep, 0)
         self._known = set()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._insert_priors(graph, values, estimate.states)
-        for row in range(self._n_poses):
+        values.insert(STATES_KEY, estimate.states)
+        if self._first_pose == 0:
+            self._insert_priors(graph)
+        else:
+            self._insert_summary(graph, values, estimate)
+        for row in range(self._first_pose, self._n_poses):
             self._insert_frame(graph, values, row, estimate.pose[row], estimate.landmark)
         self._isam.update(graph, values)
         self._last_pose = self._newest_pose()
@@ -76,7 +85,8 @@ class IncrementalSmoother:
         """
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if row == 0:
-            self._insert_priors(graph, values, self._problem.prior.mean)
+            self._insert_priors(graph)
+            values.insert(STATES_KEY, self._problem.prior.mean)
         self._insert_frame(graph, values, row, pose, landmark)
         self._isam.update(graph, values)
         self._n_poses = row + 1
@@ -100,10 +110,18 @@ class IncrementalSmoother:
             return np.full(2, np.nan)
         return np.asarray(self._isam.calculateEstimatePoint2(_landmark_key(row)))
 
-    def estimate(self) -> Estimate:
-        """Values of all that is in the graph."""
+    def estimate(self, older: FloatArray) -> Estimate:
+        """Values of all that is in the tree, behind the poses (n, 3) that no longer are."""
         values = self._isam.calculateBestEstimate()
-        return _from_values(values, self._n_poses, len(self._problem.landmark_mean), self._known)
+        pose = np.empty((self._n_poses, 3))
+        pose[: self._first_pose] = older[: self._first_pose]
+        for row in range(self._first_pose, self._n_poses):
+            at = values.atPose2(_pose_key(row))
+            pose[row] = at.x(), at.y(), at.theta()
+        landmark = np.full((len(self._problem.landmark_mean), 2), np.nan)
+        for j in self._known:
+            landmark[j] = values.atPoint2(_landmark_key(j))
+        return Estimate(pose, landmark, np.asarray(values.atVector(STATES_KEY)))
 
     def innovations(
         self, row: int, increment: FloatArray, motion: FloatArray, covariance: FloatArray, detections: IntArray
@@ -147,13 +165,28 @@ class IncrementalSmoother:
             nis[k] = e @ np.linalg.solve(s, e)
         return nis, pose_covariance
 
-    def _insert_priors(self, graph: Any, values: Any, states: FloatArray) -> None:
+    def _insert_priors(self, graph: Any) -> None:
         problem = self._problem
         prior = problem.prior
         graph.add(gtsam.PriorFactorVector(STATES_KEY, prior.mean, gtsam.noiseModel.Diagonal.Sigmas(prior.sigma)))
-        values.insert(STATES_KEY, states)
         held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
         graph.add(gtsam.PriorFactorPose2(_pose_key(0), gtsam.Pose2(*problem.start_pose), held))
+
+    def _insert_summary(self, graph: Any, values: Any, estimate: Estimate) -> None:
+        """One factor for everything before the first pose of the tree, priors included."""
+        row = self._first_pose
+        before = self._problem.until(row + 1, last_is_blind=True)
+        seen = np.zeros(len(estimate.landmark), dtype=bool)
+        seen[before.landmark_row] = True
+        linearised = Estimate(
+            estimate.pose[: row + 1], np.where(seen[:, None], estimate.landmark, np.nan), estimate.states
+        )
+        smoother = Smoother(before, self._noise, heavy=True, robust=self._robust)
+        landmarks = np.flatnonzero(linearised.known)
+        for j in landmarks:
+            values.insert(_landmark_key(int(j)), estimate.landmark[j])
+            self._known.add(int(j))
+        graph.add(_summary_factor(row, landmarks, linearised, *smoother.summary(linearised)))
 
     def _insert_frame(self, graph: Any, values: Any, row: int, pose: FloatArray, landmark: FloatArray) -> None:
         problem = self._problem
@@ -168,23 +201,44 @@ class IncrementalSmoother:
             if information.any():
                 noise = gtsam.noiseModel.Gaussian.Information(information)
                 graph.add(gtsam.PriorFactorPoint2(_landmark_key(j), problem.landmark_mean[j], noise))
-        if row > 0 or len(detections):
-            graph.add(frame_factor(problem, self._noise, row, detections, heavy=self._robust))
+        # the first pose of the tree has no odometry: the summary holds it, or the start does
+        before = row > self._first_pose
+        if before or len(detections):
+            graph.add(frame_factor(problem, self._noise, row, detections, before=before, heavy=self._robust))
 
 
-def frame_factor(problem: Problem, noise: Noise, row: int, detections: IntArray, *, heavy: bool) -> Any:
-    """The gtsam factor of one frame: odometry since the pose before (none for row 0) and its detections."""
+def _summary_factor(row: int, landmarks: IntArray, at: Estimate, root: FloatArray, right: FloatArray) -> Any:
+    """`|R x - d|^2 / 2` of the step `x` that pose `row`, some landmarks and the states make from where they were."""
+    keys = [_pose_key(row), *(_landmark_key(int(j)) for j in landmarks), STATES_KEY]
+    bounds = np.cumsum([0, 3, *([2] * len(landmarks)), 9])
+    pose, points, states = gtsam.Pose2(*at.pose[row]), at.landmark[landmarks], at.states
+
+    def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
+        step = [pose.localCoordinates(values.atPose2(keys[0]))]
+        step += [values.atPoint2(key) - point for key, point in zip(keys[1:-1], points, strict=True)]
+        step.append(values.atVector(STATES_KEY) - states)
+        if jacobians is not None:
+            for k in range(len(keys)):
+                jacobians[k] = root[:, bounds[k] : bounds[k + 1]]
+        residual: FloatArray = root @ np.concatenate(step) - right
+        return residual
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(right)), keys, error)
+
+
+def frame_factor(problem: Problem, noise: Noise, row: int, detections: IntArray, *, before: bool, heavy: bool) -> Any:
+    """The gtsam factor of one frame: its detections and, with `before`, the odometry since the pose before."""
     landmarks = list(dict.fromkeys(problem.landmark_row[detections].tolist()))
     keys = [STATES_KEY, _pose_key(row), *map(_landmark_key, landmarks)]
-    if row > 0:
+    if before:
         keys.append(_pose_key(row - 1))
-    size = 2 * len(detections) + (3 if row > 0 else 0)
-    error = _frame_error(problem, noise, row, detections, landmarks, heavy)
+    size = 2 * len(detections) + (3 if before else 0)
+    error = _frame_error(problem, noise, row, detections, landmarks, before, heavy)
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(size), keys, error)
 
 
 def _frame_error(
-    problem: Problem, noise: Noise, row: int, detections: IntArray, landmarks: list[int], heavy: bool
+    problem: Problem, noise: Noise, row: int, detections: IntArray, landmarks: list[int], before: bool, heavy: bool
 ) -> Callable[[Any, Any, Any], FloatArray]:
     """Whitened residual of a frame and its Jacobians by states, pose, landmarks and the pose before."""
     column = np.array([landmarks.index(int(j)) for j in problem.landmark_row[detections]], dtype=np.int64)
@@ -192,9 +246,9 @@ def _frame_error(
     sigma = noise.of_detections(problem.sigma_given[detections])
     variance = noise.odometry**2
     n_rows = 2 * len(detections)
-    size = n_rows + (3 if row > 0 else 0)
+    size = n_rows + (3 if before else 0)
     landmark_keys = [_landmark_key(j) for j in landmarks]
-    key, key_before = _pose_key(row), _pose_key(row - 1) if row > 0 else None
+    key, key_before = _pose_key(row), _pose_key(row - 1) if before else None
     drive, stamp, free, mount = problem.drive, problem.stamp_s, problem.prior.free, problem.mount
 
     def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
@@ -211,10 +265,10 @@ def _frame_error(
         by_before = None
         if key_before is not None:
             at = values.atPose2(key_before)
-            before = np.array([at.x(), at.y(), at.theta()])
+            pose_before = np.array([at.x(), at.y(), at.theta()])
             by_before = np.zeros((size, 3))
             whitened_odometry(
-                before,
+                pose_before,
                 pose,
                 states,
                 drive.stamp_s,
@@ -239,17 +293,6 @@ def _frame_error(
         return residual
 
     return error
-
-
-def _from_values(values: Any, n_poses: int, n_landmarks: int, known: set[int]) -> Estimate:
-    pose = np.empty((n_poses, 3))
-    for row in range(n_poses):
-        at = values.atPose2(_pose_key(row))
-        pose[row] = at.x(), at.y(), at.theta()
-    landmark = np.full((n_landmarks, 2), np.nan)
-    for j in known:
-        landmark[j] = values.atPoint2(_landmark_key(j))
-    return Estimate(pose, landmark, np.asarray(values.atVector(STATES_KEY)))
 
 
 def _parameters() -> Any:

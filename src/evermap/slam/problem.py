@@ -73,9 +73,12 @@ class Problem:
     landmark_mean: FloatArray
     landmark_information: FloatArray
 
-    def until(self, n_poses: int) -> Problem:
-        """The problem as it stood after `n_poses` poses; landmarks keep their rows."""
-        stop = int(np.searchsorted(self.pose_row, n_poses))
+    def until(self, n_poses: int, *, last_is_blind: bool = False) -> Problem:
+        """The problem as it stood after `n_poses` poses; landmarks keep their rows.
+
+        With `last_is_blind`, before the detections of the last of them.
+        """
+        stop = int(np.searchsorted(self.pose_row, n_poses - last_is_blind))
         return replace(
             self,
             stamp_s=self.stamp_s[:n_poses],

@@ -22,6 +22,10 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_STOCK = 40
 """Poses before the batch smoother takes stock for the first time."""
+KEPT = 100
+"""Poses that stay in the incremental smoother after a stock-taking; older ones are summed up in one factor."""
+LONGEST_TREE = 400
+"""Poses after which stock is taken even if their number has not doubled; grows slowly, with the recording's 16th."""
 MIN_ALIGN_LANDMARKS = 3
 MIN_ALIGN_SPREAD_M = 1.0
 """Landmarks of a prior map that must have been seen, and how far apart, before the robot is placed in it."""
@@ -98,6 +102,7 @@ class StreamingSlam:
         self._graph = IncrementalSmoother(self._problem, noise, robust=robust)
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._older = np.zeros((0, 3))
         self._n_poses = 0
         self._next_stock = FIRST_STOCK
         self._scale = 1.0
@@ -123,7 +128,7 @@ class StreamingSlam:
         self._n_poses += 1
         if self._n_poses == self._next_stock:
             self._take_stock()
-            self._next_stock *= 2
+            self._next_stock = min(2 * self._n_poses, self._n_poses + max(LONGEST_TREE, self._n_poses // 16))
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
         self.online_pose[row] = self._graph.last_pose() * [self._scale, self._scale, 1.0]
@@ -133,7 +138,7 @@ class StreamingSlam:
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
         problem = self._problem.until(self._n_poses)
-        estimate = self._graph.estimate()
+        estimate = self._estimate()
         noise, fit = self._noise, None
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
@@ -205,7 +210,7 @@ class StreamingSlam:
         """Optimum and noise levels of everything so far, then a new tree around them."""
         problem = self._problem.until(self._n_poses)
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        estimate = smoother.optimum(self._graph.estimate(), iterations=10, tolerance=1e-4)
+        estimate = smoother.optimum(self._estimate(), iterations=10, tolerance=1e-4)
         if self._estimate_noise:
             marginals = smoother.marginals(estimate)
             weights = smoother.inlier_probability(estimate)
@@ -215,8 +220,11 @@ class StreamingSlam:
         self._restart(estimate)
 
     def _restart(self, estimate: Estimate) -> None:
-        self._landmark = estimate.landmark
-        self._graph.restart(estimate, self._noise, self._problem)
+        self._landmark, self._older = estimate.landmark, estimate.pose
+        self._graph.restart(estimate, self._noise, self._problem, keep=KEPT)
+
+    def _estimate(self) -> Estimate:
+        return self._graph.estimate(self._older)
 
     def _can_align(self, *, final: bool = False) -> bool:
         """Enough landmarks of the prior map seen to know where in it the robot is; two must do at the end."""
@@ -231,7 +239,7 @@ class StreamingSlam:
         """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
         prior_map = self._prior_map
         assert prior_map is not None
-        estimate = self._graph.estimate()
+        estimate = self._estimate()
         both = prior_map.given & estimate.known
         pose_map_world = _rigid(estimate.landmark[both], prior_map.mean[both])
         moved = Estimate(
