@@ -1,0 +1,227 @@
+"""The whole run against gtsam's batch solvers of the same graph: Levenberg-Marquardt and its marginals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from problems import default_prior, slow_detection
+from recordings import building, first_seconds
+
+from evermap import se2
+from evermap.slam.arrow import Smoother
+from evermap.slam.isam import STATES_KEY, IncrementalSmoother, frame_factor
+from evermap.slam.kernels import integrate_odometry
+from evermap.slam.noise import START
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.session import prepare
+from evermap.slam.streaming import StreamingSlam
+from evermap.types import Recording
+
+NOISE = replace(START, detection=np.array([0.03, 0.01]), odometry=np.array([0.02, 0.02, 0.01, 0.015, 0.02]))
+
+
+def pose_key(row: int) -> int:
+    return int(gtsam.symbol("x", row))
+
+
+def landmark_key(row: int) -> int:
+    return int(gtsam.symbol("l", row))
+
+
+def graph_of(problem: Problem, noise: Noise, *, heavy: bool) -> gtsam.NonlinearFactorGraph:
+    """All frames and priors of a problem."""
+    graph = gtsam.NonlinearFactorGraph()
+    prior = problem.prior
+    graph.add(gtsam.PriorFactorVector(STATES_KEY, prior.mean, gtsam.noiseModel.Diagonal.Sigmas(prior.sigma)))
+    held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
+    graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*problem.start_pose), held))
+    for j in range(len(problem.landmark_mean)):
+        information = problem.landmark_information[j]
+        if information.any():
+            noise_model = gtsam.noiseModel.Gaussian.Information(information)
+            graph.add(gtsam.PriorFactorPoint2(landmark_key(j), problem.landmark_mean[j], noise_model))
+    for row in range(len(problem.stamp_s)):
+        detections = np.flatnonzero(problem.pose_row == row)
+        graph.add(frame_factor(problem, noise, row, detections, before=row > 0, heavy=heavy))
+    return graph
+
+
+def as_values(estimate: Estimate) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(STATES_KEY, estimate.states)
+    for row, pose in enumerate(estimate.pose):
+        values.insert(pose_key(row), gtsam.Pose2(*pose))
+    for j in np.flatnonzero(estimate.known):
+        values.insert(landmark_key(j), estimate.landmark[j])
+    return values
+
+
+def as_estimate(values: gtsam.Values, like: Estimate) -> Estimate:
+    at = [values.atPose2(pose_key(row)) for row in range(len(like.pose))]
+    landmark = np.full_like(like.landmark, np.nan)
+    for j in np.flatnonzero(like.known):
+        landmark[j] = values.atPoint2(landmark_key(j))
+    return Estimate(np.array([[p.x(), p.y(), p.theta()] for p in at]), landmark, values.atVector(STATES_KEY))
+
+
+def levenberg_marquardt(graph: gtsam.NonlinearFactorGraph, start: Estimate) -> gtsam.Values:
+    """To the last digit: it stops when the error stalls, which re-weighted residuals do early."""
+    values = gtsam.LevenbergMarquardtOptimizer(graph, as_values(start)).optimize()
+    for _ in range(10):
+        values = values.retract(graph.linearize(values).optimize())
+    return values
+
+
+@dataclass
+class Run:
+    """A streamed recording, and what gtsam makes of the same graph."""
+
+    problem: Problem
+    streamed: Estimate
+    smoothed: Estimate
+    marginals: Marginals
+    lm: Estimate
+    gtsam_marginals: Any
+
+
+def solve_both(recording: Recording, *, robust: bool, with_map: bool = False) -> Run:
+    """Stream, smooth, and hand the same graph to gtsam."""
+    prepared = prepare(recording, recording.true_landmarks if with_map else None)
+    slam = StreamingSlam(
+        prepared.problem, NOISE, default_prior(), prior_map=prepared.prior_map, robust=robust, estimate_noise=False
+    )
+    for _ in prepared.problem.stamp_s:
+        slam.step()
+    streamed = slam._estimate()
+    outcome = slam.finish()
+    assert outcome.aligned == with_map
+    problem = outcome.problem
+    smoother = Smoother(problem, NOISE, heavy=robust, robust=robust)
+    smoothed = smoother.optimum(outcome.graph_estimate, tolerance=1e-8)
+    graph = graph_of(problem, NOISE, heavy=robust)
+    values = levenberg_marquardt(graph, streamed)
+    return Run(
+        problem,
+        streamed,
+        smoothed,
+        smoother.marginals(smoothed),
+        as_estimate(values, smoothed),
+        gtsam.Marginals(graph, values),
+    )
+
+
+CASES = ["quadratic", "robust", "map", "mrclam"]
+
+
+@pytest.fixture(scope="module", params=CASES)
+def run(request) -> Run:
+    if request.param == "mrclam":
+        from evermap.io import read_recording
+
+        zipped = request.getfixturevalue("shared_data") / "mrclam" / "MRCLAM_Dataset6.zip"
+        return solve_both(first_seconds(read_recording(zipped, robot=2), 60.0), robust=True)
+    faults = 0.0 if request.param == "quadratic" else 0.01
+    recording = building(3, patrol_s=50.0, faults=faults).sessions[0]
+    return solve_both(recording, robust=request.param != "quadratic", with_map=request.param == "map")
+
+
+def test_batch_optimum_is_gtsams(run):
+    assert np.abs(se2.between(run.lm.pose, run.smoothed.pose)).max() < 1e-5
+    assert np.nanmax(np.abs(run.lm.landmark - run.smoothed.landmark)) < 1e-5
+    assert np.array_equal(run.lm.known, run.smoothed.known)
+    assert np.abs(run.lm.states - run.smoothed.states).max() < 1e-5
+
+
+def assert_same_covariance(found, expected):
+    """To 1e-4 of the standard deviations."""
+    sigma = np.sqrt(np.diag(expected))
+    assert np.abs((found - expected) / np.outer(sigma, sigma)).max() < 1e-4
+
+
+def test_covariances_are_gtsams(run):
+    for row in range(1, len(run.smoothed.pose)):
+        assert_same_covariance(run.marginals.pose[row], run.gtsam_marginals.marginalCovariance(pose_key(row)))
+    for j in np.flatnonzero(run.smoothed.known):
+        assert_same_covariance(run.marginals.landmark[j], run.gtsam_marginals.marginalCovariance(landmark_key(j)))
+    assert_same_covariance(run.marginals.states, run.gtsam_marginals.marginalCovariance(STATES_KEY))
+
+
+def test_joint_covariances_are_gtsams(run):
+    """Of consecutive poses, and of a pose with a landmark and the states."""
+    n = len(run.smoothed.pose)
+    for row in (n // 3, n // 2, n - 2):
+        j = int(run.problem.landmark_row[run.problem.pose_row == row][0])
+        keys = [pose_key(row), pose_key(row + 1), landmark_key(j), STATES_KEY]
+        whole = run.gtsam_marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+        marginals = run.marginals
+        ours = np.block(
+            [[marginals.pose[row], marginals.consecutive[row]], [marginals.consecutive[row].T, marginals.pose[row + 1]]]
+        )
+        theirs = np.block([[whole.at(a, b) for b in keys[:2]] for a in keys[:2]])
+        assert_same_covariance(ours, theirs)
+        columns = [2 * j, 2 * j + 1, *range(marginals.shared.shape[0] - 9, marginals.shared.shape[0])]
+        theirs = np.hstack([whole.at(keys[0], keys[2]), whole.at(keys[0], STATES_KEY)])
+        sigma = np.outer(np.sqrt(np.diag(marginals.pose[row])), np.sqrt(np.diag(marginals.shared))[columns])
+        assert np.abs((marginals.pose_shared[row][:, columns] - theirs) / sigma).max() < 1e-4
+
+
+def test_streaming_ends_near_the_batch_optimum(run):
+    """iSAM2 does not relinearise what moved little: what remains is small beside the uncertainty."""
+    gap = se2.log(se2.between(run.lm.pose, run.streamed.pose))
+    sigma = np.sqrt(np.einsum("nii->ni", run.marginals.pose))
+    assert np.abs(gap[1:] / sigma[1:]).max() < 0.7
+    assert np.sqrt((gap[:, :2] ** 2).sum(axis=1).mean()) < 0.05
+
+
+@pytest.mark.parametrize("keep", [1000, 10])
+@pytest.mark.parametrize("robust", [False, True])
+def test_innovations_are_those_of_gtsams_marginals(robust, keep):
+    """S of the next frame from the marginals of the graph with the next pose in it, derivatives by differences."""
+    recording = building(5, patrol_s=25.0).sessions[0]
+    whole = replace(prepare(recording).problem, prior=default_prior().without_scale())
+    row = 50
+    problem = whole.until(row)
+    known = np.unique(problem.landmark_row)
+    slam = StreamingSlam(whole, NOISE, default_prior(), robust=robust, estimate_noise=False)
+    for _ in range(row):
+        slam.step()
+    optimum = Smoother(problem, NOISE, heavy=robust, robust=robust).optimum(slam._estimate(), tolerance=1e-9)
+    smoother = IncrementalSmoother(whole, NOISE, robust=robust)
+    smoother.restart(optimum, NOISE, whole, keep=keep)
+    detections = np.flatnonzero((whole.pose_row == row) & np.isin(whole.landmark_row, known))
+    assert len(detections) >= 2
+    increment, motion, kinds, covariance = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
+    drive, stamps = whole.drive, whole.stamp_s
+    integrate_odometry(
+        drive.stamp_s, drive.velocity, drive.unknown, stamps[row - 1], stamps[row], optimum.states,
+        increment, motion, kinds, covariance,
+    )  # fmt: skip
+    covariance += np.tensordot(NOISE.odometry**2, kinds, 1)
+    motion *= whole.prior.free[5:]
+    nis, predicted_covariance = smoother.innovations(row, increment, motion, covariance, detections)
+
+    graph = graph_of(problem, NOISE, heavy=robust)
+    graph.add(frame_factor(whole, NOISE, row, np.arange(0), before=True, heavy=robust))
+    pose = se2.compose(optimum.pose[-1], increment)
+    marginals = gtsam.Marginals(graph, as_values(replace(optimum, pose=np.vstack([optimum.pose, pose]))))
+    assert_same_covariance(predicted_covariance, marginals.marginalCovariance(pose_key(row)))
+    for k, m in enumerate(detections):
+        j = int(whole.landmark_row[m])
+        keys = [pose_key(row), landmark_key(j), STATES_KEY]
+        joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+        full = np.block([[joint.at(a, b) for b in keys] for a in keys])
+
+        def predicted(step, j=j):
+            states = optimum.states + np.where(whole.prior.free, step[5:], 0.0)
+            at = se2.compose(pose, se2.exp(step[:3]))
+            return slow_detection(at, optimum.landmark[j] + step[3:5], states, whole.mount)
+
+        h = np.stack([(predicted(1e-6 * d) - predicted(-1e-6 * d)) / 2e-6 for d in np.eye(14)], axis=1)
+        s = h @ full @ h.T + np.diag(NOISE.detection**2)
+        innovation = whole.reading[m] - predicted(np.zeros(14))
+        innovation[1] = se2.wrap(innovation[1])
+        assert nis[k] == pytest.approx(innovation @ np.linalg.solve(s, innovation), rel=1e-3)
