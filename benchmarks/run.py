@@ -1,0 +1,154 @@
+"""All races, their ratios, and the committed baseline they are compared with.
+
+Contenders take turns in one process on one core, so that both meet the same machine in the same mood; the ratio of
+every turn is formed before the median is taken. A time alone says nothing about another machine and is only shown.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.contenders import CONTENDERS
+from benchmarks.memory import measure
+from benchmarks.world import circular_world
+from evermap.errors import InputError
+from evermap.io.atomic import write_atomic
+
+BASELINE = Path(__file__).resolve().parent / "baseline.json"
+N_POSES = 2000
+TURNS = 5
+_WARM_UP_POSES = 50
+
+METRICS: dict[str, tuple[str, float, str]] = {
+    "isam2_speed_ratio": ("higher", 0.25, "poses a second of IncrementalSmoother over plain gtsam ISAM2"),
+    "isam2_memory_ratio": ("lower", 0.25, "memory that streaming adds, over plain gtsam ISAM2"),
+    "batch_speed_ratio": ("higher", 0.25, "speed of Smoother (optimum and marginals) over gtsam LM and Marginals"),
+    "batch_memory_ratio": ("lower", 0.25, "memory that it adds, over gtsam LM and Marginals"),
+}
+"""Metric: which direction is better, relative tolerance, meaning."""
+
+
+def run(update_baseline: bool = False, *, n_poses: int = N_POSES, turns: int = TURNS) -> dict[str, Any]:
+    """Measure everything and compare it with the baseline.
+
+    Args:
+        update_baseline: make these measurements the baseline.
+        n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
+
+    Returns:
+        `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
+        (times and memory as they were, for information) and `regressions`, the names of metrics out of tolerance.
+
+    Raises:
+        InputError: the baseline is missing or damaged, and is not being updated.
+    """
+    measured: dict[str, float] = {}
+    shown: dict[str, Any] = {"n_poses": n_poses, "turns": turns}
+    for race in CONTENDERS:
+        measured[f"{race}_speed_ratio"], speeds = _speed(race, n_poses, turns)
+        measured[f"{race}_memory_ratio"], memory = _memory(race, n_poses)
+        shown[race] = speeds | memory
+    if update_baseline:
+        write_atomic(BASELINE, json.dumps(_as_baseline(measured), indent=2) + "\n")
+    metrics = compare(measured, read_baseline())
+    return {
+        "metrics": metrics,
+        "shown": shown,
+        "regressions": [row["metric"] for row in metrics if row["regression"]],
+    }
+
+
+def read_baseline(path: Path = BASELINE) -> dict[str, dict[str, Any]]:
+    """The committed baseline by metric: direction, tolerance, value.
+
+    Raises:
+        InputError: it is missing, damaged, or lacks a metric.
+    """
+    hint = "evermap bench --update-baseline"
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["metrics"]
+        baseline = {row["metric"]: {key: row[key] for key in ("direction", "tolerance", "value")} for row in rows}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("is no benchmark baseline", path=path, hint=hint) from error
+    lacking = [name for name in METRICS if name not in baseline]
+    if lacking:
+        raise InputError(f"lacks {', '.join(lacking)}", path=path, hint=hint)
+    return baseline
+
+
+def compare(measured: Mapping[str, float], baseline: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Every metric beside its baseline; `change` is relative and positive where it got better."""
+    rows = []
+    for name, value in measured.items():
+        was = baseline[name]
+        better = 1.0 if was["direction"] == "higher" else -1.0
+        change = better * (value / was["value"] - 1.0)
+        rows.append(
+            {
+                "metric": name,
+                "value": value,
+                "baseline": was["value"],
+                "direction": was["direction"],
+                "tolerance": was["tolerance"],
+                "change": change,
+                "regression": change < -was["tolerance"],
+            }
+        )
+    return rows
+
+
+def as_text(measured: Mapping[str, Any]) -> str:
+    """The comparison as aligned text, regressions marked, with the times behind it below."""
+    lines = [f"{'metric':<20} {'value':>7} {'baseline':>9} {'change':>8} {'allowed':>8}"]
+    for row in measured["metrics"]:
+        mark = "  REGRESSION" if row["regression"] else ""
+        allowed = f"-{row['tolerance']:.0%}"
+        numbers = f"{row['value']:>7.3f} {row['baseline']:>9.3f} {row['change']:>+8.0%} {allowed:>8}"
+        lines.append(f"{row['metric']:<20} {numbers}{mark}")
+        lines.append(f"  {METRICS[row['metric']][2]} ({row['direction']} is better)")
+    shown = measured["shown"]
+    lines += ["", f"on this machine now, {shown['n_poses']} poses, median of {shown['turns']} turns (for information):"]
+    for race in CONTENDERS:
+        for contender in ("evermap", "gtsam"):
+            pace, memory = shown[race][f"{contender}_poses_per_s"], shown[race][f"{contender}_memory_mb"]
+            lines.append(f"  {race:<6} {contender:<8} {pace:>8.0f} poses/s  {memory:>6.1f} MB")
+    verdict = ", ".join(measured["regressions"])
+    lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
+    return "\n".join(lines)
+
+
+def _speed(race: str, n_poses: int, turns: int) -> tuple[float, dict[str, float]]:
+    """Median over the turns of gtsam's time over evermap's, and the paces."""
+    ours, theirs = CONTENDERS[race]
+    calibrated = race == "isam2"  # streaming estimates the calibration too, as it does in earnest
+    for contender in (ours, theirs):
+        contender(circular_world(_WARM_UP_POSES, calibrated=calibrated))
+    world = circular_world(n_poses, calibrated=calibrated)
+    times = [(ours(world).elapsed_s, theirs(world).elapsed_s) for _ in range(turns)]
+    return statistics.median(their_s / our_s for our_s, their_s in times), {
+        "evermap_poses_per_s": n_poses / statistics.median(our_s for our_s, _ in times),
+        "gtsam_poses_per_s": n_poses / statistics.median(their_s for _, their_s in times),
+    }
+
+
+def _memory(race: str, n_poses: int) -> tuple[float, dict[str, float]]:
+    """Ratio of what the contenders' processes grew by, and both [MB]."""
+    grown, shown = {}, {}
+    for contender in ("evermap", "gtsam"):
+        found = measure(race, contender, n_poses)
+        grown[contender] = max(found["peak_mb"] - found["before_mb"], 0.1)
+        shown[f"{contender}_memory_mb"] = grown[contender]
+        shown[f"{contender}_peak_mb"] = found["peak_mb"]
+    return grown["evermap"] / grown["gtsam"], shown
+
+
+def _as_baseline(measured: Mapping[str, float]) -> dict[str, Any]:
+    rows = [
+        {"metric": name, "direction": direction, "tolerance": tolerance, "value": round(measured[name], 4)}
+        for name, (direction, tolerance, _) in METRICS.items()
+    ]
+    return {"n_poses": N_POSES, "metrics": rows}

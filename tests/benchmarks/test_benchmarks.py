@@ -1,0 +1,142 @@
+"""The contenders do the same work, and the baseline can be trusted. No time is asserted."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap import se2
+from evermap.cli.bench import load_benchmarks
+from evermap.errors import InputError
+
+SMALL = 150
+
+
+@pytest.fixture(scope="module")
+def run() -> ModuleType:
+    return load_benchmarks()
+
+
+@pytest.fixture(scope="module")
+def worlds(run: ModuleType) -> dict[bool, Any]:
+    return {calibrated: run.circular_world(SMALL, calibrated=calibrated) for calibrated in (False, True)}
+
+
+def apart(one: Any, other: Any) -> float:
+    """Largest distance between two answers' poses and landmarks [m]."""
+    both = zip((one.pose[:, :2], one.landmark), (other.pose[:, :2], other.landmark), strict=True)
+    return max(float(np.nanmax(np.linalg.norm(a - b, axis=1))) for a, b in both)
+
+
+@pytest.mark.parametrize("race", ["isam2", "batch"])
+def test_contenders_find_the_same_positions(run: ModuleType, worlds: dict[bool, Any], race: str) -> None:
+    ours, theirs = (contender(worlds[False]) for contender in run.CONTENDERS[race])
+    assert apart(ours, theirs) < 0.01
+    np.testing.assert_array_equal(np.isfinite(ours.landmark), np.isfinite(theirs.landmark))
+
+
+def test_both_batch_contenders_reach_the_same_uncertainty(run: ModuleType, worlds: dict[bool, Any]) -> None:
+    ours, theirs = (contender(worlds[False]) for contender in run.CONTENDERS["batch"])
+    scale = np.abs(theirs.pose_covariance).max()
+    np.testing.assert_allclose(ours.pose_covariance, theirs.pose_covariance, atol=0.01 * scale)
+
+
+def test_streaming_and_batch_agree(run: ModuleType, worlds: dict[bool, Any]) -> None:
+    """As far as they can: iSAM2 lets values drift by its threshold before it linearises anew."""
+    assert apart(run.CONTENDERS["isam2"][1](worlds[False]), run.CONTENDERS["batch"][1](worlds[False])) < 0.05
+
+
+def test_free_calibration_explains_the_readings_no_worse(run: ModuleType, worlds: dict[bool, Any]) -> None:
+    """With nominal sensors the calibrated answer is as near to the truth as the other, give or take its own doubt."""
+    world = worlds[True]
+    ours, theirs = (contender(world) for contender in run.CONTENDERS["isam2"])
+    off = [np.linalg.norm(answer.pose[:, :2] - world.pose[:, :2], axis=1).mean() for answer in (ours, theirs)]
+    assert off[0] < 2.0 * off[1] + 0.05
+
+
+def test_worlds_are_what_they_say(worlds: dict[bool, Any]) -> None:
+    world = worlds[True]
+    assert world.problem.stamp_s.shape == (SMALL,)
+    assert world.problem.prior.free.any()
+    assert not worlds[False].problem.prior.free.any()
+    np.testing.assert_array_equal(world.problem.reading, worlds[False].problem.reading)
+    assert np.linalg.norm(np.diff(world.pose[:, :2], axis=0), axis=1).max() < 0.25
+    # the increments that the other side is given are the true motion, but for noise as large as they say
+    off = se2.log(se2.between(se2.between(world.pose[:-1], world.pose[1:]), world.increment))
+    squared = np.einsum("ki,kij,kj->k", off, np.linalg.inv(world.covariance), off)
+    assert 2.0 < squared.mean() < 4.0
+
+
+def test_baseline_is_complete(run: ModuleType) -> None:
+    baseline = run.read_baseline()
+    assert set(baseline) == set(run.METRICS)
+    for name, row in baseline.items():
+        assert row["direction"] in ("higher", "lower")
+        assert row["direction"] == run.METRICS[name][0]
+        assert 0.0 < row["tolerance"] < 1.0
+        assert row["value"] > 0.0
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "{}", '{"metrics": [{"metric": "isam2_speed_ratio"}]}', '{"metrics": []}', "[1"]
+)
+def test_damaged_baseline_is_one_line(run: ModuleType, tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "baseline.json"
+    path.write_text(damage)
+    with pytest.raises(InputError, match=r"baseline.json: .*--update-baseline"):
+        run.read_baseline(path)
+
+
+@pytest.mark.parametrize(
+    ("direction", "value", "change", "regression"),
+    [("higher", 0.8, -0.2, False), ("higher", 0.7, -0.3, True), ("lower", 1.3, -0.3, True), ("lower", 0.5, 0.5, False)],
+)
+def test_regressions_are_those_beyond_the_tolerance(
+    run: ModuleType, direction: str, value: float, change: float, regression: bool
+) -> None:
+    (row,) = run.compare({"m": value}, {"m": {"direction": direction, "tolerance": 0.25, "value": 1.0}})
+    assert row["change"] == pytest.approx(change)
+    assert row["regression"] is regression
+
+
+def test_memory_is_measured_in_a_process_of_its_own(run: ModuleType) -> None:
+    """The child's own peak, not its parent's: a parent with a large array changes nothing."""
+    ballast = np.ones(60_000_000)
+    found = run.measure("isam2", "gtsam", 60)
+    assert 10.0 < found["before_mb"] <= found["peak_mb"] < ballast.nbytes / 1e6 + 100.0
+
+
+@pytest.mark.slow
+def test_a_small_run_writes_compares_and_reports(
+    run: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, json_of: Callable[[Any], Any]
+) -> None:
+    monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
+    monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
+    measured = run.run(update_baseline=True, n_poses=80, turns=1)
+    assert measured["regressions"] == []
+    assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)
+    assert all(abs(row["change"]) < 1e-3 for row in measured["metrics"])
+    assert json_of(measured) == measured
+    text = run.as_text(measured)
+    assert text.endswith("no regression")
+    assert len(re.findall(r"poses/s", text)) == 4
+    measured["metrics"][0]["regression"] = True
+    measured["regressions"] = ["isam2_speed_ratio"]
+    assert "REGRESSION" in run.as_text(measured)
+    assert run.as_text(measured).endswith("worse than the baseline allows: isam2_speed_ratio")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return {row["metric"]: row for row in json.loads(path.read_text())["metrics"]}
+
+
+@pytest.fixture
+def json_of() -> Callable[[Any], Any]:
+    return lambda value: json.loads(json.dumps(value, allow_nan=False))
