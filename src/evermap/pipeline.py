@@ -46,10 +46,12 @@ def run_slam(
     """
     from evermap.config import Config
     from evermap.slam.session import prepare
+    from evermap.slam.warmup import warm_up
 
     config = config or Config()
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     prepared = prepare(recording, prior_map)
+    warm_up()
     prior, noise = _beliefs(recording, config)
     slam = _estimator(prepared, prior, noise, config)
     step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)

@@ -9,10 +9,10 @@ from typing import Any
 Row = Mapping[str, Any]
 
 SETTING_NAMES = {
-    "calibrated": "unknown map, sensors calibrated (default)",
-    "plain": "unknown map, readings believed (`--sensor-model plain`)",
-    "true_map": "true map given, 0.02 m (`--prior-map truth`)",
-    "odometry": "odometry alone, as reported",
+    "calibrated": "unknown map",
+    "plain": "unknown map, `plain`",
+    "true_map": "true map given",
+    "odometry": "odometry alone",
 }
 
 
@@ -149,15 +149,15 @@ def _speed(rows: Sequence[Row], averages: Sequence[Row]) -> str:
 
 
 def _by_setting(columns: Sequence[tuple[str, str, str]], rows: Sequence[Row], averages: Sequence[Row]) -> str:
-    """Rows of a setting together, their mean last; settings in the order of `SETTING_NAMES`."""
+    """Rows of a setting together, their mean last; no column without a value."""
+    known = [column for column in columns if any(_value(row, column[1]) is not None for row in rows)]
     lines: list[tuple[str, ...]] = []
     for setting, title in SETTING_NAMES.items():
-        group = [row for row in rows if row["setting"] == setting]
-        mean = [row for row in averages if row["setting"] == setting]
-        for row in [*group, *mean]:
-            cells = (_number(form, _value(row, key)) for _, key, form in columns)
+        group = [row for row in (*rows, *averages) if row["setting"] == setting]
+        for row in group:
+            cells = (_number(form, _value(row, key)) for _, key, form in known)
             lines.append((title, str(row.get("robot", "mean")), *cells))
-    return _table(("setting", "robot", *(title for title, _, _ in columns)), lines)
+    return _table(("setting", "robot", *(title for title, _, _ in known)), lines)
 
 
 def _value(row: Row, key: str) -> float | None:

@@ -18,6 +18,7 @@ from evermap.slam.isam import IncrementalSmoother
 from evermap.slam.kernels import integrate_odometry
 from evermap.slam.noise import NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.triangulate import outvoted, sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_STOCK = 40
@@ -25,7 +26,10 @@ FIRST_STOCK = 40
 KEPT = 100
 """Poses that stay in the incremental smoother after a stock-taking; older ones are summed up in one factor."""
 LONGEST_TREE = 400
-"""Poses after which stock is taken even if their number has not doubled; grows slowly, with the recording's 16th."""
+"""Poses in the tree after which the older ones are summed up; in long recordings a 16th of all poses."""
+SURPRISING_NIS = 50.0
+DISPUTED_AT = (2, 4, 8, 16)
+"""Comparisons of a landmark after which it is asked whether most of them were surprising."""
 MIN_ALIGN_LANDMARKS = 3
 MIN_ALIGN_SPREAD_M = 1.0
 """Landmarks of a prior map that must have been seen, and how far apart, before the robot is placed in it."""
@@ -102,9 +106,12 @@ class StreamingSlam:
         self._graph = IncrementalSmoother(self._problem, noise, robust=robust)
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
+        self._n_surprising = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._older = np.zeros((0, 3))
         self._n_poses = 0
         self._next_stock = FIRST_STOCK
+        self._tree_since = 0
         self._scale = 1.0
         self._aligned = False
         self._increment, self._motion = np.zeros(3), np.zeros((3, 4))
@@ -128,7 +135,11 @@ class StreamingSlam:
         self._n_poses += 1
         if self._n_poses == self._next_stock:
             self._take_stock()
-            self._next_stock = min(2 * self._n_poses, self._n_poses + max(LONGEST_TREE, self._n_poses // 16))
+            self._next_stock *= 2
+        elif self._robust and self._is_disputed(detections):
+            self._take_stock()
+        elif self._n_poses - self._tree_since >= max(LONGEST_TREE, self._n_poses // 16):
+            self._sum_up()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
         self.online_pose[row] = self._graph.last_pose() * [self._scale, self._scale, 1.0]
@@ -194,23 +205,31 @@ class StreamingSlam:
             row, self._increment, motion, self._odometry_covariance, known
         )
 
+        landmark = self._problem.landmark_row[known]
+        np.add.at(self._n_compared, landmark, 1)
+        np.add.at(self._n_surprising, landmark, self.nis[known] > SURPRISING_NIS)
+
+    def _is_disputed(self, detections: IntArray) -> bool:
+        """True where a young landmark surprises at most of its sightings: its first may have been another's."""
+        seen = np.unique(self._problem.landmark_row[detections])
+        young = np.isin(self._n_compared[seen], DISPUTED_AT)
+        return bool(np.any(young & (2 * self._n_surprising[seen] > self._n_compared[seen])))
+
     def _meet_new_landmarks(self, pose: FloatArray, states: FloatArray, detections: IntArray) -> None:
         """Where a landmark that is seen for the first time must be, by this one sighting."""
         for m in detections:
             j = self._problem.landmark_row[m]
-            if np.isfinite(self._landmark[j, 0]):
-                continue
-            reported_range, reported_bearing = self._problem.reading[m]
-            b = reported_bearing - states[4]
-            r = (reported_range - states[0]) / (1.0 + states[1] + states[2] * b + states[3] * b * b)
-            sensor = se2.compose(pose, self._problem.mount)
-            self._landmark[j] = se2.transform(sensor, np.array([r * np.cos(b), r * np.sin(b)]))
+            if np.isnan(self._landmark[j, 0]):
+                self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 
     def _take_stock(self) -> None:
         """Optimum and noise levels of everything so far, then a new tree around them."""
         problem = self._problem.until(self._n_poses)
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        estimate = smoother.optimum(self._estimate(), iterations=10, tolerance=1e-4)
+        estimate = self._estimate()
+        if self._robust:
+            estimate = outvoted(problem, estimate, smoother.inlier_probability(estimate))
+        estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
         if self._estimate_noise:
             marginals = smoother.marginals(estimate)
             weights = smoother.inlier_probability(estimate)
@@ -219,8 +238,15 @@ class StreamingSlam:
         self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
         self._restart(estimate)
 
+    def _sum_up(self) -> None:
+        """A new tree of the last poses, with all before them relinearised into one factor."""
+        problem = self._problem.until(self._n_poses)
+        smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
+        self._restart(smoother.optimum(self._estimate(), iterations=2))
+
     def _restart(self, estimate: Estimate) -> None:
         self._landmark, self._older = estimate.landmark, estimate.pose
+        self._tree_since = self._n_poses
         self._graph.restart(estimate, self._noise, self._problem, keep=KEPT)
 
     def _estimate(self) -> Estimate:

@@ -1,0 +1,52 @@
+"""Compile (or load) the kernels before the first frame, so that no frame has to wait for it."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from evermap.slam.bridge import bridged, dead_reckoned
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.noise import START
+from evermap.slam.problem import Drive, Problem
+from evermap.slam.streaming import FIRST_STOCK, StreamingSlam
+
+
+@functools.cache
+def warm_up() -> None:
+    """A drive past one landmark, through everything that is compiled. Once in a process; compiled code is kept."""
+    count = FIRST_STOCK + 2
+    stamps = np.linspace(0.0, 0.1 * count, count)
+    prior = CalibrationPrior.from_settings(calibrated=True, fix={})
+    forward = 0.1 * stamps
+    problem = Problem(
+        stamp_s=stamps,
+        drive=Drive.from_rows(stamps, np.tile([0.1, 0.0, 0.0], (count, 1))),
+        pose_row=np.arange(count),
+        landmark_row=np.zeros(count, dtype=np.int64),
+        reading=np.column_stack([np.hypot(3.0 - forward, 1.0), np.arctan2(1.0, 3.0 - forward)]),
+        sigma_given=np.full((count, 2), np.nan),
+        mount=np.zeros(3),
+        prior=prior,
+        start_pose=np.zeros(3),
+        start_information=1e8,
+        landmark_mean=np.zeros((1, 2)),
+        landmark_information=np.zeros((1, 2, 2)),
+    )
+    slam = StreamingSlam(problem, START, prior)
+    for _ in range(count):
+        slam.step()
+    outcome = slam.finish()
+    marginals = outcome.graph_marginals
+    bridged(
+        stamps[:2],
+        stamps,
+        outcome.graph_estimate.pose,
+        marginals.pose,
+        marginals.consecutive,
+        problem.drive,
+        outcome.graph_estimate.states,
+        START,
+    )
+    dead_reckoned(stamps[:2], problem.drive, prior.mean, START)
