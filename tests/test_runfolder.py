@@ -242,12 +242,19 @@ def test_changes_are_written_a_line_each(run, tmp_path):
 
 def test_summary_of_an_interrupted_run_counts_what_was_done(run):
     recording, result = run
-    part = dataclasses.replace(result, interrupted=True, step_s=result.step_s[:101])
+    online = result.online
+    done = dataclasses.replace(
+        online,
+        stamp_s=online.stamp_s[:101],
+        pose_world_robot=online.pose_world_robot[:101],
+        covariance=online.covariance[:101],
+    )
+    part = dataclasses.replace(result, interrupted=True, step_s=result.step_s[:101], online=done)
     info = RunInfo(processing_s=1.0)
     summary = summary_dict(
         recording, part, {}, config={}, info=info, timing=timing_dict(recording, part, info), outputs=[]
     )
     assert summary["interrupted"] is True
     assert summary["counts"]["frames_processed"] == 101
-    expected = recording.frames.stamp_s[100] - recording.frames.stamp_s[0]
+    expected = online.stamp_s[100] - online.stamp_s[0]
     assert summary["timing"]["real_time_factor"] == pytest.approx(expected)

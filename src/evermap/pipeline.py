@@ -46,7 +46,6 @@ def run_slam(
     """
     from evermap.config import Config
     from evermap.slam.session import prepare
-    from evermap.slam.warmup import warm_up
 
     config = config or Config()
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
@@ -56,6 +55,16 @@ def run_slam(
     slam = _estimator(prepared, prior, noise, config)
     step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
     return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them where that was done before; `run_slam` does it by itself.
+
+    Worth calling ahead where the first frame must not wait: compiling takes half a minute, once on a machine.
+    """
+    from evermap.slam.warmup import warm_up
+
+    warm_up()
 
 
 def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, Noise]:

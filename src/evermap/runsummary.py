@@ -139,9 +139,7 @@ def peak_memory_mb() -> float | None:
 
 def _processed_s(recording: Recording, result: SlamResult) -> float:
     """Duration of the part that was processed."""
-    stamps = recording.frames.stamp_s
-    if result.interrupted:
-        stamps = stamps[: len(result.step_s)]
+    stamps = result.online.stamp_s if result.interrupted else recording.frames.stamp_s
     return float(stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0
 
 

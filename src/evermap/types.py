@@ -327,7 +327,7 @@ class SlamResult:
         parameters: calibration states and noise levels.
         innovations: consistency of every detection.
         misses: expected and not detected.
-        step_s: (F,) processing time of every step.
+        step_s: (N,) processing time of every step, one a pose of `online`.
         dead_reckoning: odometry alone from the first pose, at the stamps of `trajectory`.
         warnings: counted remarks of the estimator.
         interrupted: True where the run was stopped before the end of the recording.

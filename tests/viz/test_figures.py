@@ -132,9 +132,10 @@ def test_runs_with_little_to_show_still_draw(run):
         innovations=Innovations(empty, none, none, empty, empty),
         parameters=(),
         online=Trajectory(empty, np.zeros((0, 3)), np.zeros((0, 3, 3))),
+        step_s=empty,
     )
     drawn = draw_figures(bare, nothing, compare_with_truth(bare, nothing))
-    assert [figure.name for figure in drawn] == ["map", "errors", "latency"]
+    assert [figure.name for figure in drawn] == ["map", "errors"]
     alone = dataclasses.replace(recording, truth=None)
     assert len(draw_figures(alone, result, compare_with_truth(alone, result))) == 5
 

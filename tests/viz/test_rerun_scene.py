@@ -93,7 +93,12 @@ def test_large_maps_and_empty_runs_are_written(run, tmp_path):
     assert path.stat().st_size < 6e6
     empty = Trajectory(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
     nothing = dataclasses.replace(
-        result, trajectory=empty, dead_reckoning=empty, online=empty, landmarks=Landmarks.at([], np.zeros((0, 2)))
+        result,
+        trajectory=empty,
+        dead_reckoning=empty,
+        online=empty,
+        step_s=np.zeros(0),
+        landmarks=Landmarks.at([], np.zeros((0, 2))),
     )
     write_scene(recording, nothing, tmp_path / "empty.rrd")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evermap.cli.summary import show_run
-from evermap.cli.terminal import command_line, progress_bar, say, warn
+from evermap.cli.terminal import command_line, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -119,6 +119,7 @@ def run_and_write(
     from evermap.pipeline import run_slam
     from evermap.runfolder import RunInfo, write_run
 
+    warm_up()
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)

@@ -6,6 +6,7 @@ import json
 import os
 import shlex
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,6 +16,9 @@ from typing import Any, TextIO
 import typer
 
 from evermap.errors import ConfigError
+
+PATIENCE_S = 4.0
+"""Loading compiled kernels takes about a second, compiling them much longer."""
 
 Progress = Callable[[float, float], None]
 """Called with what is done and the total, in seconds of the recording."""
@@ -53,6 +57,20 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     for name, value in rows:
         table.add_row(name, value)
     Console().print(table)
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them; says so on a machine where that takes a while."""
+    from evermap.pipeline import warm_up as compile_kernels
+
+    note = "compiling the kernels, once on this machine; this takes about half a minute"
+    timer = threading.Timer(PATIENCE_S, say, [note])
+    timer.daemon = True
+    timer.start()
+    try:
+        compile_kernels()
+    finally:
+        timer.cancel()
 
 
 @contextmanager

@@ -251,10 +251,9 @@ def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluat
         ends = innovations.stamp_s[rows[[0, -1]]]
         for name, level in zip(("low", "high"), chi2_interval(2), strict=True):
             _plot(stream, f"nis/{name}", ends, np.full(2, np.log10(level)), MUTED)
-    count = min(len(result.step_s), len(recording.frames))
-    if count:
-        rows = _thin(count)
-        _plot(stream, "latency/step_ms", recording.frames.stamp_s[rows], 1e3 * result.step_s[rows], ESTIMATE)
+    if len(result.step_s):
+        rows = _thin(len(result.step_s))
+        _plot(stream, "latency/step_ms", result.online.stamp_s[rows], 1e3 * result.step_s[rows], ESTIMATE)
     poses = evaluation.poses
     if poses is not None:
         rows = _thin(len(poses.stamp_s))

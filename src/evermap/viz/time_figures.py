@@ -137,15 +137,22 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
 
 def draw_latency(recording: Recording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
     """Processing time of every step, with the median, the 99th percentile and the time there was."""
-    count = min(len(result.step_s), len(recording.frames))
+    count = len(result.step_s)
     if count == 0:
         return None
-    stamps, step_ms = recording.frames.stamp_s[:count], 1e3 * np.maximum(result.step_s[:count], 1e-7)
+    stamps, step_ms = result.online.stamp_s, 1e3 * np.maximum(result.step_s, 1e-7)
     p50, p99 = np.percentile(step_ms, [50, 99])
     figure = new_figure(7.2, 2.7)
     axes = figure.add_subplot()
     axes.plot(
-        stamps - stamps[0], step_ms, "o", color=ESTIMATE, ms=2, mec="none", alpha=0.4, rasterized=count > _RASTER_FROM
+        stamps - _start(recording),
+        step_ms,
+        "o",
+        color=ESTIMATE,
+        ms=2,
+        mec="none",
+        alpha=0.4,
+        rasterized=count > _RASTER_FROM,
     )
     axes.set_yscale("log")
     lines = [(p50, INK, f"median {p50:.2g} ms"), (p99, ALERT, f"99% {p99:.2g} ms")]
