@@ -8,7 +8,7 @@ import pytest
 
 from evermap import se2
 from evermap.metrics.landmarks import evaluate_landmarks
-from evermap.metrics.summary import evaluate
+from evermap.metrics.summary import compare_with_truth, evaluate, in_view, metrics_dict
 from evermap.types import Innovations, Landmarks
 
 STABLE_KEYS = {
@@ -98,3 +98,23 @@ def test_summary_of_a_run_without_innovations(run):
     assert summary["nis_mean"] is None
     assert summary["nis_in_band_share"] is None
     json.dumps(summary, allow_nan=False)
+
+
+def test_errors_in_view_are_those_near_a_sighting(run):
+    recording, result = run
+    blind = np.isin(recording.detections.frame, np.arange(200, 900))  # nothing seen for 700 frames
+    detections = dataclasses.replace(
+        recording.detections,
+        **{f.name: getattr(recording.detections, f.name)[~blind] for f in dataclasses.fields(recording.detections)},
+    )
+    recording = dataclasses.replace(recording, detections=detections)
+    evaluation = compare_with_truth(recording, result)
+    poses = evaluation.poses
+    sightings = [recording.frames.stamp_s[row] for row in detections.frame]
+    near = [min(abs(stamp - seen) for seen in sightings) <= 1.0 for stamp in poses.stamp_s]
+    assert 0 < sum(near) < len(near)
+    np.testing.assert_array_equal(in_view(recording, poses.stamp_s), near)
+    metrics = metrics_dict(evaluation)
+    heading = [error for error, seen in zip(poses.heading_error_rad, near, strict=True) if seen]
+    assert metrics["heading_rmse_in_view_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(heading)))))
+    assert metrics["in_view_share"] == pytest.approx(sum(near) / len(near))

@@ -12,6 +12,7 @@ from evermap.cli.terminal import print_json, print_table
 _ROWS = (
     ("metrics", "pose_rmse_m", "position error, RMSE", "{:.3f} m"),
     ("metrics", "heading_rmse_deg", "heading error, RMSE", "{:.2f} deg"),
+    ("metrics", "heading_rmse_in_view_deg", "  while landmarks were in view", "{:.2f} deg"),
     ("metrics", "landmark_rmse_m", "landmark error, RMSE", "{:.3f} m"),
     ("metrics", "dead_reckoning_rmse_m", "odometry alone, RMSE", "{:.3f} m"),
     ("metrics", "nis_mean", "innovations (2 is consistent)", "{:.2f}"),

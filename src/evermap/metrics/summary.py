@@ -11,9 +11,11 @@ import numpy as np
 from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
-from evermap.types import FloatArray, Recording, SlamResult
+from evermap.types import BoolArray, FloatArray, Recording, SlamResult
 
 RATE_HZ = 2.0
+IN_VIEW_S = 1.0
+"""A stamp counts as 'in view' this close to a frame with a landmark."""
 ONLINE_MAX_GAP_S = 1.0
 
 
@@ -29,6 +31,7 @@ class Evaluation:
         landmarks_anchored: after the alignment that makes the first pose exact (for NEES).
         landmarks_own: after the landmarks' own alignment.
         nis: innovation consistency.
+        in_view: (K,) which of the scored stamps of `poses` are within `IN_VIEW_S` of a sighting.
         rate_hz: how densely truth was sampled.
     """
 
@@ -39,6 +42,7 @@ class Evaluation:
     landmarks_anchored: LandmarkErrors | None
     landmarks_own: LandmarkErrors | None
     nis: NisSummary
+    in_view: BoolArray | None = None
     rate_hz: float = RATE_HZ
 
 
@@ -56,20 +60,37 @@ def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: flo
             if poses.pose_truth_anchor is not None:
                 anchored = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_anchor)
     nis = summarise_nis(result.innovations)
-    return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, rate_hz)
+    view = in_view(recording, poses.stamp_s) if poses is not None else None
+    return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, view, rate_hz)
+
+
+def in_view(recording: Recording, stamp_s: FloatArray) -> BoolArray:
+    """(K,) whether a landmark was seen within `IN_VIEW_S` before or after each stamp.
+
+    Where none was, only odometry speaks, and what it says wrongly no map can mend.
+    """
+    seen = recording.frames.stamp_s[np.unique(recording.detections.frame)]
+    if len(seen) == 0:
+        return np.zeros(len(stamp_s), dtype=np.bool_)
+    after = np.searchsorted(seen, stamp_s)
+    later = np.abs(seen[np.minimum(after, len(seen) - 1)] - stamp_s)
+    earlier = np.abs(seen[np.maximum(after - 1, 0)] - stamp_s)
+    near: BoolArray = np.minimum(earlier, later) <= IN_VIEW_S
+    return near
 
 
 def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
     """The stable keys of `metrics` in `summary.json`: plain floats, None where there is no truth, no key missing."""
     poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
     landmarks, own, nis = evaluation.landmarks, evaluation.landmarks_own, evaluation.nis
-    anchored = evaluation.landmarks_anchored
+    anchored, view = evaluation.landmarks_anchored, evaluation.in_view
     return {
         "pose_rmse_m": _number(poses and poses.rmse_m),
         "pose_mean_m": _number(poses and poses.mean_m),
         "pose_median_m": _number(poses and poses.median_m),
         "pose_max_m": _number(poses and poses.max_m),
         "heading_rmse_deg": _number(poses and poses.heading_rmse_deg),
+        **_view(poses, view),
         "drift_m_per_m": _number(poses and poses.drift_m_per_m),
         "online_pose_rmse_m": _number(online and online.rmse_m),
         "online_heading_rmse_deg": _number(online and online.heading_rmse_deg),
@@ -155,3 +176,14 @@ def _number(value: Any) -> float | None:
         return None
     number = float(value)
     return number if math.isfinite(number) else None
+
+
+def _view(poses: PoseErrors | None, view: BoolArray | None) -> dict[str, float | None]:
+    """Errors while landmarks were in view, and the share of that time."""
+    if poses is None or view is None or not view.any():
+        return {"pose_rmse_in_view_m": None, "heading_rmse_in_view_deg": None, "in_view_share": None}
+    return {
+        "pose_rmse_in_view_m": float(np.sqrt(np.mean(poses.position_error_m[view] ** 2))),
+        "heading_rmse_in_view_deg": float(np.degrees(np.sqrt(np.mean(poses.heading_error_rad[view] ** 2)))),
+        "in_view_share": float(np.mean(view)),
+    }
