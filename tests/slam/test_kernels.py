@@ -34,8 +34,8 @@ from evermap.slam.problem import SILENCE_S, SILENT_VARIANCE, Drive
 ONCE = FLOOR_VARIANCE * np.eye(3)
 """What every window has, however short."""
 
-settings.register_profile("kernels", deadline=None, max_examples=60)
-settings.load_profile("kernels")
+patiently = settings(deadline=None, max_examples=60)
+"""The first example waits for the compiler."""
 
 lengths = st.floats(-20.0, 20.0)
 angles = st.floats(-np.pi, np.pi)
@@ -91,6 +91,7 @@ def away_from_corners(pose, landmark, mount, reading):
     assume(abs(abs(se2.wrap(reading - bearing)) - np.pi) > 0.3)
 
 
+@patiently
 @given(poses, points, states, mounts, st.floats(0.1, 20.0), angles)
 def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -100,6 +101,7 @@ def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bear
     assert e[1] == pytest.approx(se2.wrap(expected[1]), abs=1e-10)
 
 
+@patiently
 @given(poses, points, states, mounts, angles)
 def test_detection_derivatives(pose, landmark, states, mount, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -128,6 +130,7 @@ def odometry(pose, following, increment):
     return e, j1, j2
 
 
+@patiently
 @given(poses, poses, poses)
 def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, increment):
     e, j1, j2 = odometry(pose, following, increment)
@@ -142,6 +145,7 @@ def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, in
     assert j2 == pytest.approx(by_following, rel=1e-5, abs=1e-6)
 
 
+@patiently
 @given(poses, poses)
 def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(pose, increment):
     following = se2.compose(pose, increment)
@@ -149,6 +153,7 @@ def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(
     assert by_increment == pytest.approx(-np.eye(3), abs=1e-6)
 
 
+@patiently
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-3, 2.5))
 def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, passed):
     out = integrated(drive, start, start + passed, states)
@@ -156,6 +161,7 @@ def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, pas
     assert out.increment == pytest.approx(expected, abs=1e-9)
 
 
+@patiently
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-2, 2.5))
 def test_increment_derivatives(drive, states, start, passed):
     """By delay, forward scale, turn scale and slip, as right perturbations of the increment."""
@@ -171,6 +177,7 @@ def test_increment_derivatives(drive, states, start, passed):
     assert out.jacobian == pytest.approx(central(perturbation, states[5:]), rel=1e-4, abs=1e-6)
 
 
+@patiently
 @given(drives(), states, st.floats(-0.5, 1.0), st.floats(1e-2, 1.5), st.floats(0.05, 0.95))
 def test_two_adjacent_windows_make_the_whole(drive, states, start, passed, share):
     middle, stop = start + share * passed, start + passed
@@ -280,6 +287,7 @@ def test_noise_counts_reported_distance_angle_and_time():
     assert out.noise[4] == pytest.approx(np.diag([0.0, 0.0, 3.0]), abs=1e-12)
 
 
+@patiently
 @given(
     st.floats(0.0, 300.0),
     st.one_of(st.floats(0.5, 50.0), st.just(7.0)),
