@@ -453,7 +453,6 @@ def test_a_blind_and_deaf_stretch_of_20_s_is_survived_and_admitted():
     assert np.all(error[(at > 16) & (at < 34)] < 4 * size[(at > 16) & (at < 34)])
 
 
-@pytest.mark.xfail(reason="a silent robot is thought to wander, but it drives on: far, and always the same way")
 def test_silent_odometry_alone_is_survived_and_admitted():
     recording = recording_of(0, faults=0.0)
     run = judge(without_odometry_between(recording, 10.0, 30.0), np.zeros(0))

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -127,7 +128,15 @@ def versions() -> dict[str, str]:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident size of this process so far [MB]; None where the system does not tell."""
+    """Largest resident size of this process so far [MB]; None where the system does not tell.
+
+    Linux counts the parent's size at the fork into `ru_maxrss`; the high-water mark of the address space does not.
+    """
+    status = Path("/proc/self/status")
+    if status.is_file():
+        marks = [line.split()[1] for line in status.read_text().splitlines() if line.startswith("VmHWM:")]
+        if marks:
+            return int(marks[0]) / 1e3
     try:
         import resource
         import sys

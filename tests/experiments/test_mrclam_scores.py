@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evermap.experiments.mrclam_scores import in_view, odometry_between_true_poses
+from evermap.experiments.mrclam_scores import odometry_between_true_poses
+from evermap.metrics.summary import in_view
 from evermap.slam.calibration import SPECS
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.types import (

@@ -325,7 +325,8 @@ def test_silences_become_standing_still_without_knowing():
     )
     expected = [velocity[1], velocity[2], np.zeros(3), velocity[3], velocity[4], np.zeros(3)]
     assert np.array_equal(drive.velocity[inside], expected)
-    assert drive.unknown[inside].tolist() == [0.0, 0.0, SILENT_VARIANCE, 0.0, 0.0, SILENT_VARIANCE]
+    onwards = (velocity[2] ** 2).sum() * 5.0  # after 5 s: as far as the last speed would have led
+    assert drive.unknown[inside] == pytest.approx([0.0, 0.0, SILENT_VARIANCE + onwards, 0.0, 0.0, SILENT_VARIANCE])
 
 
 def test_silence_makes_the_covariance_grow_with_its_length():
@@ -334,7 +335,8 @@ def test_silence_makes_the_covariance_grow_with_its_length():
     states = default_prior().mean
     across = integrated(drive, 1.0, 23.0, states)
     silent = 22.0 - 1.9 - 0.5 * SILENCE_S
-    assert across.floor[2, 2] == pytest.approx(SILENT_VARIANCE * silent + 22.0 * FLOOR_TURN_RAD**2 + FLOOR_VARIANCE)
+    rate = SILENT_VARIANCE + (0.5**2 + 0.1**2) * (22.0 - 1.9)
+    assert across.floor[2, 2] == pytest.approx(rate * silent + 22.0 * FLOOR_TURN_RAD**2 + FLOOR_VARIANCE)
     assert across.increment == pytest.approx(slow_increment(drive, 1.0, 23.0, states), abs=1e-9)
     assert across.increment[2] == pytest.approx(0.1 * (22.0 - silent))
     eigenvalues = np.linalg.eigvalsh(across.covariance(np.full(5, 1e-4)))

@@ -85,8 +85,8 @@ def test_given_sigmas_are_left_alone():
     weights = smoother.inlier_probability(estimate)
     fit = refine_noise(world.problem, estimate, smoother.marginals(estimate), weights, QUIET, START)
     assert fit.noise.detection[1] == pytest.approx(START.detection[1])  # nobody speaks of it but the start
-    assert fit.detection_count[1] == PSEUDO_COUNT
-    assert fit.detection_count[0] > 2 * PSEUDO_COUNT
+    assert fit.detection_relative[1] == pytest.approx(1 / np.sqrt(2 * PSEUDO_COUNT))
+    assert fit.detection_relative[0] < 0.5 * fit.detection_relative[1]
 
 
 def test_outliers_do_not_count():
@@ -102,7 +102,7 @@ def test_outliers_do_not_count():
         weights = smoother.inlier_probability(estimate)
         fit = refine_noise(spoilt.problem, estimate, smoother.marginals(estimate), weights, noise, QUIET)
         noise = fit.noise
-    assert fit.detection_count[0] < len(reading) - wrong.sum() + PSEUDO_COUNT
+    assert fit.detection_relative[0] > 1 / np.sqrt(2 * (len(reading) - wrong.sum() + PSEUDO_COUNT))
     assert noise.detection == pytest.approx(QUIET.detection, rel=0.1)
 
 
@@ -114,7 +114,7 @@ def test_levels_are_unbiased_and_as_sure_as_they_say():
     scatter = found.std(axis=0, ddof=1)
     bias = (found.mean(axis=0) - 1.0) / (scatter / np.sqrt(len(fits)))
     assert np.abs(bias).max() < 3.0
-    stated = np.array([np.concatenate(fit.relative_sigma()) for fit in fits]).mean(axis=0)
-    # those that share a direction with another kind are told apart less well than the count of residuals says
-    assert np.all(stated > 0.5 * scatter)
-    assert np.all(stated < 2.0 * scatter)
+    stated = np.array([np.concatenate([fit.detection_relative, fit.odometry_relative]) for fit in fits]).mean(axis=0)
+    # the scatter of 24 draws is itself known to 15 %
+    assert np.all(stated > 0.6 * scatter)
+    assert np.all(stated < 1.6 * scatter)

@@ -14,8 +14,8 @@ from evermap.errors import DataError
 from evermap.slam.arrow import Smoother
 from evermap.slam.problem import Estimate
 
-SMALL = 0.05
-"""Parts of a standard deviation: the derivative by the odometry's increment is exact for vanishing residuals only."""
+SMALL = 1e-4
+"""Parts of a standard deviation."""
 
 
 def with_unknown_landmark(world: World) -> World:

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 
 from evermap.metrics.alignment import interpolate
-from evermap.metrics.summary import RATE_HZ, Evaluation, metrics_dict
+from evermap.metrics.summary import RATE_HZ, Evaluation, in_view, metrics_dict
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory, scored_stamps
-from evermap.types import BoolArray, FloatArray, Recording, SlamResult, Trajectory
+from evermap.types import FloatArray, Recording, SlamResult, Trajectory
 
-IN_VIEW_S = 1.0
-"""A stamp counts as 'in view' this close to a frame with a landmark."""
 _MAX_TRUTH_GAP_S = 0.5
 """True poses are interpolated to the sightings only between truth stamps this close."""
 _FROM_METRICS = (
@@ -78,7 +76,7 @@ def odometry_scores(recording: Recording, evaluation: Evaluation) -> dict[str, A
 
 
 def view_scores(recording: Recording, errors: PoseErrors | None) -> dict[str, Any]:
-    """Heading RMSE at the scored stamps within `IN_VIEW_S` of a sighting, their share, and the longest blind time."""
+    """Heading RMSE at the stamps in view (`metrics.summary.in_view`), their share, and the longest blind time."""
     blind_s = float(np.max(np.diff(sighting_stamps(recording)), initial=0.0))
     if errors is None:
         return {"heading_in_view_deg": None, "in_view_share": None, "longest_blind_s": blind_s}
@@ -88,16 +86,6 @@ def view_scores(recording: Recording, errors: PoseErrors | None) -> dict[str, An
         "in_view_share": float(near.mean()),
         "longest_blind_s": blind_s,
     }
-
-
-def in_view(recording: Recording, stamp_s: FloatArray) -> BoolArray:
-    """(K,) whether a landmark was seen within `IN_VIEW_S` before or after each stamp."""
-    seen = sighting_stamps(recording)
-    after = np.searchsorted(seen, stamp_s)
-    later = np.abs(seen[np.minimum(after, len(seen) - 1)] - stamp_s)
-    earlier = np.abs(seen[np.maximum(after - 1, 0)] - stamp_s)
-    near: BoolArray = np.minimum(earlier, later) <= IN_VIEW_S
-    return near
 
 
 def bound_scores(recording: Recording, result: SlamResult) -> dict[str, Any]:

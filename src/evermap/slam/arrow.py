@@ -21,6 +21,7 @@ from evermap.slam.kernels import (
     kernel,
     odometry_residual,
     outlier_loss,
+    residual_by_states,
     wrapped,
 )
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
@@ -125,9 +126,7 @@ def assemble(
             covariance += variance[kind] * noise[kind]
         information = inverse_of(covariance)
         odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
-        for k in range(4):
-            for axis in range(3):
-                motion[axis, k] = -motion[axis, k] if free[5 + k] else 0.0
+        residual_by_states(motion, e, free)
         _add(diagonal[i], j1, j1, information)
         _add(diagonal[i + 1], j2, j2, information)
         _add(off[i], j2, j1, information)

@@ -86,13 +86,17 @@ class CalibrationPrior:
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale
         carry the uncertainty of both, and `split_scale` divides what it found between them afterwards.
         """
-        if not self.free[SLOPE]:
+        if not self._shares_scale:
             return self
         sigma, free = self.sigma.copy(), self.free.copy()
         free[SLOPE] = False
-        if free[FORWARD]:
-            sigma[FORWARD] = np.hypot(sigma[FORWARD], sigma[SLOPE])
+        sigma[FORWARD] = np.hypot(sigma[FORWARD], sigma[SLOPE])
         return CalibrationPrior(self.mean, sigma, free)
+
+    @property
+    def _shares_scale(self) -> bool:
+        """True where neither the range slope nor the forward scale is given, so that only their product shows."""
+        return bool(self.free[SLOPE] and self.free[FORWARD])
 
     def split_scale(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
         """Divide the product of range and odometry scale between its two factors, by their priors.
@@ -105,12 +109,10 @@ class CalibrationPrior:
             States and covariance with the slope in them; the factor by which all lengths of trajectory and map have
             to be multiplied; and the standard deviation of its logarithm.
         """
-        if not self.free[SLOPE]:
+        if not self._shares_scale:
             return states, covariance, 1.0, 0.0
         states, covariance = states.copy(), covariance.copy()
         sigma_slope, sigma_forward = self.sigma[SLOPE], self.sigma[FORWARD]
-        if not self.free[FORWARD]:  # the odometer's scale is given: all of the product is the slope's
-            sigma_forward = 0.0
         share = sigma_slope**2 / (sigma_slope**2 + sigma_forward**2)
         surplus = np.log(states[FORWARD] / self.mean[FORWARD])
         log_slope = share * surplus
@@ -119,8 +121,9 @@ class CalibrationPrior:
         variance = spread**2 + share**2 * covariance[FORWARD, FORWARD]
         states[SLOPE] = (1.0 + self.mean[SLOPE]) * np.exp(log_slope) - 1.0
         states[FORWARD] *= np.exp(-log_slope)
-        states[SLIP] *= np.exp(-log_slope)
-        states[[SKEW, CURVATURE]] *= np.exp(log_slope)
+        for state, power in ((SLIP, -1.0), (SKEW, 1.0), (CURVATURE, 1.0)):
+            if self.free[state]:
+                states[state] *= np.exp(power * log_slope)
         covariance[SLOPE, SLOPE] = variance
         covariance[FORWARD, FORWARD] = (1.0 - share) ** 2 * covariance[FORWARD, FORWARD] + spread**2
         return states, covariance, float(np.exp(-log_slope)), float(np.sqrt(variance))

@@ -6,7 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, inlier_weight, integrate_odometry, kernel, odometry_residual
+from evermap.slam.kernels import (
+    detection_residual,
+    inlier_weight,
+    integrate_odometry,
+    kernel,
+    odometry_residual,
+    residual_by_states,
+)
 from evermap.types import FloatArray
 
 
@@ -38,10 +45,8 @@ def whitened_odometry(
     residual[:] = white @ e
     by_before[:] = white @ j1
     by_pose[:] = white @ j2
-    by_motion = white @ motion
-    for k in range(4):
-        if free[5 + k]:
-            by_states[:, 5 + k] = -by_motion[:, k]
+    residual_by_states(motion, e, free)
+    by_states[:, 5:] = white @ motion
 
 
 @kernel

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -36,6 +37,21 @@ _AXIS = np.array([0, 0, 1, 2, 2])  # forward, lateral, turn
 _DRIVER = np.array([1, 2, 1, 0, 2])  # time, distance, angle
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def _drop_stale_code() -> None:
+    """Delete kept machine code that is older than any source of this package.
+
+    A kernel's machine code contains the kernels it calls, but its keeper looks at the kernel's own file only.
+    """
+    sources = Path(__file__).parent
+    newest = max(path.stat().st_mtime for path in sources.glob("*.py"))
+    for index in (sources / "__pycache__").glob("*.nbi"):
+        if index.stat().st_mtime < newest:
+            index.unlink(missing_ok=True)
+
+
+_drop_stale_code()
 
 
 def kernel(function: _Function) -> _Function:
@@ -189,10 +205,7 @@ def _add_column(p: FloatArray, right: FloatArray, axis: int, amount: float) -> N
 def odometry_residual(
     pose: FloatArray, following: FloatArray, increment: FloatArray, residual: FloatArray, j1: FloatArray, j2: FloatArray
 ) -> None:
-    """`increment^-1 * between(pose, following)` as (x, y, theta), with (3, 3) derivatives by both poses.
-
-    The derivative by the increment is minus the identity, to the accuracy of small residuals.
-    """
+    """`increment^-1 * between(pose, following)` as (x, y, theta), with (3, 3) derivatives by both poses."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = following[0] - pose[0], following[1] - pose[1]
     bx, by = c * dx + s * dy, -s * dx + c * dy
@@ -206,6 +219,17 @@ def odometry_residual(
     j1[0, 0], j1[0, 1], j1[0, 2] = -ci, -si, ci * by - si * bx
     j1[1, 0], j1[1, 1], j1[1, 2] = si, -ci, -si * by - ci * bx
     j1[2, 0], j1[2, 1], j1[2, 2] = 0.0, 0.0, -1.0
+
+
+@kernel
+def residual_by_states(motion: FloatArray, residual: FloatArray, free: Any) -> None:
+    """Turn the increment's derivatives (3, 4) by its states, in place, into the residual's; zero where not free."""
+    for k in range(4):
+        forward, left, turn = motion[0, k], motion[1, k], motion[2, k]
+        on = 1.0 if free[5 + k] else 0.0
+        motion[0, k] = on * (turn * residual[1] - forward)
+        motion[1, k] = -on * (turn * residual[0] + left)
+        motion[2, k] = -on * turn
 
 
 @kernel

@@ -17,7 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.kernels import detection_residual, integrate_odometry, inverse_of, kernel, odometry_residual
+from evermap.slam.kernels import (
+    detection_residual,
+    integrate_odometry,
+    inverse_of,
+    kernel,
+    odometry_residual,
+    residual_by_states,
+)
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
@@ -27,26 +34,23 @@ START = Noise(
     outlier_log_odds=7.0,
 )
 """Deliberately wide: too much noise converges from far away, too little locks the first mistake in."""
-PSEUDO_COUNT = 10.0
-"""Weight of the start values, in residuals: matters only for the shortest recordings."""
+PSEUDO_COUNT = 1.0
+"""Weight of the start values, in residuals: keeps levels finite that a recording says nothing about."""
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseFit:
-    """New noise levels and how many independent residuals stand behind each.
+    """New noise levels and how well they are known.
 
     Attributes:
         noise: the levels.
-        detection_count: (2,); odometry_count: (5,): effective numbers of residuals.
+        detection_relative: (2,) standard deviations of the levels, relative to them.
+        odometry_relative: (5,) the same; kinds that act on one axis are hard to tell apart, and that is in it.
     """
 
     noise: Noise
-    detection_count: FloatArray
-    odometry_count: FloatArray
-
-    def relative_sigma(self) -> tuple[FloatArray, FloatArray]:
-        """Standard deviations of the levels, relative to them: detections (2,), odometry (5,)."""
-        return 1.0 / np.sqrt(2.0 * self.detection_count), 1.0 / np.sqrt(2.0 * self.odometry_count)
+    detection_relative: FloatArray
+    odometry_relative: FloatArray
 
 
 def refine_noise(
@@ -80,7 +84,7 @@ def refine_noise(
         marginals.shared,
     )
     detection = np.sqrt((squares + PSEUDO_COUNT * start.detection**2) / (counts + PSEUDO_COUNT))
-    pulls, chances = _odometry_sums(
+    pulls, chances, fisher = _odometry_sums(
         estimate.pose,
         estimate.states,
         problem.stamp_s,
@@ -98,10 +102,13 @@ def refine_noise(
     count = np.maximum(noise.odometry**2 * chances, 0.0)
     squares_odometry = noise.odometry**4 * pulls
     odometry = np.sqrt((squares_odometry + PSEUDO_COUNT * start.odometry**2) / (count + PSEUDO_COUNT))
+    variance = noise.odometry**2
+    information, directions = np.linalg.eigh(fisher * np.outer(variance, variance))
+    unsure = (directions**2) @ (1.0 / (np.maximum(information, 0.0) + 0.5 * PSEUDO_COUNT))
     return NoiseFit(
         Noise(detection, odometry, noise.outlier_log_odds),
-        counts + PSEUDO_COUNT,
-        count + PSEUDO_COUNT,
+        1.0 / np.sqrt(2.0 * (counts + PSEUDO_COUNT)),
+        0.5 * np.sqrt(unsure),
     )
 
 
@@ -169,11 +176,15 @@ def _odometry_sums(
     cov_next: FloatArray,
     cov_cross: FloatArray,
     cov_shared: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """`sum e' W P_k W e` and `sum tr(W P_k) - tr(W P_k W V)` of every odometry noise component."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
+
+    And the Fisher information of the variances, `sum tr(P_k L P_l L) / 2`.
+    """
     kinds = len(variance)
     shared = len(cov_shared)
-    pulls, chances = np.zeros(kinds), np.zeros(kinds)
+    pulls, chances, fisher = np.zeros(kinds), np.zeros(kinds), np.zeros((kinds, kinds))
+    weighted = np.zeros((kinds, 3, 3))
     increment, motion, noise, floor = np.zeros(3), np.zeros((3, 4)), np.zeros((kinds, 3, 3)), np.zeros((3, 3))
     e, j1, j2 = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     j, cov = np.zeros((3, 10)), np.zeros((10, 10))
@@ -188,9 +199,8 @@ def _odometry_sums(
         information = inverse_of(covariance)
         odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
         j[:, :3], j[:, 3:6] = j1, j2
-        for k in range(4):
-            for axis in range(3):
-                j[axis, 6 + k] = -motion[axis, k] if free[5 + k] else 0.0
+        residual_by_states(motion, e, free)
+        j[:, 6:] = motion
         cov[:3, :3], cov[3:6, 3:6] = cov_pose[i], cov_pose[i + 1]
         cov[:3, 3:6], cov[3:6, :3] = cov_next[i], cov_next[i].T
         for a in range(3):
@@ -203,7 +213,11 @@ def _odometry_sums(
         left = information - information @ explained @ information
         for k in range(kinds):
             pulls[k] += pull @ noise[k] @ pull
-            for a in range(3):
-                for b in range(3):
-                    chances[k] += left[a, b] * noise[k, b, a]
-    return pulls, chances
+            weighted[k] = noise[k] @ left
+            chances[k] += np.trace(weighted[k])
+            for m in range(k + 1):
+                fisher[k, m] += 0.5 * np.sum(weighted[k] * weighted[m].T)
+    for k in range(kinds):
+        for m in range(k):
+            fisher[m, k] = fisher[k, m]
+    return pulls, chances, fisher

@@ -12,7 +12,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 SILENCE_S = 1.0
 """Odometry that says nothing for longer than this is not believed to go on as before."""
 SILENT_VARIANCE = 0.25
-"""Variance per second, (m^2 or rad^2) / s, while the odometry is silent."""
+"""Variance per second, (m^2 or rad^2) / s, that is added while the odometry is silent, at least."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +31,15 @@ class Drive:
 
     @classmethod
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:
-        """Velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'."""
+        """Velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'.
+
+        What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`.
+        """
         silent = np.flatnonzero(np.diff(stamp_s) > SILENCE_S)
         at = silent + 1
         stamps = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
-        unknown = np.insert(np.zeros(len(stamp_s)), at, SILENT_VARIANCE)
+        rate = (velocity[silent] ** 2).sum(axis=1) * np.diff(stamp_s)[silent]
+        unknown = np.insert(np.zeros(len(stamp_s)), at, SILENT_VARIANCE + rate)
         velocities = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
         stamps = np.append(stamps, stamps[-1] + 0.5 * SILENCE_S)

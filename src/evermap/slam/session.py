@@ -201,7 +201,7 @@ def parameters(outcome: Outcome, prior: CalibrationPrior) -> tuple[ParameterEsti
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
     levels = np.concatenate([outcome.noise.noise.detection, outcome.noise.noise.odometry])
     started = np.concatenate([START.detection, START.odometry])
-    relative = np.concatenate(outcome.noise.relative_sigma())
+    relative = np.concatenate([outcome.noise.detection_relative, outcome.noise.odometry_relative])
     meanings = (
         "noise of a range",
         "noise of a bearing",
