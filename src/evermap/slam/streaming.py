@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap import se2
+from evermap.slam.align import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.isam import IncrementalSmoother
@@ -112,6 +113,7 @@ class StreamingSlam:
         self._n_poses = 0
         self._next_stock = FIRST_STOCK
         self._tree_since = 0
+        self._align_tried = 0
         self._scale = 1.0
         self._aligned = False
         self._increment, self._motion = np.zeros(3), np.zeros((3, 4))
@@ -212,6 +214,8 @@ class StreamingSlam:
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
         seen = np.unique(self._problem.landmark_row[detections])
+        if self._aligned and self._prior_map is not None:
+            seen = seen[~self._prior_map.given[seen]]  # the map is believed: no vote moves its landmarks
         young = np.isin(self._n_compared[seen], DISPUTED_AT)
         return bool(np.any(young & (2 * self._n_surprising[seen] > self._n_compared[seen])))
 
@@ -219,7 +223,11 @@ class StreamingSlam:
         """Where a landmark that is seen for the first time must be, by this one sighting."""
         for m in detections:
             j = self._problem.landmark_row[m]
-            if np.isnan(self._landmark[j, 0]):
+            if not np.isnan(self._landmark[j, 0]):
+                continue
+            if self._aligned and self._prior_map is not None and self._prior_map.given[j]:
+                self._landmark[j] = self._prior_map.mean[j]
+            else:
                 self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 
     def _take_stock(self) -> None:
@@ -253,13 +261,21 @@ class StreamingSlam:
         return self._graph.estimate(self._older)
 
     def _can_align(self, *, final: bool = False) -> bool:
-        """Enough landmarks of the prior map seen to know where in it the robot is; two must do at the end."""
+        """Most of the prior map's landmarks seen so far stand to each other as in the map; two must do at the end."""
         assert self._prior_map is not None
         both = self._prior_map.given & np.isfinite(self._landmark[:, 0])
-        if both.sum() < (2 if final else MIN_ALIGN_LANDMARKS):
+        count = int(both.sum())
+        if count < (2 if final else MIN_ALIGN_LANDMARKS):
             return False
+        if count == self._align_tried and not final:  # nothing new has been seen since
+            return False
+        self._align_tried = count
         at = self._prior_map.mean[both]
-        return bool(np.ptp(at, axis=0).max() >= MIN_ALIGN_SPREAD_M)
+        _, agree = consensus(self._estimate().landmark[both], at)
+        if final:
+            return bool(agree.sum() >= 2)
+        enough = agree.sum() >= MIN_ALIGN_LANDMARKS and 2 * agree.sum() > count
+        return bool(enough and np.ptp(at[agree], axis=0).max() >= MIN_ALIGN_SPREAD_M)
 
     def _enter_map(self) -> None:
         """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
@@ -267,10 +283,10 @@ class StreamingSlam:
         assert prior_map is not None
         estimate = self._estimate()
         both = prior_map.given & estimate.known
-        pose_map_world = _rigid(estimate.landmark[both], prior_map.mean[both])
+        pose_map_world, _ = consensus(estimate.landmark[both], prior_map.mean[both])
         moved = Estimate(
             se2.compose(pose_map_world, estimate.pose),
-            se2.transform(pose_map_world, estimate.landmark),
+            np.where(both[:, None], prior_map.mean, se2.transform(pose_map_world, estimate.landmark)),
             estimate.states,
         )
         self._aligned, self._scale = True, 1.0
@@ -319,11 +335,3 @@ def _settled(before: Noise, after: Noise) -> bool:
     old = np.concatenate([before.detection, before.odometry])
     new = np.concatenate([after.detection, after.odometry])
     return bool(np.all(np.abs(new / old - 1.0) < NOISE_CONVERGED))
-
-
-def _rigid(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(3,) rotation and translation that brings points (k, 2) onto others, least squares."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    shift = target.mean(axis=0) - se2.rotation(theta) @ source.mean(axis=0)
-    return np.array([shift[0], shift[1], theta])
