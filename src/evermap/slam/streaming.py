@@ -236,7 +236,11 @@ class StreamingSlam:
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         estimate = self._estimate()
         if self._robust:
-            estimate = outvoted(problem, estimate, smoother.inlier_probability(estimate))
+            voted = outvoted(problem, estimate, smoother.inlier_probability(estimate))
+            # what was compared with a place that was never the landmark's own says nothing about consistency
+            misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
+            self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
+            estimate = voted
         estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
         if self._estimate_noise:
             marginals = smoother.marginals(estimate)
