@@ -96,6 +96,10 @@ class IncrementalSmoother:
         """(3,) the newest pose."""
         return self._last_pose
 
+    def last_covariance(self) -> FloatArray:
+        """(3, 3) covariance of the newest pose, in its own frame."""
+        return np.asarray(self._isam.marginalCovariance(_pose_key(self._n_poses - 1)))
+
     def _newest_pose(self) -> FloatArray:
         pose = self._isam.calculateEstimatePose2(_pose_key(self._n_poses - 1))
         return np.array([pose.x(), pose.y(), pose.theta()])
@@ -125,7 +129,7 @@ class IncrementalSmoother:
 
     def innovations(
         self, row: int, increment: FloatArray, motion: FloatArray, covariance: FloatArray, detections: IntArray
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> FloatArray:
         """What the next frame's detections of known landmarks say before they are used.
 
         Args:
@@ -136,7 +140,7 @@ class IncrementalSmoother:
             detections: (k,) rows of the problem's detections, of landmarks in the graph.
 
         Returns:
-            (k,) squared Mahalanobis distances with `S = H P H' + R`, and (3, 3) covariance of the predicted pose.
+            (k,) squared Mahalanobis distances with `S = H P H' + R`.
         """
         problem = self._problem
         landmarks = [int(x) for x in dict.fromkeys(problem.landmark_row[detections].tolist())]
@@ -149,7 +153,6 @@ class IncrementalSmoother:
         carry = np.zeros((3, len(joint)))
         carry[:, :3] = se2.adjoint(se2.inverse(increment))
         carry[:, 8:12] = motion
-        pose_covariance = carry @ joint @ carry.T + covariance
         nis = np.empty(len(detections))
         sigma = self._noise.of_detections(problem.sigma_given[detections])
         e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
@@ -163,7 +166,7 @@ class IncrementalSmoother:
             h[:, offset[landmark] : offset[landmark] + 2] += jl
             s = h @ joint @ h.T + jx @ covariance @ jx.T + np.diag(sigma[k] ** 2)
             nis[k] = e @ np.linalg.solve(s, e)
-        return nis, pose_covariance
+        return nis
 
     def _insert_priors(self, graph: Any) -> None:
         problem = self._problem

@@ -121,7 +121,7 @@ class StreamingSlam:
         self.online_pose = np.full((len(problem.stamp_s), 3), np.nan)
         """(N, 3) causal poses, as soon as each frame was processed."""
         self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
-        """(N, 3, 3) their predicted covariance, before the frame's detections were used."""
+        """(N, 3, 3) covariance of each, at the time."""
         self.nis = np.full(len(problem.pose_row), np.nan)
         """(M,) squared Mahalanobis distance of every innovation; nan where the landmark was new."""
 
@@ -144,7 +144,9 @@ class StreamingSlam:
             self._sum_up()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
-        self.online_pose[row] = self._graph.last_pose() * [self._scale, self._scale, 1.0]
+        stretch = np.array([self._scale, self._scale, 1.0])
+        self.online_pose[row] = self._graph.last_pose() * stretch
+        self.online_covariance[row] = self._graph.last_covariance() * np.outer(stretch, stretch)
 
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
@@ -200,12 +202,9 @@ class StreamingSlam:
     def _compare(self, row: int, detections: IntArray) -> None:
         known = detections[np.isfinite(self._landmark[self._problem.landmark_row[detections], 0])]
         if row == 0 or len(known) == 0:
-            self.online_covariance[row] = self._odometry_covariance
             return
         motion = self._motion * self._problem.prior.free[5:]
-        self.nis[known], self.online_covariance[row] = self._graph.innovations(
-            row, self._increment, motion, self._odometry_covariance, known
-        )
+        self.nis[known] = self._graph.innovations(row, self._increment, motion, self._odometry_covariance, known)
 
         landmark = self._problem.landmark_row[known]
         np.add.at(self._n_compared, landmark, 1)

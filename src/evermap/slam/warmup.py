@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 
+from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
@@ -38,6 +39,7 @@ def warm_up() -> None:
     for _ in range(count):
         slam.step()
     outcome = slam.finish()
+    Smoother(problem, START).summary(outcome.graph_estimate)
     marginals = outcome.graph_marginals
     bridged(
         stamps[:2],
