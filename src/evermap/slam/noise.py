@@ -102,14 +102,19 @@ def refine_noise(
     count = np.maximum(noise.odometry**2 * chances, 0.0)
     squares_odometry = noise.odometry**4 * pulls
     odometry = np.sqrt((squares_odometry + PSEUDO_COUNT * start.odometry**2) / (count + PSEUDO_COUNT))
-    variance = noise.odometry**2
-    information, directions = np.linalg.eigh(fisher * np.outer(variance, variance))
-    unsure = (directions**2) @ (1.0 / (np.maximum(information, 0.0) + 0.5 * PSEUDO_COUNT))
     return NoiseFit(
         Noise(detection, odometry, noise.outlier_log_odds),
         1.0 / np.sqrt(2.0 * (counts + PSEUDO_COUNT)),
-        0.5 * np.sqrt(unsure),
+        np.sqrt(_inflation(fisher) / (2.0 * (count + PSEUDO_COUNT))),
     )
+
+
+def _inflation(fisher: FloatArray) -> FloatArray:
+    """Factor by which each variance is known less well because others act on the same residuals (>= 1)."""
+    scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
+    correlation = fisher / np.outer(scale, scale) + 1e-3 * np.eye(len(fisher))
+    inflation: FloatArray = np.maximum(np.diag(np.linalg.inv(correlation)), 1.0)
+    return inflation
 
 
 @kernel
