@@ -1,0 +1,103 @@
+"""The least that one can know: a constant hazard of unknown size (Rosen 2016 eqs. 25-29)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from evermap.errors import ConfigError
+from evermap.survival import checks
+from evermap.survival.base import Lifetime
+from evermap.survival.logmath import (
+    entire_exponential_integral,
+    gauss_legendre,
+    log_integral_of_smooth_hazard,
+    log_one_minus_exp,
+    scaled_e1,
+)
+from evermap.survival.protocol import Seed
+from evermap.types import FloatArray
+
+_NARROW = 2.0
+"""`log(high / low)` below which the integral over the rate is taken numerically while its integrand is tame."""
+
+
+@dataclass(frozen=True, slots=True)
+class GeneralPurpose(Lifetime):
+    """`S(t) = (E1(low t) - E1(high t)) / log(high / low)`: an exponential whose rate is log-uniform.
+
+    Three forms, each where it loses nothing, with `D(t) = int_low^high exp(-(rate - low) t) / rate d rate`:
+    quadrature over a narrow range of rates, `Ein` (E1 without its logarithm) for early times, scaled E1 for the rest.
+
+    Attributes:
+        low: smallest rate in 1/s, positive.
+        high: largest rate in 1/s, above `low`.
+    """
+
+    low: float
+    high: float
+
+    def __post_init__(self) -> None:
+        checks.positive(self.low, "low")
+        checks.positive(self.high, "high")
+        if not self.high > self.low:
+            raise ConfigError(f"rates must satisfy low < high, not {self.low!r} and {self.high!r}", field="high")
+
+    @classmethod
+    def from_mean_stays(cls, shortest_s: float, longest_s: float) -> Self:
+        """Mean stays between `shortest_s` and `longest_s` seconds are thought possible."""
+        checks.positive(shortest_s, "shortest_s")
+        checks.positive(longest_s, "longest_s")
+        return cls(1.0 / longest_s, 1.0 / shortest_s)
+
+    def mean(self) -> float:
+        return (self.high - self.low) / (self.low * self.high * self._span)
+
+    def sample(self, rng: Seed, size: int | tuple[int, ...] | None = None) -> FloatArray:
+        generator = np.random.default_rng(rng)
+        rate = self.low * np.exp(self._span * np.asarray(generator.random(size)))
+        return np.asarray(np.asarray(generator.standard_exponential(size)) / rate)[()]
+
+    @property
+    def _span(self) -> float:
+        """`log(high / low)`."""
+        return math.log1p((self.high - self.low) / self.low)
+
+    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return log_integral_of_smooth_hazard(a, b, self._log_cumulative, self._log_hazard)
+
+    def _log_cumulative(self, t: FloatArray) -> FloatArray:
+        died = self._died(t)
+        late = self.low * t - (np.log(self._d(t)) - math.log(self._span))
+        return np.where(died < 0.5, np.log(-np.log1p(-np.minimum(died, 0.5))), np.log(late))
+
+    def _log_hazard(self, t: FloatArray) -> FloatArray:
+        # h = (exp(-low t) - exp(-high t)) / (t span S), both divided by exp(-low t)
+        later = log_one_minus_exp((self.high - self.low) * t) - np.log(t) - np.log(self._d(t))
+        return np.where(t > 0.0, later, math.log((self.high - self.low) / self._span))
+
+    def _is_tame(self, t: FloatArray) -> FloatArray:
+        return np.asarray(((self.high - self.low) * t < 2.0) & (self._span < _NARROW))
+
+    def _died(self, t: FloatArray) -> FloatArray:
+        """`1 - S(t)`."""
+        wide = (entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t)) / self._span
+        return np.where(self._is_tame(t), -self._mean_over_rates(lambda rate: np.expm1(-rate * t[..., None])), wide)
+
+    def _d(self, t: FloatArray) -> FloatArray:
+        """`S(t) span exp(low t)`."""
+        spread = (self.high - self.low) * t
+        late = scaled_e1(self.low * t) - np.exp(-spread) * scaled_e1(self.high * t)
+        early = np.exp(self.low * t) * self._span * (1.0 - self._died(t))
+        tame = self._span * self._mean_over_rates(lambda rate: np.exp(-(rate - self.low) * t[..., None]))
+        return np.where(self._is_tame(t), tame, np.where(self.high * t < 1.0, early, late))
+
+    def _mean_over_rates(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
+        """Mean over the log-uniform rate of a function that varies little over a narrow range; garbage else."""
+        nodes, weights = gauss_legendre(24)
+        rate = self.low * np.exp(min(self._span, _NARROW) * nodes)
+        return np.asarray(function(rate) @ weights)
