@@ -1,0 +1,114 @@
+"""One feature at a time: the batch filter's arithmetic on plain floats, without an array in sight."""
+
+from __future__ import annotations
+
+import math
+
+from evermap.errors import InputError, NumericalError
+from evermap.persistence.checks import impossible
+from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
+from evermap.survival import Exponential, LifetimePrior
+
+
+class PersistenceFilter:
+    """Rosen's persistence filter of one feature (2016, Algorithm 1; MATH.md section 2).
+
+    Times count from the feature's birth, in seconds; it is certainly there at 0.
+
+    Args:
+        prior: how long such features stay.
+    """
+
+    __slots__ = ("_evidence", "_inverse_odds", "_prior", "_rate", "_stamp")
+
+    def __init__(self, prior: LifetimePrior) -> None:
+        self._prior = prior
+        self._rate = prior.rate if isinstance(prior, Exponential) else -1.0
+        self._inverse_odds = 0.0
+        self._stamp = 0.0
+        self._evidence = 0.0
+
+    @property
+    def stamp_s(self) -> float:
+        """Time of the last observation, 0 before the first."""
+        return self._stamp
+
+    @property
+    def inverse_odds(self) -> float:
+        """`(1 - p) / p` right after the last observation: keeps its digits where `p` is close to 1."""
+        return self._inverse_odds
+
+    @property
+    def log_evidence(self) -> float:
+        """`log p(y_1:n)` of all observations so far."""
+        return self._evidence
+
+    def predict(self, stamp_s: float) -> float:
+        """Probability that the feature exists at `stamp_s`, which must not lie before the last observation.
+
+        Raises:
+            InputError: a time that is not finite or lies before the last observation.
+        """
+        if not self._stamp <= stamp_s < math.inf:
+            raise self._refusal(stamp_s, 0.0, 0.0)
+        return 1.0 / (1.0 + self._predicted(stamp_s))
+
+    def update(self, stamp_s: float, detected: bool, p_miss: float, p_false: float) -> float:
+        """Take in one look at the feature, and return the probability that it exists then.
+
+        Args:
+            stamp_s: time since birth, not before the last look.
+            detected: whether the detector fired.
+            p_miss: `P(no detection | there)`.
+            p_false: `P(detection | gone)`.
+
+        Raises:
+            InputError: a probability outside [0, 1], or time running back.
+            NumericalError: an observation that is impossible whether the feature is there or gone.
+        """
+        if not (self._stamp <= stamp_s < math.inf and 0.0 <= p_miss <= 1.0 and 0.0 <= p_false <= 1.0):
+            raise self._refusal(stamp_s, p_miss, p_false)
+        if detected not in (0, 1):
+            raise InputError(f"{detected} is neither a detection nor a miss", field="detected", hint="True or False")
+        predicted = self._predicted(stamp_s)
+        there, gone = (1.0 - p_miss, p_false) if detected else (p_miss, 1.0 - p_false)
+        probability = 1.0 / (1.0 + predicted)
+        complement = predicted * probability if predicted < math.inf else 1.0
+        likelihood = probability * there + complement * gone
+        if likelihood <= 0.0:
+            raise NumericalError(impossible(f"time {stamp_s} s"), hint="P_M and P_F strictly between 0 and 1")
+        if there == 0.0 or predicted == math.inf:
+            after = math.inf
+        elif gone == 0.0 or predicted == 0.0:
+            after = 0.0
+        else:
+            after = min(max(predicted * gone / there, SMALLEST), LARGEST)
+        self._inverse_odds = after
+        self._stamp = stamp_s
+        self._evidence += math.log(likelihood)
+        return 1.0 / (1.0 + after)
+
+    def _predicted(self, stamp_s: float) -> float:
+        """Inverse odds at a time that has been checked."""
+        before = self._inverse_odds
+        if before == math.inf:
+            return before
+        if self._rate >= 0.0:
+            odds = math.expm1(min(self._rate * (stamp_s - self._stamp), LOG_LARGEST))
+        else:
+            survival = float(self._prior.log_conditional_survival(self._stamp, stamp_s))
+            death = float(self._prior.log_conditional_death(self._stamp, stamp_s))
+            if not survival > -math.inf:
+                return math.inf
+            odds = math.exp(max(min(death - survival, LOG_LARGEST), -LOG_LARGEST)) if death > -math.inf else 0.0
+        return min(before + (1.0 + before) * odds, LARGEST)
+
+    def _refusal(self, stamp_s: float, p_miss: float, p_false: float) -> InputError:
+        """What was wrong with an update that is refused."""
+        for value, field in ((p_miss, "p_miss"), (p_false, "p_false")):
+            if not 0.0 <= value <= 1.0:
+                return InputError(f"{value} is no probability", field=field, hint="a number between 0 and 1")
+        if not math.isfinite(stamp_s):
+            return InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
+        past = f"the last observation at {self._stamp} s" if self._stamp else "the feature's birth at 0"
+        return InputError(f"time {stamp_s} s lies before {past}", field="stamp_s", hint="sort by time")

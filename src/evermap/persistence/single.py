@@ -1,0 +1,188 @@
+"""The persistence filter (Rosen 2016, Algorithm 1) in inverse odds: `init`, `predict`, `update`, and `run` for streams.
+
+All functions are pure. Rows are independent; every row has its own clock (seconds since its birth), its own prior and,
+at every observation, its own `P_M` (miss although there) and `P_F` (detection although gone). A feature exists at
+`t <= T`. With `r = (1 - p) / p` a gap of conditional survival `q` gives `r <- r + (1 + r) (1 - q) / q`, and an
+observation multiplies `r` by its likelihood when gone over its likelihood when there (MATH.md section 2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import InputError, NumericalError
+from evermap.persistence import checks
+from evermap.persistence.death import log_death_odds
+from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST, Belief, init
+from evermap.types import FloatArray, IntArray
+
+__all__ = ["Belief", "init", "predict", "run", "update"]
+
+
+def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
+    """Probability that each feature exists at `stamp_s`; the state stays as it is.
+
+    Args:
+        state: beliefs of N features.
+        stamp_s: scalar, (N,) or (len(rows),) times since birth, none before the row's last observation.
+        rows: row numbers asked about; all where None.
+
+    Returns:
+        (N,) or (len(rows),) probabilities.
+
+    Raises:
+        InputError: a time that is not finite or lies before the last observation.
+    """
+    index = np.arange(len(state)) if rows is None else np.asarray(rows, dtype=np.int64)
+    time = checks.as_rows(stamp_s, len(index), "stamp_s")
+    checks.check_times(time, state.stamp_s[index], index)
+    return 1.0 / (1.0 + _gap(state, index, time))
+
+
+def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None) -> Belief:
+    """Beliefs after one look at each feature.
+
+    Args:
+        state: beliefs of N features.
+        stamp_s: scalar, (N,) or (len(rows),) times of the looks since birth; a row whose time is NaN was not looked at.
+        detected: 1 or 0, of the same shape.
+        p_miss: `P(no detection | there)`, of the same shape.
+        p_false: `P(detection | gone)`, of the same shape.
+        rows: the rows looked at, each once; all where None.
+
+    Raises:
+        InputError: a probability outside [0, 1], time running back, or a row that does not exist.
+        DataError: a row twice (use `run`).
+        NumericalError: an observation that is impossible under both states.
+    """
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
+    values = [checks.as_rows(stamp_s, len(index), "stamp_s")]
+    for column, field in ((detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false")):
+        values.append(checks.as_rows(column, len(index), field))
+    looked = ~np.isnan(values[0])
+    if not looked.all():
+        index = index[looked]
+        values = [column[looked] for column in values]
+    time, hit, miss, false = values
+    checks.check_times(time, state.stamp_s[index], index)
+    checks.check_detected(hit, index)
+    checks.check_probability(miss, "p_miss", index)
+    checks.check_probability(false, "p_false", index)
+
+    there, gone = _likelihoods(hit, miss, false)
+    predicted = _gap(state, index, time)
+    observed = _observe(predicted, there, gone)
+    checks.check_possible(observed, index)
+
+    inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
+    inverse_odds[index] = observed
+    stamps[index] = time
+    evidence = state.log_evidence
+    if evidence is not None:
+        evidence = evidence.copy()
+        evidence[index] += _log_evidence(predicted, there, gone)
+    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=evidence)
+
+
+def run(
+    state: Belief, feature: Any, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any
+) -> tuple[Belief, FloatArray]:
+    """Apply a stream of observations in one call, in whatever order its rows come.
+
+    Rows are taken by feature and time; those of one feature at one time keep their order. The prior is asked once for
+    all gaps, then one compiled pass does the recursion.
+
+    Args:
+        state: beliefs of N features.
+        feature: (M,) row of `state` that each observation is of.
+        stamp_s: (M,) time since that feature's birth.
+        detected: (M,) 1 or 0.
+        p_miss: scalar or (M,), `P(no detection | there)`.
+        p_false: scalar or (M,), `P(detection | gone)`.
+
+    Returns:
+        The beliefs after the stream, and (M,) the probability right after each observation, in the order given.
+
+    Raises:
+        InputError, NumericalError: as `update`; messages count the stream's rows from 0.
+    """
+    from evermap.persistence.kernels import stream
+
+    entry = np.asarray(feature)
+    if entry.ndim != 1 or (entry.size and entry.dtype.kind not in "iu"):
+        raise InputError("features are row numbers", field="feature", hint="whole numbers from 0")
+    m = len(entry)
+    entry = entry.astype(np.int64)
+    wrong = np.flatnonzero((entry < 0) | (entry >= len(state)))
+    if wrong.size:
+        raise InputError(f"row {wrong[0]}: feature {entry[wrong[0]]} of {len(state)} does not exist", field="feature")
+    time, hit, miss, false = (
+        checks.as_rows(column, m, field)
+        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
+    )
+    checks.check_times(time, state.stamp_s[entry])
+    checks.check_detected(hit)
+    checks.check_probability(miss, "p_miss")
+    checks.check_probability(false, "p_false")
+
+    order = np.lexsort((time, entry))
+    entry, time = entry[order], time[order]
+    before = np.empty(m)
+    before[1:] = time[:-1]
+    first = np.ones(m, dtype=np.bool_)
+    first[1:] = entry[1:] != entry[:-1]
+    before[first] = state.stamp_s[entry[first]]
+    odds = log_death_odds(state.priors, state.prior_of_row[entry], before, time)
+
+    inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
+    evidence = np.zeros(len(state)) if state.log_evidence is None else state.log_evidence.copy()
+    posterior = np.empty(m)
+    there, gone = _likelihoods(hit[order], miss[order], false[order])
+    bad = int(stream(entry, odds, there, gone, inverse_odds, evidence, posterior))
+    if bad >= 0:
+        row = int(order[bad])
+        raise NumericalError(
+            checks.impossible(f"row {row} (feature {entry[bad]} at {time[bad]} s)"),
+            hint="P_M and P_F strictly between 0 and 1",
+        )
+    stamps[entry] = time  # sorted by time, and the last assignment holds
+    unsorted = np.empty(m)
+    unsorted[order] = posterior
+    kept = None if state.log_evidence is None else evidence
+    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=kept), unsorted
+
+
+def _likelihoods(hit: FloatArray, miss: FloatArray, false: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Likelihood of each observation if the feature is there, and if it is gone."""
+    seen = hit == 1.0
+    return np.where(seen, 1.0 - miss, miss), np.where(seen, false, 1.0 - false)
+
+
+def _gap(state: Belief, index: IntArray, time: FloatArray) -> FloatArray:
+    """Inverse odds at `time`, before any new observation; certainties stay exact, the rest within the clamp."""
+    odds = log_death_odds(state.priors, state.prior_of_row[index], state.stamp_s[index], time)
+    inverse_odds = state.inverse_odds[index]
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        ratio = np.where(np.isinf(odds), np.exp(odds), np.exp(np.clip(odds, -LOG_LARGEST, LOG_LARGEST)))
+        after = inverse_odds + (1.0 + inverse_odds) * ratio
+    certain = np.isinf(inverse_odds) | np.isposinf(odds)
+    return np.where(certain, np.inf, np.minimum(after, LARGEST))
+
+
+def _observe(predicted: FloatArray, there: FloatArray, gone: FloatArray) -> FloatArray:
+    """Inverse odds after an observation; NaN where it is impossible under both states."""
+    with np.errstate(all="ignore"):
+        after = predicted * gone / there
+    after = np.where((predicted > 0.0) & (gone > 0.0), np.maximum(after, SMALLEST), after)
+    return np.where(np.isfinite(predicted) & (there > 0.0), np.minimum(after, LARGEST), after)
+
+
+def _log_evidence(predicted: FloatArray, there: FloatArray, gone: FloatArray) -> FloatArray:
+    """`log p(y_n | y_1:n-1)`: the two likelihoods weighted by the predicted belief."""
+    probability = 1.0 / (1.0 + predicted)
+    complement = np.where(np.isinf(predicted), 1.0, np.minimum(predicted, LARGEST) * probability)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(probability * there + complement * gone), dtype=np.float64)
