@@ -68,11 +68,11 @@ def mixture(parts: list[tuple[float, Reference]]) -> Reference:
     return both
 
 
-def hazard_of(integral: Callable[["mp.mpf"], "mp.mpf"]) -> Reference:
+def hazard_of(integral: Callable[[mp.mpf], mp.mpf]) -> Reference:
     return lambda t: (-mp.expm1(-integral(t)), mp.exp(-integral(t)))
 
 
-def steps(edges: list[float], rates: list[float]) -> Callable[["mp.mpf"], "mp.mpf"]:
+def steps(edges: list[float], rates: list[float]) -> Callable[[mp.mpf], mp.mpf]:
     def integral(t: mp.mpf) -> mp.mpf:
         ends = [mp.mpf(e) for e in edges[1:]] + [mp.inf]
         return sum(
@@ -82,7 +82,7 @@ def steps(edges: list[float], rates: list[float]) -> Callable[["mp.mpf"], "mp.mp
     return integral
 
 
-def periodic(period: float, edges: list[float], rates: list[float]) -> Callable[["mp.mpf"], "mp.mpf"]:
+def periodic(period: float, edges: list[float], rates: list[float]) -> Callable[[mp.mpf], mp.mpf]:
     one = steps(edges, rates)
 
     def integral(t: mp.mpf) -> mp.mpf:
