@@ -60,6 +60,18 @@ def uniform(limit: float) -> Reference:
     return lambda t: (min(t / mp.mpf(limit), mp.mpf(1)), max(1 - t / mp.mpf(limit), mp.mpf(0)))
 
 
+def stretch(start: float, end: float) -> Reference:
+    def both(t: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
+        f = min(max(t - mp.mpf(start), 0) / (mp.mpf(end) - mp.mpf(start)), mp.mpf(1))
+        return f, 1 - f
+
+    return both
+
+
+def point(at: float) -> Reference:
+    return lambda t: (mp.mpf(1), mp.mpf(0)) if t >= at else (mp.mpf(0), mp.mpf(1))
+
+
 def mixture(parts: list[tuple[float, Reference]]) -> Reference:
     def both(t: mp.mpf) -> tuple[mp.mpf, mp.mpf]:
         values = [(mp.mpf(w), *part(t)) for w, part in parts]
@@ -120,6 +132,34 @@ CASES: dict[str, tuple[survival.LifetimePrior, Reference]] = {
     "piecewise": (
         survival.PiecewiseConstantHazard((0.0, 3.0, 1e5), (1.5, 1e-7, 1e-10)),
         hazard_of(steps([0.0, 3.0, 1e5], [1.5, 1e-7, 1e-10])),
+    ),
+    "periodic, seen at noon": (
+        survival.PeriodicHazard(86400.0, (0.0, 28800.0, 64800.0), (3e-8, 1e-6, 1e-8), start_s=43200.0),
+        hazard_of(periodic(86400.0, [0.0, 21600.0, 43200.0, 72000.0], [1e-6, 1e-8, 3e-8, 1e-6])),
+    ),
+    "step, overlapping intervals": (
+        survival.StepLifetime((0.0, 10.0, 5e5), (1e3, 1e13, 1e6), (0.5, 0.25, 0.25)),
+        mixture([(0.5, stretch(0.0, 1e3)), (0.25, stretch(10.0, 1e13)), (0.25, stretch(5e5, 1e6))]),
+    ),
+    "step, points and some that stay": (
+        survival.StepLifetime((1.0, 1e-3, 7.0), (1.0, 1e4, np.inf), (0.5, 0.25, 0.25)),
+        mixture([(0.5, point(1.0)), (0.25, stretch(1e-3, 1e4)), (0.25, point(np.inf))]),
+    ),
+    "callable, infinite at 0": (
+        survival.CallableHazard(lambda t: 1e-3 / np.sqrt(t), horizon_s=2e12),
+        hazard_of(lambda t: mp.mpf(2e-3) * mp.sqrt(t)),
+    ),
+    "callable, falling": (
+        survival.CallableHazard(lambda t: 1.0 / (100.0 + t), horizon_s=2e12),
+        hazard_of(lambda t: mp.log1p(t / 100)),
+    ),
+    "callable, growing": (
+        survival.CallableHazard(lambda t: 1e-9 * t**1.5, horizon_s=2e12),
+        hazard_of(lambda t: mp.mpf(1e-9) * t ** mp.mpf("2.5") / mp.mpf("2.5")),
+    ),
+    "callable, finite integral": (
+        survival.CallableHazard(lambda t: 1e-2 / (1.0 + 1e-3 * t) ** 2, horizon_s=2e12),
+        hazard_of(lambda t: mp.mpf(1e-2) * t / (1 + mp.mpf(1e-3) * t)),
     ),
     "periodic": (
         survival.PeriodicHazard(86400.0, (0.0, 28800.0, 64800.0), (0.0, 1e-6, 1e-8)),

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 
 from evermap import survival
 from evermap.errors import ConfigError
@@ -135,15 +135,14 @@ def test_density_is_the_slope_of_survival(name: str) -> None:
 @pytest.mark.parametrize("name", CONTINUOUS)
 def test_mean_is_the_integral_of_survival(name: str) -> None:
     prior = CONTINUOUS[name]
-    log_mean = integrate.quad(
-        lambda u: math.exp(u + float(prior.log_survival(math.exp(u)))),
-        -20.0,
-        13.0,
-        limit=2000,
-        epsabs=1e-9,
-        epsrel=1e-9,
-    )[0]
-    assert prior.mean() == pytest.approx(log_mean, rel=2e-6)
+    # In log t, on pieces short enough for the kinks of some of them.
+    nodes, weights = np.polynomial.legendre.leggauss(16)
+    edges = np.linspace(-20.0, 13.0, 20_001)
+    u = edges[:-1, None] + np.diff(edges)[:, None] * 0.5 * (nodes + 1.0)
+    integral = np.exp(-20.0) + float(
+        np.sum((np.exp(u + prior.log_survival(np.exp(u))) @ weights) * 0.5 * np.diff(edges))
+    )
+    assert prior.mean() == pytest.approx(integral, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)

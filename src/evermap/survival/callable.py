@@ -18,6 +18,12 @@ _NODES = 16
 _PANELS_PER_DECADE = 8
 _MOST_PANELS = 50_000
 _TOLERANCE = 1e-12
+_FIRST_PANEL = 1e-9
+"""End of the first panel: in seconds, or as a share of the horizon if that is less."""
+_NEAR_ZERO = 1e-20
+"""Width, as a share of the first panel, of one from 0 that is halved no more (powers of t never converge)."""
+_NEGLIGIBLE = 1e-9
+"""Most that such a panel may hold of what the first one did."""
 _JUMP_WIDTH = 1e-13
 """Relative width at which a panel that still does not converge is taken to hold a jump."""
 
@@ -94,7 +100,7 @@ class CallableHazard(Lifetime):
         return values
 
     def _first_edges(self) -> FloatArray:
-        first = min(1e-9, 1e-9 * self.horizon_s)
+        first = _FIRST_PANEL * min(1.0, self.horizon_s)
         count = math.ceil(_PANELS_PER_DECADE * math.log10(self.horizon_s / first)) + 1
         inner = [t for t in self.breaks_s if 0.0 < t < self.horizon_s]
         return np.unique(
@@ -111,14 +117,19 @@ class CallableHazard(Lifetime):
             middle = 0.5 * (open_left + open_right)
             halves = self._quadrature(open_left, middle) + self._quadrature(middle, open_right)
             error = np.abs(self._quadrature(open_left, open_right) - halves)
-            good = (error <= _TOLERANCE * halves) | (open_right - open_left <= _JUMP_WIDTH * open_right)
+            width = open_right - open_left
+            smallest = (open_left == 0.0) & (width <= _NEAR_ZERO * edges[1])
+            good = (error <= _TOLERANCE * halves) | (width <= _JUMP_WIDTH * open_right) | smallest
             done_left.append(open_left[good])
             done_integral.append(halves[good])
             panels += int(good.sum())
             if good.all():
                 left = np.concatenate(done_left)
                 order = np.argsort(left)
-                return np.append(left[order], self.horizon_s), np.concatenate(done_integral)[order]
+                refined, integral = np.append(left[order], self.horizon_s), np.concatenate(done_integral)[order]
+                if smallest.any() and integral[0] > _NEGLIGIBLE * integral[refined[:-1] < edges[1]].sum():
+                    break  # like 1/t: whatever there is lies at 0
+                return refined, integral
             bad = ~good
             open_left, open_right = (
                 np.concatenate((open_left[bad], middle[bad])),
@@ -127,9 +138,9 @@ class CallableHazard(Lifetime):
             if panels + len(open_left) > _MOST_PANELS:
                 break
         raise ConfigError(
-            f"its integral does not converge near t = {float(open_left[0])!r} s",
+            f"its integral does not converge near t = {float(open_right[0])!r} s",
             field="hazard",
-            hint="a shorter horizon, a hazard that is finite at 0, or PeriodicHazard for one that repeats",
+            hint="a shorter horizon, a hazard that is finite near 0, or PeriodicHazard for one that repeats",
         )
 
     def _quadrature(self, a: FloatArray, b: FloatArray) -> FloatArray:

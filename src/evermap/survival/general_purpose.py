@@ -20,7 +20,7 @@ from evermap.survival.logmath import (
     scaled_e1,
 )
 from evermap.survival.protocol import Seed
-from evermap.types import FloatArray
+from evermap.types import BoolArray, FloatArray
 
 _NARROW = 2.0
 """`log(high / low)` below which the integral over the rate is taken numerically while its integrand is tame."""
@@ -80,21 +80,28 @@ class GeneralPurpose(Lifetime):
         later = log_one_minus_exp((self.high - self.low) * t) - np.log(t) - np.log(self._d(t))
         return np.where(t > 0.0, later, math.log((self.high - self.low) / self._span))
 
-    def _is_tame(self, t: FloatArray) -> FloatArray:
+    def _is_tame(self, t: FloatArray) -> BoolArray:
         return np.asarray(((self.high - self.low) * t < 2.0) & (self._span < _NARROW))
 
     def _died(self, t: FloatArray) -> FloatArray:
         """`1 - S(t)`."""
-        wide = (entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t)) / self._span
-        return np.where(self._is_tame(t), -self._mean_over_rates(lambda rate: np.expm1(-rate * t[..., None])), wide)
+        wide = np.asarray(entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t))
+        wide /= self._span
+        tame = self._is_tame(t)
+        if tame.any():
+            wide[tame] = -self._mean_over_rates(lambda rate: np.expm1(-rate * t[tame][:, None]))
+        return wide
 
     def _d(self, t: FloatArray) -> FloatArray:
         """`S(t) span exp(low t)`."""
-        spread = (self.high - self.low) * t
-        late = scaled_e1(self.low * t) - np.exp(-spread) * scaled_e1(self.high * t)
-        early = np.exp(self.low * t) * self._span * (1.0 - self._died(t))
-        tame = self._span * self._mean_over_rates(lambda rate: np.exp(-(rate - self.low) * t[..., None]))
-        return np.where(self._is_tame(t), tame, np.where(self.high * t < 1.0, early, late))
+        value = np.asarray(scaled_e1(self.low * t) - np.exp(-(self.high - self.low) * t) * scaled_e1(self.high * t))
+        early = self.high * t < 1.0
+        if early.any():
+            value[early] = np.exp(self.low * t[early]) * self._span * (1.0 - self._died(t[early]))
+        tame = self._is_tame(t)
+        if tame.any():
+            value[tame] = self._span * self._mean_over_rates(lambda rate: np.exp(-(rate - self.low) * t[tame][:, None]))
+        return value
 
     def _mean_over_rates(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
         """Mean over the log-uniform rate of a function that varies little over a narrow range; garbage else."""

@@ -55,14 +55,14 @@ def log_integral_of_smooth_hazard(
     """`log int_a^b h` of a hazard that is smooth in log t, with full relative precision.
 
     Where `H` grows by more than a tenth between `a` and `b` the difference of its two values is exact enough;
-    where it grows by less, its hazard is as good as a polynomial there and twenty nodes in log t integrate it.
+    where it grows by less, its hazard is as good as a polynomial there and twelve nodes in log t integrate it.
     """
     at_a, at_b = log_cumulative(a), log_cumulative(b)
     growth = at_b - at_a
     result = np.asarray(at_b + log_one_minus_exp(np.where(a > 0.0, np.maximum(growth, 0.0), np.inf)))
     near = (a > 0.0) & ((growth < _SMOOTH_RATIO) | np.isnan(growth))
     if near.any():
-        nodes, weights = gauss_legendre(20)
+        nodes, weights = gauss_legendre(12)
         first = a[near]
         width = log_ratio(first, b[near])
         t = first[..., None] * np.exp(width[..., None] * nodes)

@@ -120,7 +120,8 @@ class StepLifetime(Lifetime):
         return alive.reshape(a.shape), dying.reshape(a.shape)
 
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
-        rough = Lifetime._time_of_log_hazard(self, log_target)
+        # A probability may equal a sum of masses but for its last digit: that is the point, not the next one.
+        rough = Lifetime._time_of_log_hazard(self, log_target - 1e-13)
         corners = np.unique([t for t in (*self.starts_s, *self.ends_s) if math.isfinite(t)] or [0.0])
         nearest = corners[np.argmin(np.abs(rough[..., None] - corners), axis=-1)]
         # Bisection ends a few last digits beside a point of mass; the quantile is the point itself.
