@@ -81,8 +81,8 @@ def impossible(who: str) -> str:
     return f"{who}: this observation is impossible, whether the feature is there or gone"
 
 
-def check_rows(rows: Any, n: int) -> IntArray:
-    """Row numbers as int64, each in range and at most once.
+def check_rows(rows: Any, n: int, *, twice: bool = False) -> IntArray:
+    """Row numbers as int64, each in range and, unless `twice` is allowed, at most once.
 
     Raises:
         InputError: a row that does not exist.
@@ -94,7 +94,7 @@ def check_rows(rows: Any, n: int) -> IntArray:
     index = index.astype(np.int64)
     if first := _first((index < 0) | (index >= n), None):
         raise InputError(f"entry {first[0]}: row {index[first[0]]} of {n} does not exist", field="rows")
-    if np.bincount(index, minlength=1).max() > 1:
+    if not twice and np.bincount(index, minlength=1).max() > 1:
         row = int(np.argmax(np.bincount(index)))
         raise DataError(f"row {row} is observed twice in one update", field="rows", hint="run(), which takes streams")
     return index

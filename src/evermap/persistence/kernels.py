@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from evermap.persistence.elementary import e1_scaled_large, e1_small, expm1, inlined, kernel, parallel_kernel
+from evermap.persistence.elementary import exp, expm1, exponential_integral, inlined, kernel, parallel_kernel
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
 from evermap.types import BoolArray, FloatArray, IntArray
 
-TINY_TIME = 1e-250
-"""Stands for time 0 where a logarithm is taken: S is 1 there to every digit."""
+TINY_TIME = 1e-80
+"""Stands for time 0 where a logarithm or a quotient is taken: S is 1 there to every digit."""
 DIFFERENCE_TRUSTED = 1e-3
 """Odds of dying in a gap above which S(a) - S(t) has lost at most three digits."""
 NODE = 0.7745966692414834
@@ -103,7 +103,7 @@ def exponential(
         gone = p_false[i] if detected[i] else 1.0 - p_false[i]
         new = observed(predicted, there, gone)
         after[i] = new
-        survives = expm1(-max(min(rate * horizon_s, LOG_LARGEST), 0.0)) + 1.0
+        survives = exp(-max(min(rate * horizon_s, LOG_LARGEST), 0.0))
         probability[i] = survives / (1.0 + new)
         fine = (gap >= 0.0) & (time_s[i] < np.inf) & (rate >= 0.0) & (rate < np.inf) & (new >= 0.0)
         fine &= (p_miss[i] >= 0.0) & (p_miss[i] <= 1.0) & (p_false[i] >= 0.0) & (p_false[i] <= 1.0)
@@ -114,20 +114,18 @@ def exponential(
 @inlined
 def _scaled_survival(low: Any, high: Any, time: Any) -> Any:
     """`e^(low t) (E1(low t) - E1(high t))`, Rosen eq. 28 without its constant and without its exponential decay."""
-    time = max(time, TINY_TIME)
-    x, y = low * time, high * time
-    grown = expm1(min(x, 1.0)) + 1.0
-    first = grown * e1_small(min(x, 1.0)) if x < 1.0 else e1_scaled_large(max(x, 1.0))
-    decayed = expm1(-min(y - x, 700.0)) + 1.0
-    second = grown * e1_small(min(y, 1.0)) if y < 1.0 else decayed * e1_scaled_large(max(y, 1.0))
-    return first - second
+    x, y = low * max(time, TINY_TIME), high * max(time, TINY_TIME)
+    grown = exp(min(x, 1.0))
+    decayed = exp(-min(y - x, 700.0))
+    first = exponential_integral(x) * (grown if x < 1.0 else 1.0)
+    return first - exponential_integral(y) * (grown if y < 1.0 else decayed)
 
 
 @inlined
 def _death_density(low: Any, high: Any, time: Any, end: Any) -> Any:
-    """`e^(low end) (e^(-low t) - e^(-high t)) / t`: scaled density of the lifetime."""
+    """`e^(low end) (e^(-low t) - e^(-high t))`: density of the lifetime times t, scaled as above."""
     u = low * (end - time)  # at most the odds of dying in the gap, which are small where this is used
-    return (1.0 + u * (1.0 + u * (0.5 + u * (1.0 / 6.0)))) * -expm1(-min((high - low) * time, 700.0)) / time
+    return (1.0 + u * (1.0 + u * (0.5 + u * (1.0 / 6.0)))) * -expm1(-min((high - low) * time, 700.0))
 
 
 @inlined
@@ -139,12 +137,21 @@ def general_purpose_death_odds(low: Any, high: Any, start: Any, stop: Any) -> An
     gap = stop - start
     at_stop = _scaled_survival(low, high, stop)
     at_start = _scaled_survival(low, high, start)
-    difference = (expm1(max(min(low * gap, LOG_LARGEST), 0.0)) * at_start + (at_start - at_stop)) / at_stop
-    middle, reach = start + 0.5 * gap, 0.5 * gap * NODE
-    density = (8.0 / 18.0) * _death_density(low, high, max(middle, TINY_TIME), stop)
-    density += (5.0 / 18.0) * _death_density(low, high, max(middle - reach, TINY_TIME), stop)
-    density += (5.0 / 18.0) * _death_density(low, high, max(middle + reach, TINY_TIME), stop)
-    return min(difference if difference > DIFFERENCE_TRUSTED else gap * density / at_stop, LARGEST)
+    difference = expm1(max(min(low * gap, LOG_LARGEST), 0.0)) * at_start + (at_start - at_stop)
+    middle = max(start + 0.5 * gap, TINY_TIME)
+    reach = 0.5 * gap * NODE
+    left, right = middle - reach, middle + reach
+    outer = _death_density(low, high, left, stop) * right + _death_density(low, high, right, stop) * left
+    mass = gap * (8.0 * _death_density(low, high, middle, stop) * left * right + 5.0 * middle * outer)
+    apart = difference > DIFFERENCE_TRUSTED * at_stop
+    quotient = (difference if apart else mass) / (at_stop if apart else at_stop * (18.0 * middle * left * right))
+    return min(quotient, LARGEST)
+
+
+@kernel
+def general_purpose_gap(low: float, high: float, start: float, stop: float) -> float:
+    """`general_purpose_death_odds` of a single gap, to be called from Python."""
+    return float(general_purpose_death_odds(low, high, start, stop))
 
 
 @kernel

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-import math
+from math import exp, expm1, inf, isfinite, log
 
 from evermap.errors import InputError, NumericalError
 from evermap.persistence.checks import impossible
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
-from evermap.survival import Exponential, LifetimePrior
+from evermap.survival import Exponential, GeneralPurpose, LifetimePrior
+
+WIDE = 1.01
+"""Ratio of highest to lowest rate above which the kernel of the unknown-rate prior keeps twelve digits."""
+_ANSWERS = (0, 1)
 
 
 class PersistenceFilter:
@@ -49,7 +53,7 @@ class PersistenceFilter:
         Raises:
             InputError: a time that is not finite or lies before the last observation.
         """
-        if not self._stamp <= stamp_s < math.inf:
+        if not self._stamp <= stamp_s < inf:
             raise self._refusal(stamp_s, 0.0, 0.0)
         return 1.0 / (1.0 + self._predicted(stamp_s))
 
@@ -66,49 +70,65 @@ class PersistenceFilter:
             InputError: a probability outside [0, 1], or time running back.
             NumericalError: an observation that is impossible whether the feature is there or gone.
         """
-        if not (self._stamp <= stamp_s < math.inf and 0.0 <= p_miss <= 1.0 and 0.0 <= p_false <= 1.0):
+        if not (self._stamp <= stamp_s < inf and 0.0 <= p_miss <= 1.0 and 0.0 <= p_false <= 1.0):
             raise self._refusal(stamp_s, p_miss, p_false)
-        if detected not in (0, 1):
+        if detected not in _ANSWERS:
             raise InputError(f"{detected} is neither a detection nor a miss", field="detected", hint="True or False")
         predicted = self._predicted(stamp_s)
         there, gone = (1.0 - p_miss, p_false) if detected else (p_miss, 1.0 - p_false)
         probability = 1.0 / (1.0 + predicted)
-        complement = predicted * probability if predicted < math.inf else 1.0
+        complement = predicted * probability if predicted < inf else 1.0
         likelihood = probability * there + complement * gone
         if likelihood <= 0.0:
             raise NumericalError(impossible(f"time {stamp_s} s"), hint="P_M and P_F strictly between 0 and 1")
-        if there == 0.0 or predicted == math.inf:
-            after = math.inf
+        if there == 0.0 or predicted == inf:
+            after = inf
         elif gone == 0.0 or predicted == 0.0:
             after = 0.0
         else:
-            after = min(max(predicted * gone / there, SMALLEST), LARGEST)
+            after = _clamped(predicted * gone / there)
         self._inverse_odds = after
         self._stamp = stamp_s
-        self._evidence += math.log(likelihood)
+        self._evidence += log(likelihood)
         return 1.0 / (1.0 + after)
 
     def _predicted(self, stamp_s: float) -> float:
         """Inverse odds at a time that has been checked."""
         before = self._inverse_odds
-        if before == math.inf:
-            return before
-        if self._rate >= 0.0:
-            odds = math.expm1(min(self._rate * (stamp_s - self._stamp), LOG_LARGEST))
-        else:
-            survival = float(self._prior.log_conditional_survival(self._stamp, stamp_s))
-            death = float(self._prior.log_conditional_death(self._stamp, stamp_s))
-            if not survival > -math.inf:
-                return math.inf
-            odds = math.exp(max(min(death - survival, LOG_LARGEST), -LOG_LARGEST)) if death > -math.inf else 0.0
-        return min(before + (1.0 + before) * odds, LARGEST)
+        exponent = self._rate * (stamp_s - self._stamp)
+        if (
+            0.0 <= exponent < 1.0 and before < inf
+        ):  # the common case of an exponential lifetime, and no gap for any other
+            return before + (1.0 + before) * expm1(exponent)
+        odds = expm1(min(exponent, LOG_LARGEST)) if exponent > 0.0 else self._death_odds(stamp_s)
+        return inf if inf in (before, odds) else min(before + (1.0 + before) * odds, LARGEST)
+
+    def _death_odds(self, stamp_s: float) -> float:
+        """`(1 - q) / q` since the last observation, for a prior that is not exponential."""
+        prior = self._prior
+        if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
+            from evermap.persistence.kernels import general_purpose_gap
+
+            return general_purpose_gap(prior.low, prior.high, self._stamp, stamp_s)
+        survival = float(prior.log_conditional_survival(self._stamp, stamp_s))
+        death = float(prior.log_conditional_death(self._stamp, stamp_s))
+        if survival == -inf:
+            return inf
+        return exp(max(min(death - survival, LOG_LARGEST), -LOG_LARGEST)) if death > -inf else 0.0
 
     def _refusal(self, stamp_s: float, p_miss: float, p_false: float) -> InputError:
         """What was wrong with an update that is refused."""
         for value, field in ((p_miss, "p_miss"), (p_false, "p_false")):
             if not 0.0 <= value <= 1.0:
                 return InputError(f"{value} is no probability", field=field, hint="a number between 0 and 1")
-        if not math.isfinite(stamp_s):
+        if not isfinite(stamp_s):
             return InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
         past = f"the last observation at {self._stamp} s" if self._stamp else "the feature's birth at 0"
         return InputError(f"time {stamp_s} s lies before {past}", field="stamp_s", hint="sort by time")
+
+
+def _clamped(inverse_odds: float) -> float:
+    """Keep a finite doubt finite."""
+    if inverse_odds < SMALLEST:
+        return SMALLEST
+    return min(LARGEST, inverse_odds)

@@ -36,7 +36,7 @@ def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
     Raises:
         InputError: a time that is not finite or lies before the last observation.
     """
-    index = np.arange(len(state)) if rows is None else np.asarray(rows, dtype=np.int64)
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
     time = checks.as_rows(stamp_s, len(index), "stamp_s")
     checks.check_times(time, state.stamp_s[index], index)
     return 1.0 / (1.0 + _gap(state, index, time))
