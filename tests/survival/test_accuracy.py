@@ -215,3 +215,24 @@ def test_logarithms_agree_with_mpmath(name: str) -> None:
     worst = max(int(np.argmax(alive)), int(np.argmax(died)), key=lambda i: max(alive[i], died[i]))
     message = f"worst at a={a[worst]!r}, b={b[worst]!r}: {alive[worst]:.1e} (q), {died[worst]:.1e} (1-q)"
     assert max(alive.max(), died.max(), marginal.max()) < TOLERANCE, message
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_any_parameters_will_do(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    low = 10.0 ** rng.uniform(-12, 2)
+    high = low * (1.0 + 10.0 ** rng.uniform(-4, 10))
+    scale, shape = 10.0 ** rng.uniform(-3, 8), 10.0 ** rng.uniform(-1.5, 2.5)
+    mu, sigma = rng.uniform(-10, 20), 10.0 ** rng.uniform(-1.3, 1)
+    a = 10.0 ** rng.uniform(-9, 12, 30)
+    b = np.minimum(a * (1.0 + 10.0 ** rng.uniform(-12, 3, 30)), 1e12)
+    for prior, both in (
+        (survival.GeneralPurpose(low, high), general_purpose(low, high)),
+        (survival.Gamma(scale, shape), gamma(scale, shape)),
+        (survival.LogNormal(mu, sigma), lognormal(mu, sigma)),
+    ):
+        with mp.workdps(60):
+            want = [references(both, x, y) for x, y in zip(a, b, strict=True)]
+            alive = relative_errors(prior.log_conditional_survival(a, b), [w[0] for w in want])
+            died = relative_errors(prior.log_conditional_death(a, b), [w[1] for w in want])
+        assert max(alive.max(), died.max()) < TOLERANCE, prior

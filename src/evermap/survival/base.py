@@ -44,7 +44,7 @@ class Lifetime(ABC):
         return 0.0
 
     def log_survival(self, t: ArrayLike) -> FloatArray:
-        return -self.cumulative_hazard(t)
+        return 0.0 - self.cumulative_hazard(t)
 
     def log_conditional_survival(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
         first, last = checks.intervals(a, b)
