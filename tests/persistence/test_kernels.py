@@ -8,6 +8,7 @@ import pytest
 
 from evermap.persistence import single
 from evermap.persistence.batch import CHUNK_ROWS, look_exponential, look_general_purpose
+from evermap.persistence.death import log_death_odds
 from evermap.persistence.elementary import exp, expm1, exponential_integral
 from evermap.persistence.kernels import general_purpose_gap
 from evermap.survival import Exponential, GeneralPurpose
@@ -96,3 +97,13 @@ def test_certainties_pass_through_the_kernels() -> None:
     )
     np.testing.assert_array_equal(look.inverse_odds, [0.0, np.inf, 0.0, 1e300])
     np.testing.assert_array_equal(look.probability, [1.0, 0.0, 1.0, 1e-300])
+
+
+def test_the_short_road_of_an_unknown_rate_agrees_with_the_prior_itself() -> None:
+    random = np.random.default_rng(4)
+    prior = GeneralPurpose(1e-5, 0.5)
+    start = np.where(random.random(200) < 0.1, 0.0, 10 ** random.uniform(-6, 6, 200))
+    stop = start + 10 ** random.uniform(-4, 6, 200)
+    expected = prior.log_conditional_death(start, stop) - prior.log_conditional_survival(start, stop)
+    odds = log_death_odds((prior,), np.zeros(200, dtype=np.int64), start, stop)
+    np.testing.assert_allclose(odds, expected, rtol=1e-10, atol=1e-10)

@@ -155,6 +155,13 @@ def general_purpose_gap(low: float, high: float, start: float, stop: float) -> f
 
 
 @kernel
+def general_purpose_gaps(low: float, high: float, start_s: FloatArray, stop_s: FloatArray, odds: FloatArray) -> None:
+    """`general_purpose_death_odds` of many gaps under one prior."""
+    for i in range(odds.size):
+        odds[i] = general_purpose_death_odds(low, high, start_s[i], stop_s[i])
+
+
+@kernel
 def general_purpose(
     inverse_odds: FloatArray,
     stamp_s: FloatArray,

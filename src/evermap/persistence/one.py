@@ -6,11 +6,10 @@ from math import exp, expm1, inf, isfinite, log
 
 from evermap.errors import InputError, NumericalError
 from evermap.persistence.checks import impossible
+from evermap.persistence.death import WIDE
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior
 
-WIDE = 1.01
-"""Ratio of highest to lowest rate above which the kernel of the unknown-rate prior keeps twelve digits."""
 _ANSWERS = (0, 1)
 
 
