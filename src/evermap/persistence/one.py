@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import exp, expm1, inf, isfinite, log
 
 from evermap.errors import InputError, NumericalError
@@ -22,11 +23,17 @@ class PersistenceFilter:
         prior: how long such features stay.
     """
 
-    __slots__ = ("_evidence", "_inverse_odds", "_prior", "_rate", "_stamp")
+    __slots__ = ("_compiled", "_evidence", "_high", "_inverse_odds", "_low", "_prior", "_rate", "_stamp")
 
     def __init__(self, prior: LifetimePrior) -> None:
         self._prior = prior
         self._rate = prior.rate if isinstance(prior, Exponential) else -1.0
+        self._low = self._high = 0.0
+        self._compiled: Callable[[float, float, float, float], float] | None = None
+        if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
+            from evermap.persistence.kernels import general_purpose_gap
+
+            self._low, self._high, self._compiled = float(prior.low), float(prior.high), general_purpose_gap
         self._inverse_odds = 0.0
         self._stamp = 0.0
         self._evidence = 0.0
@@ -104,11 +111,9 @@ class PersistenceFilter:
 
     def _death_odds(self, stamp_s: float) -> float:
         """`(1 - q) / q` since the last observation, for a prior that is not exponential."""
+        if self._compiled is not None:
+            return self._compiled(self._low, self._high, self._stamp, stamp_s)
         prior = self._prior
-        if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
-            from evermap.persistence.kernels import general_purpose_gap
-
-            return general_purpose_gap(prior.low, prior.high, self._stamp, stamp_s)
         survival = float(prior.log_conditional_survival(self._stamp, stamp_s))
         death = float(prior.log_conditional_death(self._stamp, stamp_s))
         if survival == -inf:
