@@ -16,14 +16,15 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "evermap"
 # part -> what it may import of ours, beside itself
 RULES = {
     "errors": "",
+    "compiled": "",
     "types": "",
     "se2": "types",
     "config": "errors types",
     "survival": "errors types se2",
     "sensing": "errors types se2",
-    "persistence": "errors types se2 survival sensing",
+    "persistence": "errors types se2 compiled survival sensing",
     "tracking": "errors types se2 config survival sensing persistence",
-    "slam": "errors types se2 config survival sensing persistence",
+    "slam": "errors types se2 compiled config survival sensing persistence",
     "maps": "errors types se2 config survival sensing persistence",
     "io": "errors types se2",
     "sim": "errors types se2 survival sensing",

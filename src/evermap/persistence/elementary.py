@@ -7,28 +7,17 @@ and correct to a few units in the last place over the stated ranges (their tests
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import njit
 
+from evermap.compiled import drop_stale_code
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _drop_stale_code() -> None:
-    """Delete kept machine code that is older than any source of this package.
-
-    A kernel's machine code contains the kernels it calls, but its keeper looks at the kernel's own file only.
-    """
-    sources = Path(__file__).parent
-    newest = max(path.stat().st_mtime for path in sources.glob("*.py"))
-    for index in (sources / "__pycache__").glob("*.nbi"):
-        if index.stat().st_mtime < newest:
-            index.unlink(missing_ok=True)
-
-
-_drop_stale_code()
+drop_stale_code(__file__)
 
 
 def kernel(function: _Function) -> _Function:
