@@ -195,14 +195,14 @@ class IncrementalSmoother:
         problem = self._problem
         values.insert(_pose_key(row), gtsam.Pose2(*pose))
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        mapped = problem.mapped
         for j in dict.fromkeys(problem.landmark_row[detections].tolist()):
             if j in self._known:
                 continue
             self._known.add(j)
             values.insert(_landmark_key(j), landmark[j])
-            information = problem.landmark_information[j]
-            if information.any():
-                noise = gtsam.noiseModel.Gaussian.Information(information)
+            if mapped[j]:
+                noise = gtsam.noiseModel.Gaussian.Information(problem.landmark_information[j])
                 graph.add(gtsam.PriorFactorPoint2(_landmark_key(j), problem.landmark_mean[j], noise))
         # the first pose of the tree has no odometry: the summary holds it, or the start does
         before = row > self._first_pose

@@ -77,6 +77,12 @@ class Problem:
     landmark_mean: FloatArray
     landmark_information: FloatArray
 
+    @property
+    def mapped(self) -> BoolArray:
+        """(L,) landmarks that a prior map holds."""
+        held: BoolArray = self.landmark_information[:, 0, 0] > 0.0
+        return held
+
     def until(self, n_poses: int, *, last_is_blind: bool = False) -> Problem:
         """The problem as it stood after `n_poses` poses; landmarks keep their rows.
 

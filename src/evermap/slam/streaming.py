@@ -55,9 +55,10 @@ class Outcome:
     """All that a finished session knows, in the metres and the frame of the map.
 
     Attributes:
-        estimate, marginals: smoothed values and covariances, scale uncertainty included.
+        estimate: smoothed values.
+        states_covariance: (9, 9) of its calibration states, the undivided part of the scale included.
         problem: with the start and priors that the optimum belongs to, in the graph's metres.
-        graph_estimate, graph_marginals: the same as the graph holds them, before the scale was divided.
+        graph_estimate, graph_marginals: values and covariances as the graph holds them, before the scale was divided.
         noise: levels and how well they are known.
         inlier: (M,) probability of every detection to be no outlier.
         scale: factor from the graph's metres to metres; log_scale_sigma: its uncertainty.
@@ -160,17 +161,13 @@ class StreamingSlam:
             smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
             estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
             marginals = smoother.marginals(estimate)
-            before, fit = (
-                noise,
-                refine_noise(
-                    problem, estimate, marginals, smoother.inlier_probability(estimate), noise, self._start_noise
-                ),
-            )
+            weights = smoother.inlier_probability(estimate)
+            fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
             if not self._estimate_noise:
                 if not heavy:
                     break
                 continue
-            noise = fit.noise
+            before, noise = noise, fit.noise
             if not heavy and _settled(before, noise):
                 break
         assert fit is not None
@@ -205,7 +202,6 @@ class StreamingSlam:
             return
         motion = self._motion * self._problem.prior.free[5:]
         self.nis[known] = self._graph.innovations(row, self._increment, motion, self._odometry_covariance, known)
-
         landmark = self._problem.landmark_row[known]
         np.add.at(self._n_compared, landmark, 1)
         np.add.at(self._n_surprising, landmark, self.nis[known] > SURPRISING_NIS)
@@ -213,8 +209,7 @@ class StreamingSlam:
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
         seen = np.unique(self._problem.landmark_row[detections])
-        if self._aligned and self._prior_map is not None:
-            seen = seen[~self._prior_map.given[seen]]  # the map is believed: no vote moves its landmarks
+        seen = seen[~self._problem.mapped[seen]]  # the map is believed: no vote moves its landmarks
         young = np.isin(self._n_compared[seen], DISPUTED_AT)
         return bool(np.any(young & (2 * self._n_surprising[seen] > self._n_compared[seen])))
 
@@ -222,10 +217,10 @@ class StreamingSlam:
         """Where a landmark that is seen for the first time must be, by this one sighting."""
         for m in detections:
             j = self._problem.landmark_row[m]
-            if not np.isnan(self._landmark[j, 0]):
+            if np.isfinite(self._landmark[j, 0]):
                 continue
-            if self._aligned and self._prior_map is not None and self._prior_map.given[j]:
-                self._landmark[j] = self._prior_map.mean[j]
+            if self._problem.mapped[j]:
+                self._landmark[j] = self._problem.landmark_mean[j]
             else:
                 self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 

@@ -37,10 +37,9 @@ def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estim
     """
     sightings = np.bincount(problem.landmark_row, minlength=len(estimate.landmark))
     agreeing = np.bincount(problem.landmark_row, weights=weights > 0.5, minlength=len(estimate.landmark))
-    mapped = problem.landmark_information[:, 0, 0] > 0.0  # held by a prior map: a vote would only set it against that
-    lost: IntArray = np.flatnonzero((sightings >= MIN_SIGHTINGS) & (agreeing < 0.5 * sightings) & ~mapped).astype(
-        np.int64
-    )
+    # a vote would only set a landmark of a prior map against that map
+    disputed = (sightings >= MIN_SIGHTINGS) & (agreeing < 0.5 * sightings) & ~problem.mapped
+    lost: IntArray = np.flatnonzero(disputed).astype(np.int64)
     if len(lost) == 0:
         return estimate
     landmark = estimate.landmark.copy()
