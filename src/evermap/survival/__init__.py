@@ -11,6 +11,7 @@ from evermap.survival.periodic import PeriodicHazard
 from evermap.survival.piecewise import PiecewiseConstantHazard
 from evermap.survival.protocol import LifetimePrior, Seed
 from evermap.survival.step import StepLifetime
+from evermap.survival.text import parse_prior
 from evermap.survival.uniform import Uniform
 from evermap.survival.weibull import Weibull
 
@@ -33,5 +34,6 @@ __all__ = [
     "half_life",
     "mean_stay",
     "never_leaves",
+    "parse_prior",
     "somewhere_between",
 ]

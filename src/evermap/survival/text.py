@@ -1,0 +1,248 @@
+"""Lifetime priors as text, for command lines and files: `exponential:half-life=2d`, or a mixture of such.
+
+A form is a name and, after a colon, values: `name:key=value,key=value`. Weighted forms are added to a mixture:
+`0.3*exponential:half-life=1h + 0.7*never-leaves`. `FORMS` lists all of them with an example each.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from evermap.errors import ConfigError
+from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_rate_hz
+from evermap.survival.exponential import Exponential
+from evermap.survival.gamma import Gamma
+from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.lognormal import LogNormal
+from evermap.survival.mixture import Mixture
+from evermap.survival.named import gone_by_day, gone_overnight, never_leaves, somewhere_between
+from evermap.survival.periodic import PeriodicHazard
+from evermap.survival.piecewise import PiecewiseConstantHazard
+from evermap.survival.protocol import LifetimePrior
+from evermap.survival.uniform import Uniform
+from evermap.survival.weibull import Weibull
+
+Values = Mapping[str, Any]
+Reader = Callable[[str], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """One way to write a prior.
+
+    Attributes:
+        example: text that `parse_prior` takes.
+        meaning: half a line for people.
+        build: makes the prior of the values read.
+        needed: keys that must be given, with the reader of each.
+        optional: keys that may be.
+        bare: key whose value stands alone, without `key=`.
+        steps: whether further keys are times at which a hazard begins.
+    """
+
+    example: str
+    meaning: str
+    build: Callable[[Values], LifetimePrior]
+    needed: Mapping[str, Reader] = field(default_factory=dict)
+    optional: Mapping[str, Reader] = field(default_factory=dict)
+    bare: str | None = None
+    steps: bool = False
+
+    @property
+    def keys(self) -> dict[str, Reader]:
+        """All keys with their readers."""
+        return {**self.needed, **self.optional}
+
+
+def parse_prior(text: str) -> LifetimePrior:
+    """The prior that a text stands for.
+
+    Args:
+        text: a form of `FORMS`, or weighted forms added: `0.3*exponential:half-life=1h + 0.7*never-leaves`.
+
+    Raises:
+        ConfigError: in one line what is wrong with which part, and the nearest word that is known.
+    """
+    try:
+        parts = [part.strip() for part in re.split(r"(?<![0-9][eE])\+", text)]
+        if not all(parts):
+            raise ConfigError("empty" if len(parts) == 1 else "a part of the sum is empty", hint="never-leaves")
+        if len(parts) == 1 and "*" not in text:
+            return _parse_form(text.strip())
+        return _parse_mixture(parts)
+    except ConfigError as error:
+        about = f"{error.field}: " if error.field else ""
+        raise ConfigError(f"prior '{text}': {about}{error.problem}", hint=error.hint) from None
+
+
+def _parse_mixture(parts: Iterable[str]) -> Mixture:
+    weights, priors = [], []
+    for part in parts:
+        weight, star, form = part.partition("*")
+        if not star:
+            raise ConfigError(f"no weight in '{part}'", hint=f"0.5*{part}")
+        weights.append(parse_number(weight))
+        priors.append(_parse_form(form.strip()))
+    if abs(sum(weights) - 1.0) > 1e-6:
+        raise ConfigError(f"the weights sum to {sum(weights):g}", hint="weights that sum to 1")
+    return Mixture.of(priors, weights)
+
+
+def _parse_form(text: str) -> LifetimePrior:
+    name, _, body = text.partition(":")
+    form = FORMS.get(name.strip())
+    if form is None:
+        raise ConfigError(f"no lifetime is called '{name}'", hint=_nearest(name, FORMS))
+    values: dict[str, Any] = {}
+    steps: list[tuple[float, float]] = []
+    for entry in filter(None, (item.strip() for item in body.split(","))):
+        key, equals, value = (item.strip() for item in entry.partition("="))
+        if not equals and form.bare is not None:
+            key, value = form.bare, entry
+        elif not equals:
+            raise ConfigError(f"'{entry}' is no key=value", hint=form.example)
+        if key in values:
+            raise ConfigError("given twice", field=key)
+        if key in form.keys:
+            values[key] = _read(form.keys[key], key, value)
+        elif form.steps and key[:1].isdigit():
+            begin_s = 0.0 if re.fullmatch(r"0[a-z]*", key) else parse_duration_s(key)
+            steps.append((begin_s, _read(parse_rate_hz, key, value)))
+        else:
+            raise ConfigError(f"{name} has no '{key}'", hint=_nearest(key, form.keys) if form.keys else form.example)
+    missing = [key for key in form.needed if key not in values]
+    if missing or (form.steps and not steps):
+        raise ConfigError(f"needs {missing[0] if missing else 'rates'}", hint=form.example)
+    if steps:
+        values["edges_s"], values["rates"] = zip(*steps, strict=True)
+    return form.build(values)
+
+
+def _read(reader: Reader, key: str, value: str) -> Any:
+    try:
+        return reader(value)
+    except ConfigError as error:
+        raise ConfigError(error.problem, field=error.field or key, hint=error.hint) from None
+
+
+def _nearest(word: str, known: Iterable[str]) -> str:
+    """The closest known word, or all of them."""
+    words = list(known)
+    close = difflib.get_close_matches(word.strip().lower(), words, n=1, cutoff=0.5)
+    return close[0] if close else ("one of " if len(words) > 1 else "") + ", ".join(words)
+
+
+def _between(reader: Reader) -> Reader:
+    """Reader of `from..to`."""
+
+    def read(text: str) -> tuple[Any, Any]:
+        low, dots, high = text.partition("..")
+        if not dots:
+            raise ConfigError(f"'{text}' is no range", hint="two values with two dots between them")
+        return reader(low), reader(high)
+
+    return read
+
+
+def _exponential(values: Values) -> Exponential:
+    if len(values) != 1:
+        raise ConfigError("needs one of half-life, mean and rate", hint=FORMS["exponential"].example)
+    if "half-life" in values:
+        return Exponential.from_half_life(values["half-life"])
+    return Exponential.from_mean(values["mean"]) if "mean" in values else Exponential(values["rate"])
+
+
+def _unknown(values: Values) -> GeneralPurpose:
+    shortest_s, longest_s = values["mean stays"]
+    if not shortest_s < longest_s:
+        raise ConfigError("the shorter mean stay comes first", hint=FORMS["unknown"].example)
+    return somewhere_between(shortest_s, longest_s)
+
+
+def _daily(make: Callable[..., PeriodicHazard], hours: str) -> Callable[[Values], PeriodicHazard]:
+    def build(values: Values) -> PeriodicHazard:
+        stretch = {f"{hours}_hours": values[hours]} if hours in values else {}
+        return make(values["p"], first_seen_hour=values["seen"], **stretch)
+
+    return build
+
+
+FORMS: Mapping[str, Form] = {
+    "exponential": Form(
+        "exponential:half-life=2d",
+        "half are gone after 2 days; or mean=3d, or rate=0.5/d",
+        _exponential,
+        optional={"half-life": parse_duration_s, "mean": parse_duration_s, "rate": parse_rate_hz},
+    ),
+    "unknown": Form(
+        "unknown:1h..30d",
+        "the mean stay is unknown, between 1 hour and 30 days",
+        _unknown,
+        needed={"mean stays": _between(parse_duration_s)},
+        bare="mean stays",
+    ),
+    "general-purpose": Form(
+        "general-purpose:low=0.001/s,high=1/s",
+        "the same by its rates, as in Rosen 2016",
+        lambda v: GeneralPurpose(v["low"], v["high"]),
+        needed={"low": parse_rate_hz, "high": parse_rate_hz},
+    ),
+    "uniform": Form(
+        "uniform:limit=3d",
+        "any stay up to 3 days, none longer",
+        lambda v: Uniform(v["limit"]),
+        needed={"limit": parse_duration_s},
+    ),
+    "weibull": Form(
+        "weibull:scale=2d,shape=0.7",
+        "shape < 1: what has stayed long stays longer; > 1: it wears out",
+        lambda v: Weibull(v["scale"], v["shape"]),
+        needed={"scale": parse_duration_s, "shape": parse_number},
+    ),
+    "lognormal": Form(
+        "lognormal:median=2d,spread=1.5",
+        "half are gone after 2 days, the logarithms spread by 1.5",
+        lambda v: LogNormal.from_half_life(v["median"], v["spread"]),
+        needed={"median": parse_duration_s, "spread": parse_number},
+    ),
+    "gamma": Form(
+        "gamma:scale=2d,shape=2",
+        "two exponential stages of 2 days one after the other",
+        lambda v: Gamma(v["scale"], v["shape"]),
+        needed={"scale": parse_duration_s, "shape": parse_number},
+    ),
+    "never-leaves": Form("never-leaves", "walls", lambda _: never_leaves()),
+    "gone-overnight": Form(
+        "gone-overnight:p=0.3,seen=10:00,night=20:00..6:00",
+        "a night takes 30 %, a day nothing; first seen at 10:00",
+        _daily(gone_overnight, "night"),
+        needed={"p": parse_number, "seen": parse_hour},
+        optional={"night": _between(parse_hour)},
+    ),
+    "gone-by-day": Form(
+        "gone-by-day:p=0.3,seen=10:00,day=8:00..18:00",
+        "a day takes 30 %, a night nothing",
+        _daily(gone_by_day, "day"),
+        needed={"p": parse_number, "seen": parse_hour},
+        optional={"day": _between(parse_hour)},
+    ),
+    "hazard": Form(
+        "hazard:0s=1/d,3d=0.01/d",
+        "a rate of 1 a day for 3 days, then 0.01 a day",
+        lambda v: PiecewiseConstantHazard(v["edges_s"], v["rates"]),
+        steps=True,
+    ),
+    "periodic": Form(
+        "periodic:period=1w,0s=0.2/d,5d=0/d,start=2d",
+        "a rate that repeats, here 5 days a week; first seen on day 2",
+        lambda v: PeriodicHazard(v["period"], v["edges_s"], v["rates"], start_s=v.get("start", 0.0)),
+        needed={"period": parse_duration_s},
+        optional={"start": parse_duration_s},
+        steps=True,
+    ),
+}
+"""What may be written, by name."""
