@@ -89,18 +89,17 @@ class TimeAxis:
         axes.set_xlabel(f"time [{self.zone}]")
 
 
-def label_durations(axes: Axes, low_s: float, high_s: float) -> None:
-    """A logarithmic axis of durations in seconds from `low_s` to `high_s`, with ticks such as `1 min` and `1 day`."""
+def label_durations(axes: Axes, low_s: float, high_s: float, unit: TimeUnit) -> None:
+    """A logarithmic axis in `unit` from `low_s` to `high_s`, with ticks such as `1 min` and `1 day`."""
     from matplotlib.ticker import NullFormatter, NullLocator
 
     axes.set_xscale("log")
-    axes.set_xlim(low_s, high_s)
-    ticks = [(name, value) for name, value in DURATIONS if low_s <= value <= high_s]
-    step = 1 + (len(ticks) - 1) // 6
-    chosen = ticks[::step]
-    if len(chosen) < 2:  # less than a decade: plain seconds
-        axes.set_xlabel("time since first seen [s]")
+    axes.set_xlim(low_s / unit.seconds, high_s / unit.seconds)
+    ticks = [(name, value / unit.seconds) for name, value in DURATIONS if low_s <= value <= high_s]
+    if len(ticks) < 2:  # no two of them in sight: plain numbers
+        axes.set_xlabel(f"time since first seen [{unit.name}]")
         return
+    chosen = ticks[:: 1 + (len(ticks) - 1) // 6]
     axes.set_xticks([value for _, value in chosen], [name for name, _ in chosen])
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_minor_formatter(NullFormatter())
