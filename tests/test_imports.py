@@ -23,21 +23,24 @@ RULES = {
     "survival": "errors types se2",
     "sensing": "errors types se2",
     "persistence": "errors types se2 compiled survival sensing",
-    "tracking": "errors types se2 config survival sensing persistence",
-    "slam": "errors types se2 compiled config survival sensing persistence",
-    "maps": "errors types se2 config survival sensing persistence",
+    "recurrence": "errors types compiled survival persistence",
+    "tracking": "errors types se2 config survival sensing persistence recurrence",
+    "slam": "errors types se2 compiled config survival sensing persistence recurrence",
+    "maps": "errors types se2 config survival sensing persistence recurrence",
     "io": "errors types se2",
     "sim": "errors types se2 survival sensing",
     "metrics": "errors types se2 survival",
-    "viz": "errors types se2 survival metrics",
-    "pipeline": "errors types se2 config survival sensing persistence tracking slam maps",
+    "viz": "errors types se2 survival recurrence metrics",
+    "pipeline": "errors types se2 config survival sensing persistence recurrence tracking slam maps",
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
-    "server": "errors types se2 config survival sensing persistence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence slam sim io metrics viz pipeline "
+    "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
+    "experiments": "errors types se2 config survival sensing persistence recurrence slam sim io metrics viz pipeline "
     "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
-    "cli": "errors types config io sim metrics viz maps pipeline runfolder server experiments demo",
+    "presence": "errors types survival persistence recurrence io metrics viz",
+    "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence server "
+    "experiments demo",
 }
 
 # loaded by the functions that need them, never by starting up
