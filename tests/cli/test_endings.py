@@ -13,6 +13,7 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = ["demo", "slam", "convert", "simulate", "reproduce", "bench"]
+GROUPS = {"survival": ["plot"]}
 
 
 def run(*arguments: str) -> Result:
@@ -111,10 +112,22 @@ def test_help_of_every_verb_has_an_example(verb: str) -> None:
 def test_help_lists_every_verb_and_nothing_is_cut_short() -> None:
     result = run("--help")
     assert result.exit_code == 0
-    assert [line.split()[0] for line in result.stdout.partition("Commands:")[2].splitlines() if line.strip()][
-        :-1
-    ] == VERBS
+    assert [line.split()[0] for line in result.stdout.partition("Commands:")[2].splitlines() if line.strip()][:-1] == [
+        *VERBS,
+        *GROUPS,
+    ]
     assert "..." not in result.stdout.partition("Commands:")[2]
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_groups_list_their_verbs_with_an_example_each(group: str) -> None:
+    listed = run(group, "--help").stdout.partition("Commands:")[2]
+    assert [line.split()[0] for line in listed.splitlines() if line.strip()] == GROUPS[group]
+    assert "..." not in listed
+    for verb in GROUPS[group]:
+        shown = run(group, verb, "--help").stdout
+        assert f"  evermap {group} {verb}" in shown.partition("Example")[2]
+        assert "--json" in shown
 
 
 def test_version() -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -118,13 +118,13 @@ def settle(figure: Figure) -> None:
     figure.set_layout_engine("none")
 
 
-def save_png(figure: Figure, path: Path, *, dpi: int = 160) -> None:
+def save_png(figure: Figure, path: Path | BinaryIO, *, dpi: int = 160) -> None:
     """Writes a PNG on white paper; the same figure gives the same bytes."""
     with house_style():
         figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
 
 
-def save_svg(figure: Figure, path: Path) -> None:
+def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
     """Writes a stand-alone SVG on white paper; the same figure gives the same bytes."""
     with house_style():
         figure.savefig(path, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
