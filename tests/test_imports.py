@@ -23,7 +23,7 @@ RULES = {
     "survival": "errors types se2",
     "sensing": "errors types se2",
     "persistence": "errors types se2 compiled survival sensing",
-    "recurrence": "errors types compiled survival persistence",
+    "recurrence": "errors types compiled survival persistence io",
     "tracking": "errors types se2 config survival sensing persistence recurrence",
     "slam": "errors types se2 compiled config survival sensing persistence recurrence",
     "maps": "errors types se2 config survival sensing persistence recurrence",
