@@ -3,32 +3,47 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from evermap.cli.terminal import print_json, progress_bar, say
+from evermap.cli.terminal import print_json, progress_bar, say, warn
+from evermap.errors import ConfigError
 
 
 class Experiment(StrEnum):
     """What can be reproduced."""
 
     MRCLAM = "mrclam"
+    ROSEN2016 = "rosen2016"
+
+
+DATA = {Experiment.MRCLAM: Path("../shared/data/mrclam"), Experiment.ROSEN2016: Path("../shared/golden")}
+"""Where the data of each experiment are looked for."""
 
 
 def reproduce(
     experiment: Annotated[Experiment, typer.Argument(help="Which table.")],
-    data: Annotated[Path, typer.Option(help="Folder with the recordings as their authors distribute them.")] = Path(
-        "../shared/data/mrclam"
-    ),
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with the recordings (mrclam) or with rosen2016.json, the numbers to compare with (rosen2016).",
+            show_default="../shared/data/mrclam or ../shared/golden",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<experiment>")
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Also the recordings of which only a part of the truth is known.")
+        bool, typer.Option("--all", help="mrclam: also the recordings of which only a part of the truth is known.")
     ] = False,
+    seed: Annotated[int | None, typer.Option(help="rosen2016: same seed, same numbers.", show_default="0")] = None,
+    sequences: Annotated[
+        int | None, typer.Option(help="rosen2016: sequences drawn for every setting.", show_default="10000")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace --out even if it holds other things than results.")
@@ -36,25 +51,62 @@ def reproduce(
 ) -> None:
     """Compute a table of the documents again.
 
-    Runs follow one another on one core, so that the timings mean something.
+    mrclam: all robots of the UTIAS recordings against the truth. rosen2016: figures 1 to 4 of the persistence filter's
+    paper against reference numbers. Runs follow one another on one core, so that the timings mean something.
 
     \b
     Example:
       evermap reproduce mrclam --data ~/recordings/mrclam
+      evermap reproduce rosen2016 --seed 1
     """
     _one_core()
-    from evermap.experiments import mrclam
     from evermap.runfolder import check_replaceable
 
+    _refuse_options(experiment, {"--all": everything, "--seed": seed is not None, "--sequences": sequences is not None})
     target = out or Path("evermap-out") / experiment.value
     check_replaceable(target, force=force)
     with progress_bar(experiment.value) as progress:
-        table = mrclam.reproduce(data, target, progress=progress, everything=everything, force=force)
+        if experiment is Experiment.MRCLAM:
+            from evermap.experiments import mrclam
+
+            folder = data or DATA[experiment]
+            table = mrclam.reproduce(folder, target, progress=progress, everything=everything, force=force)
+            text = mrclam.as_markdown(table)
+        else:
+            from evermap.experiments import rosen2016
+
+            paper = rosen2016.Settings()
+            settings = replace(
+                paper,
+                seed=paper.seed if seed is None else seed,
+                sequences=paper.sequences if sequences is None else sequences,
+            )
+            reference = _reference(data)
+            table = rosen2016.reproduce(target, settings, data=reference, progress=progress, force=force)
+            text = rosen2016.as_markdown(table)
     if as_json:
         print_json(table)
     else:
-        typer.echo(mrclam.as_markdown(table))
-        say(f"the runs behind it are in {target}")
+        typer.echo(text)
+        say(f"what is behind it is in {target}")
+
+
+def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
+    """An option that would be ignored is a mistake."""
+    known = {Experiment.MRCLAM: {"--all"}, Experiment.ROSEN2016: {"--seed", "--sequences"}}[experiment]
+    for name in (name for name, is_given in given.items() if is_given and name not in known):
+        raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))
+
+
+def _reference(data: Path | None) -> Path | None:
+    """Where the reference numbers are; None, and a warning, if they are not where they are looked for unasked."""
+    if data is not None:
+        return data
+    folder = DATA[Experiment.ROSEN2016]
+    if (folder / "rosen2016.json").is_file():
+        return folder
+    warn(f"no {folder / 'rosen2016.json'}: the numbers are computed, and compared with nothing (try: --data FOLDER)")
+    return None
 
 
 def _one_core() -> None:
