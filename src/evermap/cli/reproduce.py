@@ -71,7 +71,7 @@ def reproduce(
 
             folder = data or DATA[experiment]
             table = mrclam.reproduce(folder, target, progress=progress, everything=everything, force=force)
-            text = mrclam.as_markdown(table)
+            as_text = mrclam.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -83,11 +83,11 @@ def reproduce(
             )
             reference = _reference(data)
             table = rosen2016.reproduce(target, settings, data=reference, progress=progress, force=force)
-            text = rosen2016.as_markdown(table)
+            as_text = rosen2016.as_markdown
     if as_json:
         print_json(table)
     else:
-        typer.echo(text)
+        typer.echo(as_text(table))
         say(f"what is behind it is in {target}")
 
 
