@@ -1,0 +1,291 @@
+"""The run-length filter: presence as stays and absences of any lifetime, each with or without a rhythm of the week.
+
+The belief about a feature is a list of hypotheses: in this state, since this instant, with this probability. For
+lifetimes that forget their age use `PhaseType`, which needs no list.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import ConfigError, NumericalError
+from evermap.persistence import checks
+from evermap.persistence.checks import impossible
+from evermap.recurrence.hazard_table import HazardTable, tabulate
+from evermap.recurrence.protocol import Instants, Looks, Track
+from evermap.recurrence.rhythm import BIN_S, BINS, Rhythm
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.recurrence.run_length_kernels import First, Law
+
+ABSENT, PRESENT = 0, 1
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """How features come and go: an alternating renewal process (MATH.md section 4).
+
+    A hazard at local time `t` of a stay of age `a` is that of its lifetime at `a` times its rhythm at `t`. Within one
+    step of time a feature changes at most once, in the middle of it.
+
+    Attributes:
+        stay: lifetime of presences.
+        absence: lifetime of absences.
+        step_s: longest step of time; a small part of a typical stay or absence.
+        stay_rhythm: factor on the hazard of leaving, over the local week.
+        absence_rhythm: factor on the hazard of returning.
+        newborn: features are there, and new, when they are first heard of; otherwise they have come and gone for ever.
+        hypotheses: how many are kept of each feature.
+
+    Raises:
+        ConfigError: a step that is not positive, or fewer than 8 hypotheses.
+    """
+
+    stay: LifetimePrior
+    absence: LifetimePrior
+    step_s: float
+    stay_rhythm: Rhythm | None = None
+    absence_rhythm: Rhythm | None = None
+    newborn: bool = False
+    hypotheses: int = 64
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step_s < np.inf:
+            raise ConfigError(f"{self.step_s} s is no step of time", field="step_s", hint="a positive number")
+        if self.hypotheses < 8:
+            raise ConfigError(f"{self.hypotheses} hypotheses are too few", field="hypotheses", hint="8 or more")
+
+    def track(self, looks: Looks, instants: Instants | None = None) -> Track:
+        """Filter every feature's looks; asked at the looks themselves where `instants` is None.
+
+        Raises:
+            NumericalError: a look that is impossible, whether the feature is there or not.
+        """
+        from evermap.recurrence import run_length_kernels as kernels
+
+        asked = instants or Instants.of_looks(looks)
+        n = looks.n_features
+        answer, evidence, moved = np.empty(len(asked.stamp_s)), np.empty(n), np.empty(n)
+        bad = np.empty(n, dtype=np.int64)
+        kernels.track(
+            looks.first, looks.stamp_s, *likelihoods(looks), asked.first, asked.stamp_s, self.slots, self.law,
+            self.first, answer, evidence, moved, bad,
+        )  # fmt: skip
+        for feature in np.flatnonzero(bad >= 0)[:1]:
+            stamp = looks.stamp_s[looks.first[feature] + bad[feature]]
+            raise NumericalError(
+                impossible(f"feature {feature} at {stamp} s"), hint="P_M and P_F strictly between 0 and 1"
+            )
+        return Track(answer, evidence, moved)
+
+    @property
+    def slots(self) -> int:
+        """Places of a list: those of one state, and one for the newcomer."""
+        return self.hypotheses // 2 + 1
+
+    @cached_property
+    def law(self) -> Law:
+        """The model as the kernels want it."""
+        from evermap.recurrence.run_length_kernels import Law
+
+        absence, stay = self.tables
+        none = np.ones((2, 1))
+        if self.stay_rhythm or self.absence_rhythm:
+            rhythms = (self.absence_rhythm, self.stay_rhythm)
+            factor = np.stack([rhythm.factor if rhythm else np.ones(BINS) for rhythm in rhythms])
+        else:
+            factor = none
+        hazard = np.stack([absence.hazard_hz, stay.hazard_hz])
+        cumulative = np.stack([absence.cumulative, stay.cumulative])
+        # a step is never longer than the rhythm is constant
+        step_s = min(self.step_s, BIN_S) if factor is not none else self.step_s
+        return Law(float(step_s), factor, absence.offset, absence.edge_s, hazard, cumulative)
+
+    @cached_property
+    def tables(self) -> tuple[HazardTable, HazardTable]:
+        """The lifetimes of absences and of stays as tables."""
+        return tabulate(self.absence, self.step_s), tabulate(self.stay, self.step_s)
+
+    @cached_property
+    def first(self) -> First:
+        """What is believed before the first look."""
+        from evermap.recurrence.run_length_kernels import First, week_of_beliefs
+
+        age, weight = np.zeros((1, 2, self.slots)), np.zeros((1, 2, self.slots))
+        if self.newborn:
+            weight[0, PRESENT, 0] = 1.0
+            return First(age, weight, np.array([[0, 1]]))
+        for state, table in enumerate(self.tables):
+            age[0, state, :-1], weight[0, state, :-1] = _equilibrium(table, self.slots - 1)
+        weight /= weight.sum()
+        count = np.full((1, 2), self.slots - 1)
+        if self.law.factor.shape[1] == 1:
+            return First(age, weight, count)
+        from evermap.recurrence.rhythm import DAY_S
+
+        ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, 2, self.slots))
+        counts = np.zeros((BINS, 2), dtype=np.int64)
+        week_of_beliefs(4.0 * DAY_S - age[0], weight[0], count[0], self.law, ages, weights, counts)
+        return First(ages, weights, counts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The model as plain numbers and words, for JSON."""
+        from evermap.survival.text import prior_to_dict
+
+        return {
+            "kind": "run-length",
+            "stay": prior_to_dict(self.stay),
+            "absence": prior_to_dict(self.absence),
+            "step_s": self.step_s,
+            "stay_rhythm": self.stay_rhythm.to_dict() if self.stay_rhythm else None,
+            "absence_rhythm": self.absence_rhythm.to_dict() if self.absence_rhythm else None,
+            "newborn": self.newborn,
+            "hypotheses": self.hypotheses,
+        }
+
+
+def likelihoods(looks: Looks) -> tuple[FloatArray, FloatArray]:
+    """Likelihood of each look if the feature is absent, and if it is present."""
+    seen = looks.detected == 1.0
+    return np.where(seen, looks.p_false, 1.0 - looks.p_false), np.where(seen, 1.0 - looks.p_miss, looks.p_miss)
+
+
+def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
+    """Ages that a state has been found in after a long time, as `n` points of equal weight, times the mean lifetime.
+
+    The age of what is met at random has density `S(age)`, of integral `E[T]`; ages beyond the table count as its end.
+    """
+    survival, width = table.survival(), table.width_s
+    drop = np.append(np.diff(table.cumulative), 0.0)
+    mass = survival * width * np.where(drop > 1e-9, -np.expm1(-drop) / np.maximum(drop, 1e-300), 1.0)
+    middle = table.edge_s + 0.5 * width
+    total = mass.sum()
+    group = np.minimum((np.cumsum(mass) / total * n).astype(np.int64), n - 1)
+    weight = np.bincount(group, mass, n)
+    age = np.bincount(group, mass * middle, n) / np.where(weight > 0.0, weight, 1.0)
+    # older hypotheses first, as everywhere
+    return np.maximum.accumulate(age)[::-1], weight[::-1]
+
+
+@dataclass(frozen=True, slots=True)
+class RunLengthBelief:
+    """Beliefs about N features, one row each; state `s` is 0 absent, 1 present.
+
+    Attributes:
+        model: how they come and go.
+        start_s: (N, 2, S) since when.
+        weight: (N, 2, S) with which probability.
+        count: (N, 2) number of hypotheses.
+        stamp_s: (N,) when these held.
+        log_evidence: (N,) `log p(looks)`.
+        merged_mass: (N,) probability moved between hypotheses so far.
+    """
+
+    model: RunLength
+    start_s: FloatArray
+    weight: FloatArray
+    count: IntArray
+    stamp_s: FloatArray
+    log_evidence: FloatArray
+    merged_mass: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @property
+    def probability(self) -> FloatArray:
+        """(N,) probability of presence at `stamp_s`."""
+        return np.asarray(self.weight[:, PRESENT].sum(axis=1).clip(0.0, 1.0), dtype=np.float64)
+
+
+def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
+    """Beliefs about features that are heard of for the first time.
+
+    Args:
+        model: how they come and go.
+        stamp_s: (N,) when, on one clock.
+    """
+    from evermap.recurrence.run_length_kernels import begin
+
+    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
+    n = len(time)
+    start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, 2, model.slots))
+    count = np.zeros((n, 2), dtype=np.int64)
+    for row in range(n):
+        begin(start[row], weight[row], count[row], time[row], model.first)
+    return RunLengthBelief(model, start, weight, count, time, np.zeros(n), np.zeros(n))
+
+
+def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
+    """Probability that each feature is present at `stamp_s`; the state stays as it is.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: scalar, (N,) or (len(rows),) instants, none before the row's last.
+        rows: row numbers asked about; all where None.
+
+    Raises:
+        InputError: an instant that is not finite or lies before the last look.
+    """
+    from evermap.recurrence.run_length_kernels import predict_rows
+
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
+    time = checks.as_rows(stamp_s, len(index), "stamp_s")
+    checks.check_times(time, state.stamp_s[index], index)
+    belief = np.empty(len(index))
+    predict_rows(index, state.start_s, state.weight, state.count, state.stamp_s, time, state.model.law, belief)
+    return belief
+
+
+def update(
+    state: RunLengthBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
+) -> RunLengthBelief:
+    """Beliefs after one look at each feature.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: scalar, (N,) or (len(rows),) instants of the looks.
+        detected: 1 or 0, of the same shape.
+        p_miss: `P(no detection | there)`, of the same shape.
+        p_false: `P(detection | not there)`, of the same shape.
+        rows: the rows looked at, each once; all where None.
+
+    Raises:
+        InputError: a probability outside [0, 1], time running back, or a row that does not exist.
+        DataError: a row twice.
+        NumericalError: a look that is impossible under both states.
+    """
+    from evermap.recurrence.run_length_kernels import look_rows
+
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
+    time, hit, miss, false = (
+        checks.as_rows(column, len(index), field)
+        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
+    )
+    checks.check_times(time, state.stamp_s[index], index)
+    checks.check_detected(hit, index)
+    checks.check_probability(miss, "p_miss", index)
+    checks.check_probability(false, "p_false", index)
+    seen = hit == 1.0
+    after = replace(
+        state,
+        start_s=state.start_s.copy(),
+        weight=state.weight.copy(),
+        count=state.count.copy(),
+        stamp_s=state.stamp_s.copy(),
+        log_evidence=state.log_evidence.copy(),
+        merged_mass=state.merged_mass.copy(),
+    )
+    bad = look_rows(
+        index, after.start_s, after.weight, after.count, after.stamp_s, time, np.where(seen, false, 1.0 - false),
+        np.where(seen, 1.0 - miss, miss), state.model.law, after.log_evidence, after.merged_mass, np.empty(len(index)),
+    )  # fmt: skip
+    if bad >= 0:
+        raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
+    return after

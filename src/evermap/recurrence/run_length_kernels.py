@@ -1,0 +1,387 @@
+"""The run-length filter, compiled: hypotheses about when the present stay, or the present absence, began.
+
+A feature's belief is `start[s, j]`, `weight[s, j]` for `j < count[s]`: with this probability it has been in state `s`
+(0 absent, 1 present) since this instant. They are in order of `start`. One step multiplies each by the conditional
+survival of its age and gives the rest to one new hypothesis of the other state, begun in the middle of the step
+(Adams and MacKay 2007, for two alternating lifetimes). When a list is full, the two neighbours whose union changes the
+belief least become one.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import prange
+
+from evermap.recurrence.compiled import expm1, inlined, kernel, parallel_kernel
+from evermap.recurrence.hazard_table import SHIFT
+from evermap.recurrence.rhythm import BIN_S, BINS, DAY_S, WEEK_S
+from evermap.types import FloatArray, IntArray
+
+MOST = 700.0
+NO_MERGE = -1
+_MONDAY_S = 4.0 * DAY_S
+
+
+class Law(NamedTuple):
+    """All that the kernels know of a model.
+
+    Attributes:
+        step_s: longest step of time.
+        factor: (2, 1008) by what the hazards of absences (0) and stays (1) are multiplied at each ten minutes of the
+            week; (2, 1) ones where there is no rhythm.
+        offset, edge_s: the bins of age (`hazard_table`).
+        hazard_hz: (2, B) hazard in each bin.
+        cumulative: (2, B) its integral up to each edge.
+    """
+
+    step_s: float
+    factor: FloatArray
+    offset: int
+    edge_s: FloatArray
+    hazard_hz: FloatArray
+    cumulative: FloatArray
+
+
+class First(NamedTuple):
+    """Beliefs before anything is known, for each ten minutes of the week, or for all of it.
+
+    Attributes:
+        age_s: (W, 2, S) how long it has been so.
+        weight: (W, 2, S) with which probability.
+        count: (W, 2) number of hypotheses.
+    """
+
+    age_s: FloatArray
+    weight: FloatArray
+    count: IntArray
+
+
+@inlined
+def _integrated(age: Any, later: Any, s: Any, law: Any) -> Any:
+    """Integral of the hazard of state `s` between two ages."""
+    hazard, cumulative, edge, offset = law.hazard_hz, law.cumulative, law.edge_s, law.offset
+    last = edge.size - 1
+    i = min(max((np.float64(age).view(np.int64) >> SHIFT) - offset, 0), last)
+    j = min(max((np.float64(later).view(np.int64) >> SHIFT) - offset, 0), last)
+    inside = hazard[s, i] * (later - age)
+    across = (cumulative[s, j] - cumulative[s, i]) + (hazard[s, j] * (later - edge[j]) - hazard[s, i] * (age - edge[i]))
+    return inside if i == j else max(across, 0.0)
+
+
+@inlined
+def _week_bin(stamp_s: Any, n: Any) -> Any:
+    """The ten minutes of the week; 0 where there is no rhythm."""
+    if n == 1:
+        return 0
+    phase = (stamp_s - _MONDAY_S) % WEEK_S
+    return min(np.int64(phase / BIN_S), BINS - 1)
+
+
+@kernel
+def _deaths(
+    start: FloatArray,
+    weight: FloatArray,
+    n: int,
+    s: int,
+    now: float,
+    later: float,
+    factor: float,
+    law: Law,
+    died: FloatArray,
+) -> float:
+    """Mass of every hypothesis of state `s` that ends before `later`, into `died`; their sum."""
+    for j in range(n):
+        x = factor * _integrated(now - start[s, j], later - start[s, j], s, law)
+        died[j] = -weight[s, j] * expm1(-min(x, MOST))
+    total = 0.0
+    for j in range(n):
+        total += died[j]
+    return total
+
+
+@kernel
+def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float, cost: FloatArray) -> tuple[int, float]:
+    """Unite the two neighbours that differ least: product of shares times squared relative difference of age.
+
+    Returns:
+        Position of the first of the two, and the mass of the lighter.
+    """
+    for j in range(n - 1):
+        a, b = weight[s, j], weight[s, j + 1]
+        apart = start[s, j + 1] - start[s, j]
+        ages = (now - start[s, j]) * (now - start[s, j + 1])
+        cost[j] = (a * b) * (apart * apart) / ((a + b + 1e-300) * ages + 1e-300)
+    best = 0
+    for j in range(1, n - 1):
+        if cost[j] < cost[best]:
+            best = j
+    a, b = weight[s, best], weight[s, best + 1]
+    share = b / (a + b) if a + b > 0.0 else 0.5
+    start[s, best] += share * (start[s, best + 1] - start[s, best])
+    weight[s, best] = a + b
+    for j in range(best + 1, n - 1):
+        start[s, j] = start[s, j + 1]
+        weight[s, j] = weight[s, j + 1]
+    return best, min(a, b)
+
+
+@kernel
+def _step(
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    now: float,
+    later: float,
+    law: Law,
+    scratch: FloatArray,
+    merged: IntArray,
+) -> float:
+    """One step without a look; where lists were merged goes into `merged`. Returns the mass merged."""
+    middle = 0.5 * (now + later)
+    week = _week_bin(middle, law.factor.shape[1])
+    ended = [0.0, 0.0]
+    for s in range(2):
+        died = scratch[s]
+        ended[s] = _deaths(start, weight, count[s], s, now, later, law.factor[s, week], law, died)
+        for j in range(count[s]):
+            weight[s, j] -= died[j]
+    moved = 0.0
+    for s in range(2):
+        n = count[s]
+        start[s, n] = middle
+        weight[s, n] = ended[1 - s]
+        merged[s] = NO_MERGE
+        n += 1
+        if n == start.shape[1]:
+            merged[s], mass = _merge(start, weight, n, s, later, scratch[0])
+            moved += mass
+            n -= 1
+        count[s] = n
+    return moved
+
+
+@kernel
+def _look(weight: FloatArray, count: IntArray, absent: float, present: float) -> float:
+    """Multiply by the likelihoods of a look and normalise; returns the probability of the look."""
+    total = 0.0
+    for s in range(2):
+        likelihood = present if s == 1 else absent
+        for j in range(count[s]):
+            weight[s, j] *= likelihood
+            total += weight[s, j]
+    if total > 0.0:
+        for s in range(2):
+            for j in range(count[s]):
+                weight[s, j] /= total
+    return total
+
+
+@kernel
+def _present(
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    now: float,
+    later: float,
+    law: Law,
+    scratch: FloatArray,
+) -> float:
+    """Probability of presence at `later`, at most a step after `now`."""
+    week = _week_bin(0.5 * (now + later), law.factor.shape[1])
+    ended, total = [0.0, 0.0], [0.0, 0.0]
+    for s in range(2):
+        ended[s] = _deaths(start, weight, count[s], s, now, later, law.factor[s, week], law, scratch[s])
+        for j in range(count[s]):
+            total[s] += weight[s, j]
+    present = total[1] - ended[1] + ended[0]
+    return min(max(present / (total[0] + total[1]), 0.0), 1.0)
+
+
+@kernel
+def advance(
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    now: float,
+    until: float,
+    law: Law,
+    scratch: FloatArray,
+    merged: IntArray,
+    whole: bool,
+) -> tuple[float, float]:
+    """Whole steps from `now` on as long as they end before `until`, and the rest of the way unless `whole`.
+
+    Returns:
+        The time reached, and the mass merged.
+    """
+    moved = 0.0
+    while until - now > law.step_s:
+        moved += _step(start, weight, count, now, now + law.step_s, law, scratch, merged)
+        now += law.step_s
+    if not whole and until > now:
+        moved += _step(start, weight, count, now, until, law, scratch, merged)
+        now = until
+    return now, moved
+
+
+@kernel
+def begin(
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    stamp_s: float,
+    prior: First,
+) -> None:
+    """The belief before anything is known: ages and weights for this time of the week."""
+    week = _week_bin(stamp_s, len(prior.count))
+    for s in range(2):
+        count[s] = prior.count[week, s]
+        for j in range(count[s]):
+            start[s, j] = stamp_s - prior.age_s[week, s, j]
+            weight[s, j] = prior.weight[week, s, j]
+
+
+@kernel
+def _track_one(
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    asked_s: FloatArray,
+    slots: int,
+    law: Law,
+    prior: First,
+    answer: FloatArray,
+) -> tuple[float, float, int]:
+    """All looks at one feature and all instants asked for; log evidence, mass merged, impossible look or -1."""
+    start, weight = np.zeros((2, slots)), np.zeros((2, slots))
+    count, merged = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    scratch = np.zeros((2, slots))
+    evidence, moved = 0.0, 0.0
+    m, n = stamp_s.size, asked_s.size
+    if m + n == 0:
+        return evidence, moved, -1
+    now = stamp_s[0] if m else asked_s[0]
+    if n and asked_s[0] < now:
+        now = asked_s[0]
+    begin(start, weight, count, now, prior)
+    k = 0
+    for i in range(m + 1):
+        while k < n and (i == m or asked_s[k] < stamp_s[i]):
+            now, mass = advance(start, weight, count, now, asked_s[k], law, scratch, merged, True)
+            moved += mass
+            answer[k] = _present(start, weight, count, now, asked_s[k], law, scratch)
+            k += 1
+        if i < m:
+            now, mass = advance(start, weight, count, now, stamp_s[i], law, scratch, merged, False)
+            moved += mass
+            likelihood = _look(weight, count, absent[i], present[i])
+            if not likelihood > 0.0:
+                return evidence, moved, i
+            evidence += np.log(likelihood)
+    return evidence, moved, -1
+
+
+@parallel_kernel
+def track(
+    first: IntArray,
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    first_asked: IntArray,
+    asked_s: FloatArray,
+    slots: int,
+    law: Law,
+    prior: First,
+    answer: FloatArray,
+    evidence: FloatArray,
+    moved: FloatArray,
+    impossible: IntArray,
+) -> None:
+    """`_track_one` for every feature, over all threads."""
+    for f in prange(len(first) - 1):
+        a, b, c, d = first[f], first[f + 1], first_asked[f], first_asked[f + 1]
+        evidence[f], moved[f], impossible[f] = _track_one(
+            stamp_s[a:b], absent[a:b], present[a:b], asked_s[c:d], slots, law, prior, answer[c:d],
+        )  # fmt: skip
+
+
+@kernel
+def look_rows(
+    rows: IntArray,
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    now_s: FloatArray,
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    law: Law,
+    evidence: FloatArray,
+    moved: FloatArray,
+    belief: FloatArray,
+) -> int:
+    """One look at each of many features, in place; the first row that is impossible under both states, or -1."""
+    scratch, merged = np.zeros((2, start.shape[2])), np.zeros(2, dtype=np.int64)
+    for i in range(len(rows)):
+        f = rows[i]
+        now, mass = advance(start[f], weight[f], count[f], now_s[f], stamp_s[i], law, scratch, merged, False)
+        likelihood = _look(weight[f], count[f], absent[i], present[i])
+        if not likelihood > 0.0:
+            return i
+        now_s[f] = now
+        moved[f] += mass
+        evidence[f] += np.log(likelihood)
+        total = 0.0
+        for j in range(count[f, 1]):
+            total += weight[f, 1, j]
+        belief[i] = min(total, 1.0)
+    return -1
+
+
+@kernel
+def predict_rows(
+    rows: IntArray,
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    now_s: FloatArray,
+    stamp_s: FloatArray,
+    law: Law,
+    belief: FloatArray,
+) -> None:
+    """Presence of many features at one instant each; nothing of the state changes."""
+    scratch, merged = np.zeros((2, start.shape[2])), np.zeros(2, dtype=np.int64)
+    for i in range(len(rows)):
+        f = rows[i]
+        begun, mass, number, now = start[f], weight[f], count[f], now_s[f]
+        if stamp_s[i] - now > law.step_s:
+            begun, mass, number = begun.copy(), mass.copy(), number.copy()
+            now, _ = advance(begun, mass, number, now, stamp_s[i], law, scratch, merged, True)
+        belief[i] = _present(begun, mass, number, now, stamp_s[i], law, scratch)
+
+
+@kernel
+def week_of_beliefs(
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    law: Law,
+    ages: FloatArray,
+    weights: FloatArray,
+    counts: IntArray,
+) -> None:
+    """Let a belief run for two weeks from a Monday 00:00, and keep it at every ten minutes of the second."""
+    scratch, merged = np.zeros((2, start.shape[1])), np.zeros(2, dtype=np.int64)
+    now = _MONDAY_S
+    for i in range(2 * BINS):
+        at = _MONDAY_S + i * BIN_S
+        now, _ = advance(start, weight, count, now, at, law, scratch, merged, False)
+        _look(weight, count, 1.0, 1.0)
+        if i >= BINS:
+            for s in range(2):
+                counts[i - BINS, s] = count[s]
+                for j in range(count[s]):
+                    ages[i - BINS, s, j] = now - start[s, j]
+                    weights[i - BINS, s, j] = weight[s, j]

@@ -1,0 +1,177 @@
+"""Forward and backward through the run-length filter's hypotheses, compiled: what happened, given all looks.
+
+The backward pass runs through the lattice of hypotheses that the forward pass kept. To store all of it would take a
+megabyte for every thousand steps, so the forward pass keeps a checkpoint every few thousand steps, and each stretch is
+run again when the backward pass arrives there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.recurrence.compiled import expm1, kernel
+from evermap.recurrence.hazard_table import SHIFT
+from evermap.recurrence.run_length_kernels import (
+    MOST,
+    NO_MERGE,
+    First,
+    Law,
+    _integrated,
+    _look,
+    _step,
+    _week_bin,
+    begin,
+)
+from evermap.types import FloatArray, IntArray
+
+STRETCH = 4096
+"""Steps between two checkpoints."""
+
+
+class Counts(NamedTuple):
+    """Expected events and exposure of absences (0) and stays (1), by age and time of the week.
+
+    Attributes:
+        events: (2, A, W) how many ended.
+        exposure_s: (2, A, W) time spent.
+        open_ended: (2, A) how many were going on at the end of the looks.
+    """
+
+    events: FloatArray
+    exposure_s: FloatArray
+    open_ended: FloatArray
+
+
+@kernel
+def _forward(
+    a: int,
+    b: int,
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    law: Law,
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    scratch: FloatArray,
+    starts: FloatArray,
+    weights: FloatArray,
+    counts: IntArray,
+    merges: IntArray,
+    scales: FloatArray,
+) -> None:
+    """Steps `a` to `b`, keeping the belief before each, where it merged, and the probability of its look."""
+    merged = np.zeros(2, dtype=np.int64)
+    for k in range(a, b):
+        i = k - a
+        starts[i], weights[i], counts[i] = start, weight, count
+        _step(start, weight, count, stamp_s[k], stamp_s[k + 1], law, scratch, merged)
+        merges[i] = merged
+        scales[i] = _look(weight, count, absent[k + 1], present[k + 1])
+
+
+@kernel
+def expectations(
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    importance: FloatArray,
+    slots: int,
+    law: Law,
+    prior: First,
+    counts_out: Counts,
+    smoothed: FloatArray,
+) -> tuple[float, float]:
+    """Add one feature's expected counts, and fill in its presence given all looks.
+
+    Args:
+        stamp_s: (T + 1,) instants of the lattice, at most a step apart, in order and different.
+        absent: (T + 1,) likelihoods of the looks there if the feature is absent, 1 where there was none.
+        present: (T + 1,) the same if it is present.
+        importance: (T,) weight of what happens in each step.
+        slots: places of a list of hypotheses.
+        law: the model.
+        prior: its belief before the first look.
+        counts_out: filled up.
+        smoothed: (T + 1,) filled in.
+
+    Returns:
+        Log evidence of the looks (-inf if they are impossible), and the presence at the first instant, given all.
+    """
+    steps = stamp_s.size - 1
+    stretches = (steps + STRETCH - 1) // STRETCH
+    start, weight, count = np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64)
+    scratch = np.zeros((2, slots))
+    starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 2, slots))
+    counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
+    scales = np.zeros(STRETCH)
+    kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 2, slots))
+    kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
+
+    begin(start, weight, count, stamp_s[0], prior)
+    evidence = np.log(_look(weight, count, absent[0], present[0]))
+    for c in range(stretches):
+        kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
+        a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
+        _forward(
+            a, b, stamp_s, absent, present, law, start, weight, count, scratch, starts, weights, counts, merges, scales
+        )
+        for i in range(b - a):
+            evidence += np.log(scales[i])
+    if not np.isfinite(evidence):
+        return -np.inf, 0.0
+
+    groups = counts_out.events.shape[1]
+    per_group = (law.edge_s.size + groups - 1) // groups
+    weeks = counts_out.events.shape[2]
+    for s in range(2):
+        for j in range(count[s]):
+            age = stamp_s[steps] - start[s, j]
+            i = min(max((np.float64(age).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1)
+            counts_out.open_ended[s, i // per_group] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
+    smoothed[steps] = weight[1, : count[1]].sum()
+
+    later, sooner = np.ones((2, slots)), np.ones((2, slots))
+    for c in range(stretches - 1, -1, -1):
+        a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
+        start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
+        _forward(
+            a, b, stamp_s, absent, present, law, start, weight, count, scratch, starts, weights, counts, merges, scales
+        )
+        for k in range(b - 1, a - 1, -1):
+            i = k - a
+            now, then = stamp_s[k], stamp_s[k + 1]
+            gap, middle = then - now, 0.5 * (now + then)
+            week = _week_bin(middle, law.factor.shape[1])
+            column = week if weeks > 1 else 0
+            there = 0.0
+            for s in range(2):
+                same = (present[k + 1] if s == 1 else absent[k + 1]) / scales[i]
+                other = (absent[k + 1] if s == 1 else present[k + 1]) / scales[i]
+                newcomer = counts[i, 1 - s]
+                if merges[i, 1 - s] != NO_MERGE and newcomer > merges[i, 1 - s]:
+                    newcomer -= 1
+                for j in range(counts[i, s]):
+                    age = now - starts[i, s, j]
+                    x = min(law.factor[s, week] * _integrated(age, age + gap, s, law), MOST)
+                    p_end = -expm1(-x)
+                    to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
+                    lives = (1.0 - p_end) * same * later[s, to]
+                    ends = p_end * other * later[1 - s, newcomer]
+                    sooner[s, j] = lives + ends
+                    mass = weights[i, s, j]
+                    if s == 1:
+                        there += mass * (lives + ends)
+                    # a stay that ends in this step lasted on the mean for this part of it
+                    part = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - (1.0 - p_end) / p_end
+                    row = min(
+                        max((np.float64(age + 0.5 * gap).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1
+                    )
+                    mass *= importance[k]
+                    counts_out.events[s, row // per_group, column] += mass * ends
+                    counts_out.exposure_s[s, row // per_group, column] += mass * gap * (lives + part * ends)
+            smoothed[k] = there
+            later, sooner = sooner, later
+    return evidence, smoothed[0]
