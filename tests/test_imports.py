@@ -38,7 +38,7 @@ RULES = {
     "experiments": "errors types se2 config survival sensing persistence recurrence slam sim io metrics viz pipeline "
     "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
-    "presence": "errors types survival persistence recurrence io metrics viz",
+    "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence server "
     "experiments demo",
 }

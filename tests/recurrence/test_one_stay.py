@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap.errors import NumericalError
+from evermap.errors import ConfigError, NumericalError
 from evermap.persistence.one import PersistenceFilter
 from evermap.recurrence.one_stay import OneStay, births
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel
@@ -116,3 +116,11 @@ def test_the_median_of_what_remains() -> None:
 
 def test_it_is_a_model_of_presence() -> None:
     assert isinstance(OneStay(Exponential(1.0)), PresenceModel)
+
+
+def test_it_is_stored_as_it_was_written() -> None:
+    model = OneStay.of_text("exponential:half-life=2d")
+    assert OneStay.from_dict(model.to_dict()) == model
+    assert model.prior == Exponential.from_half_life(2 * 86400.0)
+    with pytest.raises(ConfigError, match="no text to store"):
+        OneStay(Exponential(1.0)).to_dict()

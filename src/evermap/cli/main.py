@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__
-from evermap.cli import bench, convert, demo, reproduce, simulate, slam, survival
+from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival
 from evermap.cli.terminal import fail, say
 from evermap.errors import EvermapError
 
@@ -79,6 +79,7 @@ app = typer.Typer(
 
 app.command("demo")(demo.demo)
 app.command("slam")(slam.slam)
+app.command("persist")(persist.persist)
 app.command("convert")(convert.convert)
 app.add_typer(survival.app)
 app.command("simulate")(simulate.simulate)

@@ -21,7 +21,7 @@ PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
 
 Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in seconds of the recording."""
+"""Called with what is done and the total, for most verbs in seconds of the recording."""
 
 
 def say(line: str) -> None:
@@ -59,10 +59,12 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     Console().print(table)
 
 
-def warm_up() -> None:
-    """Compile the kernels, or load them; says so on a machine where that takes a while."""
-    from evermap.pipeline import warm_up as compile_kernels
+def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
+    """Compile the kernels (of the pipeline if not told which), or load them; says so where that takes a while."""
+    if compile_kernels is None:
+        from evermap.pipeline import warm_up as of_the_pipeline
 
+        compile_kernels = of_the_pipeline
     note = "compiling the kernels, once on this machine; this takes about half a minute"
     timer = threading.Timer(PATIENCE_S, say, [note])
     timer.daemon = True
@@ -74,8 +76,13 @@ def warm_up() -> None:
 
 
 @contextmanager
-def progress_bar(label: str) -> Iterator[Progress | None]:
-    """A progress bar with the real-time factor on stderr; None, and silence, where stderr is no terminal."""
+def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]:
+    """A progress bar on stderr; None, and silence, where stderr is no terminal.
+
+    Args:
+        label: in front of the bar.
+        speed: show the real-time factor; off where progress is not counted in seconds of a recording.
+    """
     if not sys.stderr.isatty():
         yield None
         return
@@ -95,8 +102,8 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
 
         def advance(done: float, total: float) -> None:
             elapsed = time.perf_counter() - start
-            speed = f"{done / elapsed:.0f} x real time" if elapsed > 0.5 else ""
-            bars.update(task, completed=done, total=total, speed=speed)
+            shown = f"{done / elapsed:.0f} x real time" if speed and elapsed > 0.5 else ""
+            bars.update(task, completed=done, total=total, speed=shown)
 
         yield advance
 

@@ -163,6 +163,18 @@ def parse_parquet(data: bytes, path: Path) -> Table:
     Raises:
         InputError: not Parquet, damaged, a repeated column name, or a column of another type.
     """
+    table = read_parquet(data, path)
+    names = table.column_names
+    columns = {name: _arrow_column(column, path, name) for name, column in zip(names, table.columns, strict=True)}
+    return Table(path, columns, np.arange(1, table.num_rows + 1))
+
+
+def read_parquet(data: bytes, path: Path) -> Any:
+    """A Parquet file as a pyarrow table.
+
+    Raises:
+        InputError: not Parquet, damaged, or a repeated column name.
+    """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -171,12 +183,10 @@ def parse_parquet(data: bytes, path: Path) -> Table:
         table.validate(full=True)
     except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
         raise InputError(f"not a readable Parquet file: {reason(error)}", path=path, hint="write it again") from error
-    columns: dict[str, Sequence[str] | FloatArray] = {}
-    for name, column in zip(table.column_names, table.columns, strict=True):
-        if name in columns:
+    for name in table.column_names:
+        if table.column_names.count(name) > 1:
             raise InputError("column appears twice", path=path, field=name)
-        columns[name] = _arrow_column(column, path, name)
-    return Table(path, columns, np.arange(1, table.num_rows + 1))
+    return table
 
 
 def parquet_bytes(columns: dict[str, Any], metadata: dict[str, str] | None = None) -> bytes:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from evermap.errors import NumericalError
+from evermap.errors import ConfigError, NumericalError
 from evermap.persistence.checks import impossible
 from evermap.persistence.death import log_death_odds
 from evermap.recurrence.protocol import Instants, Looks, Track
 from evermap.survival.protocol import LifetimePrior
+from evermap.survival.text import parse_prior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _HALVINGS = 60
@@ -28,9 +29,20 @@ class OneStay:
 
     Attributes:
         prior: how long such features stay.
+        text: how the prior is written (`survival.text`), '' for one that has no text; only written ones can be stored.
     """
 
     prior: LifetimePrior
+    text: str = ""
+
+    @classmethod
+    def of_text(cls, text: str) -> Self:
+        """The model of a prior as people write it.
+
+        Raises:
+            ConfigError: no prior is written like this.
+        """
+        return cls(parse_prior(text), text)
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks in one compiled pass; see `PresenceModel.track`.
@@ -73,8 +85,19 @@ class OneStay:
         return Track(p_present, evidence, np.zeros(looks.n_features))
 
     def to_dict(self) -> dict[str, Any]:
-        """The kind of the model and the prior as Python writes it."""
-        return {"kind": "one-stay", "prior": repr(self.prior)}
+        """The prior as it is written, for JSON.
+
+        Raises:
+            ConfigError: this prior has no text.
+        """
+        if not self.text:
+            raise ConfigError("this prior has no text to store", field="prior", hint="OneStay.of_text(...)")
+        return {"kind": "one-stay", "prior": self.text}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """What `to_dict` wrote."""
+        return cls.of_text(str(data["prior"]))
 
     def median_remaining_s(self, age_s: Any) -> FloatArray:
         """Time by which half of the features that are there at an age have left; inf where half never do.

@@ -1,0 +1,279 @@
+"""Long tables of looks and the like: CSV (also gzipped) and Parquet, a million rows in a fraction of a second.
+
+pyarrow reads the file and converts whole columns. Whatever it refuses goes through `Table`, which is slow but finds
+line and cell at fault; both take the same files and give the same values.
+"""
+
+from __future__ import annotations
+
+import gzip
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.io.quantities import Quantity
+from evermap.io.table import Table, parse_csv, read_parquet
+from evermap.io.text import quote, reason
+from evermap.types import UNKNOWN, FloatArray, IntArray
+
+_FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """A table by columns, as pyarrow holds them: text from CSV, any type from Parquet.
+
+    Attributes:
+        path: file it came from, for messages.
+        cells: name -> pyarrow array of R cells.
+        line: (R,) line numbers in the file; for Parquet the row, counted from 1.
+        header_line: where the names of the columns stand, None for Parquet.
+    """
+
+    path: Path
+    cells: Mapping[str, Any]
+    line: IntArray
+    header_line: int | None
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.cells
+
+    def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
+        """An error that names file, line and column; `row` None blames the header."""
+        return self._table({}).error(problem, row=row, field=field, hint=hint)
+
+    def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
+        """Raises InputError unless all of `required` and nothing beside `required` and `optional` is there."""
+        self._table(dict.fromkeys(self.cells, ())).expect(required, optional)
+
+    def numbers(self, quantity: Quantity) -> FloatArray:
+        """A numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        cells = self.cells[quantity.name]
+        if _is_text(cells.type):
+            text = pc.utf8_trim_whitespace(cells)
+            blank = pc.equal(text, "")
+            try:
+                if not quantity.optional and pc.any(blank).as_py():
+                    raise pa.ArrowInvalid("an empty cell")
+                values = _as_float(pc.if_else(blank, pa.scalar(None, text.type), text))
+            except pa.ArrowInvalid:
+                return self._table({quantity.name: cells.to_pylist()}).numbers(quantity)
+        else:
+            values = self._converted(cells, quantity.name)
+        quantity.check(values, path=self.path, line=self.line)
+        return values
+
+    def flags(self, name: str, *, hint: str) -> FloatArray:
+        """A column of 1 or true, 0 or false; nan where it is empty. Shape (R,).
+
+        Raises:
+            InputError: another word or number.
+        """
+        import pyarrow.compute as pc
+
+        cells = self.cells[name]
+        if not _is_text(cells.type):
+            values = self._converted(cells, name)
+            wrong = np.flatnonzero(~((values == 0.0) | (values == 1.0) | np.isnan(values)))
+            if wrong.size:
+                raise self.error(f"{values[wrong[0]]:g} is neither 1 nor 0", row=int(wrong[0]), field=name, hint=hint)
+            return values
+        words = pc.utf8_lower(pc.utf8_trim_whitespace(cells))
+        row_word, known = _coded(words)
+        unknown = [k for k, word in enumerate(known) if word not in _FLAGS]
+        if unknown:
+            row = int(np.flatnonzero(np.isin(row_word, unknown))[0])
+            raise self.error(f"{quote(cells[row].as_py())} is neither 1 nor 0", row=row, field=name, hint=hint)
+        return np.array([*(_FLAGS[word] for word in known), np.nan])[row_word]
+
+    def labels(self, name: str) -> tuple[list[str], IntArray]:
+        """A column of names or whole numbers: the different ones in natural order, and which each row has.
+
+        Returns:
+            The names (numbers in order of size, else by alphabet), and (R,) the index of each row's, `UNKNOWN` where
+            the cell is empty.
+
+        Raises:
+            InputError: numbers that are not whole, or characters that cannot be printed.
+        """
+        import pyarrow as pa
+        import pyarrow.compute as pc
+
+        cells = self.cells[name]
+        if pa.types.is_floating(cells.type):
+            values = self._converted(cells, name)
+            wrong = np.flatnonzero(~np.isnan(values) & (values != np.floor(values)))
+            if wrong.size:
+                problem = f"{values[wrong[0]]:g} is no name"
+                raise self.error(problem, row=int(wrong[0]), field=name, hint="text or whole numbers")
+            cells = pa.array(values, from_pandas=True).cast(pa.int64())
+        elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
+            raise self.error(f"holds {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
+        row_name, names = _coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
+        for code, text in enumerate(names):
+            if not text.isprintable():
+                row = int(np.argmax(row_name == code))
+                raise self.error("holds a character that cannot be printed", row=row, field=name)
+        order = sorted((code for code, text in enumerate(names) if text), key=_natural(names))
+        rank = np.full(len(names) + 1, UNKNOWN, dtype=np.int64)  # one more for the code -1 of a missing cell
+        rank[order] = np.arange(len(order))
+        return [names[code] for code in order], rank[row_name]
+
+    def _table(self, columns: Mapping[str, Any]) -> Table:
+        return Table(self.path, columns, self.line, self.header_line)
+
+    def _converted(self, cells: Any, name: str) -> FloatArray:
+        """Cells that are no text as float64."""
+        import pyarrow as pa
+
+        kind = cells.type
+        fits = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_null)
+        if not any(is_kind(kind) for is_kind in fits):
+            raise self.error(f"holds {kind}, not numbers", row=None, field=name, hint="cast the column to float64")
+        return _as_float(cells)
+
+
+def read_columns(path: str | Path, warnings: list[str]) -> Columns:
+    """A `.csv`, `.csv.gz` or `.parquet` file; `warnings` gets a remark on an unfinished last line.
+
+    Raises:
+        InputError: it is missing, damaged, or no table.
+    """
+    path = Path(path)
+    data = _content(path)
+    if data[:4] == b"PAR1":
+        table = read_parquet(data, path)
+        cells = {name: _plain(column) for name, column in zip(table.column_names, table.columns, strict=True)}
+        return Columns(path, cells, np.arange(1, table.num_rows + 1), None)
+    return _fast_csv(data, path) or _careful_csv(data, path, warnings)
+
+
+def named(names: Sequence[str], index: IntArray) -> Any:
+    """A column of names for `csv_bytes`: which of `names` each row has."""
+    import pyarrow as pa
+
+    return pa.array(list(names), type=pa.string()).take(pa.array(index))
+
+
+def csv_bytes(columns: Mapping[str, Any]) -> bytes:
+    """A CSV file of arrays of numbers and of `named` columns; floats in the shortest form that reads back the same.
+
+    Missing numbers (nan) are empty cells.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+    from pyarrow import csv
+
+    arrays = {name: pa.array(cells, from_pandas=True) for name, cells in columns.items()}
+    marks = any(
+        _is_text(cells.type) and pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py()
+        for cells in arrays.values()
+    )
+    options = csv.WriteOptions(include_header=False, quoting_style="needed" if marks else "none")
+    sink = pa.BufferOutputStream()
+    sink.write((",".join(columns) + "\n").encode())
+    if len(next(iter(arrays.values()))):
+        csv.write_csv(pa.table(arrays), sink, options)
+    return bytes(sink.getvalue())
+
+
+def _content(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError("no such file", path=path, hint="check the path") from None
+    except IsADirectoryError:
+        raise InputError("is a folder", path=path, hint="a .csv, .csv.gz or .parquet file") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read: {reason(error)}", path=path) from error
+    if data[:2] != b"\x1f\x8b":
+        return data
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"damaged gzip file: {reason(error)}", path=path, hint="fetch or pack it again") from error
+
+
+def _fast_csv(data: bytes, path: Path) -> Columns | None:
+    """The table, if it is plain: no comments and empty lines after the header, as many cells as names everywhere."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    head = re.match(rb"(?:\xef\xbb\xbf)?(?:[ \t]*(?:#[^\n]*)?\r?\n)*[^\n]*\n", data)
+    if head is None or b"\0" in data or re.search(rb"\n[ \t]*#", data[head.end() - 1 :]):
+        return None
+    header = parse_csv(head[0], path, [])
+    names = list(header.columns)
+    rows = data.count(b"\n", head.end()) + (not data.endswith(b"\n"))
+    try:
+        table = csv.read_csv(
+            pa.BufferReader(pa.py_buffer(data).slice(head.end())),
+            read_options=csv.ReadOptions(column_names=names),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
+            ),
+        )
+    except pa.ArrowInvalid:
+        return None
+    if table.num_rows != rows or header.header_line is None:
+        return None
+    cells = {name: _plain(column) for name, column in zip(names, table.columns, strict=True)}
+    return Columns(path, cells, header.header_line + 1 + np.arange(rows), header.header_line)
+
+
+def _careful_csv(data: bytes, path: Path, warnings: list[str]) -> Columns:
+    import pyarrow as pa
+
+    table = parse_csv(data, path, warnings)
+    cells = {name: pa.array(list(column), type=pa.string()) for name, column in table.columns.items()}
+    return Columns(path, cells, table.line, table.header_line)
+
+
+def _plain(column: Any) -> Any:
+    """One array in place of chunks and dictionaries."""
+    import pyarrow as pa
+
+    if pa.types.is_dictionary(column.type):
+        column = column.cast(column.type.value_type)
+    if pa.types.is_large_string(column.type) or pa.types.is_string_view(column.type):
+        column = column.cast(pa.string())
+    return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
+
+
+def _is_text(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return bool(pa.types.is_string(kind))
+
+
+def _as_float(cells: Any) -> FloatArray:
+    import pyarrow as pa
+
+    if pa.types.is_boolean(cells.type):
+        cells = cells.cast(pa.int8())
+    return np.array(cells.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def _coded(words: Any) -> tuple[IntArray, list[str]]:
+    """Which of its different values each cell has, -1 where it is missing, and these values."""
+    coded = words.dictionary_encode()
+    codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+    return codes, coded.dictionary.to_pylist()
+
+
+def _natural(names: list[str]) -> Any:
+    """Order of the names: by size where all are whole numbers, else by alphabet."""
+    numbers = all(re.fullmatch(r"-?\d+", name) for name in names if name)
+    return (lambda code: (int(names[code]), names[code])) if numbers else (lambda code: names[code])

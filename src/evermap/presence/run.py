@@ -1,0 +1,244 @@
+"""From a table of looks to beliefs, changes, forecasts and scores; reads as the steps of a run."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.io.text import counted, quote
+from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
+from evermap.presence.changes import Changes, find_changes
+from evermap.presence.config import DEFAULT_PRIOR, PersistConfig
+from evermap.presence.forecasts import Forecasts, forecast
+from evermap.presence.models import ModelOfEach, models_for
+from evermap.presence.table import LookTable, Truth, truth_of
+from evermap.recurrence.one_stay import OneStay
+from evermap.recurrence.protocol import Instants, Looks
+from evermap.types import FloatArray, IntArray
+
+Progress = Callable[[float, float], None]
+"""Called with the steps that are done and how many there are."""
+
+MOST_ROWS = 100_000_000
+"""More beliefs than this are a mistake in the step, not a wish."""
+_GRID_STEPS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Beliefs:
+    """B beliefs: in the order of the table, or by feature and time on a grid.
+
+    Attributes:
+        stamp_s: (B,) when.
+        feature: (B,) index of the feature.
+        p_exists: (B,) probability that it was there, from the looks up to and including that time; nan before the
+            first detection of a feature that stays once.
+    """
+
+    stamp_s: FloatArray
+    feature: IntArray
+    p_exists: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class PersistResult:
+    """Everything a run found.
+
+    Attributes:
+        table: what was read.
+        config: what was chosen.
+        models: the model of every feature.
+        looks: the looks by feature and time.
+        p_at_looks: (M,) belief right after each look.
+        beliefs: at the instants asked for.
+        changes: what vanished and returned.
+        forecasts: presence after the latest look.
+        truth: None where unknown.
+        scores, reliability: beliefs against truth; None where unknown.
+        merged_mass: largest probability that a filter of limited memory moved about within one feature.
+        step_s: wall time of each step by name.
+        warnings: remarks.
+    """
+
+    table: LookTable
+    config: PersistConfig
+    models: ModelOfEach
+    looks: Looks
+    p_at_looks: FloatArray
+    beliefs: Beliefs
+    changes: Changes
+    forecasts: Forecasts
+    truth: Truth | None
+    scores: BeliefScores | None
+    reliability: Reliability | None
+    merged_mass: float
+    step_s: dict[str, float]
+    warnings: tuple[str, ...]
+
+
+def run_persist(
+    table: LookTable,
+    config: PersistConfig | None = None,
+    *,
+    truth: Truth | None = None,
+    progress: Progress | None = None,
+) -> PersistResult:
+    """Beliefs, changes and forecasts of a table of looks.
+
+    Args:
+        table: `read_looks(path)`.
+        config: choices; the defaults where None.
+        truth: what truly was there, for scores and figures only; None takes the column `present` of the table.
+        progress: told after each step.
+
+    Raises:
+        ConfigError: choices that cannot be.
+        InputError: a look that is impossible, whether the feature was there or not.
+    """
+    config = config or PersistConfig()
+    clock = _Steps(("sort", "learn", "filter", "changes", "forecast", "score"), progress)
+    looks = table.looks()
+    clock.done("sort")
+    models = models_for(config, table, looks)
+    clock.done("learn")
+    try:
+        beliefs, p_at_looks, merged_mass = _filter(table, config, models, looks)
+    except NumericalError as error:
+        raise _named(error, table) from error
+    clock.done("filter")
+    changes = find_changes(looks, p_at_looks, config.confidence)
+    clock.done("changes")
+    forecasts = forecast(models, looks, table, config)
+    clock.done("forecast")
+    truth = truth or _own_truth(table)
+    scores, bins = _score(table, beliefs, truth)
+    clock.done("score")
+    warnings = (*table.warnings, *_remarks(config, models, beliefs, changes))
+    return PersistResult(
+        table, config, models, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins, merged_mass,
+        clock.step_s, warnings,
+    )  # fmt: skip
+
+
+def warm_up() -> None:
+    """Compile the kernels of the persistence filter, or load them."""
+    looks = Looks.from_rows([0, 0], [0.0, 1.0], [1, 1], 0.1, 0.1)
+    OneStay.of_text(DEFAULT_PRIOR).track(looks)
+
+
+def _filter(
+    table: LookTable, config: PersistConfig, models: ModelOfEach, looks: Looks
+) -> tuple[Beliefs, FloatArray, float]:
+    """Beliefs at the instants asked for and at the looks, and the mass that was moved about."""
+    if config.query == "grid":
+        instants = grid(table, config)
+        feature = np.repeat(np.arange(table.n_features), np.diff(instants.first))
+        track = models.track(looks, instants)
+        beliefs = Beliefs(instants.stamp_s, feature, track.p_present)
+        return beliefs, models.track(looks).p_present, float(track.merged_mass.max())
+    instants, row = table.instants()
+    track = models.track(looks, instants)
+    p_exists = np.empty(len(table))
+    p_exists[row] = track.p_present
+    p_at_looks = track.p_present[table.looked[row]]  # rows and looks are sorted alike
+    return Beliefs(table.stamp_s, table.feature, p_exists), p_at_looks, float(track.merged_mass.max())
+
+
+def grid(table: LookTable, config: PersistConfig) -> Instants:
+    """Regular instants from the first to the last row of the table, the same for all features.
+
+    Raises:
+        ConfigError: so many that the step must be wrong.
+    """
+    start_s, stop_s = float(table.stamp_s.min()), float(table.stamp_s.max())
+    step_s = config.step_s or nice_step((stop_s - start_s) / _GRID_STEPS)
+    count = int(np.floor((stop_s - start_s) / step_s * (1.0 + 1e-12))) + 1
+    if count * table.n_features > MOST_ROWS:
+        problem = f"{step_s:g} s make {count} instants of {table.n_features} features"
+        raise ConfigError(problem, field="--step-s", hint="a longer step, or --query times")
+    return Instants.same_for_all(table.n_features, start_s + step_s * np.arange(count))
+
+
+def nice_step(at_least_s: float) -> float:
+    """The next longer one of 1, 2, 5, 10, ... s or parts of it; 1 s for no span at all."""
+    if at_least_s <= 0.0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(at_least_s))
+    return float(next(power * f for f in (1.0, 2.0, 5.0, 10.0) if power * f >= at_least_s * (1.0 - 1e-9)))
+
+
+def _own_truth(table: LookTable) -> Truth | None:
+    if table.present is None:
+        return None
+    known = ~np.isnan(table.present)
+    return truth_of(table.feature[known], table.stamp_s[known], table.present[known], table.n_features)
+
+
+def _score(table: LookTable, beliefs: Beliefs, truth: Truth | None) -> tuple[BeliefScores | None, Reliability | None]:
+    """Beliefs against truth wherever there are both."""
+    if truth is None:
+        return None, None
+    present = truth.at(beliefs.feature, beliefs.stamp_s)
+    both = ~np.isnan(present) & ~np.isnan(beliefs.p_exists)
+    if not both.any():
+        problem = "no belief falls into the time of which the truth is known"
+        raise InputError(problem, path=table.source or None, field="present", hint="the same clock in both tables")
+    belief, there = beliefs.p_exists[both], present[both]
+    return belief_scores(belief, there), reliability(belief, there)
+
+
+def _remarks(config: PersistConfig, models: ModelOfEach, beliefs: Beliefs, changes: Changes) -> list[str]:
+    remarks = []
+    for name, model in zip(models.names, models.models, strict=True):
+        stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
+        if stay > 0.0:
+            whose = f"class {quote(name)}: " if name else ""
+            remarks.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, says the prior")
+    unborn = int(np.isnan(beliefs.p_exists).sum())
+    if unborn and config.stays_once:
+        remarks.append(
+            f"{counted(unborn, 'belief')} left empty: before the feature's first detection nothing is believed"
+        )
+    back = len(np.unique(changes.feature[changes.returned]))
+    if back and config.stays_once:
+        remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try --recurrent")
+    return remarks
+
+
+def _named(error: NumericalError, table: LookTable) -> Exception:
+    """The error of a model, which counts features, with the feature's own name and the line in the file."""
+    found = re.match(r"feature (\d+) at (\S+) s: (.*)", error.problem)
+    if found is None:
+        return error
+    feature, stamp_s = int(found[1]), float(found[2])
+    row = np.flatnonzero((table.feature == feature) & (table.stamp_s == stamp_s) & table.looked)
+    return InputError(
+        f"feature {quote(table.names[feature])} at {stamp_s:.15g} s: {found[3]}",
+        path=table.source or None,
+        line=int(table.line[row[0]]) if row.size else None,
+        field="detected",
+        hint=error.hint,
+    )
+
+
+class _Steps:
+    """Wall time by step, and the progress of the whole."""
+
+    def __init__(self, names: tuple[str, ...], progress: Progress | None) -> None:
+        self._names, self._progress, self._start = names, progress, time.perf_counter()
+        self.step_s: dict[str, float] = {}
+
+    def done(self, name: str) -> None:
+        now = time.perf_counter()
+        self.step_s[name] = now - self._start
+        self._start = now
+        if self._progress:
+            self._progress(len(self.step_s), len(self._names))

@@ -1,0 +1,240 @@
+"""The table of looks that `evermap persist` reads: who was looked at when, and whether it was detected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evermap.errors import ConfigError, InputError
+from evermap.io.columns import Columns, read_columns
+from evermap.io.quantities import STAMP_S, Quantity
+from evermap.io.text import counted, quote
+from evermap.recurrence.protocol import Instants, Looks
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+_REQUIRED = ("stamp_s", "feature_id", "detected")
+_OPTIONAL = ("p_miss", "p_false", "class_id", "present")
+_P_MISS = Quantity("p_miss", 0.0, 1.0, optional=True, hint="the probability of no detection of a feature that is there")
+_P_FALSE = Quantity("p_false", 0.0, 1.0, optional=True, hint="the probability of a detection of one that is not there")
+_FLAG_HINT = "1 or true, 0 or false"
+
+
+@dataclass(frozen=True, slots=True)
+class LookTable:
+    """R rows of a table, in its order; a row without a look only asks for the belief at its time.
+
+    Attributes:
+        names: F feature ids as they were given, in natural order.
+        feature: (R,) index of each row's feature.
+        stamp_s: (R,) when.
+        detected: (R,) 1 where the detector fired, 0 where it did not, nan where nobody looked.
+        p_miss: (R,) `P(no detection | there)`.
+        p_false: (R,) `P(detection | not there)`.
+        class_names: classes in use.
+        class_of_feature: (F,) index into them, `UNKNOWN` where none was given.
+        present: (R,) truth: 1 there, 0 not, nan unknown; None without any. Read by the metrics and figures only.
+        source: file it came from, '' if none.
+        line: (R,) line of each row in that file.
+        warnings: remarks of the reader.
+    """
+
+    names: tuple[str, ...]
+    feature: IntArray
+    stamp_s: FloatArray
+    detected: FloatArray
+    p_miss: FloatArray
+    p_false: FloatArray
+    class_names: tuple[str, ...]
+    class_of_feature: IntArray
+    present: FloatArray | None
+    source: str
+    line: IntArray
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @property
+    def n_features(self) -> int:
+        """F."""
+        return len(self.names)
+
+    @property
+    def looked(self) -> BoolArray:
+        """(R,) whether the row is a look."""
+        return ~np.isnan(self.detected)
+
+    @property
+    def now_s(self) -> float:
+        """Time of the latest look."""
+        return float(self.stamp_s[self.looked].max())
+
+    def looks(self) -> Looks:
+        """The looks by feature and time."""
+        rows = self.looked
+        columns = (self.feature, self.stamp_s, self.detected, self.p_miss, self.p_false)
+        return Looks.from_rows(*(column[rows] for column in columns), n_features=self.n_features)
+
+    def instants(self) -> tuple[Instants, IntArray]:
+        """Times of all rows by feature and time, and (R,) the row of this table that each is of."""
+        return instants_of(self.feature, self.stamp_s, self.n_features)
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What truly was there: T samples, each holding until the feature's next one.
+
+    Attributes:
+        first: (F + 1,) those of feature `f` are rows `first[f]` to `first[f + 1]`, in order of time.
+        stamp_s: (T,) when.
+        present: (T,) 1 or 0.
+    """
+
+    first: IntArray
+    stamp_s: FloatArray
+    present: FloatArray
+
+    def at(self, feature: IntArray, stamp_s: FloatArray) -> FloatArray:
+        """(N,) truth about features at instants; nan before a feature's first sample and after its last."""
+        of_sample = np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
+        n = len(of_sample)
+        asked = np.concatenate([np.full(n, -1), np.arange(len(stamp_s))])
+        all_features = np.concatenate([of_sample, feature])
+        order = np.lexsort((np.concatenate([self.stamp_s, stamp_s]), all_features))  # stable: samples before instants
+        latest = np.maximum.accumulate(np.where(order < n, order, -1))
+        answer = np.full(len(stamp_s), np.nan)
+        mine = (order >= n) & (latest >= 0)
+        instant, sample = asked[order[mine]], latest[mine]
+        known = of_sample[sample] == feature[instant]
+        known &= stamp_s[instant] <= self.stamp_s[self.first[feature[instant] + 1] - 1]
+        answer[instant[known]] = self.present[sample[known]]
+        return answer
+
+
+def instants_of(feature: IntArray, stamp_s: FloatArray, n_features: int) -> tuple[Instants, IntArray]:
+    """Rows of (feature, time) as instants by feature and time, and (N,) the row that each of them is."""
+    order = np.lexsort((stamp_s, feature))
+    first = np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=n_features))]).astype(np.int64)
+    return Instants(first, stamp_s[order]), order
+
+
+def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
+    """A table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
+
+    Args:
+        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
+        p_miss: `P(no detection | there)` where the table does not say.
+        p_false: `P(detection | not there)` where the table does not say.
+
+    Raises:
+        InputError: anything wrong in the file, by line and column.
+        ConfigError: a default that is no probability.
+    """
+    for option, value in (("--p-miss", p_miss), ("--p-false", p_false)):
+        if not 0.0 <= value <= 1.0:
+            raise ConfigError(f"{value} is no probability", field=option, hint="a number between 0 and 1")
+    warnings: list[str] = []
+    table = read_columns(path, warnings)
+    _explain_missing(table)
+    table.expect(_REQUIRED, _OPTIONAL)
+    if len(table) == 0:
+        raise InputError("has no rows below its header", path=path, hint="one row a look")
+    names, feature = _features(table)
+    detected = table.flags("detected", hint=_FLAG_HINT + ", empty where the sensor did not look")
+    if np.isnan(detected).all():
+        hint = "1 where it was detected, 0 where it was looked at and not detected"
+        raise InputError("nobody looked: the whole column is empty", path=path, field="detected", hint=hint)
+    class_names, class_of_feature = _classes(table, feature, names)
+    present = table.flags("present", hint=_FLAG_HINT + ", empty where unknown") if "present" in table else None
+    return LookTable(
+        names=names,
+        feature=feature,
+        stamp_s=table.numbers(STAMP_S),
+        detected=detected,
+        p_miss=_probabilities(table, _P_MISS, p_miss),
+        p_false=_probabilities(table, _P_FALSE, p_false),
+        class_names=class_names,
+        class_of_feature=class_of_feature,
+        present=None if present is None or np.isnan(present).all() else present,
+        source=str(path),
+        line=table.line,
+        warnings=tuple(warnings),
+    )
+
+
+def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ...]]:
+    """A table with `stamp_s, feature_id, present` about the features of `looks`, and remarks about others.
+
+    Raises:
+        InputError: anything wrong in the file, or no feature in common.
+    """
+    warnings: list[str] = []
+    table = read_columns(path, warnings)
+    table.expect(("stamp_s", "feature_id", "present"), ("detected", "p_miss", "p_false", "class_id"))
+    names, feature = _features(table)
+    present = table.flags("present", hint=_FLAG_HINT + ", empty where unknown")
+    stamp_s = table.numbers(STAMP_S)
+    index = {name: k for k, name in enumerate(looks.names)}
+    ours = np.array([index.get(name, UNKNOWN) for name in names], dtype=np.int64)
+    strangers = int((ours == UNKNOWN).sum())
+    if strangers == len(names):
+        problem = f"knows none of the features of {looks.source or 'the looks'}"
+        raise InputError(problem, path=path, field="feature_id", hint=f"such as {quote(looks.names[0])}")
+    if strangers:
+        warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks left out")
+    known = (ours[feature] != UNKNOWN) & ~np.isnan(present)
+    return truth_of(ours[feature[known]], stamp_s[known], present[known], looks.n_features), tuple(warnings)
+
+
+def truth_of(feature: IntArray, stamp_s: FloatArray, present: FloatArray, n_features: int) -> Truth:
+    """Samples of truth, sorted by feature and time."""
+    instants, order = instants_of(feature, stamp_s, n_features)
+    return Truth(instants.first, instants.stamp_s, present[order])
+
+
+def _explain_missing(table: Columns) -> None:
+    """More than 'missing column' about the two columns that tables of looks lack most often."""
+    if set(table.cells) - {*_REQUIRED, *_OPTIONAL}:
+        return  # a name that is nearly right is the likelier mistake
+    if "feature_id" not in table:
+        hint = "add it, with one and the same value if there is only one feature"
+        raise table.error("missing column", row=None, field="feature_id", hint=hint)
+    if "detected" not in table and "present" in table:
+        hint = "what the detector said, 1 or 0; 'present' is the truth, which only scores the result"
+        raise table.error("missing column", row=None, field="detected", hint=hint)
+
+
+def _features(table: Columns) -> tuple[tuple[str, ...], IntArray]:
+    names, feature = table.labels("feature_id")
+    empty = np.flatnonzero(feature == UNKNOWN)
+    if empty.size:
+        raise table.error("is empty", row=int(empty[0]), field="feature_id", hint="a name or a number in every row")
+    return tuple(names), feature
+
+
+def _probabilities(table: Columns, quantity: Quantity, default: float) -> FloatArray:
+    if quantity.name not in table:
+        return np.full(len(table), float(default))
+    values = table.numbers(quantity)
+    return np.where(np.isnan(values), default, values)
+
+
+def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:
+    """Class names, and each feature's; rows of a feature may leave it empty but not contradict each other."""
+    of_feature = np.full(len(names), UNKNOWN, dtype=np.int64)
+    if "class_id" not in table:
+        return (), of_feature
+    class_names, of_row = table.labels("class_id")
+    said = np.flatnonzero(of_row != UNKNOWN)
+    of_feature[feature[said][::-1]] = of_row[said][::-1]  # of several assignments the last holds: the first row
+    other = said[of_row[said] != of_feature[feature[said]]]
+    if other.size:
+        row = int(other[0])
+        first = class_names[of_feature[feature[row]]]
+        problem = (
+            f"feature {quote(names[feature[row]])} is {quote(class_names[of_row[row]])} here and {quote(first)} above"
+        )
+        raise table.error(problem, row=row, field="class_id", hint="one class a feature")
+    return tuple(class_names), of_feature

@@ -1,0 +1,193 @@
+"""The folder of a run: beliefs, changes, forecasts, summary, figures and report, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap import __version__
+from evermap.io.columns import csv_bytes, named
+from evermap.presence.draw import draw_run
+from evermap.presence.report import render_report
+from evermap.presence.run import PersistResult
+from evermap.runfolder import SUMMARY, RunFolder, summary_text
+from evermap.runsummary import peak_memory_mb, versions
+from evermap.types import Clock
+from evermap.viz.style import NamedFigure, save_png
+
+SCHEMA_VERSION = "1"
+FIGURES = 12
+
+
+def write_persist(
+    out: str | Path,
+    result: PersistResult,
+    *,
+    figures: int = FIGURES,
+    clock: Clock | None = None,
+    command: str = "",
+    read_s: float | None = None,
+    force: bool = False,
+    progress: Callable[[float, float], None] | None = None,
+) -> dict[str, Any]:
+    """Writes the folder of a run. Returns the content of `summary.json`.
+
+    Args:
+        out: the folder; an older run there is replaced at the end.
+        result: of `run_persist`.
+        figures: how many features get a figure of their own.
+        clock: of the stamps, for the figures; None guesses.
+        command: the command line, '' if there was none.
+        read_s: wall time of reading the table.
+        force: replace `out` whatever it holds.
+        progress: told after each figure.
+
+    Raises:
+        ConfigError: `out` must not or cannot be written.
+    """
+    with RunFolder(out, force=force) as folder:
+        start = _now()
+        folder.path("beliefs.csv").write_bytes(_beliefs(result))
+        folder.path("forecasts.csv").write_bytes(_forecasts(result))
+        folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
+        if not result.config.stays_once and not result.config.model:
+            from evermap.recurrence.storage import save_model
+
+            save_model(result.models.models[0], folder.path("model.json"))
+        written = _now()
+        drawn: list[NamedFigure] = []
+        total = min(figures, result.table.n_features) + 1 + (result.scores is not None)
+        for figure in draw_run(result, figures=figures, clock=clock):
+            save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
+            drawn.append(figure)
+            if progress:
+                progress(len(drawn), total)
+        timing = {
+            **({} if read_s is None else {"read_s": read_s}),
+            **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
+            "write_s": written - start,
+            "draw_s": _now() - written,
+        }
+        summary = persist_summary(result, command=command, timing=timing)
+        summary["outputs"] = sorted([*folder.files(), SUMMARY, "report.html"])
+        pages = [folder.path(f"figures/{figure.name}.png").read_bytes() for figure in drawn]
+        folder.path("report.html").write_text(render_report(result, summary, drawn, pages), encoding="utf-8")
+        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+    return summary
+
+
+def persist_summary(result: PersistResult, *, command: str, timing: dict[str, float]) -> dict[str, Any]:
+    """The content of `summary.json`; outside of `timing` and `versions` a function of the input and the choices."""
+    table, changes = result.table, result.changes
+    looked = table.looked
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "evermap": __version__,
+        "versions": versions(),
+        "command": command,
+        "source": table.source,
+        "config": result.config.to_dict(),
+        "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
+        "counts": {
+            "rows": len(table),
+            "looks": int(looked.sum()),
+            "detections": int((table.detected == 1.0).sum()),
+            "features": table.n_features,
+            "features_detected": len(np.unique(table.feature[table.detected == 1.0])),
+            "classes": len(table.class_names),
+            "beliefs": int((~np.isnan(result.beliefs.p_exists)).sum()),
+            "vanished": int((~changes.returned).sum()),
+            "returned": int(changes.returned.sum()),
+            "duration_s": float(table.stamp_s.max() - table.stamp_s.min()),
+        },
+        "never_leave_share": _never_leave(result),
+        "expected_present_now": _number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
+        "merged_mass": _number(result.merged_mass),
+        "metrics": None if result.scores is None else {k: _number(v) for k, v in asdict(result.scores).items()},
+        "reliability": None if result.reliability is None else _reliability(result),
+        "timing": {
+            **timing,
+            "total_s": sum(timing.values()),
+            "peak_memory_mb": _number(peak_memory_mb()),
+            "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        },
+        "warnings": list(result.warnings),
+    }
+
+
+def _beliefs(result: PersistResult) -> bytes:
+    beliefs = result.beliefs
+    return csv_bytes(
+        {
+            "stamp_s": beliefs.stamp_s,
+            "feature_id": named(result.table.names, beliefs.feature),
+            "p_exists": beliefs.p_exists,
+        }
+    )
+
+
+def _forecasts(result: PersistResult) -> bytes:
+    """By feature and time; the median stay stands where the forecast begins."""
+    stamp_s, p_exists = result.forecasts.stamp_s, result.forecasts.p_exists
+    features, steps = p_exists.shape
+    stay_s = np.full((features, steps), np.nan)
+    stay_s[:, 0] = result.forecasts.median_stay_s
+    return csv_bytes(
+        {
+            "stamp_s": np.tile(stamp_s, features),
+            "feature_id": named(result.table.names, np.repeat(np.arange(features), steps)),
+            "p_exists": p_exists.ravel(),
+            "median_stay_s": stay_s.ravel(),
+        }
+    )
+
+
+def _changes(result: PersistResult) -> str:
+    """One JSON object a line; ids that are numbers in the table are numbers here."""
+    names: tuple[Any, ...] = result.table.names
+    if all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names):
+        names = tuple(int(name) for name in names)
+    return "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in _rows(result, names))
+
+
+def _rows(result: PersistResult, names: tuple[Any, ...]) -> Iterator[dict[str, Any]]:
+    changes = result.changes
+    columns = ("stamp_s", "earliest_s", "latest_s", "decided_s", "confidence")
+    values = zip(*(getattr(changes, name).tolist() for name in columns), strict=True)
+    for feature, returned, row in zip(changes.feature.tolist(), changes.returned.tolist(), values, strict=True):
+        what = {"feature_id": names[feature], "change": "returned" if returned else "vanished"}
+        yield what | dict(zip(columns, row, strict=True))
+
+
+def _never_leave(result: PersistResult) -> dict[str, float]:
+    """Share of the features that never leave, by class, where the lifetime says so."""
+    models = zip(result.models.names, result.models.models, strict=True)
+    return {name or "all": float(getattr(getattr(m, "prior", None), "p_never_leaves", 0.0)) for name, m in models}
+
+
+def _reliability(result: PersistResult) -> dict[str, list[Any]]:
+    bins = result.reliability
+    assert bins is not None
+    return {
+        "edge": bins.edge.tolist(),
+        "count": bins.count.tolist(),
+        "belief": [_number(value) for value in bins.belief.tolist()],
+        "present": [_number(value) for value in bins.present.tolist()],
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
+
+
+def _now() -> float:
+    from time import perf_counter
+
+    return perf_counter()
