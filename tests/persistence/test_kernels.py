@@ -6,11 +6,13 @@ import mpmath
 import numpy as np
 import pytest
 
+from evermap.errors import InputError
 from evermap.persistence import single
 from evermap.persistence.batch import CHUNK_ROWS, look_exponential, look_general_purpose
 from evermap.persistence.death import log_death_odds
-from evermap.persistence.elementary import exp, expm1, exponential_integral
+from evermap.persistence.elementary import exp, expm1
 from evermap.persistence.kernels import general_purpose_gap
+from evermap.persistence.unknown_rate import scaled_survival
 from evermap.survival import Exponential, GeneralPurpose
 
 
@@ -21,10 +23,24 @@ def test_exponentials_to_the_last_digits() -> None:
 
 
 def test_exponential_integral_to_the_last_digits() -> None:
+    """It is the scaled survival of a lifetime whose highest rate is past every time."""
     with mpmath.workdps(30):
         for x in np.concatenate([np.logspace(-90, 8, 300), [1.0, np.nextafter(1.0, 0.0)]]):
             exact = mpmath.e1(x) * (mpmath.exp(x) if x >= 1.0 else 1)
-            assert exponential_integral(float(x)) == pytest.approx(float(exact), rel=2e-15, abs=0.0)
+            assert scaled_survival(float(x), 1e30, 1.0)[0] == pytest.approx(float(exact), rel=2e-15, abs=0.0)
+
+
+def test_scaled_survival_of_the_young_and_of_narrow_ranges() -> None:
+    """Relative to E1 itself, of which it is a difference: both below 1, astride, both above, hardly apart."""
+    with mpmath.workdps(40):
+        for low in np.logspace(-8, 2, 60):
+            for ratio in (1.02, 3.0, 1e4):
+                x, y = mpmath.mpf(float(low)), mpmath.mpf(float(low * ratio))
+                scale = mpmath.exp(x) if low >= 1.0 else mpmath.mpf(1)
+                survival, decay = scaled_survival(float(low), float(low * ratio), 1.0)
+                exact = float(scale * (mpmath.e1(x) - mpmath.e1(y)))
+                assert survival == pytest.approx(exact, rel=2e-15, abs=4e-15 * min(1.0, float(scale * mpmath.e1(x))))
+                assert decay == pytest.approx(float(scale * mpmath.exp(-y)) - 1.0, rel=2e-15, abs=2e-15)
 
 
 def exact_odds(low: float, high: float, a: float, b: float) -> float:
@@ -81,11 +97,20 @@ def test_kernels_are_the_generic_filter(threads: bool, horizon_s: float) -> None
 def test_threads_change_no_digit() -> None:
     random = np.random.default_rng(3)
     n = 2 * CHUNK_ROWS + 17
-    columns = (random.random(n), random.random(n), random.random(n), 1.0 + random.random(n))
-    looks = (random.random(n) < 0.5, random.uniform(0.1, 0.9, n), random.uniform(0.1, 0.9, n))
-    serial, spread = (look_exponential(*columns, *looks, threads=threads) for threads in (False, True))
-    np.testing.assert_allclose(serial.inverse_odds, spread.inverse_odds, rtol=1e-15)
-    np.testing.assert_allclose(serial.probability, spread.probability, rtol=1e-15)
+    state, low, high = (random.random(n), random.random(n)), 0.5 * random.random(n), 0.5 + random.random(n)
+    looks = (1.0 + random.random(n), random.random(n) < 0.5, random.uniform(0.1, 0.9, n), random.uniform(0.1, 0.9, n))
+    for look, parameters in ((look_exponential, (low,)), (look_general_purpose, (low, high))):
+        serial, spread = (look(*state, *parameters, *looks, threads=threads) for threads in (False, True))
+        np.testing.assert_allclose(serial.inverse_odds, spread.inverse_odds, rtol=1e-13)
+        np.testing.assert_allclose(serial.probability, spread.probability, rtol=1e-15)
+
+
+def test_threads_name_the_row_too() -> None:
+    n = 2 * CHUNK_ROWS
+    ones, time = np.ones(n), np.full(n, 2.0)
+    time[n - 3] = 0.5
+    with pytest.raises(InputError, match=f"row {n - 3}: time 0.5 s lies before"):
+        look_exponential(ones, ones, ones, time, ones > 0.0, 0.5 * ones, 0.5 * ones, threads=True)
 
 
 def test_certainties_pass_through_the_kernels() -> None:

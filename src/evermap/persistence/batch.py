@@ -7,6 +7,9 @@ nothing is allocated at a million rows: the new stamps are `time_s` itself, and 
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +18,8 @@ from evermap.errors import InputError, NumericalError
 from evermap.persistence import checks
 from evermap.types import BoolArray, FloatArray
 
-CHUNK_ROWS = 16384
-"""Rows that a thread takes at a time: its arrays stay in the second-level cache."""
+CHUNK_ROWS = 65536
+"""Rows that a thread takes at a time: much longer than handing them out, short enough to share them out evenly."""
 
 
 class Look(NamedTuple):
@@ -69,8 +72,7 @@ def look_exponential(
     )
     seen, answer = _prepared(arrays, detected, horizon_s, out)
     odds, stamp, rate, time, miss, false = arrays.values()
-    common = (odds, stamp, rate, time, seen, miss, false, float(horizon_s), *answer)
-    if kernels.exponential_parallel(*common, CHUNK_ROWS) if threads else kernels.exponential(*common):
+    if _apply(kernels.exponential, (odds, stamp, rate, time, seen, miss, false), horizon_s, answer, threads):
         _refuse(arrays, answer, (rate >= 0.0) & np.isfinite(rate), "rate_hz", "no rate: a finite number >= 0 is needed")
     return answer
 
@@ -103,12 +105,31 @@ def look_general_purpose(
     )
     seen, answer = _prepared(arrays, detected, horizon_s, out)
     odds, stamp, low, high, time, miss, false = arrays.values()
-    common = (odds, stamp, low, high, time, seen, miss, false, float(horizon_s), *answer)
-    if kernels.general_purpose_parallel(*common, CHUNK_ROWS) if threads else kernels.general_purpose(*common):
+    if _apply(kernels.general_purpose, (odds, stamp, low, high, time, seen, miss, false), horizon_s, answer, threads):
         _refuse(
             arrays, answer, (low > 0.0) & (high > low) & np.isfinite(high), "low_hz", "rates are not 0 < low < high"
         )
     return answer
+
+
+def _apply(kernel: Any, columns: tuple[Any, ...], horizon_s: float, answer: Look, threads: bool) -> bool:
+    """Run a kernel over all rows, at once or chunk by chunk on all cores; True if it refused a row."""
+    n, horizon = len(answer.probability), float(horizon_s)
+
+    def chunk(first: int) -> bool:
+        rows = slice(first, first + CHUNK_ROWS)
+        return bool(kernel(*(column[rows] for column in columns), horizon, *(array[rows] for array in answer)))
+
+    if not threads or n <= CHUNK_ROWS:
+        return bool(kernel(*columns, horizon, *answer))
+    return any(list(_pool().map(chunk, range(0, n, CHUNK_ROWS))))  # a list: all of them, also after a refusal
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    """A thread for each core that this process may use, started at the first call and kept."""
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive into a child
+    return ThreadPoolExecutor(len(os.sched_getaffinity(0)))
 
 
 def _contiguous(**columns: Any) -> dict[str, FloatArray]:

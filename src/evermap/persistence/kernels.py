@@ -10,18 +10,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
-from evermap.persistence.elementary import exp, expm1, exponential_integral, inlined, kernel, parallel_kernel
+from evermap.persistence.elementary import aligned_stack, exp, expm1, inlined, kernel
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
+from evermap.persistence.unknown_rate import conditional_survival, gap_odds, odds_of_dying, scaled_survival
 from evermap.types import BoolArray, FloatArray, IntArray
-
-TINY_TIME = 1e-80
-"""Stands for time 0 where a logarithm or a quotient is taken: S is 1 there to every digit."""
-DIFFERENCE_TRUSTED = 1e-3
-"""Odds of dying in a gap above which S(a) - S(t) has lost at most three digits."""
-NODE = 0.7745966692414834
-"""Outer nodes of Gauss-Legendre quadrature with three points; weights 5/18, 8/18, 5/18."""
 
 
 @inlined
@@ -80,6 +73,15 @@ def stream(
     return -1
 
 
+@inlined
+def _looked(predicted: Any, detected: Any, p_miss: Any, p_false: Any) -> Any:
+    """Inverse odds after a look, and whether its numbers were in order."""
+    there = 1.0 - p_miss if detected else p_miss
+    gone = p_false if detected else 1.0 - p_false
+    new = observed(predicted, there, gone)
+    return new, (new >= 0.0) & (p_miss >= 0.0) & (p_miss <= 1.0) & (p_false >= 0.0) & (p_false <= 1.0)
+
+
 @kernel
 def exponential(
     inverse_odds: FloatArray,
@@ -99,66 +101,26 @@ def exponential(
         gap = time_s[i] - stamp_s[i]
         rate = rate_hz[i]
         predicted = aged(inverse_odds[i], expm1(max(min(rate * gap, LOG_LARGEST), 0.0)))
-        there = 1.0 - p_miss[i] if detected[i] else p_miss[i]
-        gone = p_false[i] if detected[i] else 1.0 - p_false[i]
-        new = observed(predicted, there, gone)
+        new, fine = _looked(predicted, detected[i], p_miss[i], p_false[i])
         after[i] = new
         survives = exp(-max(min(rate * horizon_s, LOG_LARGEST), 0.0))
         probability[i] = survives / (1.0 + new)
-        fine = (gap >= 0.0) & (time_s[i] < np.inf) & (rate >= 0.0) & (rate < np.inf) & (new >= 0.0)
-        fine &= (p_miss[i] >= 0.0) & (p_miss[i] <= 1.0) & (p_false[i] >= 0.0) & (p_false[i] <= 1.0)
+        fine &= (gap >= 0.0) & (time_s[i] < np.inf) & (rate >= 0.0) & (rate < np.inf)
         refused |= 0 if fine else 1
     return refused != 0
 
 
-@inlined
-def _scaled_survival(low: Any, high: Any, time: Any) -> Any:
-    """`e^(low t) (E1(low t) - E1(high t))`, Rosen eq. 28 without its constant and without its exponential decay."""
-    x, y = low * max(time, TINY_TIME), high * max(time, TINY_TIME)
-    grown = exp(min(x, 1.0))
-    decayed = exp(-min(y - x, 700.0))
-    first = exponential_integral(x) * (grown if x < 1.0 else 1.0)
-    return first - exponential_integral(y) * (grown if y < 1.0 else decayed)
-
-
-@inlined
-def _death_density(low: Any, high: Any, time: Any, end: Any) -> Any:
-    """`e^(low end) (e^(-low t) - e^(-high t))`: density of the lifetime times t, scaled as above."""
-    u = low * (end - time)  # at most the odds of dying in the gap, which are small where this is used
-    return (1.0 + u * (1.0 + u * (0.5 + u * (1.0 / 6.0)))) * -expm1(-min((high - low) * time, 700.0))
-
-
-@inlined
-def general_purpose_death_odds(low: Any, high: Any, start: Any, stop: Any) -> Any:
-    """`(1 - q) / q` of a gap for the unknown-rate prior (Rosen eqs. 26-29).
-
-    The difference of two survivals where they differ; the integral of the density where they nearly agree.
-    """
-    gap = stop - start
-    at_stop = _scaled_survival(low, high, stop)
-    at_start = _scaled_survival(low, high, start)
-    difference = expm1(max(min(low * gap, LOG_LARGEST), 0.0)) * at_start + (at_start - at_stop)
-    middle = max(start + 0.5 * gap, TINY_TIME)
-    reach = 0.5 * gap * NODE
-    left, right = middle - reach, middle + reach
-    outer = _death_density(low, high, left, stop) * right + _death_density(low, high, right, stop) * left
-    mass = gap * (8.0 * _death_density(low, high, middle, stop) * left * right + 5.0 * middle * outer)
-    apart = difference > DIFFERENCE_TRUSTED * at_stop
-    quotient = (difference if apart else mass) / (at_stop if apart else at_stop * (18.0 * middle * left * right))
-    return min(quotient, LARGEST)
-
-
 @kernel
 def general_purpose_gap(low: float, high: float, start: float, stop: float) -> float:
-    """`general_purpose_death_odds` of a single gap, to be called from Python."""
-    return float(general_purpose_death_odds(low, high, start, stop))
+    """Odds of dying within one gap under an unknown rate, to be called from Python."""
+    return float(gap_odds(low, high, start, stop))
 
 
 @kernel
 def general_purpose_gaps(low: float, high: float, start_s: FloatArray, stop_s: FloatArray, odds: FloatArray) -> None:
-    """`general_purpose_death_odds` of many gaps under one prior."""
+    """The same for many gaps under one prior."""
     for i in range(odds.size):
-        odds[i] = general_purpose_death_odds(low, high, start_s[i], stop_s[i])
+        odds[i] = gap_odds(low, high, start_s[i], stop_s[i])
 
 
 @kernel
@@ -176,75 +138,37 @@ def general_purpose(
     probability: FloatArray,
 ) -> bool:
     """One look at each row of an unknown-rate lifetime, and its belief `horizon_s` later; True if a row was refused."""
+    aligned_stack()
     refused = 0
-    for i in range(inverse_odds.size):
-        low, high, start, stop = low_hz[i], high_hz[i], stamp_s[i], time_s[i]
-        predicted = aged(inverse_odds[i], general_purpose_death_odds(low, high, start, stop))
-        there = 1.0 - p_miss[i] if detected[i] else p_miss[i]
-        gone = p_false[i] if detected[i] else 1.0 - p_false[i]
-        new = observed(predicted, there, gone)
-        after[i] = new
-        probability[i] = 1.0 / (1.0 + new)
-        fine = (stop >= start) & (stop < np.inf) & (low > 0.0) & (high > low) & (high < np.inf) & (new >= 0.0)
-        fine &= (p_miss[i] >= 0.0) & (p_miss[i] <= 1.0) & (p_false[i] >= 0.0) & (p_false[i] <= 1.0)
-        refused |= 0 if fine else 1
     if horizon_s > 0.0:
         for i in range(inverse_odds.size):
-            later = general_purpose_death_odds(low_hz[i], high_hz[i], time_s[i], time_s[i] + horizon_s)
-            probability[i] = 1.0 / (1.0 + aged(after[i], later))
+            low, high, stop = low_hz[i], high_hz[i], time_s[i]
+            new, at_stop, fine = _look_general_purpose(
+                inverse_odds[i], stamp_s[i], low, high, stop, detected[i], p_miss[i], p_false[i]
+            )
+            at_end, _ = scaled_survival(low, high, stop + horizon_s)
+            after[i] = new
+            probability[i] = conditional_survival(low, stop, stop + horizon_s, at_stop, at_end) / (1.0 + new)
+            refused |= 0 if fine else 1
+    else:
+        for i in range(inverse_odds.size):
+            new, _, fine = _look_general_purpose(
+                inverse_odds[i], stamp_s[i], low_hz[i], high_hz[i], time_s[i], detected[i], p_miss[i], p_false[i]
+            )
+            after[i] = new
+            probability[i] = 1.0 / (1.0 + new)
+            refused |= 0 if fine else 1
     return refused != 0
 
 
-@parallel_kernel
-def exponential_parallel(
-    inverse_odds: FloatArray,
-    stamp_s: FloatArray,
-    rate_hz: FloatArray,
-    time_s: FloatArray,
-    detected: BoolArray,
-    p_miss: FloatArray,
-    p_false: FloatArray,
-    horizon_s: float,
-    after: FloatArray,
-    probability: FloatArray,
-    chunk: int,
-) -> bool:
-    """`exponential` over all threads, in chunks of rows."""
-    n = inverse_odds.size
-    chunks = (n + chunk - 1) // chunk
-    refused = np.zeros(chunks, dtype=np.bool_)
-    for c in prange(chunks):
-        a, b = c * chunk, min(n, (c + 1) * chunk)
-        refused[c] = exponential(
-            inverse_odds[a:b], stamp_s[a:b], rate_hz[a:b], time_s[a:b], detected[a:b], p_miss[a:b], p_false[a:b],
-            horizon_s, after[a:b], probability[a:b],
-        )  # fmt: skip
-    return bool(refused.any())
-
-
-@parallel_kernel
-def general_purpose_parallel(
-    inverse_odds: FloatArray,
-    stamp_s: FloatArray,
-    low_hz: FloatArray,
-    high_hz: FloatArray,
-    time_s: FloatArray,
-    detected: BoolArray,
-    p_miss: FloatArray,
-    p_false: FloatArray,
-    horizon_s: float,
-    after: FloatArray,
-    probability: FloatArray,
-    chunk: int,
-) -> bool:
-    """`general_purpose` over all threads, in chunks of rows."""
-    n = inverse_odds.size
-    chunks = (n + chunk - 1) // chunk
-    refused = np.zeros(chunks, dtype=np.bool_)
-    for c in prange(chunks):
-        a, b = c * chunk, min(n, (c + 1) * chunk)
-        refused[c] = general_purpose(
-            inverse_odds[a:b], stamp_s[a:b], low_hz[a:b], high_hz[a:b], time_s[a:b], detected[a:b], p_miss[a:b],
-            p_false[a:b], horizon_s, after[a:b], probability[a:b],
-        )  # fmt: skip
-    return bool(refused.any())
+@inlined
+def _look_general_purpose(
+    inverse_odds: Any, start: Any, low: Any, high: Any, stop: Any, detected: Any, p_miss: Any, p_false: Any
+) -> Any:
+    """Inverse odds after a look, the scaled survival at its time, and whether all was in order."""
+    at_start, _ = scaled_survival(low, high, start)
+    at_stop, decay = scaled_survival(low, high, stop)
+    predicted = aged(inverse_odds, odds_of_dying(low, high, start, stop, at_start, at_stop, decay))
+    new, fine = _looked(predicted, detected, p_miss, p_false)
+    fine &= (stop >= start) & (stop < np.inf) & (low > 0.0) & (high > low) & (high < np.inf)
+    return new, at_stop, fine
