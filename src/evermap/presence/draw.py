@@ -16,8 +16,8 @@ from evermap.viz.style import NamedFigure
 RASTER_ROWS = 60
 _RASTER_COLUMNS = 480
 _CURVE_POINTS = 400
-_JUMPS_UP_TO = 3000
-"""Looks up to which each one's jump is drawn upright; more are dense enough as they are."""
+_PIXELS = 1200
+"""Columns of a figure: of more looks, each column shows the lowest and the highest belief, and one tick a kind."""
 _FIRST_UNIX_S = 6e8
 """Stamps beyond this (1989) are dates."""
 
@@ -100,12 +100,12 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     from evermap.viz.belief_figure import plot_belief, stretches
 
     index = np.array([feature])
-    looks, _ = looks_at(result.looks, index)
+    looks, look_rows = looks_at(result.looks, index)
     start_s, end_s = _span(result)
-    stamps = [np.linspace(start_s, end_s, _CURVE_POINTS), looks.stamp_s]
-    if len(looks.stamp_s) <= _JUMPS_UP_TO:
-        stamps.append(np.nextafter(looks.stamp_s, -np.inf))
-    time_s = np.unique(np.concatenate(stamps))
+    pixel = np.floor((looks.stamp_s - start_s) / (end_s - start_s or 1.0) * _PIXELS)
+    turn_s = looks.stamp_s[_extremes(pixel, result.p_at_looks[look_rows])]
+    before_s = np.nextafter(turn_s, -np.inf)  # draws the jump of a look upright
+    time_s = np.unique(np.concatenate([np.linspace(start_s, end_s, _CURVE_POINTS), before_s, turn_s]))
     track = result.models.only(index).track(looks, Instants.same_for_all(1, time_s))
     truth = result.truth
     there = None
@@ -113,11 +113,12 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
         rows = slice(int(truth.first[feature]), int(truth.first[feature + 1]))
         there = stretches(truth.stamp_s[rows], truth.present[rows])
     name = result.table.names[feature]
+    shown = np.unique(pixel + 1j * looks.detected, return_index=True)[1]
     figure = plot_belief(
         time_s,
         track.p_present,
-        look_s=looks.stamp_s,
-        detected=looks.detected,
+        look_s=looks.stamp_s[shown],
+        detected=looks.detected[shown],
         truth_s=there,
         forecast_from_s=result.table.now_s,
         title=f"feature {name if len(name) <= 60 else name[:59] + '…'}",
@@ -129,6 +130,13 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     taken.add(slug)
     caption = "Belief, detections (above) and misses (below); shaded where it truly was there, dashed the forecast."
     return NamedFigure(f"feature-{slug}", figure, f"Feature {name}", caption)
+
+
+def _extremes(pixel: FloatArray, belief: FloatArray) -> IntArray:
+    """The looks with the lowest and the highest belief in each column of pixels; nan counts as highest."""
+    order = np.lexsort((belief, pixel))
+    edge = np.flatnonzero(np.diff(pixel[order], prepend=-np.inf, append=np.inf))
+    return np.unique(np.concatenate([order[edge[:-1]], order[edge[1:] - 1]]))
 
 
 def _span(result: PersistResult) -> tuple[float, float]:

@@ -16,7 +16,7 @@ from evermap.presence.changes import Changes, find_changes
 from evermap.presence.config import DEFAULT_PRIOR, PersistConfig
 from evermap.presence.forecasts import Forecasts, forecast
 from evermap.presence.models import ModelOfEach, models_for
-from evermap.presence.table import LookTable, Truth, truth_of
+from evermap.presence.table import LookTable, Truth
 from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.protocol import Instants, Looks
 from evermap.types import FloatArray, IntArray
@@ -105,12 +105,13 @@ def run_persist(
     """
     config = config or PersistConfig()
     clock = _Steps(("sort", "learn", "filter", "changes", "forecast", "score"), progress)
-    looks = table.looks()
+    order = table.order()
+    looks = table.looks(order)
     clock.done("sort")
     models = models_for(config, table, looks)
     clock.done("learn")
     try:
-        beliefs, p_at_looks, merged_mass = _filter(table, config, models, looks)
+        beliefs, p_at_looks, merged_mass = _filter(table, order, config, models, looks)
     except NumericalError as error:
         raise _named(error, table) from error
     clock.done("filter")
@@ -118,8 +119,9 @@ def run_persist(
     clock.done("changes")
     forecasts = forecast(models, looks, table, config)
     clock.done("forecast")
-    truth = truth or _own_truth(table)
-    scores, bins = _score(table, beliefs, truth)
+    at_rows = table.present if truth is None and config.query == "times" else None
+    truth = truth or table.truth(order)
+    scores, bins = _score(table, beliefs, truth, at_rows)
     clock.done("score")
     warnings = (*table.warnings, *_remarks(config, models, beliefs, changes))
     return PersistResult(
@@ -135,7 +137,7 @@ def warm_up() -> None:
 
 
 def _filter(
-    table: LookTable, config: PersistConfig, models: ModelOfEach, looks: Looks
+    table: LookTable, order: IntArray, config: PersistConfig, models: ModelOfEach, looks: Looks
 ) -> tuple[Beliefs, FloatArray, float]:
     """Beliefs at the instants asked for and at the looks, and the mass that was moved about."""
     if config.query == "grid":
@@ -144,11 +146,10 @@ def _filter(
         track = models.track(looks, instants)
         beliefs = Beliefs(instants.stamp_s, feature, track.p_present)
         return beliefs, models.track(looks).p_present, float(track.merged_mass.max())
-    instants, row = table.instants()
-    track = models.track(looks, instants)
+    track = models.track(looks, table.instants(order))
     p_exists = np.empty(len(table))
-    p_exists[row] = track.p_present
-    p_at_looks = track.p_present[table.looked[row]]  # rows and looks are sorted alike
+    p_exists[order] = track.p_present
+    p_at_looks = track.p_present[table.looked[order]]  # rows and looks are sorted alike
     return Beliefs(table.stamp_s, table.feature, p_exists), p_at_looks, float(track.merged_mass.max())
 
 
@@ -175,18 +176,13 @@ def nice_step(at_least_s: float) -> float:
     return float(next(power * f for f in (1.0, 2.0, 5.0, 10.0) if power * f >= at_least_s * (1.0 - 1e-9)))
 
 
-def _own_truth(table: LookTable) -> Truth | None:
-    if table.present is None:
-        return None
-    known = ~np.isnan(table.present)
-    return truth_of(table.feature[known], table.stamp_s[known], table.present[known], table.n_features)
-
-
-def _score(table: LookTable, beliefs: Beliefs, truth: Truth | None) -> tuple[BeliefScores | None, Reliability | None]:
-    """Beliefs against truth wherever there are both."""
+def _score(
+    table: LookTable, beliefs: Beliefs, truth: Truth | None, at_rows: FloatArray | None
+) -> tuple[BeliefScores | None, Reliability | None]:
+    """Beliefs against truth wherever there are both; `at_rows` is the truth where it stands beside the beliefs."""
     if truth is None:
         return None, None
-    present = truth.at(beliefs.feature, beliefs.stamp_s)
+    present = truth.at(beliefs.feature, beliefs.stamp_s) if at_rows is None else at_rows
     both = ~np.isnan(present) & ~np.isnan(beliefs.p_exists)
     if not both.any():
         problem = "no belief falls into the time of which the truth is known"

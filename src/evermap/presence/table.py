@@ -71,15 +71,26 @@ class LookTable:
         """Time of the latest look."""
         return float(self.stamp_s[self.looked].max())
 
-    def looks(self) -> Looks:
-        """The looks by feature and time."""
-        rows = self.looked
-        columns = (self.feature, self.stamp_s, self.detected, self.p_miss, self.p_false)
-        return Looks.from_rows(*(column[rows] for column in columns), n_features=self.n_features)
+    def order(self) -> IntArray:
+        """(R,) the rows by feature and time."""
+        return np.lexsort((self.stamp_s, self.feature))
 
-    def instants(self) -> tuple[Instants, IntArray]:
-        """Times of all rows by feature and time, and (R,) the row of this table that each is of."""
-        return instants_of(self.feature, self.stamp_s, self.n_features)
+    def looks(self, order: IntArray) -> Looks:
+        """The looks by feature and time; `order` is `self.order()`."""
+        rows = order[self.looked[order]]
+        columns = (self.stamp_s, self.detected, self.p_miss, self.p_false)
+        return Looks(_firsts(self.feature[rows], self.n_features), *(column[rows] for column in columns))
+
+    def instants(self, order: IntArray) -> Instants:
+        """Times of all rows by feature and time; `order` is `self.order()`."""
+        return Instants(_firsts(self.feature, self.n_features), self.stamp_s[order])
+
+    def truth(self, order: IntArray) -> Truth | None:
+        """What the column `present` says; None without any. `order` is `self.order()`."""
+        if self.present is None:
+            return None
+        rows = order[~np.isnan(self.present[order])]
+        return Truth(_firsts(self.feature[rows], self.n_features), self.stamp_s[rows], self.present[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +122,6 @@ class Truth:
         known &= stamp_s[instant] <= self.stamp_s[self.first[feature[instant] + 1] - 1]
         answer[instant[known]] = self.present[sample[known]]
         return answer
-
-
-def instants_of(feature: IntArray, stamp_s: FloatArray, n_features: int) -> tuple[Instants, IntArray]:
-    """Rows of (feature, time) as instants by feature and time, and (N,) the row that each of them is."""
-    order = np.lexsort((stamp_s, feature))
-    first = np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=n_features))]).astype(np.int64)
-    return Instants(first, stamp_s[order]), order
 
 
 def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
@@ -184,14 +188,15 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
         raise InputError(problem, path=path, field="feature_id", hint=f"such as {quote(looks.names[0])}")
     if strangers:
         warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks left out")
-    known = (ours[feature] != UNKNOWN) & ~np.isnan(present)
-    return truth_of(ours[feature[known]], stamp_s[known], present[known], looks.n_features), tuple(warnings)
+    rows = np.flatnonzero((ours[feature] != UNKNOWN) & ~np.isnan(present))
+    rows = rows[np.lexsort((stamp_s[rows], ours[feature[rows]]))]
+    truth = Truth(_firsts(ours[feature[rows]], looks.n_features), stamp_s[rows], present[rows])
+    return truth, tuple(warnings)
 
 
-def truth_of(feature: IntArray, stamp_s: FloatArray, present: FloatArray, n_features: int) -> Truth:
-    """Samples of truth, sorted by feature and time."""
-    instants, order = instants_of(feature, stamp_s, n_features)
-    return Truth(instants.first, instants.stamp_s, present[order])
+def _firsts(feature: IntArray, n_features: int) -> IntArray:
+    """(F + 1,) where each feature starts in rows sorted by feature."""
+    return np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=n_features))]).astype(np.int64)
 
 
 def _explain_missing(table: Columns) -> None:

@@ -49,12 +49,13 @@ def plot_raster(
     if belief.shape != (len(names), len(edge) - 1) or len(names) == 0:
         raise InputError(f"shape {belief.shape} instead of ({len(names)}, {len(edge) - 1})", field="p_exists")
     height = float(np.clip(_ROW_IN * len(names), _LEAST_IN, _MOST_IN))
+    row_in = height / len(names)
     with house_style():
         figure = new_figure(7.2, height + 1.05)
         axes = figure.add_subplot()
         axis = TimeAxis.over(float(edge[0]), float(edge[-1]), clock)
         _paint(figure, axes, axis.coordinates(edge), belief)
-        _mark(axes, axis, changes, height / len(names))
+        _mark(axes, axis, changes, row_in)
         if forecast_from_s is not None and edge[0] < forecast_from_s < edge[-1]:
             axes.axvline(
                 axis.coordinates(forecast_from_s), color=INK, lw=0.9, ls=(0, (3, 2)), label="forecast from here"
@@ -65,7 +66,7 @@ def plot_raster(
             axes.set_title(title)
         handles, labels = axes.get_legend_handles_labels()
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=4)
+            figure.legend(handles, labels, loc="outside lower center", ncols=4, markerscale=5.5 / _mark_size(row_in))
         settle(figure)
     return figure
 
@@ -85,13 +86,18 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
 
 
 def _mark(axes: Axes, axis: TimeAxis, changes: Sequence[tuple[int, float, bool]], row_in: float) -> None:
-    size = float(np.clip(30.0 * row_in, 2.0, 5.5))
+    size = _mark_size(row_in)
     for returned, marker, label in ((False, "v", "vanished"), (True, "^", "returned")):
         mine = [(time_s, row) for row, time_s, back in changes if back == returned]
         if mine:
             at, rows = zip(*mine, strict=True)
             style: Any = {"mfc": INK, "mec": PAPER, "mew": 0.6, "ms": size, "ls": "none", "zorder": 3}
             axes.plot(axis.coordinates(np.array(at)), rows, marker, label=label, **style)
+
+
+def _mark_size(row_in: float) -> float:
+    """Points, for rows of this height."""
+    return float(np.clip(30.0 * row_in, 2.0, 5.5))
 
 
 def _label_rows(axes: Axes, names: Sequence[str]) -> None:
