@@ -37,6 +37,18 @@ def parse_number(text: str) -> float:
     return float(text)
 
 
+def parse_positive(text: str) -> float:
+    """A plain positive number.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    number = parse_number(text)
+    if not number > 0.0:
+        raise ConfigError(f"must be positive, not '{text}'")
+    return number
+
+
 def parse_duration_s(text: str) -> float:
     """`90s`, `10min`, `2h`, `3d`, `4w`, `1y` (of 365.25 days), `20ms` in seconds. A unit is needed.
 

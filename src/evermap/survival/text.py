@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from evermap.errors import ConfigError
-from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_rate_hz
+from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
 from evermap.survival.general_purpose import GeneralPurpose
@@ -117,6 +117,8 @@ def _parse_form(text: str) -> LifetimePrior:
     missing = [key for key in form.needed if key not in values]
     if missing or (form.steps and not steps):
         raise ConfigError(f"needs {missing[0] if missing else 'rates'}", hint=form.example)
+    if steps and steps[0][0] > 0.0:
+        raise ConfigError("nothing is said of the time before the first rate", hint=form.example)
     if steps:
         values["edges_s"], values["rates"] = zip(*steps, strict=True)
     return form.build(values)
@@ -201,19 +203,19 @@ FORMS: Mapping[str, Form] = {
         "weibull:scale=2d,shape=0.7",
         "shape < 1: what has stayed stays longer; > 1: it wears out",
         lambda v: Weibull(v["scale"], v["shape"]),
-        needed={"scale": parse_duration_s, "shape": parse_number},
+        needed={"scale": parse_duration_s, "shape": parse_positive},
     ),
     "lognormal": Form(
         "lognormal:median=2d,spread=1.5",
         "half are gone after 2 days, the logarithms spread by 1.5",
         lambda v: LogNormal.from_half_life(v["median"], v["spread"]),
-        needed={"median": parse_duration_s, "spread": parse_number},
+        needed={"median": parse_duration_s, "spread": parse_positive},
     ),
     "gamma": Form(
         "gamma:scale=2d,shape=2",
         "two exponential stages of 2 days one after the other",
         lambda v: Gamma(v["scale"], v["shape"]),
-        needed={"scale": parse_duration_s, "shape": parse_number},
+        needed={"scale": parse_duration_s, "shape": parse_positive},
     ),
     "never-leaves": Form("never-leaves", "walls", lambda _: never_leaves()),
     "gone-overnight": Form(

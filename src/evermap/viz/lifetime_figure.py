@@ -36,7 +36,8 @@ def plot(
     """Figure of hazard, cumulative hazard, survival and density over the time since a feature was first seen.
 
     A prior of which some features never leave (its hazard has a finite integral) says so in the legend, with the
-    level at which its survival ends as a dotted line.
+    level at which its survival ends as a dotted line. A point of mass shows as a step of survival and cumulative
+    hazard; its infinite hazard and density are left out.
 
     Args:
         priors: by the names for the legend, or a single one.
@@ -125,7 +126,7 @@ def _limit(axes: Axes, logarithmic: bool) -> None:
         lowest = max(float(heights.min()), highest * 10.0**-_DECADES)
         axes.set_ylim(0.5 * lowest, 2.0 * max(highest, 2.0 * lowest))
         return
-    typical = float(np.quantile(heights, 0.95))
+    typical = float(np.quantile(heights, 0.98))
     axes.set_ylim(0.0, 1.08 * (highest if highest < 5.0 * typical else 2.0 * typical))
 
 
