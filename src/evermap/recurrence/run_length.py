@@ -136,7 +136,7 @@ class RunLength:
 
     def to_dict(self) -> dict[str, Any]:
         """The model as plain numbers and words, for JSON."""
-        from evermap.survival.text import prior_to_dict
+        from evermap.survival.plain import prior_to_dict
 
         return {
             "kind": "run-length",
