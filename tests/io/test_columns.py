@@ -1,0 +1,165 @@
+"""Long tables: the fast road gives what the careful one gives, and both name what is wrong."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from evermap.errors import InputError
+from evermap.io import columns as module
+from evermap.io.columns import Columns, csv_bytes, named, read_columns
+from evermap.io.quantities import Quantity
+
+VALUE = Quantity("value", -1e3, 1e3)
+MAYBE = Quantity("value", -1e3, 1e3, optional=True)
+
+PLAIN = "stamp_s,who,value,flag\n1.5, a ,2,1\n0.5,b,-3e2,\n7,a,0.25,TRUE\n7,é,-0.0,false\n"
+
+
+def read(tmp_path: Path, content: str | bytes, name: str = "t.csv") -> Columns:
+    path = tmp_path / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return read_columns(path, [])
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        PLAIN,
+        PLAIN.rstrip("\n"),
+        PLAIN.replace("\n", "\r\n"),
+        "\ufeff# a comment\n\n  # another\n" + PLAIN,
+        PLAIN.replace("\n", ",\n"),  # a comma at the end of every line
+        PLAIN.replace("0.5,b", "# in between\n\n0.5,b"),
+        PLAIN.replace(" a ", '" a "'),
+    ],
+)
+@pytest.mark.parametrize("packed", [False, True])
+def test_every_way_to_write_a_table_gives_the_same(tmp_path: Path, content: str, packed: bool) -> None:
+    data = gzip.compress(content.encode()) if packed else content
+    table = read(tmp_path, data, "t.csv.gz" if packed else "t.csv")
+    np.testing.assert_array_equal(table.numbers(Quantity("stamp_s")), [1.5, 0.5, 7.0, 7.0])
+    np.testing.assert_array_equal(table.numbers(VALUE), [2.0, -300.0, 0.25, 0.0])
+    np.testing.assert_array_equal(table.flags("flag", hint=""), [1.0, np.nan, 1.0, 0.0])
+    names, who = table.labels("who")
+    assert [names[k] for k in who] == ["a", "b", "a", "é"]
+    lines = content.replace("\r\n", "\n").split("\n")
+    for line, value in zip(table.line, ("2", "-3e2", "0.25", "-0.0"), strict=True):
+        assert value in lines[line - 1]
+
+
+def test_the_fast_road_is_taken_where_it_can_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def careful(*_: Any) -> None:
+        raise AssertionError("a plain table takes the slow road")
+
+    monkeypatch.setattr(module, "_careful_csv", careful)
+    assert len(read(tmp_path, "# comment\n" + PLAIN)) == 4
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_names_are_in_natural_order_and_as_they_were_given(tmp_path: Path, kind: str) -> None:
+    given = ["10", "9", "-2", "007", "9"]
+    if kind == "csv":
+        table = read(tmp_path, "who\n" + "\n".join(given) + "\n")
+    else:
+        pq.write_table(pa.table({"who": pa.array(given).dictionary_encode()}), tmp_path / "t.parquet")
+        table = read_columns(tmp_path / "t.parquet", [])
+    names, who = table.labels("who")
+    assert names == ["-2", "007", "9", "10"]
+    assert [names[k] for k in who] == given
+
+
+def test_parquet_of_every_type(tmp_path: Path) -> None:
+    content = {
+        "i": pa.array([2**60 + 1, None, 3], type=pa.int64()),
+        "f": pa.array([1.0, None, 2.0]),
+        "b": pa.array([True, None, False]),
+        "u": pa.array([1, 0, 1], type=pa.uint8()),
+        "t": pa.array(["1", None, "2.5"], type=pa.large_string()),
+        "n": pa.nulls(3),
+    }
+    pq.write_table(pa.table(content), tmp_path / "t.parquet")
+    table = read_columns(tmp_path / "t.parquet", [])
+    assert table.labels("i")[0] == ["3", str(2**60 + 1)]  # not one digit of a large id is lost
+    np.testing.assert_array_equal(table.labels("i")[1], [1, -1, 0])
+    assert table.labels("f")[0] == ["1", "2"]
+    np.testing.assert_array_equal(table.flags("b", hint=""), [1.0, np.nan, 0.0])
+    np.testing.assert_array_equal(table.flags("u", hint=""), [1.0, 0.0, 1.0])
+    np.testing.assert_array_equal(table.numbers(Quantity("t", optional=True)), [1.0, np.nan, 2.5])
+    np.testing.assert_array_equal(table.numbers(Quantity("n", optional=True)), [np.nan] * 3)
+    np.testing.assert_array_equal(table.line, [1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("x", r"t\.csv:3: field 'value': 'x' is not a number"),
+        ("", r"t\.csv:3: field 'value': is empty"),
+        ("1_0", r"t\.csv:3: field 'value': '1_0' is not a number"),
+        ("nan", r"t\.csv:3: field 'value': nan where a finite number is needed"),
+        ("inf", r"t\.csv:3: field 'value': inf where a finite number is needed"),
+        ("2e3", r"t\.csv:3: field 'value': 2000 is outside \[-1000, 1000\]"),
+        ("1,2", r"t\.csv:3: 3 cells instead of 2"),
+        ('"1', r"t\.csv:3: quotation marks do not match"),
+    ],
+)
+def test_a_bad_number_is_named_with_its_line(tmp_path: Path, bad: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, f"value,b\n1,x\n{bad},x\n3,x\n").numbers(VALUE)
+
+
+def test_an_empty_cell_may_be_allowed(tmp_path: Path) -> None:
+    table = read(tmp_path, "value,b\n1,x\n,x\n nan ,x\n")
+    np.testing.assert_array_equal(table.numbers(MAYBE), [1.0, np.nan, np.nan])
+
+
+def test_bad_flags_names_and_files(tmp_path: Path) -> None:
+    table = read(tmp_path, "a,flag\nx\u0007,1\ny,2\n")
+    with pytest.raises(InputError, match=r"t\.csv:3: field 'flag': '2' is neither 1 nor 0 \(try: so\)"):
+        table.flags("flag", hint="so")
+    with pytest.raises(InputError, match=r"t\.csv:2: field 'a': holds a character that cannot be printed"):
+        table.labels("a")
+    with pytest.raises(InputError, match="no such file"):
+        read_columns(tmp_path / "none.csv", [])
+    with pytest.raises(InputError, match="is a folder"):
+        read_columns(tmp_path, [])
+    with pytest.raises(InputError, match="damaged gzip"):
+        read(tmp_path, gzip.compress(PLAIN.encode())[:-12], "t.csv.gz")
+    with pytest.raises(InputError, match="not a readable Parquet file"):
+        read(tmp_path, b"PAR1 and then nonsense", "t.parquet")
+    with pytest.raises(InputError, match="is empty"):
+        read(tmp_path, "")
+    with pytest.raises(InputError, match=r"t\.csv:2: is not plain text"):
+        read(tmp_path, b"a\n\xff\n")
+    pq.write_table(pa.table({"a": [1.5], "s": [[1]]}), tmp_path / "t.parquet")
+    table = read_columns(tmp_path / "t.parquet", [])
+    with pytest.raises(InputError, match=r"t\.parquet:1: field 'a': 1\.5 is no name"):
+        table.labels("a")
+    with pytest.raises(InputError, match=r"field 's': holds list<.*>, not numbers"):
+        table.numbers(Quantity("s"))
+
+
+def test_an_unfinished_last_line_is_left_out_with_a_remark(tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n3")
+    warnings: list[str] = []
+    assert len(read_columns(tmp_path / "t.csv", warnings)) == 1
+    assert warnings == ["t.csv: 1 unfinished last line (3) left out"]
+
+
+def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    values = np.concatenate([rng.random(50), 1e9 + rng.random(50) * 1e6, [0.0, 1e-300, 1.0, np.nan]])
+    index = rng.integers(0, 3, len(values))
+    for names in (["1", "2", "3"], ["plain", "com,ma", 'quo"te'], ["#x", "y", " z"]):
+        table = read(tmp_path, csv_bytes({"v": values, "who": named(names, index)}))
+        np.testing.assert_array_equal(table.numbers(Quantity("v", optional=True)), values)
+        found, who = table.labels("who")
+        assert [found[k] for k in who] == [names[k].strip() for k in index]
+    assert csv_bytes({"v": np.zeros(0)}) == b"v\n"
+    assert csv_bytes({"v": np.array([1.0, np.nan]), "who": named(["a"], np.array([0, 0]))}) == b"v,who\n1,a\n,a\n"
