@@ -1,6 +1,6 @@
-"""Polynomials of the exponential integral, fitted with 50 digits; highest power first.
+"""Numbers of the unknown-rate lifetime, for the kernels and for tensors alike.
 
-They serve the compiled kernels and the tensors of `torch_batch` alike.
+The polynomials of the exponential integral were fitted with 50 digits; highest power first.
 """
 
 SERIES = (
@@ -19,3 +19,12 @@ DENOMINATOR = (
     21270.39202563451, 10171.588737098129, 1983.5082469855927, 106.49313334660272, 0.0,
 )  # fmt: skip
 """`NUMERATOR(x) / DENOMINATOR(x)` is `e^x E1(x)` from 1 on: minimax, relative error 4e-16, no zeros and no poles."""
+
+TINY_TIME = 1e-80
+"""Stands for time 0 where a logarithm or a quotient is taken: S is 1 there to every digit."""
+GAMMA = 0.5772156649015329
+"""Euler's constant."""
+DIFFERENCE_TRUSTED = 2e-4
+"""Odds of dying in a gap above which a difference of survivals has lost less than four digits."""
+NODE = 0.28867513459481287
+"""Gauss-Legendre quadrature with two points: half a gap over the square root of three either side of its middle."""

@@ -6,20 +6,22 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
-from evermap.persistence.coefficients import DENOMINATOR, NUMERATOR, SERIES
+from evermap.persistence.coefficients import (
+    DENOMINATOR,
+    DIFFERENCE_TRUSTED,
+    GAMMA,
+    NODE,
+    NUMERATOR,
+    SERIES,
+    TINY_TIME,
+)
 from evermap.persistence.elementary import exp, expm1, inlined, log_of_split, split
 from evermap.persistence.state import LARGEST, LOG_LARGEST
 
-TINY_TIME = 1e-80
-"""Stands for time 0 where a logarithm or a quotient is taken: S is 1 there to every digit."""
-EXP_GAMMA = 1.781072417990198
-"""`e^gamma`, Euler's constant."""
-DIFFERENCE_TRUSTED = 2e-4
-"""Odds of dying in a gap above which a difference of survivals has lost less than four digits."""
-NODE = 0.28867513459481287
-"""Gauss-Legendre quadrature with two points: half a gap over the square root of three either side of its middle."""
+EXP_GAMMA = math.exp(GAMMA)
 
 
 @inlined
