@@ -12,7 +12,7 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "slam", "convert", "simulate", "reproduce", "bench"]
+VERBS = ["demo", "slam", "persist", "convert", "simulate", "reproduce", "bench"]
 GROUPS = {"survival": ["plot"]}
 
 
