@@ -27,7 +27,7 @@ def test_raster_has_a_row_a_feature_with_its_changes() -> None:
     changes = [(0, 5400.0, False), (1, 9000.0, True)]
     figure = plot_raster(["door", "c" * 30], [0.0, 3600.0, 7200.0, 10800.0 * 1.01], belief, changes=changes)
     axes = figure.axes[0]
-    mesh = axes.collections[0]
+    mesh: Any = axes.collections[0]
     np.testing.assert_array_equal(mesh.get_array().filled(-1.0).ravel(), [1.0, 0.5, 0.0, -1.0, 0.2, 0.9])
     assert mesh.get_clim() == (0.0, 1.0)
     labels = [tick.get_text() for tick in axes.get_yticklabels()]

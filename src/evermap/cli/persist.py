@@ -70,7 +70,7 @@ def persist(
         typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False),
     ] = None,
 ) -> None:
-    """Tell from detections and misses what is there, what changed, and what will be.
+    """Tell what is still there, from detections and misses.
 
     \b
     The table has a row a look: stamp_s, feature_id, and detected (1, 0, or empty where nobody looked); it may have

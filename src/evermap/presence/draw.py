@@ -80,7 +80,7 @@ def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
     )
     total = result.table.n_features
     which = "All features" if len(features) == total else f"The {len(features)} of {total:,} features that changed most"
-    caption = f"{which}: blue is there, orange is not, pale is undecided, grey is not yet seen."
+    caption = f"{which}: blue is there, orange is not, pale is undecided, hatched is not yet seen."
     return NamedFigure("overview", figure, "Beliefs of all features", caption)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.types import Clock
-from evermap.viz.style import ALERT, ESTIMATE, INK, PAPER, SHADE, house_style, new_figure, settle
+from evermap.viz.style import ALERT, ESTIMATE, GRID, INK, PAPER, SHADE, house_style, new_figure, settle
 from evermap.viz.time_axis import TimeAxis
 
 if TYPE_CHECKING:
@@ -72,14 +72,16 @@ def plot_raster(
 
 
 def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
-    """Blue is there, orange is not, pale is undecided, grey is no belief."""
+    """Blue is there, orange is not, pale is undecided, hatched is no belief."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(bad=SHADE)
+    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(bad=(0.0, 0.0, 0.0, 0.0))
     rows = np.arange(len(belief) + 1) - 0.5
     shown = np.ma.masked_invalid(belief)
     mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)
     axes.grid(visible=False)
+    axes.set_facecolor(SHADE)
+    axes.patch.set(hatch="/////", edgecolor=GRID, linewidth=0.0)
     bar = figure.colorbar(mesh, ax=axes, pad=0.015, fraction=0.03, aspect=12, ticks=[0.0, 0.5, 1.0])
     bar.set_label("P(exists) [1]")
     bar.outline.set_visible(False)
