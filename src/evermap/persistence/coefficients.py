@@ -16,9 +16,12 @@ NUMERATOR = (
 )  # fmt: skip
 DENOMINATOR = (
     1.0, 35.37770363805599, 477.37230701372374, 3173.0385720540626, 11226.977793969772, 21396.548962835925,
-    21270.39202563451, 10171.588737098129, 1983.5082469855927, 106.49313334660272, 0.0,
+    21270.39202563451, 10171.588737098129, 1983.5082469855927, 106.49313334660272, 1e-300,
 )  # fmt: skip
-"""`NUMERATOR(x) / DENOMINATOR(x)` is `e^x E1(x)` from 1 on: minimax, relative error 4e-16, no zeros and no poles."""
+"""`NUMERATOR(x) / DENOMINATOR(x)` is `e^x E1(x)` from 1 on: minimax, relative error 4e-16, no zeros and no poles.
+
+The last coefficient stands for 0 and keeps the reciprocal finite where x is 0 and the quotient is not asked for.
+"""
 
 TINY_TIME = 1e-80
 """Stands for time 0 where a logarithm or a quotient is taken: S is 1 there to every digit."""

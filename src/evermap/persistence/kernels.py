@@ -148,7 +148,7 @@ def general_purpose(
             )
             at_end, _ = scaled_survival(low, high, stop + horizon_s)
             after[i] = new
-            probability[i] = conditional_survival(low, stop, stop + horizon_s, at_stop, at_end) / (1.0 + new)
+            probability[i] = conditional_survival(low, stop, stop + horizon_s, at_stop * (1.0 + new), at_end)
             refused |= 0 if fine else 1
     else:
         for i in range(inverse_odds.size):

@@ -26,19 +26,27 @@ EXP_GAMMA = math.exp(GAMMA)
 
 @inlined
 def _numerator(x: Any, large: Any) -> Any:
-    """Polynomial of the exponential integral below 1 and from 1 on: one chain of products serves both."""
-    p = NUMERATOR[0] if large else SERIES[0]
-    for k in range(1, len(SERIES)):
-        p = p * x + (NUMERATOR[k] if large else SERIES[k])
-    return p
+    """Polynomial of the exponential integral below 1 and from 1 on: one chain of products serves both.
+
+    Even and odd powers apart, here and below, for the second chain runs in the waiting times of the first.
+    """
+    z = x * x
+    even = NUMERATOR[0] if large else SERIES[0]
+    odd = NUMERATOR[1] if large else SERIES[1]
+    for k in range(2, 10, 2):
+        even = even * z + (NUMERATOR[k] if large else SERIES[k])
+        odd = odd * z + (NUMERATOR[k + 1] if large else SERIES[k + 1])
+    return (even * z + (NUMERATOR[10] if large else SERIES[10])) + x * odd
 
 
 @inlined
 def _denominator(x: Any) -> Any:
-    q = DENOMINATOR[0]
-    for k in range(1, len(DENOMINATOR)):
-        q = q * x + DENOMINATOR[k]
-    return q
+    z = x * x
+    even, odd = DENOMINATOR[0], DENOMINATOR[1]
+    for k in range(2, 10, 2):
+        even = even * z + DENOMINATOR[k]
+        odd = odd * z + DENOMINATOR[k + 1]
+    return (even * z + DENOMINATOR[10]) + x * odd
 
 
 @inlined
@@ -48,8 +56,8 @@ def scaled_survival(low: Any, high: Any, time: Any) -> Any:
     E1 is a series and a logarithm below 1, a rational function of x from there on. Where both arguments are below 1,
     the two logarithms are one of `low / high`. One division serves everything.
     """
-    x, y = min(low * max(time, TINY_TIME), 1e15), min(high * max(time, TINY_TIME), 1e15)
-    late, grown = x >= 1.0, y >= 1.0
+    late, grown = low * time >= 1.0, high * time >= 1.0
+    x, y = min(low * time, 1e15), min(high * time, 1e15)
     p, q = _numerator(x, late), _denominator(x)
     p_high, q_high = _numerator(y, grown), _denominator(y)
     exponent, f = split(x * EXP_GAMMA if grown else low / high)
