@@ -72,4 +72,5 @@ def tabulate(prior: LifetimePrior, step_s: float) -> HazardTable:
 
 def bins_of(age_s: FloatArray, offset: int, n: int) -> IntArray:
     """The bin of each age."""
-    return np.clip((np.asarray(age_s, dtype=np.float64).view(np.int64) >> SHIFT) - offset, 0, n - 1)
+    leading = np.asarray(age_s, dtype=np.float64).view(np.int64) >> SHIFT
+    return np.asarray(np.clip(leading - offset, 0, n - 1), dtype=np.int64)

@@ -149,6 +149,23 @@ class RunLength:
             "hypotheses": self.hypotheses,
         }
 
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> RunLength:
+        """What `to_dict` wrote."""
+        from evermap.survival.plain import prior_from_dict
+
+        rhythms = (data["stay_rhythm"], data["absence_rhythm"])
+        stay_rhythm, absence_rhythm = (Rhythm.from_dict(rhythm) if rhythm else None for rhythm in rhythms)
+        return cls(
+            prior_from_dict(data["stay"]),
+            prior_from_dict(data["absence"]),
+            float(data["step_s"]),
+            stay_rhythm,
+            absence_rhythm,
+            bool(data["newborn"]),
+            int(data["hypotheses"]),
+        )
+
 
 def likelihoods(looks: Looks) -> tuple[FloatArray, FloatArray]:
     """Likelihood of each look if the feature is absent, and if it is present."""
@@ -170,7 +187,7 @@ def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
     weight = np.bincount(group, mass, n)
     age = np.bincount(group, mass * middle, n) / np.where(weight > 0.0, weight, 1.0)
     # older hypotheses first, as everywhere
-    return np.maximum.accumulate(age)[::-1], weight[::-1]
+    return np.maximum.accumulate(age)[::-1].copy(), np.array(weight[::-1], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

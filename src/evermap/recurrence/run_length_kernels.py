@@ -21,6 +21,7 @@ from evermap.types import FloatArray, IntArray
 
 MOST = 700.0
 NO_MERGE = -1
+AS_THEY_ARE = (1.0, 1.0)
 _MONDAY_S = 4.0 * DAY_S
 
 
@@ -50,12 +51,12 @@ class First(NamedTuple):
     Attributes:
         age_s: (W, 2, S) how long it has been so.
         weight: (W, 2, S) with which probability.
-        count: (W, 2) number of hypotheses.
+        number: (W, 2) number of hypotheses.
     """
 
     age_s: FloatArray
     weight: FloatArray
-    count: IntArray
+    number: IntArray
 
 
 @inlined
@@ -135,16 +136,20 @@ def _step(
     now: float,
     later: float,
     law: Law,
+    scale: tuple[float, float],
     scratch: FloatArray,
     merged: IntArray,
 ) -> float:
-    """One step without a look; where lists were merged goes into `merged`. Returns the mass merged."""
+    """One step without a look; where lists were merged goes into `merged`. Returns the mass merged.
+
+    Hazards are those of the law times `scale`.
+    """
     middle = 0.5 * (now + later)
     week = _week_bin(middle, law.factor.shape[1])
     ended = [0.0, 0.0]
     for s in range(2):
         died = scratch[s]
-        ended[s] = _deaths(start, weight, count[s], s, now, later, law.factor[s, week], law, died)
+        ended[s] = _deaths(start, weight, count[s], s, now, later, scale[s] * law.factor[s, week], law, died)
         for j in range(count[s]):
             weight[s, j] -= died[j]
     moved = 0.0
@@ -164,17 +169,22 @@ def _step(
 
 @kernel
 def _look(weight: FloatArray, count: IntArray, absent: float, present: float) -> float:
-    """Multiply by the likelihoods of a look and normalise; returns the probability of the look."""
-    total = 0.0
+    """Multiply by the likelihoods of a look and normalise; returns the probability of the look.
+
+    A state that the look rules out keeps no hypotheses.
+    """
+    mass = [0.0, 0.0]
     for s in range(2):
         likelihood = present if s == 1 else absent
         for j in range(count[s]):
             weight[s, j] *= likelihood
-            total += weight[s, j]
-    if total > 0.0:
-        for s in range(2):
-            for j in range(count[s]):
-                weight[s, j] /= total
+            mass[s] += weight[s, j]
+        if mass[s] == 0.0:
+            count[s] = 0
+    total = mass[0] + mass[1]
+    for s in range(2):
+        for j in range(count[s]):
+            weight[s, j] /= total
     return total
 
 
@@ -218,10 +228,10 @@ def advance(
     """
     moved = 0.0
     while until - now > law.step_s:
-        moved += _step(start, weight, count, now, now + law.step_s, law, scratch, merged)
+        moved += _step(start, weight, count, now, now + law.step_s, law, AS_THEY_ARE, scratch, merged)
         now += law.step_s
     if not whole and until > now:
-        moved += _step(start, weight, count, now, until, law, scratch, merged)
+        moved += _step(start, weight, count, now, until, law, AS_THEY_ARE, scratch, merged)
         now = until
     return now, moved
 
@@ -235,9 +245,9 @@ def begin(
     prior: First,
 ) -> None:
     """The belief before anything is known: ages and weights for this time of the week."""
-    week = _week_bin(stamp_s, len(prior.count))
+    week = _week_bin(stamp_s, len(prior.number))
     for s in range(2):
-        count[s] = prior.count[week, s]
+        count[s] = prior.number[week, s]
         for j in range(count[s]):
             start[s, j] = stamp_s - prior.age_s[week, s, j]
             weight[s, j] = prior.weight[week, s, j]

@@ -35,13 +35,17 @@ class Counts(NamedTuple):
 
     Attributes:
         events: (2, A, W) how many ended.
-        exposure_s: (2, A, W) time spent.
+        exposure_s: (2, A, W) time spent, times the period's level.
         open_ended: (2, A) how many were going on at the end of the looks.
+        of_period: (2, P) how many ended in each period of the calendar.
+        expected_of_period: (2, P) how many would have by the hazards of the model alone, without the period's level.
     """
 
     events: FloatArray
     exposure_s: FloatArray
     open_ended: FloatArray
+    of_period: FloatArray
+    expected_of_period: FloatArray
 
 
 @kernel
@@ -52,6 +56,8 @@ def _forward(
     absent: FloatArray,
     present: FloatArray,
     law: Law,
+    period: IntArray,
+    level: FloatArray,
     start: FloatArray,
     weight: FloatArray,
     count: IntArray,
@@ -67,7 +73,8 @@ def _forward(
     for k in range(a, b):
         i = k - a
         starts[i], weights[i], counts[i] = start, weight, count
-        _step(start, weight, count, stamp_s[k], stamp_s[k + 1], law, scratch, merged)
+        scale = (level[0, period[k]], level[1, period[k]])
+        _step(start, weight, count, stamp_s[k], stamp_s[k + 1], law, scale, scratch, merged)
         merges[i] = merged
         scales[i] = _look(weight, count, absent[k + 1], present[k + 1])
 
@@ -78,6 +85,8 @@ def expectations(
     absent: FloatArray,
     present: FloatArray,
     importance: FloatArray,
+    period: IntArray,
+    level: FloatArray,
     slots: int,
     law: Law,
     prior: First,
@@ -91,6 +100,8 @@ def expectations(
         absent: (T + 1,) likelihoods of the looks there if the feature is absent, 1 where there was none.
         present: (T + 1,) the same if it is present.
         importance: (T,) weight of what happens in each step.
+        period: (T,) period of the calendar of each step.
+        level: (2, P) by what hazards are multiplied in each.
         slots: places of a list of hypotheses.
         law: the model.
         prior: its belief before the first look.
@@ -116,7 +127,23 @@ def expectations(
         kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         _forward(
-            a, b, stamp_s, absent, present, law, start, weight, count, scratch, starts, weights, counts, merges, scales
+            a,
+            b,
+            stamp_s,
+            absent,
+            present,
+            law,
+            period,
+            level,
+            start,
+            weight,
+            count,
+            scratch,
+            starts,
+            weights,
+            counts,
+            merges,
+            scales,
         )
         for i in range(b - a):
             evidence += np.log(scales[i])
@@ -129,8 +156,8 @@ def expectations(
     for s in range(2):
         for j in range(count[s]):
             age = stamp_s[steps] - start[s, j]
-            i = min(max((np.float64(age).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1)
-            counts_out.open_ended[s, i // per_group] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
+            oldest = min(max((np.float64(age).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1)
+            counts_out.open_ended[s, oldest // per_group] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
     smoothed[steps] = weight[1, : count[1]].sum()
 
     later, sooner = np.ones((2, slots)), np.ones((2, slots))
@@ -138,7 +165,23 @@ def expectations(
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
         _forward(
-            a, b, stamp_s, absent, present, law, start, weight, count, scratch, starts, weights, counts, merges, scales
+            a,
+            b,
+            stamp_s,
+            absent,
+            present,
+            law,
+            period,
+            level,
+            start,
+            weight,
+            count,
+            scratch,
+            starts,
+            weights,
+            counts,
+            merges,
+            scales,
         )
         for k in range(b - 1, a - 1, -1):
             i = k - a
@@ -146,7 +189,7 @@ def expectations(
             gap, middle = then - now, 0.5 * (now + then)
             week = _week_bin(middle, law.factor.shape[1])
             column = week if weeks > 1 else 0
-            there = 0.0
+            there, when = 0.0, period[k]
             for s in range(2):
                 same = (present[k + 1] if s == 1 else absent[k + 1]) / scales[i]
                 other = (absent[k + 1] if s == 1 else present[k + 1]) / scales[i]
@@ -155,7 +198,8 @@ def expectations(
                     newcomer -= 1
                 for j in range(counts[i, s]):
                     age = now - starts[i, s, j]
-                    x = min(law.factor[s, week] * _integrated(age, age + gap, s, law), MOST)
+                    usual = law.factor[s, week] * _integrated(age, age + gap, s, law)
+                    x = min(level[s, when] * usual, MOST)
                     p_end = -expm1(-x)
                     to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
                     lives = (1.0 - p_end) * same * later[s, to]
@@ -169,9 +213,13 @@ def expectations(
                     row = min(
                         max((np.float64(age + 0.5 * gap).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1
                     )
+                    counts_out.of_period[s, when] += mass * ends
+                    counts_out.expected_of_period[s, when] += mass * usual * (lives + part * ends)
                     mass *= importance[k]
                     counts_out.events[s, row // per_group, column] += mass * ends
-                    counts_out.exposure_s[s, row // per_group, column] += mass * gap * (lives + part * ends)
+                    counts_out.exposure_s[s, row // per_group, column] += (
+                        mass * level[s, when] * gap * (lives + part * ends)
+                    )
             smoothed[k] = there
             later, sooner = sooner, later
     return evidence, smoothed[0]

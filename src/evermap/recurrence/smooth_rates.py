@@ -24,7 +24,8 @@ _WEAK = 1e-5
 _WEEKEND = 0.03
 """Precision of the prior of the weekend's log factor: a factor of e^6 is one standard deviation."""
 _SMOOTHEST, _ROUGHEST = 1e6, 1e-4
-_SETTLED = 0.05
+_SETTLED = 0.01
+"""Change of the effective number of parameters below which the smoothness is found."""
 _MAX_ROUNDS = 60
 _MAX_NEWTON = 25
 _MAX_STEP = 4.0
@@ -53,11 +54,15 @@ class SmoothRates:
         log_age: (I,) log of events per unit of exposure.
         log_week: (J,) log factor, of mean 0 over the events.
         freedom: effective number of parameters.
+        coefficients: of the columns of both bases.
+        weights: of the penalties.
     """
 
     log_age: FloatArray
     log_week: FloatArray
     freedom: float
+    coefficients: FloatArray
+    weights: FloatArray
 
 
 def constant(n: int) -> Basis:
@@ -92,7 +97,15 @@ def week_basis() -> Basis:
     return Basis(columns, penalties, _padded(np.array([[_WEEKEND]]), int(starts[1]), size))
 
 
-def fit(events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None) -> SmoothRates:
+def steady_level(n: int) -> Basis:
+    """A level for each of n periods, from one to the next changed as little as the events allow: a random walk."""
+    difference = np.diff(np.eye(n), axis=0)
+    return Basis(np.eye(n), (difference.T @ difference,) if n > 1 else (), np.zeros((n, n)))
+
+
+def fit(
+    events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None = None
+) -> SmoothRates:
     """Log rates of greatest penalised likelihood, the penalties' weights by marginal likelihood.
 
     Args:
@@ -100,10 +113,12 @@ def fit(events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None
         exposure: (I, J) time spent there.
         age: basis of the I ages.
         week: basis of the J times of the week; None where there is no rhythm (then J may be 1).
+        start: where to begin: an earlier fit of the same bases.
     """
     total = exposure.sum()
     if total <= 0.0:
-        return SmoothRates(np.full(len(exposure), _LOWEST), np.zeros(exposure.shape[1]), 0.0)
+        none = np.zeros(0)
+        return SmoothRates(np.full(len(exposure), _LOWEST), np.zeros(exposure.shape[1]), 0.0, none, none)
     counted = events + HALF_AN_EVENT * exposure / total
     columns_week = week.columns if week else np.zeros((exposure.shape[1], 0))
     p, q = age.columns.shape[1], columns_week.shape[1]
@@ -114,7 +129,9 @@ def fit(events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None
         fixed += _padded(week.fixed, p, p + q)
     weights = np.ones(len(penalties))
     beta = np.concatenate([np.full(p, np.log(counted.sum() / total)), np.zeros(q)])
-    covariance = penalty = np.zeros((0, 0))
+    if start is not None and len(start.coefficients) == p + q:
+        beta, weights = start.coefficients, start.weights
+    freedom = 0.0
     for _ in range(_MAX_ROUNDS):
         penalty = fixed + sum((w * m for w, m in zip(weights, penalties, strict=True)), np.zeros_like(fixed))
         beta, covariance = _newton(beta, counted, exposure, age.columns, columns_week, penalty)
@@ -125,15 +142,13 @@ def fit(events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None
                 for w, m in zip(weights, penalties, strict=True)
             ]
         )
-        updated = np.clip(updated, _ROUGHEST, _SMOOTHEST)
-        settled = not len(weights) or np.abs(np.log(updated / weights)).max() < _SETTLED
-        weights = updated
-        if settled:
+        weights = np.clip(updated, _ROUGHEST, _SMOOTHEST)
+        before, freedom = freedom, p + q - float(np.sum(covariance * penalty))
+        if abs(freedom - before) < _SETTLED:
             break
     log_age, log_week = age.columns @ beta[:p], columns_week @ beta[p:]
     level = float(counted.sum(0) @ log_week / counted.sum())
-    freedom = p + q - float(np.sum(covariance * penalty))
-    return SmoothRates(log_age + level, log_week - level, freedom)
+    return SmoothRates(log_age + level, log_week - level, freedom, beta, weights)
 
 
 def _newton(

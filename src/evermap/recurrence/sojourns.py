@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 
 from evermap.recurrence.rhythm import Rhythm
-from evermap.recurrence.smooth_rates import HALF_AN_EVENT, age_basis, constant, fit, week_basis
+from evermap.recurrence.smooth_rates import HALF_AN_EVENT, SmoothRates, age_basis, constant, fit, week_basis
 from evermap.survival import Exponential, Gamma, LogNormal, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import FloatArray
@@ -69,12 +69,14 @@ class Fitted:
         prior: the lifetime.
         rhythm: factor on its hazard, or None.
         freedom: how many parameters it took.
+        rates: the smooth rates behind it, for the next fit to begin with.
     """
 
     family: str
     prior: LifetimePrior
     rhythm: Rhythm | None
     freedom: float
+    rates: SmoothRates | None = None
 
     def log_likelihood(self, counts: Sojourns) -> float:
         """`sum events log h - exposure h`, of the table of counts."""
@@ -91,7 +93,7 @@ class Fitted:
 
     def score(self, counts: Sojourns) -> float:
         """Log likelihood less the price of the parameters (Schwarz 1978)."""
-        return self.log_likelihood(counts) - 0.5 * self.freedom * np.log(max(counts.n_events, 2.0))
+        return self.log_likelihood(counts) - 0.5 * self.freedom * float(np.log(max(counts.n_events, 2.0)))
 
 
 def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
@@ -100,12 +102,12 @@ def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(-survived, 800.0) / np.diff(edge_s), dtype=np.float64)
 
 
-def exponential(counts: Sojourns, *, rhythm: bool = False) -> Fitted:
+def exponential(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
     """A hazard that does not depend on age."""
     total = counts.exposure_s.sum()
     if rhythm:
         events, exposure = counts.events.sum(0)[None, :], counts.exposure_s.sum(0)[None, :]
-        rates = fit(events, exposure, constant(1), week_basis())
+        rates = fit(events, exposure, constant(1), week_basis(), start.rates if start else None)
         return Fitted(
             "exponential", Exponential(float(np.exp(rates.log_age[0]))), Rhythm(rates.log_week), rates.freedom
         )
@@ -113,41 +115,42 @@ def exponential(counts: Sojourns, *, rhythm: bool = False) -> Fitted:
     return Fitted("exponential", Exponential(float(rate)), None, 1.0)
 
 
-def smooth(counts: Sojourns, *, rhythm: bool = False) -> Fitted:
+def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
     """Any smooth function of log age as log hazard, constant beyond the ages that were seen."""
     seen = np.flatnonzero(counts.exposure_s.sum(1) > 0.0)
     if not seen.size:
         return exponential(counts, rhythm=rhythm)
+    earlier = start.rates if start else None
     rows = slice(int(seen[0]), int(seen[-1]) + 1)
     log_age = np.log(counts.age_s[rows])
     knots = int(np.clip(KNOTS_PER_DOUBLING * (log_age[-1] - log_age[0]) / np.log(2.0), 4, MOST_KNOTS))
     basis = age_basis(log_age, knots)
     if rhythm:
-        rates = fit(counts.events[rows], counts.exposure_s[rows], basis, week_basis())
+        rates = fit(counts.events[rows], counts.exposure_s[rows], basis, week_basis(), earlier)
     else:
-        rates = fit(counts.events[rows].sum(1)[:, None], counts.exposure_s[rows].sum(1)[:, None], basis, None)
+        rates = fit(counts.events[rows].sum(1)[:, None], counts.exposure_s[rows].sum(1)[:, None], basis, None, earlier)
     edge = counts.edge_s[:-1][rows].copy()
     edge[0] = 0.0
     prior = PiecewiseConstantHazard(tuple(edge), tuple(np.exp(rates.log_age)))
-    return Fitted("smooth", prior, Rhythm(rates.log_week) if rhythm else None, rates.freedom)
+    return Fitted("smooth", prior, Rhythm(rates.log_week) if rhythm else None, rates.freedom, rates)
 
 
-def weibull(counts: Sojourns) -> Fitted:
+def weibull(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """A hazard that is a power of age."""
     return _two_parameters("weibull", counts, lambda a, b: Weibull(np.exp(a), np.exp(b)))
 
 
-def gamma(counts: Sojourns) -> Fitted:
+def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """A sum of exponential phases."""
     return _two_parameters("gamma", counts, lambda a, b: Gamma(np.exp(a - b), np.exp(b)))
 
 
-def lognormal(counts: Sojourns) -> Fitted:
+def lognormal(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """One typical duration and its spread."""
     return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, np.exp(b)))
 
 
-def peaks(counts: Sojourns) -> Fitted:
+def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """Some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
     best = _mixture(counts, 0)
     for n in range(1, MOST_PEAKS + 1):
@@ -157,7 +160,9 @@ def peaks(counts: Sojourns) -> Fitted:
     return best
 
 
-FAMILIES: dict[str, Callable[[Sojourns], Fitted]] = {
+Family = Callable[[Sojourns, Fitted | None], Fitted]
+"""Counts, and an earlier fit to begin with, to a lifetime."""
+FAMILIES: dict[str, Family] = {
     "exponential": exponential,
     "weibull": weibull,
     "gamma": gamma,
@@ -166,7 +171,7 @@ FAMILIES: dict[str, Callable[[Sojourns], Fitted]] = {
     "smooth": smooth,
 }
 """Families without a rhythm, by name."""
-WITH_RHYTHM: dict[str, Callable[[Sojourns], Fitted]] = {
+WITH_RHYTHM: dict[str, Family] = {
     "exponential": partial(exponential, rhythm=True),
     "smooth": partial(smooth, rhythm=True),
 }
