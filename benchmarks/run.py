@@ -1,7 +1,8 @@
 """All races, their ratios, and the committed baseline they are compared with.
 
-Contenders take turns in one process on one core, so that both meet the same machine in the same mood; the ratio of
-every turn is formed before the median is taken. A time alone says nothing about another machine and is only shown.
+Contenders take turns in one process, so that both meet the same machine in the same mood. Of the long races (SLAM, on
+one core) the ratio of every turn is formed before the median is taken; of the short ones see `persistence`. A time
+alone says nothing about another machine and is only shown.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from benchmarks import persistence
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -28,32 +30,54 @@ METRICS: dict[str, tuple[str, float, str]] = {
     "isam2_memory_ratio": ("lower", 0.25, "memory that streaming adds, over plain gtsam ISAM2"),
     "batch_speed_ratio": ("higher", 0.25, "speed of Smoother (optimum and marginals) over gtsam LM and Marginals"),
     "batch_memory_ratio": ("lower", 0.25, "memory that it adds, over gtsam LM and Marginals"),
+    **persistence.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
+PARTS = ("slam", "persistence")
+_RENEW = "evermap bench --update-baseline"
 
-def run(update_baseline: bool = False, *, n_poses: int = N_POSES, turns: int = TURNS) -> dict[str, Any]:
+
+def run(
+    update_baseline: bool = False,
+    *,
+    only: str | None = None,
+    n_poses: int = N_POSES,
+    turns: int = TURNS,
+    n_features: int = persistence.N_FEATURES,
+    short_turns: int = persistence.TURNS,
+) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
     Args:
-        update_baseline: make these measurements the baseline.
+        update_baseline: make these measurements the baseline; what is not measured stays.
+        only: one of `PARTS`; all where None.
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
+        n_features, short_turns: the same for the persistence filter.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
         (times and memory as they were, for information) and `regressions`, the names of metrics out of tolerance.
 
     Raises:
-        InputError: the baseline is missing or damaged, and is not being updated.
+        InputError: the baseline is missing or damaged, and is not being updated; a part that does not exist.
     """
+    if only not in (None, *PARTS):
+        raise InputError(f"no part '{only}'", field="only", hint=" or ".join(PARTS))
     measured: dict[str, float] = {}
-    shown: dict[str, Any] = {"n_poses": n_poses, "turns": turns}
-    for race in CONTENDERS:
-        measured[f"{race}_speed_ratio"], speeds = _speed(race, n_poses, turns)
-        measured[f"{race}_memory_ratio"], memory = _memory(race, n_poses)
-        shown[race] = speeds | memory
+    shown: dict[str, Any] = {}
+    if only in (None, "slam"):
+        shown |= {"n_poses": n_poses, "turns": turns}
+        for race in CONTENDERS:
+            measured[f"{race}_speed_ratio"], speeds = _speed(race, n_poses, turns)
+            measured[f"{race}_memory_ratio"], memory = _memory(race, n_poses)
+            shown[race] = speeds | memory
+    if only in (None, "persistence"):
+        ratios, shown["persistence"] = persistence.run(n_features, short_turns)
+        measured |= ratios
     if update_baseline:
-        write_atomic(BASELINE, json.dumps(_as_baseline(measured), indent=2) + "\n")
+        kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
+        write_atomic(BASELINE, json.dumps(_as_baseline(kept | measured), indent=2) + "\n")
     metrics = compare(measured, read_baseline())
     return {
         "metrics": metrics,
@@ -68,16 +92,20 @@ def read_baseline(path: Path = BASELINE) -> dict[str, dict[str, Any]]:
     Raises:
         InputError: it is missing, damaged, or lacks a metric.
     """
-    hint = "evermap bench --update-baseline"
-    try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["metrics"]
-        baseline = {row["metric"]: {key: row[key] for key in ("direction", "tolerance", "value")} for row in rows}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError("is no benchmark baseline", path=path, hint=hint) from error
+    baseline = _rows(path)
     lacking = [name for name in METRICS if name not in baseline]
     if lacking:
-        raise InputError(f"lacks {', '.join(lacking)}", path=path, hint=hint)
+        raise InputError(f"lacks {', '.join(lacking)}", path=path, hint=_RENEW)
     return baseline
+
+
+def _rows(path: Path) -> dict[str, dict[str, Any]]:
+    """What a baseline file holds, complete or not."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["metrics"]
+        return {row["metric"]: {key: row[key] for key in ("direction", "tolerance", "value")} for row in rows}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("is no benchmark baseline", path=path, hint=_RENEW) from error
 
 
 def compare(measured: Mapping[str, float], baseline: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -103,19 +131,24 @@ def compare(measured: Mapping[str, float], baseline: Mapping[str, Mapping[str, A
 
 def as_text(measured: Mapping[str, Any]) -> str:
     """The comparison as aligned text, regressions marked, with the times behind it below."""
-    lines = [f"{'metric':<20} {'value':>7} {'baseline':>9} {'change':>8} {'allowed':>8}"]
+    width = max(map(len, METRICS))
+    lines = [f"{'metric':<{width}} {'value':>7} {'baseline':>9} {'change':>8} {'allowed':>8}"]
     for row in measured["metrics"]:
         mark = "  REGRESSION" if row["regression"] else ""
         allowed = f"-{row['tolerance']:.0%}"
         numbers = f"{row['value']:>7.3f} {row['baseline']:>9.3f} {row['change']:>+8.0%} {allowed:>8}"
-        lines.append(f"{row['metric']:<20} {numbers}{mark}")
+        lines.append(f"{row['metric']:<{width}} {numbers}{mark}")
         lines.append(f"  {METRICS[row['metric']][2]} ({row['direction']} is better)")
     shown = measured["shown"]
-    lines += ["", f"on this machine now, {shown['n_poses']} poses, median of {shown['turns']} turns (for information):"]
-    for race in CONTENDERS:
+    if "n_poses" in shown:
+        size = f"{shown['n_poses']} poses, median of {shown['turns']} turns"
+        lines += ["", f"on this machine now, {size} (for information):"]
+    for race in CONTENDERS if "n_poses" in shown else ():
         for contender in ("evermap", "gtsam"):
             pace, memory = shown[race][f"{contender}_poses_per_s"], shown[race][f"{contender}_memory_mb"]
             lines.append(f"  {race:<6} {contender:<8} {pace:>8.0f} poses/s  {memory:>6.1f} MB")
+    if "persistence" in shown:
+        lines += ["", persistence.as_markdown(shown["persistence"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)
@@ -150,5 +183,6 @@ def _as_baseline(measured: Mapping[str, float]) -> dict[str, Any]:
     rows = [
         {"metric": name, "direction": direction, "tolerance": tolerance, "value": round(measured[name], 4)}
         for name, (direction, tolerance, _) in METRICS.items()
+        if name in measured
     ]
-    return {"n_poses": N_POSES, "metrics": rows}
+    return {"n_poses": N_POSES, "n_features": persistence.N_FEATURES, "metrics": rows}

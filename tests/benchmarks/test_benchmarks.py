@@ -61,6 +61,22 @@ def test_free_calibration_explains_the_readings_no_worse(run: ModuleType, worlds
     assert off[0] < 2.0 * off[1] + 0.05
 
 
+@pytest.mark.parametrize("exponential", [True, False])
+def test_rosen_s_algorithm_and_the_filter_believe_the_same(run: ModuleType, exponential: bool) -> None:
+    """Every contender of a case, from the same state: all give the belief at the horizon."""
+    case = (run.persistence.exponential if exponential else run.persistence.general_purpose)(3000)
+    expected = case.peers["numpy"]()
+    assert 0.05 < np.std(expected) < 0.5
+    for work in (case.work, case.spread, case.peers["numba"]):
+        np.testing.assert_allclose(work(), expected, rtol=1e-8, atol=1e-12)
+
+
+def test_one_feature_and_rosen_s_algorithm_believe_the_same(run: ModuleType) -> None:
+    for make in (run.persistence.one_exponential, run.persistence.one_general_purpose):
+        case = make(5000)
+        assert case.work() == pytest.approx(case.peers["Python"](), abs=1e-9)
+
+
 def test_worlds_are_what_they_say(worlds: dict[bool, Any]) -> None:
     world = worlds[True]
     assert world.problem.stamp_s.shape == (SMALL,)
@@ -113,13 +129,30 @@ def test_memory_is_measured_in_a_process_of_its_own(run: ModuleType) -> None:
     assert 10.0 < found["before_mb"] <= found["peak_mb"] < ballast.nbytes / 1e6 + 100.0
 
 
+def test_one_part_leaves_the_baseline_of_the_other(
+    run: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, path = _read(run.BASELINE), tmp_path / "baseline.json"
+    path.write_text(json.dumps({"metrics": [row for name, row in before.items() if name.startswith("isam2")]}))
+    monkeypatch.setattr(run, "BASELINE", path)
+    monkeypatch.setattr(run.persistence, "run", lambda *_: (dict.fromkeys(run.persistence.METRICS, 2.0), {}))
+    run.run(update_baseline=True, only="persistence")
+    after = _read(path)
+    assert after["isam2_speed_ratio"] == before["isam2_speed_ratio"]
+    assert {name for name, row in after.items() if row["value"] == 2.0} == set(run.persistence.METRICS)
+    with pytest.raises(InputError, match="lacks batch_speed_ratio"):
+        run.read_baseline(path)
+    with pytest.raises(InputError, match="no part 'slams'"):
+        run.run(only="slams")
+
+
 @pytest.mark.slow
 def test_a_small_run_writes_compares_and_reports(
     run: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, json_of: Callable[[Any], Any]
 ) -> None:
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
-    measured = run.run(update_baseline=True, n_poses=80, turns=1)
+    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, short_turns=2)
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)
     assert all(abs(row["change"]) < 1e-3 for row in measured["metrics"])
@@ -127,6 +160,7 @@ def test_a_small_run_writes_compares_and_reports(
     text = run.as_text(measured)
     assert text.endswith("no regression")
     assert len(re.findall(r"poses/s", text)) == 4
+    assert "| general purpose | ≤ 30 |" in text
     measured["metrics"][0]["regression"] = True
     measured["regressions"] = ["isam2_speed_ratio"]
     assert "REGRESSION" in run.as_text(measured)

@@ -20,6 +20,7 @@ def bench(
     update_baseline: Annotated[
         bool, typer.Option("--update-baseline", help="Make these measurements the new baseline.")
     ] = False,
+    only: Annotated[str | None, typer.Option(help="Measure one part: slam or persistence.")] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
 
@@ -27,12 +28,12 @@ def bench(
 
     \b
     Example:
-      evermap bench
+      evermap bench --only persistence
     """
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, below
     runner = load_benchmarks()
-    measured = runner.run(update_baseline=update_baseline)
+    measured = runner.run(update_baseline=update_baseline, only=only)
     if as_json:
         print_json(measured)
     else:
