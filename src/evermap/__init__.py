@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from evermap.errors import EvermapError
     from evermap.io import read_recording, write_native
     from evermap.pipeline import run_slam
+    from evermap.presence.config import PersistConfig
+    from evermap.presence.run import run_persist
+    from evermap.presence.table import read_looks
     from evermap.runfolder import write_run
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
@@ -29,6 +32,9 @@ _HOME = {
     "evermap.errors": ("EvermapError",),
     "evermap.io": ("read_recording", "write_native"),
     "evermap.pipeline": ("run_slam",),
+    "evermap.presence.config": ("PersistConfig",),
+    "evermap.presence.run": ("run_persist",),
+    "evermap.presence.table": ("read_looks",),
     "evermap.runfolder": ("write_run",),
     "evermap.types": (
         "Detections",
@@ -50,13 +56,16 @@ __all__ = [
     "Frames",
     "Landmarks",
     "Odometry",
+    "PersistConfig",
     "Recording",
     "Sensor",
     "SlamResult",
     "Trajectory",
     "__version__",
     "load_config",
+    "read_looks",
     "read_recording",
+    "run_persist",
     "run_slam",
     "write_native",
     "write_run",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,14 @@ import typer
 
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
-from evermap.types import Clock
+
+
+class Stamps(StrEnum):
+    """What stamps count, as `types.Clock`, which would load numpy for `--help`."""
+
+    UNIX = "unix"
+    RECORDING = "recording"
+    LOCAL_WALL = "local_wall"
 
 
 def persist(
@@ -59,7 +67,7 @@ def persist(
     ] = None,
     figures: Annotated[int, typer.Option(min=0, help="How many features get a figure of their own.")] = 12,
     clock: Annotated[
-        Clock | None, typer.Option(help="What stamps count, for the figures.", show_default="by their size")
+        Stamps | None, typer.Option(help="What stamps count, for the figures.", show_default="by their size")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
@@ -97,6 +105,7 @@ def persist(
     from evermap.presence.table import read_looks, read_truth
     from evermap.presence.write import write_persist
     from evermap.runfolder import check_replaceable
+    from evermap.types import Clock
 
     out = out or default_out(table_path)
     check_replaceable(out, force=force)  # better now than after the run
@@ -125,7 +134,7 @@ def persist(
             out,
             result,
             figures=figures,
-            clock=clock,
+            clock=None if clock is None else Clock(clock.value),
             command=command_line(),
             read_s=read_s,
             force=force,
@@ -160,8 +169,7 @@ def _show(summary: Mapping[str, Any], out: Path, *, as_json: bool) -> None:
     rows = [
         ("looks", f"{counts['looks']:,} at {counts['features']:,} features"),
         ("there now, expected", f"{summary['expected_present_now']:.1f}"),
-        ("vanished", f"{counts['vanished']:,} times"),
-        ("returned", f"{counts['returned']:,} times"),
+        ("vanished, returned", f"{counts['vanished']:,}, {counts['returned']:,}"),
     ]
     names = {"brier": "Brier score", "log_loss": "log loss", "calibration_error": "calibration error"}
     rows += [(label, f"{metrics[key]:.4f}") for key, label in names.items() if key in metrics]

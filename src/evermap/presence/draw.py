@@ -104,7 +104,7 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     start_s, end_s = _span(result)
     pixel = np.floor((looks.stamp_s - start_s) / (end_s - start_s or 1.0) * _PIXELS)
     turn_s = looks.stamp_s[_extremes(pixel, result.p_at_looks[look_rows])]
-    before_s = np.nextafter(turn_s, -np.inf)  # draws the jump of a look upright
+    before_s = np.maximum(np.nextafter(turn_s, -np.inf), start_s)  # draws the jump of a look upright
     time_s = np.unique(np.concatenate([np.linspace(start_s, end_s, _CURVE_POINTS), before_s, turn_s]))
     track = result.models.only(index).track(looks, Instants.same_for_all(1, time_s))
     truth = result.truth

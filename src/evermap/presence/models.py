@@ -16,7 +16,37 @@ from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel, Track
 from evermap.types import IntArray
 
-LEARNERS: Mapping[str, Callable[[Looks], PresenceModel]] = {}
+Learner = Callable[[Looks], PresenceModel]
+
+
+def _phases(phases: str, rhythm: bool | str) -> Learner:
+    """Learns a chain of phases."""
+
+    def learn(looks: Looks) -> PresenceModel:
+        from evermap.recurrence.learn_phases import learn
+
+        return learn(looks, phases=phases, rhythm=rhythm).model
+
+    return learn
+
+
+def _run_length(rhythm: bool) -> Learner:
+    """Learns how long stays and absences last."""
+
+    def learn(looks: Looks) -> PresenceModel:
+        from evermap.recurrence.learn_sojourns import learn
+
+        return learn(looks, rhythm=rhythm).model
+
+    return learn
+
+
+LEARNERS: Mapping[str, Learner] = {
+    "two-state": _phases("two-state", False),
+    "phase-type": _phases("auto", "auto"),
+    "run-length": _run_length(False),
+    "run-length-rhythm": _run_length(True),
+}
 """Kinds of recurrent models by the name that `--recurrent` takes, each learned from looks alone."""
 
 
@@ -98,7 +128,7 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
     return ModelOfEach(tuple(models), tuple(texts), of_class[table.class_of_feature])
 
 
-def _learner(name: str) -> Callable[[Looks], PresenceModel]:
+def _learner(name: str) -> Learner:
     if name not in LEARNERS:
         raise ConfigError(
             f"'{name}' is no kind of model", field="--recurrent", hint=", ".join([NO_RECURRENCE, *LEARNERS])

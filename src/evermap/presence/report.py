@@ -63,8 +63,8 @@ def _cards(summary: Mapping[str, Any]) -> str:
     counts, metrics = summary["counts"], summary["metrics"]
     cards = [
         ("There now", summary["expected_present_now"], "{:.1f}", f"of {counts['features']:,}", "Sum of all beliefs."),
-        ("Vanished", counts["vanished"], "{:,}", "times", "Belief fell below 1 minus the confidence at a look."),
-        ("Returned", counts["returned"], "{:,}", "times", "Belief rose above the confidence again."),
+        ("Vanished", counts["vanished"], "{:,}", "", "Belief fell below 1 minus the confidence at a look."),
+        ("Returned", counts["returned"], "{:,}", "", "Belief rose above the confidence again."),
     ]
     if metrics:
         cards += [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +67,9 @@ def plot_raster(
             axes.set_title(title)
         handles, labels = axes.get_legend_handles_labels()
         if handles:
-            figure.legend(handles, labels, loc="outside lower center", ncols=4, markerscale=5.5 / _mark_size(row_in))
+            figure.legend(
+                handles, labels, loc="outside lower center", ncols=4, markerscale=5.5 / _mark_size(row_in, changes)
+            )
         settle(figure)
     return figure
 
@@ -75,7 +78,9 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
     """Blue is there, orange is not, pale is undecided, hatched is no belief."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(bad=(0.0, 0.0, 0.0, 0.0))
+    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(
+        bad=(0.0, 0.0, 0.0, 0.0)
+    )
     rows = np.arange(len(belief) + 1) - 0.5
     shown = np.ma.masked_invalid(belief)
     mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)
@@ -88,7 +93,7 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
 
 
 def _mark(axes: Axes, axis: TimeAxis, changes: Sequence[tuple[int, float, bool]], row_in: float) -> None:
-    size = _mark_size(row_in)
+    size = _mark_size(row_in, changes)
     for returned, marker, label in ((False, "v", "vanished"), (True, "^", "returned")):
         mine = [(time_s, row) for row, time_s, back in changes if back == returned]
         if mine:
@@ -97,9 +102,10 @@ def _mark(axes: Axes, axis: TimeAxis, changes: Sequence[tuple[int, float, bool]]
             axes.plot(axis.coordinates(np.array(at)), rows, marker, label=label, **style)
 
 
-def _mark_size(row_in: float) -> float:
-    """Points, for rows of this height."""
-    return float(np.clip(30.0 * row_in, 2.0, 5.5))
+def _mark_size(row_in: float, changes: Sequence[tuple[int, float, bool]]) -> float:
+    """Points, for rows of this height; smaller where many changes share a row."""
+    crowd = max(Counter(row for row, _, _ in changes).values(), default=1)
+    return float(np.clip(min(30.0 * row_in, 150.0 / crowd), 2.0, 5.5))
 
 
 def _label_rows(axes: Axes, names: Sequence[str]) -> None:
