@@ -17,7 +17,7 @@ from evermap.types import FloatArray
 
 HALF_AN_EVENT = 0.5
 """Added to every table where the exposure is, so that no rate is zero (Jeffreys' prior of a Poisson rate)."""
-DAY_KNOTS = 24
+DAY_KNOTS = 72
 DEVIATION_KNOTS = 12
 _WEAK = 1e-5
 """Precision of the prior of directions that no penalty reaches."""
