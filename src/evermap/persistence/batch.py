@@ -28,7 +28,7 @@ Column = TypeVar("Column")
 """A numpy array or a torch tensor."""
 
 CHUNK_ROWS = 65536
-"""Rows that a thread takes at a time: much longer than handing them out, short enough to share them out evenly."""
+"""Most rows that a thread takes at a time: much longer than handing them out, short enough for busy cores to help."""
 
 
 class Look(NamedTuple, Generic[Column]):
@@ -131,20 +131,23 @@ def _apply(
     """Run a kernel over all rows, at once or chunk by chunk on all cores; True if it refused a row."""
     n = len(answer.probability)
 
-    def chunk(first: int) -> bool:
-        rows = slice(first, first + CHUNK_ROWS)
+    def chunk(rows: slice) -> bool:
         return kernel(*(column[rows] for column in columns), horizon_s, *(array[rows] for array in answer))
 
     if not threads or n <= CHUNK_ROWS:
-        return kernel(*columns, horizon_s, *answer)
-    return any(list(_pool().map(chunk, range(0, n, CHUNK_ROWS))))  # a list: all of them, also after a refusal
+        return chunk(slice(None))
+    cores, pool = _pool()
+    count = cores * -(-n // (cores * CHUNK_ROWS))  # as many for each core
+    edges = [n * k // count for k in range(count + 1)]
+    return any(list(pool.map(chunk, map(slice, edges, edges[1:]))))  # a list: all of them, also after a refusal
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
-    """A thread for each core that this process may use, started at the first call and kept."""
+def _pool() -> tuple[int, ThreadPoolExecutor]:
+    """How many cores this process may use, and a thread for each, started at the first call and kept."""
     os.register_at_fork(after_in_child=_pool.cache_clear)  # threads do not survive into a child
-    return ThreadPoolExecutor(len(os.sched_getaffinity(0)))
+    cores = len(os.sched_getaffinity(0))
+    return cores, ThreadPoolExecutor(cores)
 
 
 def _contiguous(columns: dict[str, Any]) -> dict[str, Any]:
