@@ -102,10 +102,10 @@ class RunLength:
         else:
             factor = none
         hazard = np.stack([absence.hazard_hz, stay.hazard_hz])
-        cumulative = np.stack([absence.cumulative, stay.cumulative])
+        intercept = np.stack([table.cumulative - table.hazard_hz * table.edge_s for table in self.tables])
         # a step is never longer than the rhythm is constant
         step_s = min(self.step_s, BIN_S) if factor is not none else self.step_s
-        return Law(float(step_s), factor, absence.offset, absence.edge_s, hazard, cumulative)
+        return Law(float(step_s), factor, absence.offset, hazard, intercept)
 
     @cached_property
     def tables(self) -> tuple[HazardTable, HazardTable]:

@@ -14,15 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from evermap.recurrence.compiled import expm1, inlined, kernel, parallel_kernel
+from evermap.recurrence.compiled import exp, expm1, inlined, kernel, parallel_kernel
 from evermap.recurrence.hazard_table import SHIFT
 from evermap.recurrence.rhythm import BIN_S, BINS, DAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
 MOST = 700.0
+"""Integrated hazard that nobody survives."""
 NO_MERGE = -1
 AS_THEY_ARE = (1.0, 1.0)
 _MONDAY_S = 4.0 * DAY_S
+_POSITION = 0xFFFFF
+_HIGHEST = 0x7FFFFFFFFFFFFFFF
 
 
 class Law(NamedTuple):
@@ -32,17 +35,16 @@ class Law(NamedTuple):
         step_s: longest step of time.
         factor: (2, 1008) by what the hazards of absences (0) and stays (1) are multiplied at each ten minutes of the
             week; (2, 1) ones where there is no rhythm.
-        offset, edge_s: the bins of age (`hazard_table`).
+        offset: of the bins of age (`hazard_table`).
         hazard_hz: (2, B) hazard in each bin.
-        cumulative: (2, B) its integral up to each edge.
+        intercept: (2, B) the hazard integrated up to an age `a` in bin `i` is `intercept[i] + hazard_hz[i] a`.
     """
 
     step_s: float
     factor: FloatArray
     offset: int
-    edge_s: FloatArray
     hazard_hz: FloatArray
-    cumulative: FloatArray
+    intercept: FloatArray
 
 
 class First(NamedTuple):
@@ -60,15 +62,36 @@ class First(NamedTuple):
 
 
 @inlined
+def age_bin(age_s: Any, law: Any) -> Any:
+    """The bin of an age."""
+    return min(max((np.float64(age_s).view(np.int64) >> SHIFT) - law.offset, 0), law.hazard_hz.shape[1] - 1)
+
+
+@inlined
 def _integrated(age: Any, later: Any, s: Any, law: Any) -> Any:
     """Integral of the hazard of state `s` between two ages."""
-    hazard, cumulative, edge, offset = law.hazard_hz, law.cumulative, law.edge_s, law.offset
-    last = edge.size - 1
-    i = min(max((np.float64(age).view(np.int64) >> SHIFT) - offset, 0), last)
-    j = min(max((np.float64(later).view(np.int64) >> SHIFT) - offset, 0), last)
-    inside = hazard[s, i] * (later - age)
-    across = (cumulative[s, j] - cumulative[s, i]) + (hazard[s, j] * (later - edge[j]) - hazard[s, i] * (age - edge[i]))
-    return inside if i == j else max(across, 0.0)
+    i, j = age_bin(age, law), age_bin(later, law)
+    levels = law.intercept[s, j] - law.intercept[s, i]
+    return max(levels + (law.hazard_hz[s, j] * later - law.hazard_hz[s, i] * age), 0.0)
+
+
+@inlined
+def _sum(values: Any, s: Any, n: Any) -> Any:
+    """Sum of the first `n` of row `s`: eight sums side by side, which a compiler may not make of one."""
+    a = b = c = d = e = f = g = h = 0.0
+    whole = n & ~7
+    for j in range(0, whole, 8):
+        a += values[s, j]
+        b += values[s, j + 1]
+        c += values[s, j + 2]
+        d += values[s, j + 3]
+        e += values[s, j + 4]
+        f += values[s, j + 5]
+        g += values[s, j + 6]
+        h += values[s, j + 7]
+    for j in range(whole, n):
+        a += values[s, j]
+    return ((a + b) + (c + d)) + ((e + f) + (g + h))
 
 
 @inlined
@@ -80,50 +103,44 @@ def _week_bin(stamp_s: Any, n: Any) -> Any:
     return min(np.int64(phase / BIN_S), BINS - 1)
 
 
-@kernel
-def _deaths(
-    start: FloatArray,
-    weight: FloatArray,
-    n: int,
-    s: int,
-    now: float,
-    later: float,
-    factor: float,
-    law: Law,
-    died: FloatArray,
-) -> float:
-    """Mass of every hypothesis of state `s` that ends before `later`, into `died`; their sum."""
-    for j in range(n):
-        x = factor * _integrated(now - start[s, j], later - start[s, j], s, law)
-        died[j] = -weight[s, j] * expm1(-min(x, MOST))
-    total = 0.0
-    for j in range(n):
-        total += died[j]
-    return total
+@inlined
+def _hazards(start: Any, n: Any, s: Any, now: Any, later: Any, factor: Any, law: Any, hazard: Any) -> None:
+    """Integrated hazard of every hypothesis of state `s` between two instants, into `hazard[s]`.
 
-
-@kernel
-def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float, cost: FloatArray) -> tuple[int, float]:
-    """Unite the two neighbours that differ least: product of shares times squared relative difference of age.
-
-    Returns:
-        Position of the first of the two, and the mass of the lighter.
+    A loop of its own: one that looks up a table keeps a compiler from using vectors for the exponentials.
     """
+    for j in range(n):
+        hazard[s, j] = min(factor * _integrated(now - start[s, j], later - start[s, j], s, law), MOST)
+
+
+@inlined
+def _cheapest(start: Any, weight: Any, n: Any, s: Any, now: Any) -> Any:
+    """Position of the neighbours that differ least: product of shares times squared relative difference of age.
+
+    Positive numbers are ordered as their bits are; the last bits of a cost give way to its position, so that the
+    least cost brings it along.
+    """
+    best = np.int64(_HIGHEST)
     for j in range(n - 1):
         a, b = weight[s, j], weight[s, j + 1]
         apart = start[s, j + 1] - start[s, j]
         ages = (now - start[s, j]) * (now - start[s, j + 1])
-        cost[j] = (a * b) * (apart * apart) / ((a + b + 1e-300) * ages + 1e-300)
-    best = 0
-    for j in range(1, n - 1):
-        if cost[j] < cost[best]:
-            best = j
+        cost = (a * b) * (apart * apart) / ((a + b + 1e-300) * ages + 1e-300)
+        best = min(best, (np.float64(cost).view(np.int64) & ~_POSITION) | j)
+    return best & _POSITION
+
+
+@kernel
+def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float) -> tuple[int, float]:
+    """Unite the two cheapest neighbours; position of the first of them, and the mass of the lighter."""
+    best = _cheapest(start, weight, n, s, now)
     a, b = weight[s, best], weight[s, best + 1]
     share = b / (a + b) if a + b > 0.0 else 0.5
     start[s, best] += share * (start[s, best + 1] - start[s, best])
     weight[s, best] = a + b
     for j in range(best + 1, n - 1):
         start[s, j] = start[s, j + 1]
+    for j in range(best + 1, n - 1):
         weight[s, j] = weight[s, j + 1]
     return best, min(a, b)
 
@@ -146,12 +163,13 @@ def _step(
     """
     middle = 0.5 * (now + later)
     week = _week_bin(middle, law.factor.shape[1])
-    ended = [0.0, 0.0]
     for s in range(2):
-        died = scratch[s]
-        ended[s] = _deaths(start, weight, count[s], s, now, later, scale[s] * law.factor[s, week], law, died)
+        _hazards(start, count[s], s, now, later, scale[s] * law.factor[s, week], law, scratch)
         for j in range(count[s]):
-            weight[s, j] -= died[j]
+            x, mass = scratch[s, j], weight[s, j]
+            scratch[s, j] = -mass * expm1(-x)
+            weight[s, j] = mass * exp(-x) if x < MOST else 0.0
+    ended = (_sum(scratch, 0, count[0]), _sum(scratch, 1, count[1]))
     moved = 0.0
     for s in range(2):
         n = count[s]
@@ -160,7 +178,7 @@ def _step(
         merged[s] = NO_MERGE
         n += 1
         if n == start.shape[1]:
-            merged[s], mass = _merge(start, weight, n, s, later, scratch[0])
+            merged[s], mass = _merge(start, weight, n, s, later)
             moved += mass
             n -= 1
         count[s] = n
@@ -173,18 +191,14 @@ def _look(weight: FloatArray, count: IntArray, absent: float, present: float) ->
 
     A state that the look rules out keeps no hypotheses.
     """
-    mass = [0.0, 0.0]
-    for s in range(2):
-        likelihood = present if s == 1 else absent
-        for j in range(count[s]):
-            weight[s, j] *= likelihood
-            mass[s] += weight[s, j]
-        if mass[s] == 0.0:
-            count[s] = 0
+    mass = (absent * _sum(weight, 0, count[0]), present * _sum(weight, 1, count[1]))
     total = mass[0] + mass[1]
     for s in range(2):
+        if mass[s] == 0.0:
+            count[s] = 0
+        scale = (present if s == 1 else absent) / total
         for j in range(count[s]):
-            weight[s, j] /= total
+            weight[s, j] *= scale
     return total
 
 
@@ -200,13 +214,13 @@ def _present(
 ) -> float:
     """Probability of presence at `later`, at most a step after `now`."""
     week = _week_bin(0.5 * (now + later), law.factor.shape[1])
-    ended, total = [0.0, 0.0], [0.0, 0.0]
     for s in range(2):
-        ended[s] = _deaths(start, weight, count[s], s, now, later, law.factor[s, week], law, scratch[s])
+        _hazards(start, count[s], s, now, later, law.factor[s, week], law, scratch)
         for j in range(count[s]):
-            total[s] += weight[s, j]
-    present = total[1] - ended[1] + ended[0]
-    return min(max(present / (total[0] + total[1]), 0.0), 1.0)
+            scratch[s, j] = -weight[s, j] * expm1(-scratch[s, j])
+    absent, there = _sum(weight, 0, count[0]), _sum(weight, 1, count[1])
+    present = there - _sum(scratch, 1, count[1]) + _sum(scratch, 0, count[0])
+    return min(max(present / (absent + there), 0.0), 1.0)
 
 
 @kernel
@@ -343,10 +357,7 @@ def look_rows(
         now_s[f] = now
         moved[f] += mass
         evidence[f] += np.log(likelihood)
-        total = 0.0
-        for j in range(count[f, 1]):
-            total += weight[f, 1, j]
-        belief[i] = min(total, 1.0)
+        belief[i] = min(_sum(weight[f], 1, count[f, 1]), 1.0)
     return -1
 
 

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.recurrence.compiled import expm1, kernel
-from evermap.recurrence.hazard_table import SHIFT
 from evermap.recurrence.run_length_kernels import (
     MOST,
     NO_MERGE,
@@ -22,6 +21,7 @@ from evermap.recurrence.run_length_kernels import (
     _look,
     _step,
     _week_bin,
+    age_bin,
     begin,
 )
 from evermap.types import FloatArray, IntArray
@@ -151,12 +151,11 @@ def expectations(
         return -np.inf, 0.0
 
     groups = counts_out.events.shape[1]
-    per_group = (law.edge_s.size + groups - 1) // groups
+    per_group = (law.hazard_hz.shape[1] + groups - 1) // groups
     weeks = counts_out.events.shape[2]
     for s in range(2):
         for j in range(count[s]):
-            age = stamp_s[steps] - start[s, j]
-            oldest = min(max((np.float64(age).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1)
+            oldest = age_bin(stamp_s[steps] - start[s, j], law)
             counts_out.open_ended[s, oldest // per_group] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
     smoothed[steps] = weight[1, : count[1]].sum()
 
@@ -210,9 +209,7 @@ def expectations(
                         there += mass * (lives + ends)
                     # a stay that ends in this step lasted on the mean for this part of it
                     part = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - (1.0 - p_end) / p_end
-                    row = min(
-                        max((np.float64(age + 0.5 * gap).view(np.int64) >> SHIFT) - law.offset, 0), law.edge_s.size - 1
-                    )
+                    row = age_bin(age + 0.5 * gap, law)
                     counts_out.of_period[s, when] += mass * ends
                     counts_out.expected_of_period[s, when] += mass * usual * (lives + part * ends)
                     mass *= importance[k]
