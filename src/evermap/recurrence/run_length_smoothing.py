@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.recurrence.compiled import expm1, kernel
+from evermap.recurrence.compiled import exp, expm1, kernel
 from evermap.recurrence.run_length_kernels import (
     MOST,
     NO_MERGE,
     First,
     Law,
-    _integrated,
+    _hazards,
     _look,
     _step,
     _week_bin,
@@ -127,61 +127,33 @@ def expectations(
         kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         _forward(
-            a,
-            b,
-            stamp_s,
-            absent,
-            present,
-            law,
-            period,
-            level,
-            start,
-            weight,
-            count,
-            scratch,
-            starts,
-            weights,
-            counts,
-            merges,
-            scales,
-        )
+            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
+            starts, weights, counts, merges, scales,
+        )  # fmt: skip
         for i in range(b - a):
             evidence += np.log(scales[i])
     if not np.isfinite(evidence):
         return -np.inf, 0.0
 
-    groups = counts_out.events.shape[1]
-    per_group = (law.hazard_hz.shape[1] + groups - 1) // groups
+    n_bins, n_groups = law.hazard_hz.shape[1], counts_out.events.shape[1]
+    group = np.arange(n_bins) // ((n_bins + n_groups - 1) // n_groups)
     weeks = counts_out.events.shape[2]
     for s in range(2):
         for j in range(count[s]):
             oldest = age_bin(stamp_s[steps] - start[s, j], law)
-            counts_out.open_ended[s, oldest // per_group] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
+            counts_out.open_ended[s, group[oldest]] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
     smoothed[steps] = weight[1, : count[1]].sum()
 
+    # what the looks to come say for each hypothesis, after this step and before it
     later, sooner = np.ones((2, slots)), np.ones((2, slots))
+    usual, lived, died, part = (np.empty((2, slots)), np.empty(slots), np.empty(slots), np.empty(slots))
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
         _forward(
-            a,
-            b,
-            stamp_s,
-            absent,
-            present,
-            law,
-            period,
-            level,
-            start,
-            weight,
-            count,
-            scratch,
-            starts,
-            weights,
-            counts,
-            merges,
-            scales,
-        )
+            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
+            starts, weights, counts, merges, scales,
+        )  # fmt: skip
         for k in range(b - 1, a - 1, -1):
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]
@@ -195,28 +167,30 @@ def expectations(
                 newcomer = counts[i, 1 - s]
                 if merges[i, 1 - s] != NO_MERGE and newcomer > merges[i, 1 - s]:
                     newcomer -= 1
-                for j in range(counts[i, s]):
-                    age = now - starts[i, s, j]
-                    usual = law.factor[s, week] * _integrated(age, age + gap, s, law)
-                    x = min(level[s, when] * usual, MOST)
-                    p_end = -expm1(-x)
+                other *= later[1 - s, newcomer]
+                n, drift = counts[i, s], level[s, when]
+                _hazards(starts[i], n, s, now, then, law.factor[s, week], law, usual)
+                for j in range(n):
+                    x = min(drift * usual[s, j], MOST)
+                    p_end, p_live = -expm1(-x), exp(-x)
+                    died[j], lived[j] = p_end * other, p_live * same
+                    # a stay that ends in this step lasted on the mean for this part of it
+                    part[j] = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - p_live / p_end
+                ended = expected = 0.0
+                for j in range(n):
                     to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
-                    lives = (1.0 - p_end) * same * later[s, to]
-                    ends = p_end * other * later[1 - s, newcomer]
+                    mass, lives, ends = weights[i, s, j], lived[j] * later[s, to], died[j]
                     sooner[s, j] = lives + ends
-                    mass = weights[i, s, j]
                     if s == 1:
                         there += mass * (lives + ends)
-                    # a stay that ends in this step lasted on the mean for this part of it
-                    part = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - (1.0 - p_end) / p_end
-                    row = age_bin(age + 0.5 * gap, law)
-                    counts_out.of_period[s, when] += mass * ends
-                    counts_out.expected_of_period[s, when] += mass * usual * (lives + part * ends)
-                    mass *= importance[k]
-                    counts_out.events[s, row // per_group, column] += mass * ends
-                    counts_out.exposure_s[s, row // per_group, column] += (
-                        mass * level[s, when] * gap * (lives + part * ends)
-                    )
+                    spent = mass * (lives + part[j] * ends)
+                    ended += mass * ends
+                    expected += usual[s, j] * spent
+                    row = group[age_bin(middle - starts[i, s, j], law)]
+                    counts_out.events[s, row, column] += importance[k] * mass * ends
+                    counts_out.exposure_s[s, row, column] += importance[k] * drift * gap * spent
+                counts_out.of_period[s, when] += ended
+                counts_out.expected_of_period[s, when] += expected
             smoothed[k] = there
             later, sooner = sooner, later
     return evidence, smoothed[0]
