@@ -23,7 +23,8 @@ from evermap.survival import Exponential, GeneralPurpose
 from evermap.types import FloatArray
 
 N_FEATURES = 1_000_000
-TURNS = 30
+SECONDS = 4.0
+"""How long contenders take turns, at least twice."""
 HORIZON_S = 3600.0
 """How long after the look the belief is asked for: later costs more than at the look."""
 CORES = len(os.sched_getaffinity(0))
@@ -158,21 +159,21 @@ CASES: tuple[Callable[[int], Case], ...] = (
 """Each makes its case for a number of features. The recurrent filters belong here."""
 
 
-def run(n_features: int = N_FEATURES, turns: int = TURNS) -> tuple[dict[str, float], dict[str, Any]]:
+def run(n_features: int = N_FEATURES, seconds: float = SECONDS) -> tuple[dict[str, float], dict[str, Any]]:
     """The metrics, and all times as they were: a row for each case, the memory, and what the machine was busy with."""
     busy_before = os.getloadavg()[0]
-    bandwidth = {"one": _copy_bandwidth(n_features, turns, 1), "all": _copy_bandwidth(n_features, turns, CORES)}
+    bandwidth = {"one": _copy_bandwidth(n_features, seconds, 1), "all": _copy_bandwidth(n_features, seconds, CORES)}
     rows: dict[str, dict[str, Any]] = {}
     for make in CASES:
-        rows[make.__name__] = _row(make(n_features), turns, bandwidth)
+        rows[make.__name__] = _row(make(n_features), seconds, bandwidth)
     shown = {
         "n_features": n_features,
-        "turns": turns,
+        "seconds": seconds,
         "cores": CORES,
         "load": [busy_before, os.getloadavg()[0]],
         "copy_gb_per_s": bandwidth,
         "cases": rows,
-        "torch": _torch(n_features, turns),
+        "torch": _torch(n_features, seconds),
     }
     measured = {f"{name}_speed_ratio": rows[name]["peers_ns"]["numba"] / rows[name]["ns"] for name in _BATCH}
     for name in ("one_exponential", "one_general_purpose"):
@@ -200,9 +201,9 @@ def as_markdown(shown: dict[str, Any]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     copy, load = shown["copy_gb_per_s"], shown["load"]
     said = (
-        f"{shown['n_features']} features, best of {shown['turns']} turns; load of the machine (1 minute) before and "
-        f"after: {load[0]:.1f}, {load[1]:.1f}. Floor: bytes read and written over the bandwidth of a plain copy in the "
-        f"same run, {copy['one']:.1f} GB/s on one thread and {copy['all']:.1f} GB/s on {threads}."
+        f"{shown['n_features']} features, best of the turns of {shown['seconds']:.3g} s; load of the machine (1 minute) "
+        f"before and after: {load[0]:.1f}, {load[1]:.1f}. Floor: bytes read and written over the bandwidth of a plain copy "
+        f"in the same run, {copy['one']:.1f} GB/s on one thread and {copy['all']:.1f} GB/s on {threads}."
     )
     lines += ["", said]
     for device, times in shown["torch"].items():
@@ -263,12 +264,12 @@ def _one_case(name: str, n: int, prior: Exponential | GeneralPurpose, log_surviv
     return Case(name, count, 1000.0, lambda: drive(PersistenceFilter(prior)), peers=peers)
 
 
-def _row(case: Case, turns: int, bandwidth: dict[str, float]) -> dict[str, Any]:
+def _row(case: Case, seconds: float, bandwidth: dict[str, float]) -> dict[str, Any]:
     """Nanoseconds an update of everyone in a case, and what the memory needs."""
     contenders: dict[str, Callable[[], Any]] = {"": case.work, **({"all": case.spread} if case.spread else {})}
     peers = {f"peer {name}": work for name, work in case.peers.items()}
-    best = {name: ns / case.n for name, ns in _best_ns(contenders, turns).items()}
-    best |= {name: ns / case.n for name, ns in _best_ns(peers, max(turns // 6, 1)).items()}
+    best = {name: ns / case.n for name, ns in _best_ns(contenders, seconds).items()}
+    best |= {name: ns / case.n for name, ns in _best_ns(peers, seconds / 2).items()}
     floors = [case.moved_bytes / rate if case.moved_bytes else None for rate in bandwidth.values()]
     spread = best.get("all")
     return {
@@ -284,29 +285,32 @@ def _row(case: Case, turns: int, bandwidth: dict[str, float]) -> dict[str, Any]:
     }
 
 
-def _best_ns(contenders: dict[str, Callable[[], Any]], turns: int) -> dict[str, float]:
+def _best_ns(contenders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
     """Shortest time of each [ns], taking turns; the first call of all compiles and does not count."""
     best = dict.fromkeys(contenders, np.inf)
-    for turn in range(turns + 1):
+    for work in contenders.values():
+        work()
+    end, turns = time.perf_counter() + seconds, 0
+    while turns < 2 or time.perf_counter() < end:
+        turns += 1
         for name, work in contenders.items():
             begin = time.perf_counter()
             work()
-            if turn:
-                best[name] = min(best[name], 1e9 * (time.perf_counter() - begin))
+            best[name] = min(best[name], 1e9 * (time.perf_counter() - begin))
     return best
 
 
-def _copy_bandwidth(n: int, turns: int, threads: int) -> float:
+def _copy_bandwidth(n: int, seconds: float, threads: int) -> float:
     """Bytes read and written a second by copying as much as a look moves [GB/s]."""
     source, target = np.ones(5 * n), np.empty(5 * n)
     parts = [slice(5 * n * k // threads, 5 * n * (k + 1) // threads) for k in range(threads)]
     with ThreadPoolExecutor(threads) as pool:
         copy = lambda: list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))  # noqa: E731
-        ns = _best_ns({"copy": copy}, turns)["copy"]
+        ns = _best_ns({"copy": copy}, seconds)["copy"]
     return 2 * source.nbytes / ns
 
 
-def _torch(n: int, turns: int) -> dict[str, dict[str, float]]:
+def _torch(n: int, seconds: float) -> dict[str, dict[str, float]]:
     """Nanoseconds an update on a GPU by device name; empty where torch or a GPU is missing."""
     try:
         import torch
@@ -329,5 +333,5 @@ def _torch(n: int, turns: int) -> dict[str, dict[str, float]]:
                 torch.cuda.synchronize()
 
             name = f"{look.__name__.removeprefix('look_')}_{str(kind).removeprefix('torch.')}"
-            times[name] = _best_ns({"": work}, turns)[""] / n
+            times[name] = _best_ns({"": work}, seconds)[""] / n
     return {torch.cuda.get_device_name(): times}

@@ -45,7 +45,7 @@ def run(
     n_poses: int = N_POSES,
     turns: int = TURNS,
     n_features: int = persistence.N_FEATURES,
-    short_turns: int = persistence.TURNS,
+    seconds: float = persistence.SECONDS,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -53,7 +53,7 @@ def run(
         update_baseline: make these measurements the baseline; what is not measured stays.
         only: one of `PARTS`; all where None.
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
-        n_features, short_turns: the same for the persistence filter.
+        n_features, seconds: the same for the persistence filter.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -73,7 +73,7 @@ def run(
             measured[f"{race}_memory_ratio"], memory = _memory(race, n_poses)
             shown[race] = speeds | memory
     if only in (None, "persistence"):
-        ratios, shown["persistence"] = persistence.run(n_features, short_turns)
+        ratios, shown["persistence"] = persistence.run(n_features, seconds)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}

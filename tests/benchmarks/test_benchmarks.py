@@ -152,7 +152,7 @@ def test_a_small_run_writes_compares_and_reports(
 ) -> None:
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
-    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, short_turns=2)
+    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01)
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)
     assert all(abs(row["change"]) < 1e-3 for row in measured["metrics"])
