@@ -201,9 +201,9 @@ def as_markdown(shown: dict[str, Any]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     copy, load = shown["copy_gb_per_s"], shown["load"]
     said = (
-        f"{shown['n_features']} features, best of the turns of {shown['seconds']:.3g} s; load of the machine (1 minute) "
-        f"before and after: {load[0]:.1f}, {load[1]:.1f}. Floor: bytes read and written over the bandwidth of a plain copy "
-        f"in the same run, {copy['one']:.1f} GB/s on one thread and {copy['all']:.1f} GB/s on {threads}."
+        f"{shown['n_features']} features, best turn in {shown['seconds']:.3g} s; load of the machine (1 minute) "
+        f"{load[0]:.1f} before and {load[1]:.1f} after. Floor: bytes read and written over the bandwidth of a plain "
+        f"copy in the same run, {copy['one']:.1f} GB/s on one thread and {copy['all']:.1f} GB/s on {threads}."
     )
     lines += ["", said]
     for device, times in shown["torch"].items():
