@@ -36,6 +36,19 @@ def load_model(path: str | Path) -> PresenceModel:
     Raises:
         InputError: no such file, no JSON, a newer schema, an unknown kind, or numbers that cannot be.
     """
+    data = read_model_file(path)
+    try:
+        return model_of(data)
+    except EvermapError as error:
+        raise InputError(error.problem, path=path, field=error.field, hint=error.hint) from error
+
+
+def read_model_file(path: str | Path) -> dict[str, Any]:
+    """The content of a model file of a version that we know.
+
+    Raises:
+        InputError: no such file, no JSON, or a newer schema.
+    """
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
@@ -54,10 +67,7 @@ def load_model(path: str | Path) -> PresenceModel:
             field="schema_version",
             hint="the evermap that wrote it",
         )
-    try:
-        return model_of(data)
-    except EvermapError as error:
-        raise InputError(error.problem, path=path, field=error.field, hint=error.hint) from error
+    return data
 
 
 def model_of(data: dict[str, Any]) -> PresenceModel:
