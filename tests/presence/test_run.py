@@ -12,7 +12,7 @@ from evermap.errors import ConfigError, EvermapError, InputError
 from evermap.metrics.belief import belief_scores
 from evermap.persistence.one import PersistenceFilter
 from evermap.presence.config import PersistConfig, split_priors
-from evermap.presence.models import ModelOfEach
+from evermap.presence.models import ModelOfEach, some_looks
 from evermap.presence.run import nice_step, run_persist
 from evermap.presence.table import LookTable, read_looks
 from evermap.recurrence.one_stay import OneStay
@@ -181,6 +181,21 @@ def test_models_by_class_answer_for_a_part_of_the_features() -> None:
     assert [model["kind"] for model in models.to_dict().values()] == ["one-stay", "phase-type"]
 
 
+@pytest.mark.parametrize("most", [100, 57, 20, 3])
+def test_learning_takes_whole_features_or_the_latest_looks_of_one(tmp_path: Path, most: int) -> None:
+    looks = run_persist(table(tmp_path)).looks
+    assert some_looks(looks, len(looks.stamp_s)) is looks
+    part = some_looks(looks, most)
+    assert 0 < len(part.stamp_s) <= most
+    whole = [looks.of(feature).stamp_s.tolist() for feature in range(looks.n_features)]
+    for feature in range(part.n_features):
+        mine = part.of(feature).stamp_s.tolist()
+        if len(mine) == most:
+            assert any(stamps[-most:] == mine for stamps in whole)
+        else:
+            assert mine in whole
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -192,6 +207,7 @@ def test_models_by_class_answer_for_a_part_of_the_features() -> None:
         ({"prior": "hazard:0s=-1/d"}, "field '--prior': .*not negative"),
         ({"class_priors": {"door": PRIOR}}, "field '--prior': no feature is of class 'door'"),
         ({"recurrent": "sometimes"}, "field '--recurrent': 'sometimes' is no kind of model"),
+        ({"learn_from": 1}, "field '--learn-from': 1 looks teach nothing"),
         ({"model": "/no/such.json"}, "cannot be read"),
         ({"query": "grid", "step_s": 1e-7}, "field '--step-s': .* instants of 8 features"),
         ({"horizon_s": 1e9, "step_s": 1.0}, "field '--horizon'"),

@@ -46,6 +46,7 @@ def persist(
     model: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Model learned by an earlier run (its model.json).")
     ] = None,
+    learn_from: Annotated[int, typer.Option(help="Most looks that --recurrent learns from.")] = 100_000,
     query: Annotated[
         str, typer.Option(metavar="times|grid", help="Beliefs at the rows' times, or regularly.")
     ] = "times",
@@ -115,6 +116,7 @@ def persist(
         class_priors=by_class,
         recurrent=recurrent,
         model="" if model is None else str(model),
+        learn_from=learn_from,
         query=query,
         step_s=step_s,
         horizon_s=None if horizon is None else _duration_s(horizon),

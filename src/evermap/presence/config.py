@@ -24,6 +24,7 @@ class PersistConfig:
         class_priors: the same for single classes.
         recurrent: how features come back: 'none' for features that stay once, or a kind of model to learn.
         model: file of a model that was learned before, '' to learn it from the table.
+        learn_from: at most so many looks are learned from: all those at some of the features, drawn at random.
         query: 'times' asks for the belief at the time of every row, 'grid' at regular times.
         step_s: step of the grid, and of the forecasts; None chooses.
         horizon_s: how far the forecasts reach beyond the latest look; None: a quarter of their span.
@@ -37,6 +38,7 @@ class PersistConfig:
     class_priors: Mapping[str, str] = field(default_factory=dict)
     recurrent: str = NO_RECURRENCE
     model: str = ""
+    learn_from: int = 100_000
     query: str = "times"
     step_s: float | None = None
     horizon_s: float | None = None
@@ -48,6 +50,8 @@ class PersistConfig:
         for name, value in (("--step-s", self.step_s), ("--horizon", self.horizon_s)):
             if value is not None and not 0.0 < value < float("inf"):
                 raise ConfigError(f"must be positive and finite, not {value:g} s", field=name)
+        if self.learn_from < 2:
+            raise ConfigError(f"{self.learn_from} looks teach nothing", field="--learn-from", hint="100000")
         if not 0.5 < self.confidence < 1.0:
             problem = f"must lie above 0.5 and below 1, not {self.confidence:g}"
             raise ConfigError(problem, field="--confidence", hint="0.9")

@@ -106,7 +106,7 @@ def models_for(config: PersistConfig, table: LookTable, looks: Looks) -> ModelOf
 
         model = load_model(config.model)
     else:
-        model = _learner(config.recurrent)(looks)
+        model = _learner(config.recurrent)(some_looks(looks, config.learn_from))
     return ModelOfEach((model,), ("",), np.zeros(table.n_features, dtype=np.int64))
 
 
@@ -134,6 +134,20 @@ def _learner(name: str) -> Learner:
             f"'{name}' is no kind of model", field="--recurrent", hint=", ".join([NO_RECURRENCE, *LEARNERS])
         )
     return LEARNERS[name]
+
+
+def some_looks(looks: Looks, most: int) -> Looks:
+    """All looks at as many features, drawn at random, as make up at most `most`; of a single one its latest."""
+    if len(looks.stamp_s) <= most:
+        return looks
+    drawn = np.random.default_rng(0).permutation(looks.n_features)
+    enough = int(np.searchsorted(np.cumsum(np.diff(looks.first)[drawn]), most, side="right"))
+    part, _ = looks_at(looks, np.sort(drawn[: max(enough, 1)]))
+    if len(part.stamp_s) <= most:
+        return part
+    latest = slice(len(part.stamp_s) - most, None)
+    columns = (part.stamp_s, part.detected, part.p_miss, part.p_false)
+    return Looks(np.array([0, most]), *(column[latest] for column in columns))
 
 
 def looks_at(looks: Looks, features: IntArray) -> tuple[Looks, IntArray]:

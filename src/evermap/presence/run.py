@@ -123,7 +123,7 @@ def run_persist(
     truth = truth or table.truth(order)
     scores, bins = _score(table, beliefs, truth, at_rows)
     clock.done("score")
-    warnings = (*table.warnings, *_remarks(config, models, beliefs, changes))
+    warnings = (*table.warnings, *_remarks(config, models, looks, beliefs, changes))
     return PersistResult(
         table, config, models, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins, merged_mass,
         clock.step_s, warnings,
@@ -191,8 +191,12 @@ def _score(
     return belief_scores(belief, there), reliability(belief, there)
 
 
-def _remarks(config: PersistConfig, models: ModelOfEach, beliefs: Beliefs, changes: Changes) -> list[str]:
+def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: Beliefs, changes: Changes) -> list[str]:
     remarks = []
+    if not config.stays_once and not config.model and len(looks.stamp_s) > config.learn_from:
+        remarks.append(
+            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (--learn-from)"
+        )
     for name, model in zip(models.names, models.models, strict=True):
         stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
         if stay > 0.0:
