@@ -62,7 +62,7 @@ def test_survival_is_exact_at_the_edges(name: str) -> None:
 
 @pytest.mark.parametrize("name", PRIORS)
 def test_between_edges_it_is_off_by_a_quarter_of_the_change_of_hazard_at_most(name: str) -> None:
-    """A chord of a curve whose slope lies between `h1` and `h2` over a width `w` is off by `|h2 - h1| w / 4` at most."""
+    """A chord of a curve of slopes between `h1` and `h2` over a width `w` is off by `|h2 - h1| w / 4` at most."""
     prior = PRIORS[name]
     rng = np.random.default_rng(1)
     age = np.exp(rng.uniform(0.0, np.log(2000.0), 2000))

@@ -227,15 +227,18 @@ def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
     Args:
         model: how they come and go.
         stamp_s: (N,) when, on one clock.
+
+    Raises:
+        InputError: an instant that is not finite.
     """
-    from evermap.recurrence.run_length_kernels import begin
+    from evermap.recurrence.run_length_kernels import begin_rows
 
     time = np.array(stamp_s, dtype=np.float64).reshape(-1)
     n = len(time)
+    checks.check_times(time, np.full(n, -np.inf))
     start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, 2, model.slots))
     count = np.zeros((n, 2), dtype=np.int64)
-    for row in range(n):
-        begin(start[row], weight[row], count[row], time[row], model.first)
+    begin_rows(start, weight, count, time, model.first)
     return RunLengthBelief(model, start, weight, count, time, np.zeros(n), np.zeros(n))
 
 

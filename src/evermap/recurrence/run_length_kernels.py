@@ -268,6 +268,13 @@ def begin(
 
 
 @kernel
+def begin_rows(start: FloatArray, weight: FloatArray, count: IntArray, stamp_s: FloatArray, prior: First) -> None:
+    """`begin` for every row."""
+    for f in range(len(stamp_s)):
+        begin(start[f], weight[f], count[f], stamp_s[f], prior)
+
+
+@kernel
 def _track_one(
     stamp_s: FloatArray,
     absent: FloatArray,
