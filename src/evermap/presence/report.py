@@ -89,8 +89,9 @@ def _warnings(summary: Mapping[str, Any]) -> str:
 
 def _figure(named: NamedFigure, picture: bytes) -> str:
     data = base64.b64encode(picture).decode("ascii")
+    width = f"{7.5 * float(named.figure.get_size_inches()[0]):.0f}rem"  # one scale for all
     return (
-        f'<figure><img alt="{escape(named.title, quote=True)}" src="data:image/png;base64,{data}">'
+        f'<figure><img style="max-width:{width}" alt="{escape(named.title, quote=True)}" src="data:image/png;base64,{data}">'
         f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"
     )
 

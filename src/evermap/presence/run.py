@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.io.text import counted, quote
 from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
 from evermap.presence.changes import Changes, find_changes
@@ -102,18 +102,21 @@ def run_persist(
     Raises:
         ConfigError: choices that cannot be.
         InputError: a look that is impossible, whether the feature was there or not.
+        DataError: looks from which no model can be learned.
     """
     config = config or PersistConfig()
     clock = _Steps(("sort", "learn", "filter", "changes", "forecast", "score"), progress)
     order = table.order()
     looks = table.looks(order)
     clock.done("sort")
-    models = models_for(config, table, looks)
-    clock.done("learn")
     try:
+        models = models_for(config, table, looks)
+        clock.done("learn")
         beliefs, p_at_looks, merged_mass = _filter(table, order, config, models, looks)
     except NumericalError as error:
         raise _named(error, table) from error
+    except DataError as error:
+        raise DataError(error.problem, path=table.source or None, hint=error.hint) from error
     clock.done("filter")
     changes = find_changes(looks, p_at_looks, config.confidence)
     clock.done("changes")

@@ -107,6 +107,10 @@ def persist_summary(result: PersistResult, *, command: str, timing: dict[str, fl
             "returned": int(changes.returned.sum()),
             "duration_s": float(table.stamp_s.max() - table.stamp_s.min()),
         },
+        "detector": {
+            name: {"least": float(values[looked].min()), "most": float(values[looked].max())}
+            for name, values in (("p_miss", table.p_miss), ("p_false", table.p_false))
+        },
         "never_leave_share": _never_leave(result),
         "expected_present_now": _number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
         "merged_mass": _number(result.merged_mass),
