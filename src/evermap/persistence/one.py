@@ -116,18 +116,17 @@ class PersistenceFilter:
 def _death_odds_under(prior: LifetimePrior) -> Callable[[float, float], float]:
     """What gives `(1 - q) / q` of a gap from its begin and its end, by the shortest road that the prior allows."""
     if isinstance(prior, Exponential):
-        rate = float(prior.rate)
-
-        def of_constant_hazard(start_s: float, stop_s: float) -> float:
-            hazard = rate * (stop_s - start_s)
-            return expm1(hazard) if hazard < LOG_LARGEST else LARGEST
-
-        return of_constant_hazard
+        return partial(_of_constant_hazard, float(prior.rate))
     if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
         from evermap.persistence.kernels import general_purpose_gap
 
         return partial(general_purpose_gap, float(prior.low), float(prior.high))
     return partial(_of_any_prior, prior)
+
+
+def _of_constant_hazard(rate_hz: float, start_s: float, stop_s: float) -> float:
+    hazard = rate_hz * (stop_s - start_s)
+    return expm1(hazard) if hazard < LOG_LARGEST else LARGEST
 
 
 def _of_any_prior(prior: LifetimePrior, start_s: float, stop_s: float) -> float:
