@@ -159,6 +159,20 @@ def test_ids_that_are_numbers_stay_numbers(tmp_path: Path) -> None:
     assert change["change"] == "vanished"
 
 
+def test_a_learned_model_is_kept_and_gives_the_same_beliefs_again(example: Path, tmp_path: Path) -> None:
+    learned = run(example, "--recurrent", "two-state", "--out", tmp_path / "one", "--json", "--figures", "0")
+    summary = json.loads(learned.stdout)
+    assert summary["learning"]["per"] == "class"
+    assert {model["kind"] for model in summary["learning"]["models"].values()} == {"two-state"}
+    assert not summary["counts"]["rows"] - summary["counts"]["beliefs"]
+    model = tmp_path / "one" / "model.json"
+    again = run(example, "--model", model, "--out", tmp_path / "two", "--json", "--figures", "0")
+    assert json.loads(again.stdout)["learning"] is None
+    first, second = (rows_of(tmp_path / name / "beliefs.csv") for name in ("one", "two"))
+    for a, b in zip(first, second, strict=True):
+        assert float(a["p_exists"]) == pytest.approx(float(b["p_exists"]), abs=1e-9)
+
+
 def refuse(result: Result) -> str:
     assert result.exit_code == 2, result.stderr
     assert result.stdout == ""

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evermap.errors import ConfigError, EvermapError, InputError
+from evermap.errors import ConfigError, DataError, EvermapError, InputError
 from evermap.metrics.belief import belief_scores
 from evermap.persistence.one import PersistenceFilter
 from evermap.presence.config import PersistConfig, split_priors
-from evermap.presence.models import ModelOfEach, some_looks
+from evermap.presence.models import ModelOfEach, looks_at, some_looks
 from evermap.presence.run import nice_step, run_persist
 from evermap.presence.table import LookTable, read_looks
 from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.phase_type import PhaseType
+from evermap.recurrence.protocol import Instants
 from evermap.recurrence.storage import save_model
 from evermap.survival import parse_prior
 
@@ -149,6 +150,28 @@ def test_a_model_from_a_file_lets_features_return(tmp_path: Path) -> None:
     assert np.isnan(result.forecasts.median_stay_s).all()
 
 
+def test_learned_models_follow_their_class(tmp_path: Path) -> None:
+    looks = table(tmp_path, classes=True)
+    result = run_persist(looks, PersistConfig(recurrent="two-state"))
+    assert result.learned is not None
+    assert result.learned.per == "class"
+    assert result.models.names == ("cart", "wall")
+    for number, name in enumerate(result.models.names):
+        mine = np.flatnonzero(looks.class_of_feature == looks.class_names.index(name))
+        np.testing.assert_array_equal(result.models.of_feature[mine], number)
+        part, rows = looks_at(result.looks, mine)
+        expected = result.models.models[number].track(part, Instants.of_looks(part)).p_present
+        np.testing.assert_allclose(result.p_at_looks[rows], expected, rtol=1e-12)
+    assert not np.isnan(result.beliefs.p_exists).any()  # what comes back has no birth
+
+
+def test_looks_that_teach_nothing_are_an_error_about_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "looks.csv"
+    path.write_text("stamp_s,feature_id,detected\n0,a,1\n0,b,0\n")
+    with pytest.raises(DataError, match=r"looks\.csv: no feature has looks at two instants"):
+        run_persist(read_looks(path), PersistConfig(recurrent="two-state", per="all"))
+
+
 def test_an_impossible_look_is_named_with_feature_and_line(tmp_path: Path) -> None:
     path = tmp_path / "looks.csv"
     path.write_text("stamp_s,feature_id,detected,p_false\n0,box,1,0\n0,other,1,0.1\n90,box,1,0\n")
@@ -207,6 +230,8 @@ def test_learning_takes_whole_features_or_the_latest_looks_of_one(tmp_path: Path
         ({"prior": "hazard:0s=-1/d"}, "field '--prior': .*not negative"),
         ({"class_priors": {"door": PRIOR}}, "field '--prior': no feature is of class 'door'"),
         ({"recurrent": "sometimes"}, "field '--recurrent': 'sometimes' is no kind of model"),
+        ({"recurrent": "two-state", "model": "m.json"}, "field '--recurrent': a model from a file is not learned"),
+        ({"recurrent": "two-state", "per": "row"}, "field '--per': 'row' is no grouping"),
         ({"learn_from": 1}, "field '--learn-from': 1 looks teach nothing"),
         ({"model": "/no/such.json"}, "cannot be read"),
         ({"query": "grid", "step_s": 1e-7}, "field '--step-s': .* instants of 8 features"),

@@ -41,8 +41,11 @@ def persist(
         ),
     ] = None,
     recurrent: Annotated[
-        str, typer.Option(metavar="KIND", help="How features come back: none, or a kind of model to learn.")
+        str, typer.Option(metavar="KIND", help="How features come back: none, auto, or a kind of model to learn.")
     ] = "none",
+    per: Annotated[
+        str, typer.Option(metavar="all|class|feature", help="Whose looks are put together to learn.")
+    ] = "auto",
     model: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Model learned by an earlier run (its model.json).")
     ] = None,
@@ -116,6 +119,7 @@ def persist(
         class_priors=by_class,
         recurrent=recurrent,
         model="" if model is None else str(model),
+        per=per,
         learn_from=learn_from,
         query=query,
         step_s=step_s,
@@ -176,4 +180,9 @@ def _show(summary: Mapping[str, Any], out: Path, *, as_json: bool) -> None:
     names = {"brier": "Brier score", "log_loss": "log loss", "calibration_error": "calibration error"}
     rows += [(label, f"{metrics[key]:.4f}") for key, label in names.items() if key in metrics]
     rows += [(name.partition(".")[0], str(out / name)) for name in ("report.html", "beliefs.csv")]
+    if summary["learning"]:
+        kinds = sorted({model["kind"] for model in summary["learning"]["models"].values()})
+        rows.insert(
+            1, ("learned", f"{', '.join(kinds)}, per {summary['learning']['per']}".replace("per all", "for all"))
+        )
     print_table(Path(summary["source"]).name, rows)

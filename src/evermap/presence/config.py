@@ -22,7 +22,8 @@ class PersistConfig:
     Attributes:
         prior: lifetime of features that stay once, as `survival.text` writes it.
         class_priors: the same for single classes.
-        recurrent: how features come back: 'none' for features that stay once, or a kind of model to learn.
+        recurrent: how features come back: 'none' for features that stay once, a kind of model to learn, or 'auto'.
+        per: whose looks are put together to learn: 'all' features, each 'class', each 'feature', or 'auto'.
         model: file of a model that was learned before, '' to learn it from the table.
         learn_from: at most so many looks are learned from: all those at some of the features, drawn at random.
         query: 'times' asks for the belief at the time of every row, 'grid' at regular times.
@@ -37,6 +38,7 @@ class PersistConfig:
     prior: str = DEFAULT_PRIOR
     class_priors: Mapping[str, str] = field(default_factory=dict)
     recurrent: str = NO_RECURRENCE
+    per: str = "auto"
     model: str = ""
     learn_from: int = 100_000
     query: str = "times"
@@ -60,6 +62,11 @@ class PersistConfig:
     def stays_once(self) -> bool:
         """Whether features have one lifetime and never return."""
         return self.recurrent == NO_RECURRENCE and not self.model
+
+    @property
+    def learns(self) -> bool:
+        """Whether a model is learned from the looks."""
+        return self.recurrent != NO_RECURRENCE and not self.model
 
     def to_dict(self) -> dict[str, Any]:
         """For `summary.json`."""

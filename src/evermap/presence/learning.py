@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError
 from evermap.io.text import quote
-from evermap.presence.models import ModelOfEach, looks_at
+from evermap.presence.models import ModelOfEach, looks_at, some_looks
 from evermap.presence.table import LookTable
 from evermap.recurrence.choose import KINDS, Choice, choose
 from evermap.recurrence.protocol import Looks
@@ -19,6 +19,8 @@ AUTO = "auto"
 PER = (AUTO, "all", "class", "feature")
 MOST_FEATURES_ALONE = 32
 FEWEST_LOOKS_ALONE = 200
+MOST_LOOKS = 100_000
+"""Looks that are learned from: more make learning slow and the model hardly better."""
 
 Progress = Callable[[float], None]
 
@@ -39,7 +41,13 @@ class LearnedModels:
 
 
 def learn_models(
-    table: LookTable, looks: Looks, kind: str = AUTO, per: str = AUTO, *, progress: Progress | None = None
+    table: LookTable,
+    looks: Looks,
+    kind: str = AUTO,
+    per: str = AUTO,
+    *,
+    most_looks: int = MOST_LOOKS,
+    progress: Progress | None = None,
 ) -> LearnedModels:
     """Learn how features come and go from looks alone.
 
@@ -49,6 +57,7 @@ def learn_models(
         kind: one of `choose.KINDS`, or 'auto', which chooses for each model by foretelling looks that were held out.
         per: 'all' features share a model, or those of a 'class', or every 'feature' has its own. 'auto': by class where
             the table has classes, by feature where there are few features with many looks each, else one for all.
+        most_looks: of more, whole features drawn at random are learned from, or the latest looks at one.
         progress: called with the part that is done.
 
     Raises:
@@ -65,7 +74,7 @@ def learn_models(
     choices: list[Choice] = []
     tell = progress or (lambda _: None)
     for number, (name, features) in enumerate(groups):
-        part, _ = looks_at(looks, features)
+        part = some_looks(looks_at(looks, features)[0], max(most_looks // len(groups), 2))
 
         def within(done: float, number: int = number) -> None:
             tell((number + done) / len(groups))

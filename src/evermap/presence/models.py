@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,38 +16,8 @@ from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel, Track
 from evermap.types import IntArray
 
-Learner = Callable[[Looks], PresenceModel]
-
-
-def _phases(phases: str, rhythm: bool | str) -> Learner:
-    """Learns a chain of phases."""
-
-    def learn(looks: Looks) -> PresenceModel:
-        from evermap.recurrence.learn_phases import learn
-
-        return learn(looks, phases=phases, rhythm=rhythm).model
-
-    return learn
-
-
-def _run_length(rhythm: bool) -> Learner:
-    """Learns how long stays and absences last."""
-
-    def learn(looks: Looks) -> PresenceModel:
-        from evermap.recurrence.learn_sojourns import learn
-
-        return learn(looks, rhythm=rhythm).model
-
-    return learn
-
-
-LEARNERS: Mapping[str, Learner] = {
-    "two-state": _phases("two-state", False),
-    "phase-type": _phases("auto", "auto"),
-    "run-length": _run_length(False),
-    "run-length-rhythm": _run_length(True),
-}
-"""Kinds of recurrent models by the name that `--recurrent` takes, each learned from looks alone."""
+if TYPE_CHECKING:
+    from evermap.presence.learning import LearnedModels
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,24 +60,30 @@ class ModelOfEach:
         return {name or "all": model.to_dict() for name, model in zip(self.names, self.models, strict=True)}
 
 
-def models_for(config: PersistConfig, table: LookTable, looks: Looks) -> ModelOfEach:
-    """The model of every feature.
+def models_for(
+    config: PersistConfig, table: LookTable, looks: Looks, progress: Callable[[float], None] | None = None
+) -> tuple[ModelOfEach, LearnedModels | None]:
+    """The model of every feature, and how it was learned where it was.
 
     Raises:
         ConfigError: an unknown kind of model, a prior that cannot be, or choices that contradict each other.
         InputError: a model file that cannot be read.
+        DataError: too few looks to learn from.
     """
     if config.stays_once:
-        return _one_stay(config, table)
+        return _one_stay(config, table), None
     if config.class_priors:
         raise ConfigError("lifetimes are for features that stay once", field="--prior", hint="without --recurrent")
     if config.model:
-        from evermap.recurrence.storage import load_model
+        if config.recurrent != NO_RECURRENCE:
+            raise ConfigError("a model from a file is not learned", field="--recurrent", hint="without --model")
+        from evermap.presence.modelfile import load_models
 
-        model = load_model(config.model)
-    else:
-        model = _learner(config.recurrent)(some_looks(looks, config.learn_from))
-    return ModelOfEach((model,), ("",), np.zeros(table.n_features, dtype=np.int64))
+        return load_models(config.model, table), None
+    from evermap.presence.learning import learn_models
+
+    learned = learn_models(table, looks, config.recurrent, config.per, most_looks=config.learn_from, progress=progress)
+    return learned.models, learned
 
 
 def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
@@ -126,14 +102,6 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
     index = {name: k for k, name in enumerate(texts)}
     of_class = np.array([index.get(name, 0) for name in table.class_names] + [0])  # the last one is for UNKNOWN = -1
     return ModelOfEach(tuple(models), tuple(texts), of_class[table.class_of_feature])
-
-
-def _learner(name: str) -> Learner:
-    if name not in LEARNERS:
-        raise ConfigError(
-            f"'{name}' is no kind of model", field="--recurrent", hint=", ".join([NO_RECURRENCE, *LEARNERS])
-        )
-    return LEARNERS[name]
 
 
 def some_looks(looks: Looks, most: int) -> Looks:

@@ -91,7 +91,8 @@ def _figure(named: NamedFigure, picture: bytes) -> str:
     data = base64.b64encode(picture).decode("ascii")
     width = f"{7.5 * float(named.figure.get_size_inches()[0]):.0f}rem"  # one scale for all
     return (
-        f'<figure><img style="max-width:{width}" alt="{escape(named.title, quote=True)}" src="data:image/png;base64,{data}">'
+        f'<figure><img style="max-width:{width}" alt="{escape(named.title, quote=True)}"'
+        f' src="data:image/png;base64,{data}">'
         f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"
     )
 
@@ -143,5 +144,5 @@ def _stay(seconds: float) -> str:
 
 def _provenance(summary: Mapping[str, Any]) -> str:
     """Command, configuration and versions."""
-    shown = {name: summary[name] for name in ("command", "config", "model", "versions", "timing")}
+    shown = {name: summary[name] for name in ("command", "config", "model", "learning", "versions", "timing")}
     return json.dumps(shown, indent=2, ensure_ascii=False)

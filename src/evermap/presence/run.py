@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from evermap.presence.table import LookTable, Truth
 from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.protocol import Instants, Looks
 from evermap.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.presence.learning import LearnedModels
 
 Progress = Callable[[float, float], None]
 """Called with the steps that are done and how many there are."""
@@ -56,6 +60,7 @@ class PersistResult:
         table: what was read.
         config: what was chosen.
         models: the model of every feature.
+        learned: how they were learned; None where they were not.
         looks: the looks by feature and time.
         p_at_looks: (M,) belief right after each look.
         beliefs: at the instants asked for.
@@ -71,6 +76,7 @@ class PersistResult:
     table: LookTable
     config: PersistConfig
     models: ModelOfEach
+    learned: LearnedModels | None
     looks: Looks
     p_at_looks: FloatArray
     beliefs: Beliefs
@@ -110,7 +116,7 @@ def run_persist(
     looks = table.looks(order)
     clock.done("sort")
     try:
-        models = models_for(config, table, looks)
+        models, learned = models_for(config, table, looks, clock.within)
         clock.done("learn")
         beliefs, p_at_looks, merged_mass = _filter(table, order, config, models, looks)
     except NumericalError as error:
@@ -128,8 +134,8 @@ def run_persist(
     clock.done("score")
     warnings = (*table.warnings, *_remarks(config, models, looks, beliefs, changes))
     return PersistResult(
-        table, config, models, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins, merged_mass,
-        clock.step_s, warnings,
+        table, config, models, learned, looks, p_at_looks, beliefs, changes, forecasts, truth, scores, bins,
+        merged_mass, clock.step_s, warnings,
     )  # fmt: skip
 
 
@@ -196,7 +202,7 @@ def _score(
 
 def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: Beliefs, changes: Changes) -> list[str]:
     remarks = []
-    if not config.stays_once and not config.model and len(looks.stamp_s) > config.learn_from:
+    if config.learns and len(looks.stamp_s) > config.learn_from:
         remarks.append(
             f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (--learn-from)"
         )
@@ -239,9 +245,13 @@ class _Steps:
         self._names, self._progress, self._start = names, progress, time.perf_counter()
         self.step_s: dict[str, float] = {}
 
+    def within(self, part: float) -> None:
+        """A part of the present step is done."""
+        if self._progress:
+            self._progress(len(self.step_s) + part, len(self._names))
+
     def done(self, name: str) -> None:
         now = time.perf_counter()
         self.step_s[name] = now - self._start
         self._start = now
-        if self._progress:
-            self._progress(len(self.step_s), len(self._names))
+        self.within(0.0)

@@ -57,10 +57,10 @@ def write_persist(
         folder.path("beliefs.csv").write_bytes(_beliefs(result))
         folder.path("forecasts.csv").write_bytes(_forecasts(result))
         folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
-        if not result.config.stays_once and not result.config.model:
-            from evermap.recurrence.storage import save_model
+        if result.learned is not None:
+            from evermap.presence.modelfile import save_models
 
-            save_model(result.models.models[0], folder.path("model.json"))
+            save_models(result.models, result.learned.per, folder.path("model.json"))
         written = _now()
         drawn: list[NamedFigure] = []
         total = min(figures, result.table.n_features) + 1 + (result.scores is not None)
@@ -95,6 +95,7 @@ def persist_summary(result: PersistResult, *, command: str, timing: dict[str, fl
         "source": table.source,
         "config": result.config.to_dict(),
         "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
+        "learning": _learning(result),
         "counts": {
             "rows": len(table),
             "looks": int(looked.sum()),
@@ -168,6 +169,18 @@ def _rows(result: PersistResult, names: tuple[Any, ...]) -> Iterator[dict[str, A
     for feature, returned, row in zip(changes.feature.tolist(), changes.returned.tolist(), values, strict=True):
         what = {"feature_id": names[feature], "change": "returned" if returned else "vanished"}
         yield what | dict(zip(columns, row, strict=True))
+
+
+def _learning(result: PersistResult) -> dict[str, Any] | None:
+    """Whose looks were put together, and why each model is of its kind: evidence for looks that were held out."""
+    learned = result.learned
+    if learned is None:
+        return None
+    models = {
+        name or "all": {"kind": choice.kind, "held_out_s": choice.held_out_s, "scores": dict(choice.scores)}
+        for name, choice in zip(result.models.names, learned.choices, strict=True)
+    }
+    return {"per": learned.per, "models": models}
 
 
 def _never_leave(result: PersistResult) -> dict[str, float]:
