@@ -78,10 +78,7 @@ class RunLength:
             self.first, answer, evidence, moved, bad,
         )  # fmt: skip
         for feature in np.flatnonzero(bad >= 0)[:1]:
-            stamp = looks.stamp_s[looks.first[feature] + bad[feature]]
-            raise NumericalError(
-                impossible(f"feature {feature} at {stamp} s"), hint="P_M and P_F strictly between 0 and 1"
-            )
+            raise impossible_look(looks, int(looks.first[feature] + bad[feature]))
         return Track(answer, evidence, moved)
 
     @property
@@ -167,6 +164,14 @@ class RunLength:
         )
 
 
+def impossible_look(looks: Looks, row: int) -> NumericalError:
+    """The error that names a look which neither state of the feature can have caused."""
+    feature = int(np.searchsorted(looks.first, row, side="right")) - 1
+    return NumericalError(
+        impossible(f"feature {feature} at {looks.stamp_s[row]} s"), hint="P_M and P_F strictly between 0 and 1"
+    )
+
+
 def likelihoods(looks: Looks) -> tuple[FloatArray, FloatArray]:
     """Likelihood of each look if the feature is absent, and if it is present."""
     seen = looks.detected == 1.0
@@ -198,7 +203,7 @@ class RunLengthBelief:
         model: how they come and go.
         start_s: (N, 2, S) since when.
         weight: (N, 2, S) with which probability.
-        count: (N, 2) number of hypotheses.
+        count: (N, 2) number of hypotheses; places beyond it hold anything.
         stamp_s: (N,) when these held.
         log_evidence: (N,) `log p(looks)`.
         merged_mass: (N,) probability moved between hypotheses so far.
@@ -218,7 +223,8 @@ class RunLengthBelief:
     @property
     def probability(self) -> FloatArray:
         """(N,) probability of presence at `stamp_s`."""
-        return np.asarray(self.weight[:, PRESENT].sum(axis=1).clip(0.0, 1.0), dtype=np.float64)
+        held = np.arange(self.weight.shape[2]) < self.count[:, PRESENT, None]
+        return np.asarray(self.weight[:, PRESENT].sum(axis=1, where=held).clip(0.0, 1.0), dtype=np.float64)
 
 
 def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
