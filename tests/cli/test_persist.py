@@ -95,7 +95,9 @@ def test_changes_tell_what_happened(done: tuple[Path, dict[str, Any]]) -> None:
 
 def test_forecasts_never_rise_without_a_look_and_say_how_long(done: tuple[Path, dict[str, Any]]) -> None:
     forecasts = rows_of(done[0] / "forecasts.csv")
-    assert list(forecasts[0]) == ["stamp_s", "feature_id", "p_exists", "median_stay_s"]
+    assert list(forecasts[0]) == [
+        "stamp_s", "feature_id", "p_exists", "median_stay_s", "mean_stay_s", "mean_absence_s",
+    ]  # fmt: skip
     for name in ("pillar-1", "cart-3"):
         mine = [row for row in forecasts if row["feature_id"] == name]
         assert len(mine) == 11

@@ -18,8 +18,9 @@ from evermap.presence.table import LookTable, read_looks
 from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.phase_type import PhaseType
 from evermap.recurrence.protocol import Instants
+from evermap.recurrence.run_length import RunLength
 from evermap.recurrence.storage import save_model
-from evermap.survival import parse_prior
+from evermap.survival import Exponential, parse_prior
 
 PRIOR = "exponential:half-life=5min"
 
@@ -148,6 +149,15 @@ def test_a_model_from_a_file_lets_features_return(tmp_path: Path) -> None:
     expected = model.track(result.looks, looks.instants(looks.order())).p_present
     np.testing.assert_allclose(result.beliefs.p_exists[looks.order()], expected, rtol=1e-12)
     assert np.isnan(result.forecasts.median_stay_s).all()
+
+
+def test_a_run_length_model_says_when_to_expect_what(tmp_path: Path) -> None:
+    looks = table(tmp_path)
+    model = RunLength(Exponential(1 / 300), Exponential(1 / 200), 10.0)
+    path = save_model(model, tmp_path / "model.json")
+    forecasts = run_persist(looks, PersistConfig(model=str(path))).forecasts
+    np.testing.assert_allclose(forecasts.mean_stay_s, 300.0, rtol=0.02)  # memoryless, whatever the looks were
+    np.testing.assert_allclose(forecasts.mean_absence_s, 200.0, rtol=0.02)
 
 
 def test_learned_models_follow_their_class(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Presence after the latest look, and when half of what is there will have left."""
+"""Presence after the latest look, and how long what is there will stay, or what is away stay away."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from evermap.presence.config import PersistConfig
 from evermap.presence.models import ModelOfEach, looks_at
 from evermap.presence.table import LookTable
 from evermap.recurrence.one_stay import OneStay, births
-from evermap.recurrence.protocol import Instants, Looks
+from evermap.recurrence.protocol import Instants, Looks, PresenceModel
+from evermap.recurrence.run_length import RunLength
 from evermap.types import FloatArray
 
 SHARE = 0.25
@@ -28,12 +29,16 @@ class Forecasts:
         stamp_s: (N,) when; the first is the time of the latest look in the table.
         p_exists: (F, N) probability of presence then; nan for features that nothing is believed of.
         median_stay_s: (F,) if it is there now: time until it is as likely as not to have left; inf where it will
-            rather stay forever, nan where the model does not say.
+            rather stay for ever, nan where the model is not of one stay.
+        mean_stay_s: (F,) if it is there now: expected time until it leaves; nan where the model does not say.
+        mean_absence_s: (F,) if it is away now: expected time until it returns; nan where the model does not say.
     """
 
     stamp_s: FloatArray
     p_exists: FloatArray
     median_stay_s: FloatArray
+    mean_stay_s: FloatArray
+    mean_absence_s: FloatArray
 
 
 def forecast(models: ModelOfEach, looks: Looks, table: LookTable, config: PersistConfig) -> Forecasts:
@@ -51,17 +56,33 @@ def forecast(models: ModelOfEach, looks: Looks, table: LookTable, config: Persis
         raise ConfigError(f"{horizon_s:g} s in steps of {step_s:g} s", field="--horizon", hint="a longer --step-s")
     stamp_s = now_s + step_s * np.arange(count + 1, dtype=np.float64)
     track = models.track(looks, Instants.same_for_all(looks.n_features, stamp_s))
-    median_s = _median_stay(models, looks, now_s)
-    return Forecasts(stamp_s, track.p_present.reshape(looks.n_features, count + 1), median_s)
-
-
-def _median_stay(models: ModelOfEach, looks: Looks, now_s: float) -> FloatArray:
-    median_s = np.full(looks.n_features, np.nan)
+    outlook = np.full((3, looks.n_features), np.nan)
     for k, model in enumerate(models.models):
-        if not isinstance(model, OneStay):
-            continue
         mine = np.flatnonzero(models.of_feature == k)
-        birth_s = births(looks_at(looks, mine)[0])
+        if mine.size:
+            outlook[:, mine] = _outlook(model, looks_at(looks, mine)[0], now_s)
+    return Forecasts(stamp_s, track.p_present.reshape(looks.n_features, count + 1), *outlook)
+
+
+def _outlook(model: PresenceModel, looks: Looks, now_s: float) -> FloatArray:
+    """(3, F) median stay, mean stay and mean absence from now on; nan for what the model does not say."""
+    answer = np.full((3, looks.n_features), np.nan)
+    if isinstance(model, OneStay):
+        birth_s = births(looks)
         born = ~np.isnan(birth_s)
-        median_s[mine[born]] = model.median_remaining_s(now_s - birth_s[born])
-    return median_s
+        answer[0, born] = model.median_remaining_s(now_s - birth_s[born])
+    elif isinstance(model, RunLength):
+        from evermap.recurrence.run_length_forecast import after, time_to_leave, time_to_return
+
+        state = after(model, _heard_of(looks, now_s))
+        answer[1:] = time_to_leave(state), time_to_return(state)
+    return answer
+
+
+def _heard_of(looks: Looks, now_s: float) -> Looks:
+    """The same looks and one at every feature now, which says nothing: it takes the filter there."""
+    features = np.arange(looks.n_features)
+    old = (np.repeat(features, np.diff(looks.first)), looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
+    nothing = np.full(looks.n_features, 0.5)
+    new = (features, np.full(looks.n_features, now_s), np.ones(looks.n_features), nothing, nothing)
+    return Looks.from_rows(*(np.concatenate(pair) for pair in zip(old, new, strict=True)))

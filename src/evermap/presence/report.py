@@ -122,23 +122,28 @@ def _forecasts(result: PersistResult) -> str:
     if believed.size == 0:
         return ""
     horizon = duration_text(float(forecasts.stamp_s[-1] - forecasts.stamp_s[0]))
-    says_stay = not np.isnan(forecasts.median_stay_s).all()
+    outlooks = {
+        "if there, half are gone after": forecasts.median_stay_s,
+        "if there, leaves after": forecasts.mean_stay_s,
+        "if away, returns after": forecasts.mean_absence_s,
+    }
+    outlooks = {title: times_s for title, times_s in outlooks.items() if not np.isnan(times_s).all()}
     rows = [
         (
             escape(names[k]),
             f"{forecasts.p_exists[k, 0]:.3f}",
             f"{forecasts.p_exists[k, -1]:.3f}",
-            *([_stay(float(forecasts.median_stay_s[k]))] if says_stay else []),
+            *(_time(float(times_s[k])) for times_s in outlooks.values()),
         )
         for k in believed[:_MOST_ROWS].tolist()
     ]
-    head = ("feature", "P(exists) now", f"in {horizon}", *(["if there, half are gone after"] if says_stay else []))
+    head = ("feature", "P(exists) now", f"in {horizon}", *outlooks)
     more = believed.size - len(rows)
     note = f"<p>{more:,} more are in <code>forecasts.csv</code>.</p>" if more > 0 else ""
-    return f"<h2>Now and later</h2>{table(head, rows, numbers=(1, 2, 3))}{note}"
+    return f"<h2>Now and later</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
 
 
-def _stay(seconds: float) -> str:
+def _time(seconds: float) -> str:
     return "–" if math.isnan(seconds) else duration_text(seconds)
 
 

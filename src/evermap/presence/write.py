@@ -139,19 +139,19 @@ def _beliefs(result: PersistResult) -> bytes:
 
 
 def _forecasts(result: PersistResult) -> bytes:
-    """By feature and time; the median stay stands where the forecast begins."""
+    """By feature and time; what is expected from now on stands where the forecast begins."""
     stamp_s, p_exists = result.forecasts.stamp_s, result.forecasts.p_exists
     features, steps = p_exists.shape
-    stay_s = np.full((features, steps), np.nan)
-    stay_s[:, 0] = result.forecasts.median_stay_s
-    return csv_bytes(
-        {
-            "stamp_s": np.tile(stamp_s, features),
-            "feature_id": named(result.table.names, np.repeat(np.arange(features), steps)),
-            "p_exists": p_exists.ravel(),
-            "median_stay_s": stay_s.ravel(),
-        }
-    )
+    columns = {
+        "stamp_s": np.tile(stamp_s, features),
+        "feature_id": named(result.table.names, np.repeat(np.arange(features), steps)),
+        "p_exists": p_exists.ravel(),
+    }
+    for name in ("median_stay_s", "mean_stay_s", "mean_absence_s"):
+        column = np.full((features, steps), np.nan)
+        column[:, 0] = getattr(result.forecasts, name)
+        columns[name] = column.ravel()
+    return csv_bytes(columns)
 
 
 def _changes(result: PersistResult) -> str:
