@@ -122,24 +122,23 @@ def residual_life(table: HazardTable, age_s: FloatArray) -> FloatArray:
     """
     hazard, edge = table.hazard_hz, table.edge_s
     left = np.empty(len(edge) + 1)
-    left[-1] = np.inf if hazard[-1] == 0.0 else 1.0 / hazard[-1]
-    left[-2] = left[-1]
+    endless = hazard[-1] == 0.0
+    left[-2:] = 0.0 if endless else 1.0 / hazard[-1]
     for k in range(len(edge) - 2, -1, -1):
         left[k] = _through_bin(hazard[k], edge[k + 1] - edge[k], left[k + 1])
     i = bins_of(age_s, table.offset, len(edge))
     width = np.append(edge[1:], np.inf)[i] - age_s
     last = i == len(edge) - 1
-    inside = _through_bin(hazard[i], np.where(last, 0.0, width), left[i + 1])
-    return np.asarray(np.where(last, left[-1], inside), dtype=np.float64)
+    inside = np.where(last, left[-1], _through_bin(hazard[i], np.where(last, 0.0, width), left[i + 1]))
+    to_go = table.cumulative[-1] - (table.cumulative[i] + hazard[i] * np.where(last, 0.0, age_s - edge[i]))
+    return np.asarray(np.where(endless & (np.exp(-to_go) > 0.0), np.inf, inside), dtype=np.float64)
 
 
 def _through_bin(hazard: Any, width: Any, beyond: Any) -> Any:
     """Expected time left, from inside a bin of constant hazard with `width` to go to one where `beyond` is left."""
     x = hazard * width
     spent = width * np.where(x > 1e-9, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
-    survived = np.exp(-x)
-    # what nobody reaches counts for nothing, even where it would last for ever
-    return spent + survived * np.where(survived > 0.0, beyond, 0.0)
+    return spent + np.exp(-x) * beyond
 
 
 def _time_to_change(state: RunLengthBelief, which: int) -> FloatArray:

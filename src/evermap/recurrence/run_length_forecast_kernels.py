@@ -5,12 +5,21 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.recurrence.compiled import exp, expm1, kernel
-from evermap.recurrence.rhythm import WEEK_S
-from evermap.recurrence.run_length_kernels import MOST, Law, _hazards, _sum, _week_bin
+from evermap.recurrence.rhythm import BIN_S, WEEK_S
+from evermap.recurrence.run_length_kernels import _MONDAY_S, MOST, Law, _hazards, _sum, _week_bin
 from evermap.types import FloatArray, IntArray
 
 _NOTHING = 1e-10
 """Probability of going on below which what remains does not matter."""
+_SLIVER_S = 1e-3
+"""Shortest step, lest rounding makes one of nothing."""
+
+
+@kernel
+def _step_end(now: float, law: Law) -> float:
+    """End of a step that begins now: as the filter's, but within one ten minutes of the week."""
+    rest = BIN_S - (now - _MONDAY_S) % BIN_S
+    return now + min(law.step_s, rest if rest > _SLIVER_S else rest + BIN_S)
 
 
 @kernel
@@ -54,7 +63,7 @@ def lasting_rows(
         total = _sum(left, s, n)
         for k in range(len(asked_s)):
             while now < asked_s[k]:
-                later = asked_s[k] if constant else min(now + law.step_s, asked_s[k])
+                later = asked_s[k] if constant else min(_step_end(now, law), asked_s[k])
                 _go_on(start[f], left, n, s, now, later, law, scratch, spent)
                 now = later
             out[f, k] = min(_sum(left, s, n) / total, 1.0) if total > 0.0 else np.nan
@@ -76,7 +85,6 @@ def remaining_rows(
     Of what is left then, each further week leaves the same part as the last one did.
     """
     scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
-    steps = int(np.ceil(WEEK_S / law.step_s))
     for f in range(len(now_s)):
         left, n, now = weight[f].copy(), count[f, s], now_s[f]
         total = _sum(left, s, n)
@@ -86,9 +94,9 @@ def remaining_rows(
         passed, of_week, kept = 0.0, 0.0, 1.0
         for _ in range(weeks):
             before, of_week = _sum(left, s, n), 0.0
-            begun = now
-            for k in range(steps):
-                later = begun + min((k + 1) * law.step_s, WEEK_S)
+            end_of_week = now + WEEK_S
+            while now < end_of_week:
+                later = min(_step_end(now, law), end_of_week)
                 _go_on(start[f], left, n, s, now, later, law, scratch, spent)
                 of_week += _sum(spent, s, n)
                 now = later
