@@ -13,7 +13,7 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = ["demo", "slam", "persist", "convert", "simulate", "reproduce", "bench"]
-GROUPS = {"survival": ["plot"]}
+GROUPS = {"survival": ["fit", "plot"]}
 
 
 def run(*arguments: str) -> Result:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evermap.cli.fit import fit
+from evermap.cli.picture import check_picture, write_picture
 from evermap.cli.terminal import print_json, print_table, say
 from evermap.errors import ConfigError
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from evermap.survival import LifetimePrior
 
 app = typer.Typer(name="survival", help="How long features stay.", no_args_is_help=True, rich_markup_mode=None)
+app.command("fit")(fit)
 
 
 @app.command("plot")
@@ -62,14 +64,13 @@ def plot(
     from evermap.survival.text import parse_prior
     from evermap.viz.lifetime_figure import plot as draw
 
-    if out.suffix.lower() not in (".png", ".svg"):
-        raise ConfigError(f"cannot draw a '{out.suffix}' file", path=out, field="--out", hint="a name ending in .png")
+    check_picture(out, "--out")
     named = {text: parse_prior(text) for text in priors}
     try:
         until_s = None if until is None else parse_duration_s(until)
     except ConfigError as error:
         raise ConfigError(error.problem, field="--until", hint=error.hint) from None
-    _write_picture(out, draw(named, until_s=until_s, log_time=log_time))
+    write_picture(out, draw(named, until_s=until_s, log_time=log_time))
     rows = {name: _numbers(prior) for name, prior in named.items()}
     if as_json:
         print_json({"out": str(out), "priors": rows})
@@ -77,15 +78,6 @@ def plot(
     for name, numbers in rows.items():
         print_table(name, _lines(numbers))
     say(f"drawn in {out}")
-
-
-def _write_picture(path: Path, figure: Any) -> None:
-    from evermap.io.atomic import write_atomic
-    from evermap.viz.style import save_png, save_svg
-
-    content = io.BytesIO()
-    (save_svg if path.suffix.lower() == ".svg" else save_png)(figure, content)
-    write_atomic(path, content.getvalue())
 
 
 def _numbers(prior: LifetimePrior) -> dict[str, float | None]:
