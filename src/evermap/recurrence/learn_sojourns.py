@@ -14,7 +14,7 @@ import numpy as np
 from evermap.errors import ConfigError, DataError
 from evermap.recurrence.protocol import Looks
 from evermap.recurrence.run_length import RunLength
-from evermap.recurrence.sojourn_em import Ascent, Data, Expected, best_fit, climb, with_lifetimes
+from evermap.recurrence.sojourn_em import Ascent, Data, Expected, climb, ranked_fits, with_lifetimes
 from evermap.recurrence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns
 from evermap.survival import Exponential
 
@@ -78,8 +78,8 @@ class Learned:
         fade = 2.0 ** (-max(data.last_s - self.last_s, 0.0) / self.half_life_s)
         absences, stays = (_added(old, more, fade) for old, more in zip(self.expected.counts, new.counts, strict=True))
         fitted = (
-            best_fit(absences, self.families, None, rhythm=rhythm),
-            best_fit(stays, self.families, None, rhythm=rhythm),
+            ranked_fits(absences, self.families, None, rhythm=rhythm)[0],
+            ranked_fits(stays, self.families, None, rhythm=rhythm)[0],
         )
         return replace(
             self,

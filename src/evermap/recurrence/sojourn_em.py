@@ -26,6 +26,8 @@ AGE_GROUP = 4
 """Bins of age that count as one where there is a rhythm."""
 CHOOSING_ROUNDS = 4
 """Rounds in which the families are chosen anew."""
+HOPELESS = 20.0
+"""A family whose score is this much below the best is not tried again."""
 SETTLED = 0.02
 """Gain of log evidence below which EM stops."""
 
@@ -175,10 +177,12 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) ->
     best: Ascent | None = None
     fitted: tuple[Fitted, Fitted] | None = None
     for number in range(rounds):
-        absence, stay = (
-            best_fit(expected.counts[s], allowed[s], fitted[s] if fitted else None, rhythm=data.rhythm) for s in (0, 1)
-        )
-        fitted = (absence, stay)
+        ranked = [
+            ranked_fits(expected.counts[s], allowed[s], fitted[s] if fitted else None, rhythm=data.rhythm)
+            for s in (0, 1)
+        ]
+        fitted = (ranked[0][0], ranked[1][0])
+        allowed = [_promising(fits, expected.counts[s]) for s, fits in enumerate(ranked)]
         if number >= CHOOSING_ROUNDS - 1:
             allowed = [[one.family] for one in fitted]
         before = expected.log_evidence
@@ -192,11 +196,17 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) ->
     return best
 
 
-def best_fit(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> Fitted:
-    """The lifetime of the highest score among some families."""
+def ranked_fits(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> list[Fitted]:
+    """Lifetimes of some families, the highest score first."""
     known = WITH_RHYTHM if rhythm else FAMILIES
     fits = [known[name](counts, start if start and start.family == name else None) for name in families]
-    return max(fits, key=lambda one: one.score(counts)) if len(fits) > 1 else fits[0]
+    return sorted(fits, key=lambda one: -one.score(counts)) if len(fits) > 1 else fits
+
+
+def _promising(ranked: Sequence[Fitted], counts: Sojourns) -> list[str]:
+    """The families that are worth another round."""
+    best = ranked[0].score(counts)
+    return list(dict.fromkeys(one.family for one in ranked if one.score(counts) > best - HOPELESS))
 
 
 def with_lifetimes(model: RunLength, fitted: tuple[Fitted, Fitted]) -> RunLength:
