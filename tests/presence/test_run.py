@@ -146,8 +146,12 @@ def test_a_model_from_a_file_lets_features_return(tmp_path: Path) -> None:
     model = PhaseType.two_state(1 / 300, 1 / 200)
     path = save_model(model, tmp_path / "model.json")
     result = run_persist(looks, PersistConfig(model=str(path)))
-    expected = model.track(result.looks, looks.instants(looks.order())).p_present
-    np.testing.assert_allclose(result.beliefs.p_exists[looks.order()], expected, rtol=1e-12)
+    for feature in range(looks.n_features):
+        rows = np.flatnonzero(looks.feature == feature)
+        rows = rows[np.argsort(looks.stamp_s[rows])]
+        asked = Instants.same_for_all(1, looks.stamp_s[rows])
+        expected = model.track(result.looks.of(feature), asked).p_present
+        np.testing.assert_allclose(result.beliefs.p_exists[rows], expected, rtol=1e-12)
     assert np.isnan(result.forecasts.median_stay_s).all()
 
 

@@ -44,9 +44,6 @@ def test_all_columns_in_any_order_of_rows(tmp_path: Path) -> None:
     np.testing.assert_array_equal(looks.stamp_s, [0.0, 1.0, 5.0])
     np.testing.assert_array_equal(looks.detected, [1.0, 0.0, 1.0])
     np.testing.assert_array_equal(looks.p_false, [0.05, 0.3, 0.05])
-    instants = table.instants(table.order())
-    np.testing.assert_array_equal(instants.first, [0, 2, 4])
-    np.testing.assert_array_equal(instants.stamp_s, [0.0, 1.0, 3.0, 5.0])
     truth = table.truth(table.order())
     assert truth is not None
     np.testing.assert_array_equal(truth.first, [0, 1, 3])

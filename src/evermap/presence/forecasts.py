@@ -9,9 +9,8 @@ import numpy as np
 from evermap.errors import ConfigError
 from evermap.presence.config import PersistConfig
 from evermap.presence.models import ModelOfEach, looks_at
-from evermap.presence.table import LookTable
 from evermap.recurrence.one_stay import OneStay, births
-from evermap.recurrence.protocol import Instants, Looks, PresenceModel
+from evermap.recurrence.protocol import Looks, PresenceModel
 from evermap.recurrence.run_length import RunLength
 from evermap.types import FloatArray
 
@@ -41,27 +40,35 @@ class Forecasts:
     mean_absence_s: FloatArray
 
 
-def forecast(models: ModelOfEach, looks: Looks, table: LookTable, config: PersistConfig) -> Forecasts:
-    """Presence from the latest look of the table on, `--horizon` far.
+def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatArray:
+    """(N,) instants from the latest look on, `--horizon` far.
 
     Raises:
         ConfigError: so many steps that one of them must be wrong.
     """
-    now_s = table.now_s
-    span_s = now_s - float(looks.stamp_s.min())
-    horizon_s = config.horizon_s or SHARE * span_s or 1.0
+    horizon_s = config.horizon_s or SHARE * (now_s - float(looks.stamp_s.min())) or 1.0
     step_s = config.step_s or horizon_s / STEPS
     count = int(np.floor(horizon_s / step_s * (1.0 + 1e-12)))
     if count > MOST_STEPS:
         raise ConfigError(f"{horizon_s:g} s in steps of {step_s:g} s", field="--horizon", hint="a longer --step-s")
-    stamp_s = now_s + step_s * np.arange(count + 1, dtype=np.float64)
-    track = models.track(looks, Instants.same_for_all(looks.n_features, stamp_s))
+    return now_s + step_s * np.arange(count + 1, dtype=np.float64)
+
+
+def forecasts_of(models: ModelOfEach, looks: Looks, stamp_s: FloatArray, p_exists: FloatArray) -> Forecasts:
+    """Forecasts with what each model expects from their first instant on.
+
+    Args:
+        models: the model of every feature.
+        looks: by feature and time.
+        stamp_s: (N,) instants of the forecast.
+        p_exists: (F, N) presence then.
+    """
     outlook = np.full((3, looks.n_features), np.nan)
     for k, model in enumerate(models.models):
         mine = np.flatnonzero(models.of_feature == k)
         if mine.size:
-            outlook[:, mine] = _outlook(model, looks_at(looks, mine)[0], now_s)
-    return Forecasts(stamp_s, track.p_present.reshape(looks.n_features, count + 1), *outlook)
+            outlook[:, mine] = _outlook(model, looks_at(looks, mine)[0], float(stamp_s[0]))
+    return Forecasts(stamp_s, p_exists, *outlook)
 
 
 def _outlook(model: PresenceModel, looks: Looks, now_s: float) -> FloatArray:

@@ -14,7 +14,7 @@ from evermap.presence.config import NO_RECURRENCE, PersistConfig
 from evermap.presence.table import LookTable
 from evermap.recurrence.one_stay import OneStay
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel, Track
-from evermap.types import IntArray
+from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
     from evermap.presence.learning import LearnedModels
@@ -102,6 +102,28 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
     index = {name: k for k, name in enumerate(texts)}
     of_class = np.array([index.get(name, 0) for name in table.class_names] + [0])  # the last one is for UNKNOWN = -1
     return ModelOfEach(tuple(models), tuple(texts), of_class[table.class_of_feature])
+
+
+def ask(model: PresenceModel, looks: Looks, *questions: tuple[IntArray, FloatArray]) -> tuple[list[FloatArray], Track]:
+    """Answers to several lists of (feature, time) in one pass over the looks.
+
+    Args:
+        model: of the features.
+        looks: at F features.
+        questions: (N,) features and (N,) times each, in any order.
+
+    Returns:
+        (N,) probabilities of presence for each list, and the track with all of them.
+    """
+    feature = np.concatenate([features for features, _ in questions])
+    stamp_s = np.concatenate([stamps for _, stamps in questions])
+    order = np.lexsort((stamp_s, feature))
+    first = np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=looks.n_features))]).astype(np.int64)
+    track = model.track(looks, Instants(first, stamp_s[order]))
+    answers = np.empty(len(order))
+    answers[order] = track.p_present
+    ends = np.cumsum([len(features) for features, _ in questions])
+    return np.split(answers, ends[:-1]), track
 
 
 def some_looks(looks: Looks, most: int) -> Looks:

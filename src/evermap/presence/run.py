@@ -15,11 +15,11 @@ from evermap.io.text import counted, quote
 from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
 from evermap.presence.changes import Changes, find_changes
 from evermap.presence.config import DEFAULT_PRIOR, PersistConfig
-from evermap.presence.forecasts import Forecasts, forecast
-from evermap.presence.models import ModelOfEach, models_for
+from evermap.presence.forecasts import Forecasts, forecast_stamps, forecasts_of
+from evermap.presence.models import ModelOfEach, ask, models_for
 from evermap.presence.table import LookTable, Truth
 from evermap.recurrence.one_stay import OneStay
-from evermap.recurrence.protocol import Instants, Looks
+from evermap.recurrence.protocol import Looks
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -111,14 +111,14 @@ def run_persist(
         DataError: looks from which no model can be learned.
     """
     config = config or PersistConfig()
-    clock = _Steps(("sort", "learn", "filter", "changes", "forecast", "score"), progress)
+    clock = _Steps(("sort", "learn", "filter", "changes", "score"), progress)
     order = table.order()
     looks = table.looks(order)
     clock.done("sort")
     try:
         models, learned = models_for(config, table, looks, clock.within)
         clock.done("learn")
-        beliefs, p_at_looks, merged_mass = _filter(table, order, config, models, looks)
+        beliefs, p_at_looks, forecasts, merged_mass = _filter(table, order, config, models, looks)
     except NumericalError as error:
         raise _named(error, table) from error
     except DataError as error:
@@ -126,8 +126,6 @@ def run_persist(
     clock.done("filter")
     changes = find_changes(looks, p_at_looks, config.confidence)
     clock.done("changes")
-    forecasts = forecast(models, looks, table, config)
-    clock.done("forecast")
     at_rows = table.present if truth is None and config.query == "times" else None
     truth = truth or table.truth(order)
     scores, bins = _score(table, beliefs, truth, at_rows)
@@ -147,22 +145,23 @@ def warm_up() -> None:
 
 def _filter(
     table: LookTable, order: IntArray, config: PersistConfig, models: ModelOfEach, looks: Looks
-) -> tuple[Beliefs, FloatArray, float]:
-    """Beliefs at the instants asked for and at the looks, and the mass that was moved about."""
-    if config.query == "grid":
-        instants = grid(table, config)
-        feature = np.repeat(np.arange(table.n_features), np.diff(instants.first))
-        track = models.track(looks, instants)
-        beliefs = Beliefs(instants.stamp_s, feature, track.p_present)
-        return beliefs, models.track(looks).p_present, float(track.merged_mass.max())
-    track = models.track(looks, table.instants(order))
-    p_exists = np.empty(len(table))
-    p_exists[order] = track.p_present
-    p_at_looks = track.p_present[table.looked[order]]  # rows and looks are sorted alike
-    return Beliefs(table.stamp_s, table.feature, p_exists), p_at_looks, float(track.merged_mass.max())
+) -> tuple[Beliefs, FloatArray, Forecasts, float]:
+    """Beliefs at the instants asked for and at the looks, forecasts, and the mass that was moved about."""
+    at_rows = config.query == "times"
+    feature, stamp_s = (table.feature, table.stamp_s) if at_rows else _grid(table, config)
+    later_s = forecast_stamps(looks, table.now_s, config)
+    ahead = np.repeat(np.arange(looks.n_features), len(later_s)), np.tile(later_s, looks.n_features)
+    if at_rows:
+        (p_ahead, p_exists), track = ask(models, looks, ahead, (feature, stamp_s))
+        p_at_looks = p_exists[order[table.looked[order]]]
+    else:
+        at_looks = np.repeat(np.arange(looks.n_features), np.diff(looks.first)), looks.stamp_s
+        (p_ahead, p_exists, p_at_looks), track = ask(models, looks, ahead, (feature, stamp_s), at_looks)
+    forecasts = forecasts_of(models, looks, later_s, p_ahead.reshape(looks.n_features, len(later_s)))
+    return Beliefs(stamp_s, feature, p_exists), p_at_looks, forecasts, float(track.merged_mass.max())
 
 
-def grid(table: LookTable, config: PersistConfig) -> Instants:
+def _grid(table: LookTable, config: PersistConfig) -> tuple[IntArray, FloatArray]:
     """Regular instants from the first to the last row of the table, the same for all features.
 
     Raises:
@@ -174,7 +173,8 @@ def grid(table: LookTable, config: PersistConfig) -> Instants:
     if count * table.n_features > MOST_ROWS:
         problem = f"{step_s:g} s make {count} instants of {table.n_features} features"
         raise ConfigError(problem, field="--step-s", hint="a longer step, or --query times")
-    return Instants.same_for_all(table.n_features, start_s + step_s * np.arange(count))
+    instants = start_s + step_s * np.arange(count)
+    return np.repeat(np.arange(table.n_features), count), np.tile(instants, table.n_features)
 
 
 def nice_step(at_least_s: float) -> float:

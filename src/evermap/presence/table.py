@@ -11,7 +11,7 @@ from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
 from evermap.io.quantities import STAMP_S, Quantity
 from evermap.io.text import counted, quote
-from evermap.recurrence.protocol import Instants, Looks
+from evermap.recurrence.protocol import Looks
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 _REQUIRED = ("stamp_s", "feature_id", "detected")
@@ -80,10 +80,6 @@ class LookTable:
         rows = order[self.looked[order]]
         columns = (self.stamp_s, self.detected, self.p_miss, self.p_false)
         return Looks(_firsts(self.feature[rows], self.n_features), *(column[rows] for column in columns))
-
-    def instants(self, order: IntArray) -> Instants:
-        """Times of all rows by feature and time; `order` is `self.order()`."""
-        return Instants(_firsts(self.feature, self.n_features), self.stamp_s[order])
 
     def truth(self, order: IntArray) -> Truth | None:
         """What the column `present` says; None without any. `order` is `self.order()`."""

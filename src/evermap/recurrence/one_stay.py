@@ -72,7 +72,9 @@ class OneStay:
         before_s = np.zeros(len(time))
         same = np.flatnonzero(feature[1:] == feature[:-1]) + 1
         before_s[same] = age_s[same - 1]
-        odds = log_death_odds((self.prior,), np.zeros(len(time), dtype=np.int64), before_s, age_s)
+        odds = np.full(len(time), -np.inf)
+        gap = np.flatnonzero(age_s > before_s)  # nobody dies in no time, and some priors take long to say so
+        odds[gap] = log_death_odds((self.prior,), np.zeros(len(gap), dtype=np.int64), before_s[gap], age_s[gap])
         evidence, belief = np.zeros(looks.n_features), np.empty(len(time))
         bad = int(stream(feature, odds, there, gone, np.zeros(looks.n_features), evidence, belief))
         if bad >= 0:
