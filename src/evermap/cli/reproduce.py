@@ -19,9 +19,14 @@ class Experiment(StrEnum):
 
     MRCLAM = "mrclam"
     ROSEN2016 = "rosen2016"
+    PRESENCE = "presence"
 
 
-DATA = {Experiment.MRCLAM: Path("../shared/data/mrclam"), Experiment.ROSEN2016: Path("../shared/golden")}
+DATA = {
+    Experiment.MRCLAM: Path("../shared/data/mrclam"),
+    Experiment.ROSEN2016: Path("../shared/golden"),
+    Experiment.PRESENCE: Path("../shared/data/presence"),
+}
 """Where the data of each experiment are looked for."""
 
 
@@ -30,8 +35,8 @@ def reproduce(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with the recordings (mrclam) or with rosen2016.json, the numbers to compare with (rosen2016).",
-            show_default="../shared/data/mrclam or ../shared/golden",
+            help="Folder with the recordings (mrclam, presence) or with rosen2016.json, the numbers to compare with.",
+            show_default="../shared/data/mrclam, ../shared/data/presence or ../shared/golden",
         ),
     ] = None,
     out: Annotated[
@@ -40,7 +45,9 @@ def reproduce(
     everything: Annotated[
         bool, typer.Option("--all", help="mrclam: also the recordings of which only a part of the truth is known.")
     ] = False,
-    seed: Annotated[int | None, typer.Option(help="rosen2016: same seed, same numbers.", show_default="0")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="rosen2016, presence: same seed, same numbers.", show_default="0")
+    ] = None,
     sequences: Annotated[
         int | None, typer.Option(help="rosen2016: sequences drawn for every setting.", show_default="10000")
     ] = None,
@@ -52,12 +59,14 @@ def reproduce(
     """Compute a table of the documents again.
 
     mrclam: all robots of the UTIAS recordings against the truth. rosen2016: figures 1 to 4 of the persistence filter's
-    paper against reference numbers. Runs follow one another on one core, so that the timings mean something.
+    paper against reference numbers. presence: models of things that come and go against simple and published ones, in
+    a room and at a door. Runs follow one another on one core, so that the timings mean something.
 
     \b
     Example:
       evermap reproduce mrclam --data ~/recordings/mrclam
       evermap reproduce rosen2016 --seed 1
+      evermap reproduce presence --out out/presence
     """
     _one_core()
     from evermap.runfolder import check_replaceable
@@ -65,13 +74,18 @@ def reproduce(
     _refuse_options(experiment, {"--all": everything, "--seed": seed is not None, "--sequences": sequences is not None})
     target = out or Path("evermap-out") / experiment.value
     check_replaceable(target, force=force)
-    with progress_bar(experiment.value) as progress:
+    with progress_bar(experiment.value, speed=experiment is not Experiment.PRESENCE) as progress:
         if experiment is Experiment.MRCLAM:
             from evermap.experiments import mrclam
 
             folder = data or DATA[experiment]
             table = mrclam.reproduce(folder, target, progress=progress, everything=everything, force=force)
             as_text = mrclam.as_markdown
+        elif experiment is Experiment.PRESENCE:
+            from evermap.experiments import presence
+
+            table = presence.reproduce(data or DATA[experiment], target, seed=seed or 0, progress=progress, force=force)
+            as_text = presence.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -93,7 +107,11 @@ def reproduce(
 
 def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
     """An option that would be ignored is a mistake."""
-    known = {Experiment.MRCLAM: {"--all"}, Experiment.ROSEN2016: {"--seed", "--sequences"}}[experiment]
+    known = {
+        Experiment.MRCLAM: {"--all"},
+        Experiment.ROSEN2016: {"--seed", "--sequences"},
+        Experiment.PRESENCE: {"--seed"},
+    }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))
 
