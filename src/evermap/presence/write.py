@@ -177,7 +177,11 @@ def _learning(result: PersistResult) -> dict[str, Any] | None:
     if learned is None:
         return None
     models = {
-        name or "all": {"kind": choice.kind, "held_out_s": choice.held_out_s, "scores": dict(choice.scores)}
+        name or "all": {
+            "kind": choice.kind,
+            "held_out_s": choice.held_out_s,
+            "scores": {kind: _number(score) for kind, score in choice.scores.items()},
+        }
         for name, choice in zip(result.models.names, learned.choices, strict=True)
     }
     return {"per": learned.per, "models": models}
