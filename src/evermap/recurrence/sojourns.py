@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from math import exp
 
 import numpy as np
 
@@ -137,17 +138,17 @@ def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = Fals
 
 def weibull(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """A hazard that is a power of age."""
-    return _two_parameters("weibull", counts, lambda a, b: Weibull(np.exp(a), np.exp(b)))
+    return _two_parameters("weibull", counts, lambda a, b: Weibull(exp(a), exp(b)))
 
 
 def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """A sum of exponential phases."""
-    return _two_parameters("gamma", counts, lambda a, b: Gamma(np.exp(a - b), np.exp(b)))
+    return _two_parameters("gamma", counts, lambda a, b: Gamma(exp(a - b), exp(b)))
 
 
 def lognormal(counts: Sojourns, _: Fitted | None = None) -> Fitted:
     """One typical duration and its spread."""
-    return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, np.exp(b)))
+    return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, exp(b)))
 
 
 def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
