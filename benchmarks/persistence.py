@@ -17,9 +17,10 @@ import numpy as np
 
 from benchmarks import rosen
 from evermap.persistence import single
-from evermap.persistence.batch import Look, look_exponential, look_general_purpose
+from evermap.persistence.batch import Look, look_exponential, look_general_purpose, look_two_state
 from evermap.persistence.one import PersistenceFilter
-from evermap.survival import Exponential, GeneralPurpose
+from evermap.recurrence import run_length as run_length_filter
+from evermap.survival import Exponential, GeneralPurpose, LogNormal
 from evermap.types import FloatArray
 
 N_FEATURES = 1_000_000
@@ -148,6 +149,35 @@ def stream(n: int) -> Case:
     return Case("`run` on a stream", n, np.inf, lambda: single.run(state, feature, stamp, *looks))
 
 
+def two_state(n: int) -> Case:
+    """Features that come and go, stays and absences exponential."""
+    features = fleet(n, exponential=True)
+    random = np.random.default_rng(2)
+    parameters = (features.low_hz, 10 ** random.uniform(-6, -4, n))
+    columns = (features.inverse_odds, features.before.stamp_s, *parameters, *features.looks)
+    out = Look(np.empty(n), np.empty(n))
+
+    def ours(threads: bool) -> FloatArray:
+        return look_two_state(*columns, horizon_s=HORIZON_S, out=out, threads=threads).probability
+
+    moved = sum(column.itemsize for column in (*columns, *out))
+    return Case("leaves and returns, exponential", n, 40.0, lambda: ours(False), lambda: ours(True), moved)
+
+
+def run_length(n: int) -> Case:
+    """Features that come and go, stays and absences log-normal, 64 hypotheses each, looked at every ten seconds."""
+    model = run_length_filter.RunLength(LogNormal(6.0, 0.5), LogNormal(7.0, 0.5), step_s=10.0, hypotheses=64)
+    count = max(n // 100, 1)
+    random = np.random.default_rng(3)
+    rates = (random.uniform(0.05, 0.5, count), random.uniform(0.01, 0.3, count))
+    state = run_length_filter.init(model, random.uniform(0.0, 10.0, count))
+    for _ in range(100):  # until the lists are full
+        state = run_length_filter.update(state, state.stamp_s + 10.0, random.random(count) < 0.5, *rates)
+    seen = random.random(count) < 0.5
+    work = lambda: run_length_filter.update(state, state.stamp_s + 10.0, seen, *rates).probability  # noqa: E731
+    return Case("leaves and returns, 64 hypotheses of run length", count, 1000.0, work)
+
+
 CASES: tuple[Callable[[int], Case], ...] = (
     exponential,
     general_purpose,
@@ -155,8 +185,10 @@ CASES: tuple[Callable[[int], Case], ...] = (
     one_exponential,
     one_general_purpose,
     stream,
+    two_state,
+    run_length,
 )
-"""Each makes its case for a number of features. The recurrent filters belong here."""
+"""Each makes its case for a number of features."""
 
 
 def run(n_features: int = N_FEATURES, seconds: float = SECONDS) -> tuple[dict[str, float], dict[str, Any]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError, NumericalError
-from evermap.persistence.batch import Look, look_exponential, look_general_purpose
+from evermap.persistence.batch import Look, look_exponential, look_general_purpose, look_two_state
 from evermap.types import FloatArray
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'evermap[torch]'")
@@ -21,12 +21,14 @@ N = 400
 def parameters_of(look: Callable[..., Any], random: np.random.Generator) -> tuple[FloatArray, ...]:
     if look is look_exponential:
         return (10 ** random.uniform(-6, 0, N),)
+    if look is look_two_state:
+        return 10 ** random.uniform(-6, 0, N), 10 ** random.uniform(-6, 0, N)
     return 10 ** random.uniform(-7, -3, N), 10 ** random.uniform(-2.5, 2, N)
 
 
 @pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize("horizon_s", [0.0, 40.0])
-@pytest.mark.parametrize("look", [look_exponential, look_general_purpose])
+@pytest.mark.parametrize("look", [look_exponential, look_general_purpose, look_two_state])
 @pytest.mark.parametrize(("name", "tolerance"), [("float32", 1e-6), ("float64", 1e-12)])
 def test_tensors_give_what_arrays_give(
     look: Callable[..., Any], horizon_s: float, name: str, tolerance: float, device: str

@@ -99,6 +99,30 @@ def look_general_purpose(
     return _look("general_purpose", columns, horizon_s, out, threads)
 
 
+def look_two_state(
+    inverse_odds: Column,
+    stamp_s: Column,
+    leave_hz: Column,
+    return_hz: Column,
+    time_s: Column,
+    detected: Any,
+    p_miss: Column,
+    p_false: Column,
+    *,
+    horizon_s: float = 0.0,
+    out: Look[Column] | None = None,
+    threads: bool = False,
+) -> Look[Column]:
+    """As `look_exponential`, for features that leave and return: exponential stays and absences (MATH.md section 4).
+
+    At birth the inverse odds are 0; of a feature that may have come and gone for long they are
+    `leave_hz / return_hz`. With `return_hz = 0` this is `look_exponential`.
+    """
+    columns = {"inverse_odds": inverse_odds, "stamp_s": stamp_s, "leave_hz": leave_hz, "return_hz": return_hz}
+    columns |= {"time_s": time_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
+    return _look("two_state", columns, horizon_s, out, threads)
+
+
 def _look(kind: str, columns: dict[str, Any], horizon_s: float, out: Look[Any] | None, threads: bool) -> Look[Any]:
     """The look under the lifetimes of this kind, by the kernels or by torch, whichever the columns are of."""
     if not 0.0 <= horizon_s < np.inf:
@@ -192,14 +216,16 @@ def _refuse(columns: dict[str, Any], after: FloatArray) -> None:
     checks.check_times(columns["time_s"], columns["stamp_s"])
     checks.check_probability(columns["p_miss"], "p_miss")
     checks.check_probability(columns["p_false"], "p_false")
-    if "rate_hz" in columns:
-        rate = columns["rate_hz"]
-        field, fine, problem = "rate_hz", (rate >= 0.0) & np.isfinite(rate), "no rate: a finite number >= 0 is needed"
-    else:
+    for field in ("rate_hz", "leave_hz", "return_hz"):
+        rate = columns.get(field, np.zeros(1))
+        fine = (rate >= 0.0) & np.isfinite(rate)
+        if not fine.all():
+            raise InputError(f"row {int(np.argmin(fine))}: no rate: a finite number >= 0 is needed", field=field)
+    if "low_hz" in columns:
         low, high = columns["low_hz"], columns["high_hz"]
-        field, fine, problem = "low_hz", (low > 0.0) & (high > low) & np.isfinite(high), "rates are not 0 < low < high"
-    if not fine.all():
-        raise InputError(f"row {int(np.argmin(fine))}: {problem}", field=field)
+        fine = (low > 0.0) & (high > low) & np.isfinite(high)
+        if not fine.all():
+            raise InputError(f"row {int(np.argmin(fine))}: rates are not 0 < low < high", field="low_hz")
     odds = columns["inverse_odds"]
     if not (odds >= 0.0).all():
         row = int(np.argmin(odds >= 0.0))

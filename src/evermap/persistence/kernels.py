@@ -110,6 +110,50 @@ def exponential(
     return refused != 0
 
 
+@inlined
+def _mixed(inverse_odds: Any, leave: Any, comes: Any, gap: Any) -> Any:
+    """Inverse odds after a gap in which a feature may leave and return any number of times; sums of positive terms."""
+    total = leave + comes
+    x = max(min(total * gap, LOG_LARGEST), 0.0)
+    fresh, kept = -expm1(-x), exp(-x)
+    scale = 1.0 / max(total, SMALLEST)
+    leaving = leave * scale if total > 0.0 else 1.0  # who neither leaves nor returns stays as it is
+    returning = comes * scale
+    bounded = min(inverse_odds, LARGEST)
+    gone = leaving * fresh + bounded * (leaving + returning * kept)
+    there = (returning + leaving * kept) + bounded * returning * fresh
+    return min(gone / there, LARGEST)
+
+
+@kernel
+def two_state(
+    inverse_odds: FloatArray,
+    stamp_s: FloatArray,
+    leave_hz: FloatArray,
+    return_hz: FloatArray,
+    time_s: FloatArray,
+    detected: BoolArray,
+    p_miss: FloatArray,
+    p_false: FloatArray,
+    horizon_s: float,
+    after: FloatArray,
+    probability: FloatArray,
+) -> bool:
+    """One look at each row of a feature that comes and goes, and its belief `horizon_s` later; True if refused."""
+    refused = 0
+    for i in range(inverse_odds.size):
+        gap, leave, comes = time_s[i] - stamp_s[i], leave_hz[i], return_hz[i]
+        predicted = _mixed(inverse_odds[i], leave, comes, gap)
+        gone_for_good = (inverse_odds[i] == np.inf) & (comes * gap == 0.0)
+        new, fine = _looked(np.inf if gone_for_good else predicted, detected[i], p_miss[i], p_false[i])
+        after[i] = new
+        probability[i] = 1.0 / (1.0 + _mixed(new, leave, comes, horizon_s))
+        fine &= (inverse_odds[i] >= 0.0) & (gap >= 0.0) & (time_s[i] < np.inf)
+        fine &= (leave >= 0.0) & (leave < np.inf) & (comes >= 0.0) & (comes < np.inf)
+        refused |= 0 if fine else 1
+    return refused != 0
+
+
 @kernel
 def general_purpose_gap(low: float, high: float, start: float, stop: float) -> float:
     """Odds of dying within one gap under an unknown rate, to be called from Python."""

@@ -72,6 +72,42 @@ def general_purpose(
     return _answered(inverse_odds, new, probability, fine)
 
 
+def two_state(
+    inverse_odds: Tensor,
+    stamp_s: Tensor,
+    leave_hz: Tensor,
+    return_hz: Tensor,
+    time_s: Tensor,
+    detected: Tensor,
+    p_miss: Tensor,
+    p_false: Tensor,
+    horizon_s: float,
+) -> tuple[Tensor, Tensor, bool]:
+    """As the kernel of this name; inverse odds, probability, and whether a row was refused."""
+    gap = time_s - stamp_s
+    mixed = _mixed(inverse_odds, leave_hz, return_hz, gap)
+    gone_for_good = inverse_odds.isinf() & (return_hz * gap == 0.0)
+    new, fine = _updated(mixed.where(~gone_for_good, float("inf")), detected, p_miss, p_false)
+    probability = 1.0 / (1.0 + _mixed(new, leave_hz, return_hz, horizon_s))
+    fine = fine & (inverse_odds >= 0.0) & (gap >= 0.0) & time_s.isfinite()
+    fine = fine & (leave_hz >= 0.0) & leave_hz.isfinite() & (return_hz >= 0.0) & return_hz.isfinite()
+    return _answered(inverse_odds, new, probability, fine)
+
+
+def _mixed(inverse_odds: Tensor, leave: Tensor, comes: Tensor, gap: Any) -> Tensor:
+    """Inverse odds after a gap in which a feature may leave and return any number of times."""
+    smallest, largest, log_largest = _range(inverse_odds)
+    total = leave + comes
+    x = (total * gap).clamp(0.0, log_largest)
+    fresh, kept = -(-x).expm1(), (-x).exp()
+    scale = 1.0 / total.clamp(min=smallest)
+    leaving, returning = (leave * scale).where(total > 0.0, 1.0), comes * scale
+    bounded = inverse_odds.clamp(max=largest)
+    gone = leaving * fresh + bounded * (leaving + returning * kept)
+    there = (returning + leaving * kept) + bounded * returning * fresh
+    return (gone / there).clamp(max=largest)
+
+
 def _range(like: Tensor) -> tuple[float, float, float]:
     """Smallest and largest finite inverse odds in a tensor's type, and the logarithm of the largest."""
     return (SMALLEST, LARGEST, LOG_LARGEST) if like.element_size() == 8 else (1e-37, 1e37, 85.0)
@@ -79,9 +115,13 @@ def _range(like: Tensor) -> tuple[float, float, float]:
 
 def _looked(before: Tensor, dying: Tensor, detected: Tensor, p_miss: Tensor, p_false: Tensor) -> tuple[Tensor, Tensor]:
     """Inverse odds after a gap and a look, and whether the numbers of the look were in order."""
-    smallest, largest, _ = _range(before)
-    predicted = (before + (1.0 + before) * dying).clamp(max=largest)
-    predicted = predicted.where(before.isfinite() & dying.isfinite(), float("inf"))
+    predicted = (before + (1.0 + before) * dying).clamp(max=_range(before)[1])
+    return _updated(predicted.where(before.isfinite() & dying.isfinite(), float("inf")), detected, p_miss, p_false)
+
+
+def _updated(predicted: Tensor, detected: Tensor, p_miss: Tensor, p_false: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverse odds after a look, and whether its numbers were in order."""
+    smallest, largest, _ = _range(predicted)
     there, gone = (1.0 - p_miss).where(detected, p_miss), p_false.where(detected, 1.0 - p_false)
     after = predicted * gone / there
     after = after.clamp(min=smallest).where((predicted > 0.0) & (gone > 0.0), after)
