@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ from evermap.experiments.presence_tasks import (
     Task,
     Trial,
     read_door,
+    read_home,
     read_room,
 )
 from evermap.recurrence.protocol import Instants
@@ -98,11 +99,14 @@ def reproduce(
         raise ConfigError(f"must not be negative, not {seed}", field="seed")
     with RunFolder(out, force=force) as folder:
         start = time.perf_counter()
-        room, door = read_room(Path(data)), read_door(Path(data))
-        steps = _Steps(progress, len(models.ROOM) * len(room) + len(models.DOOR) * len(TASKS))
+        room, door, home = read_room(Path(data)), read_door(Path(data)), read_home(Path(data))
+        steps = _Steps(
+            progress, len(models.ROOM) * len(room) + len(TASKS) * (len(models.DOOR) + len(models.HOME) * len(home))
+        )
         found = Found()
         room_rows = [_room(contender, room, found, steps) for contender in models.ROOM]
-        door_rows = list(_door(door, seed, found, steps))
+        door_rows = list(_door(models.DOOR, door, seed, found, steps))
+        home_rows = _home(home, seed, steps)
         table: dict[str, Any] = {
             "schema_version": SCHEMA_VERSION,
             "evermap": __version__,
@@ -115,6 +119,7 @@ def reproduce(
             "targets": judged(room_rows, door_rows),
             "room": room_rows,
             "door": door_rows,
+            "home": home_rows,
             "published": PUBLISHED,
         }  # fmt: skip
         draw_all(room, found, folder.path)
@@ -164,10 +169,12 @@ def _room(contender: Contender, room: Sequence[RoomFeature], found: Found, steps
     }
 
 
-def _door(door: Door, seed: int, found: Found, steps: _Steps) -> Iterator[dict[str, Any]]:
+def _door(
+    contenders: Sequence[Contender], door: Door, seed: int, found: Found, steps: _Steps
+) -> Iterator[dict[str, Any]]:
     """One row a task and contender."""
     found.trials = {task.name: door.trials(task, seed) for task in TASKS}
-    for contender in models.DOOR:
+    for contender in contenders:
         start = time.perf_counter()
         learned = contender.learn(door.train.certain_looks())
         learn_s = time.perf_counter() - start
@@ -185,6 +192,24 @@ def _door(door: Door, seed: int, found: Found, steps: _Steps) -> Iterator[dict[s
                 "chosen": contender.says(learned, option),
             }
             steps.one_more()
+
+
+def _home(home: Mapping[str, Door], seed: int, steps: _Steps) -> list[dict[str, Any]]:
+    """One row a task and contender: means over the rooms, and each room's scores."""
+    rows: dict[tuple[str, str], dict[str, Any]] = {}
+    names = ("brier", "log_loss", "calibration_error", "mae", "balanced_accuracy")
+    for room, door in home.items():
+        for row in _door(models.HOME, door, seed, Found(), steps):
+            mean = rows.setdefault(
+                (row["task"], row["contender"]),
+                {name: row[name] for name in ("task", "contender", "label", "default")} | {"rooms": {}},
+            )
+            mean["rooms"][room] = {name: row[name] for name in (*names, "chosen", "learn_s")}
+    for row in rows.values():
+        for name in names:
+            known = [room[name] for room in row["rooms"].values() if room[name] is not None]
+            row[name] = sum(known) / len(known) if known else None
+    return list(rows.values())
 
 
 def _door_row(contender: Contender, task: Task, scores: dict[str, float]) -> dict[str, Any]:

@@ -48,7 +48,7 @@ PERIODIC_OPTIONS = tuple(
 SPECTRAL_OPTIONS = tuple(
     Harmonics(harmonics, margin)
     for harmonics, margin in product(
-        (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128), (0.001, 0.003, 0.01, 0.03, 0.1)
+        (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 168), (0.001, 0.003, 0.01, 0.03, 0.1)
     )
 )
 

@@ -78,12 +78,20 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     for task in TASKS:
         parts.append(f"### Door, ({task.name}) {task.title}")
         parts.append(_door([row for row in table["door"] if row["task"] == task.name]))
+    if table["home"]:
+        parts.append("### Once more: which room a person is in")
+        parts.append(_home(table["home"]))
     return "\n\n".join(parts)
 
 
 def _targets(targets: Sequence[Row]) -> str:
     lines = (
-        [row["what"], f"{row['sign']} {row['limit']:.4g}", _number(row["measured"]), "yes" if row["met"] else "**no**"]
+        [
+            row["what"],
+            f"{row['sign']} {row['limit']:.4g}",
+            _number(row["measured"], 5),
+            "yes" if row["met"] else "**no**",
+        ]
         for row in targets
     )
     return _table(("default models", "expected", "measured", "met"), lines)
@@ -129,6 +137,16 @@ def _door(rows: Sequence[Row]) -> str:
     return _table(header, lines, words=(0, len(header) - 1))
 
 
+def _home(rows: Sequence[Row]) -> str:
+    names = ("brier", "log_loss", "calibration_error", "mae", "balanced_accuracy")
+    lines = [
+        [f"({row['task']})", _label(row), *(_number(row[name]) for name in names), str(len(row["rooms"]))]
+        for row in rows
+    ]
+    header = ("task", "contender", "Brier", "log loss", "calibration error", "MAE", "balanced accuracy", "rooms")
+    return _table(header, sorted(lines, key=lambda line: line[0]), words=(0, 1))
+
+
 def _label(row: Row) -> str:
     return f"**{row['label']}**" if row["default"] else str(row["label"])
 
@@ -143,8 +161,8 @@ def _chosen(said: Sequence[str]) -> str:
     return "; ".join(f"{choice} ({', '.join(landmarks)})" for choice, landmarks in where.items())
 
 
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.4f}"
+def _number(value: float | None, digits: int = 4) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
 
 
 def _with_error(value: float | None, error: float | None) -> str:

@@ -20,6 +20,10 @@ P_MISS = P_FALSE = 0.1
 NOISE_SEEDS = 10
 """How often the robot's looks are drawn."""
 DOOR_TESTS = 4
+HOME = "aruba_person_room.csv.gz"
+HOME_WEEKS = 10
+RARE = 0.01
+"""A room that is hardly ever used says nothing: always 'nobody there' is as good as right."""
 _FLAGS = "1 or 0"
 
 
@@ -143,6 +147,39 @@ class Door:
         return trial(late, task, _stream(seed, task, 0))
 
 
+def read_home(folder: Path) -> dict[str, Door]:
+    """Whether a person is in each of the rooms of a flat: ten weeks to learn from, the whole weeks after them as tests.
+
+    The recording begins on a Thursday at 00:00, as stamps from 1970 do, so days of the week are right as they are.
+
+    Returns:
+        By room, those that the person is in at least `RARE` of the ten weeks; nothing where the file is not there.
+
+    Raises:
+        InputError: the file is malformed, or too short.
+    """
+    path = folder / HOME
+    if not path.is_file():
+        return {}
+    table = read_columns(path, [])
+    table.expect(("stamp_s", "room"))
+    stamp_s, (names, room) = table.numbers(STAMP_S), table.labels("room")
+    week = ((stamp_s - stamp_s[0]) // WEEK_S).astype(np.int64)
+    whole = int((stamp_s[-1] + 60.0 - stamp_s[0]) // WEEK_S)
+    if whole <= HOME_WEEKS or (np.diff(stamp_s) <= 0.0).any():
+        raise InputError(f"needs more than {HOME_WEEKS} weeks, in order of time", path=path, field="stamp_s")
+    doors = {}
+    for index, name in enumerate(names):
+        there = (room == index).astype(np.float64)
+        early = week < HOME_WEEKS
+        if there[early].mean() < RARE:
+            continue
+        train = Stretch(name, stamp_s[early], there[early])
+        tests = (week == number for number in range(HOME_WEEKS, whole))
+        doors[name] = Door(train, tuple(Stretch(name, stamp_s[rows], there[rows]) for rows in tests))
+    return doors
+
+
 @dataclass(frozen=True, slots=True)
 class RoomFeature:
     """A landmark of the room.
@@ -234,4 +271,16 @@ def _stream(seed: int, task: Task, number: int) -> np.random.Generator:
     return np.random.default_rng([seed, TASKS.index(task), number])
 
 
-__all__ = ["NOISE_SEEDS", "TASKS", "Door", "RoomFeature", "Stretch", "Task", "Trial", "read_door", "read_room", "trial"]
+__all__ = [
+    "NOISE_SEEDS",
+    "TASKS",
+    "Door",
+    "RoomFeature",
+    "Stretch",
+    "Task",
+    "Trial",
+    "read_door",
+    "read_home",
+    "read_room",
+    "trial",
+]
