@@ -16,7 +16,7 @@ from evermap.errors import DataError
 from evermap.recurrence.hazard_table import edges
 from evermap.recurrence.lattice import Lattice, lattice
 from evermap.recurrence.protocol import Looks
-from evermap.recurrence.rhythm import BINS, WEEK_S
+from evermap.recurrence.rhythm import BIN_S, BINS, WEEK_S
 from evermap.recurrence.run_length import RunLength
 from evermap.recurrence.smooth_rates import fit, steady_level
 from evermap.recurrence.sojourns import FAMILIES, WITH_RHYTHM, Fitted, Sojourns
@@ -96,7 +96,9 @@ class Data:
         Raises:
             DataError: no feature with two looks at different times.
         """
-        pieces = [lattice(one, step_s) for one in map(looks.of, range(looks.n_features)) if len(one.stamp_s)]
+        # as the filter's: never longer than a rhythm is constant
+        step = min(step_s, BIN_S) if rhythm else step_s
+        pieces = [lattice(one, step) for one in map(looks.of, range(looks.n_features)) if len(one.stamp_s)]
         pieces = [piece for piece in pieces if len(piece.stamp_s) > 1]
         if not pieces:
             raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
