@@ -35,7 +35,7 @@ def between(prior: LifetimePrior, step_s: float, a: np.ndarray, b: np.ndarray) -
         i = bins_of(age, table.offset, len(table.edge_s))
         return np.asarray(table.cumulative[i] + table.hazard_hz[i] * (age - table.edge_s[i]))
 
-    return up_to(b) - up_to(a)
+    return np.asarray(up_to(b) - up_to(a))
 
 
 @pytest.mark.parametrize("step_s", [1e-3, 0.7, 1.0, 600.0, 86400.0])

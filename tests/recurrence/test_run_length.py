@@ -6,8 +6,8 @@ the lifetimes' own conditional survival gives the probability.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -20,6 +20,9 @@ from evermap.recurrence.rhythm import BINS, Rhythm, bin_of_week
 from evermap.recurrence.run_length import RunLength, init, predict, update
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Uniform, never_leaves
 from evermap.types import FloatArray
+
+if TYPE_CHECKING:
+    from evermap.recurrence.run_length_kernels import First
 
 # Steps of hazard whose edges are edges of the filter's bins: the table is exact.
 STAY = PiecewiseConstantHazard((0.0, 1.0, 2.0, 5.0, 12.0), (0.02, 0.3, 0.9, 0.05, 0.2))
@@ -57,7 +60,7 @@ def summed(
     level = np.ones((2, period.max() + 1)) if level is None else level
 
     def look(k: int) -> FloatArray:
-        return np.where(state == 1, grid.present[k], grid.absent[k])
+        return np.asarray(np.where(state == 1, grid.present[k], grid.absent[k]))
 
     def presence(mass: FloatArray, where: Any) -> float:
         return float(mass[where == 1].sum() / mass.sum())
@@ -88,16 +91,16 @@ def summed(
     events: dict[tuple[int, int, int], float] = {}
     exposure: dict[tuple[int, int, int], float] = {}
     of_period, expected = np.zeros(level.shape), np.zeros(level.shape)
-    for k, (s, age, part, usual) in enumerate(was):
+    for k, (of_state, age, part, usual) in enumerate(was):
         gap, now = grid.stamp_s[k + 1] - grid.stamp_s[k], grid.stamp_s[k]
         row, column = np.searchsorted(edge, age, side="right") - 1, int(bin_of_week(now + 0.5 * gap))
         for i in np.flatnonzero(posterior > 0.0):
-            key = (int(s[i]), int(row[i]), column)
+            key = (int(of_state[i]), int(row[i]), column)
             events[key] = events.get(key, 0.0) + posterior[i] * changes[i, k]
-            exposure[key] = exposure.get(key, 0.0) + posterior[i] * part[i] * gap * level[s[i], period[k]]
+            exposure[key] = exposure.get(key, 0.0) + posterior[i] * part[i] * gap * level[of_state[i], period[k]]
         for z in (0, 1):
-            of_period[z, period[k]] += (posterior * changes[:, k])[s == z].sum()
-            expected[z, period[k]] += (posterior * usual * part)[s == z].sum()
+            of_period[z, period[k]] += (posterior * changes[:, k])[of_state == z].sum()
+            expected[z, period[k]] += (posterior * usual * part)[of_state == z].sum()
     smoothed = np.array([presence(posterior, z) for z in states])
     # a prefix of a pattern stands for all that begin with it, but the whole for itself alone
     evidence = float(np.log(weight.sum()))
@@ -110,13 +113,18 @@ def beginning(model: RunLength, begin: Any = BEGIN) -> RunLength:
 
     age, weight = np.zeros((1, 2, model.slots)), np.zeros((1, 2, model.slots))
     number = np.zeros((1, 2), dtype=np.int64)
-    for s, years, mass in sorted(begin, key=lambda row: -row[1]):
-        age[0, s, number[0, s]], weight[0, s, number[0, s]] = years, mass
+    for s, old, mass in sorted(begin, key=lambda row: -row[1]):
+        age[0, s, number[0, s]], weight[0, s, number[0, s]] = old, mass
         number[0, s] += 1
-    if model.law.factor.shape[1] > 1:
-        age, weight, number = (np.repeat(values, BINS, axis=0) for values in (age, weight, number))
-    model.__dict__["first"] = First(age, weight, number)
+    first = First(age, weight, number)
+    model = replace(model)
+    model.__dict__["first"] = for_all_week(first) if model.law.factor.shape[1] > 1 else first
     return model
+
+
+def for_all_week(first: First) -> First:
+    """The same hypotheses at every ten minutes of the week."""
+    return type(first)(*(np.repeat(values, BINS, axis=0) for values in first))  # type: ignore[arg-type]
 
 
 def looks_at(stamp_s: Any, seed: int) -> Looks:
@@ -176,7 +184,7 @@ def test_between_looks_it_is_a_step_without_a_look(name: str) -> None:
     for asked in np.random.default_rng(6).uniform(looks.stamp_s[0], looks.stamp_s[-1] + 4.0, 20):
         before = looks.stamp_s <= asked
         seen = Looks(
-            np.array([0, before.sum()]), *(c[before] for c in (looks.stamp_s, looks.detected)), looks.p_miss[before],
+            np.array([0, before.sum()]), looks.stamp_s[before], looks.detected[before], looks.p_miss[before],
             looks.p_false[before],
         )  # fmt: skip
         # whole steps from the last look on, and the rest of the way: a look that tells nothing
@@ -218,7 +226,7 @@ def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
     law = model.law
     if law.factor.shape[1] == 1:  # so that columns are counted here too
         law = law._replace(factor=np.ones((2, BINS)))
-        first = type(model.first)(*(np.repeat(values, BINS, axis=0) for values in model.first))
+        first = for_all_week(model.first)
     else:
         first = model.first
     evidence, at_first = expectations(*grid, np.ones(steps), period, level, model.slots, law, first, counts, smoothed)
@@ -245,8 +253,10 @@ def test_smoothing_weighs_steps_by_their_importance() -> None:
     def count(importance: FloatArray) -> Counts:
         shape = (2, model.law.hazard_hz.shape[1], 1)
         zeros = Counts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 1)), np.zeros((2, 1)))
-        nothing = np.zeros(steps, dtype=np.int64), np.ones((2, 1)), model.slots, model.law, model.first
-        expectations(*grid, importance, *nothing, zeros, np.empty(steps + 1))
+        expectations(
+            *grid, importance, np.zeros(steps, dtype=np.int64), np.ones((2, 1)), model.slots, model.law, model.first,
+            zeros, np.empty(steps + 1),
+        )  # fmt: skip
         return zeros
 
     single = [count(np.eye(steps)[k]) for k in range(steps)]

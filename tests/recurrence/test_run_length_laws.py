@@ -28,7 +28,8 @@ from evermap.types import FloatArray
 
 STAY, ABSENCE = LogNormal(np.log(40.0), 0.5), Gamma(2.0, 30.0)
 PLAIN = RunLength(STAY, ABSENCE, 1.0)
-WITH_RHYTHM = RunLength(STAY, ABSENCE, 1.0, *(Rhythm(np.random.default_rng(k).normal(0.0, 0.7, BINS)) for k in (1, 2)))
+RHYTHMS = [Rhythm(np.random.default_rng(k).normal(0.0, 0.7, BINS)) for k in (1, 2)]
+WITH_RHYTHM = RunLength(STAY, ABSENCE, 1.0, RHYTHMS[0], RHYTHMS[1])
 MODELS = {"no rhythm": PLAIN, "rhythm": WITH_RHYTHM}
 
 

@@ -65,7 +65,7 @@ def test_an_exponential_is_events_by_exposure(durations: dict[str, FloatArray]) 
 @pytest.mark.parametrize("longest", [np.inf, 110.0])
 def test_two_parameters_are_those_of_maximum_likelihood(durations: dict[str, FloatArray], longest: float) -> None:
     """Up to the width of a bin (a hundredth of an age); lifelines where some are cut off."""
-    import lifelines
+    import lifelines  # type: ignore[import-untyped]
 
     for name in ("weibull", "lognormal"):
         seen, ended = np.minimum(durations[name], longest), durations[name] <= longest
