@@ -1,0 +1,129 @@
+"""A chain of phases in a robot: `init`, `predict`, `update`, pure functions on many features at once.
+
+As `evermap.persistence.single`, with a row of phase probabilities for every feature in the place of one number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from evermap.persistence import checks
+from evermap.recurrence.phase_type import PhaseType
+from evermap.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class PhaseBelief:
+    """Presence of N features, one row each.
+
+    Attributes:
+        model: how they come and go.
+        phases: (N, n) probability of each phase at `stamp_s`.
+        stamp_s: (N,) time of the last look, or of `init`.
+        log_evidence: (N,) `log p(looks)` so far.
+    """
+
+    model: PhaseType
+    phases: FloatArray
+    stamp_s: FloatArray
+    log_evidence: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @property
+    def probability(self) -> FloatArray:
+        """(N,) probability of presence at `stamp_s`."""
+        return _presence(self.model, self.phases)
+
+
+def init(n: int, model: PhaseType, stamp_s: Any) -> PhaseBelief:
+    """Beliefs in `n` features before their first look: the model's start, or its long run at this time.
+
+    Args:
+        n: number of features.
+        model: how they come and go.
+        stamp_s: scalar or (n,), when.
+
+    Raises:
+        InputError: a time that is not finite.
+    """
+    time = checks.as_rows(stamp_s, n, "stamp_s")
+    checks.check_times(time, np.full(n, -np.inf))
+    if model.start is not None:
+        phases = np.tile(model.start, (n, 1))
+    else:
+        instants, which = np.unique(time, return_inverse=True)
+        phases = np.array([model.stationary(float(t)) for t in instants]).reshape(-1, model.n_phases)[which]
+    return PhaseBelief(model, phases, time, np.zeros(n))
+
+
+def predict(state: PhaseBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
+    """Probability that each feature is there at `stamp_s`; the state stays as it is.
+
+    Args:
+        state: beliefs in N features.
+        stamp_s: scalar or (N,) or (len(rows),), not before the row's last look.
+        rows: row numbers asked about; all where None.
+
+    Raises:
+        InputError: a time that is not finite or lies before the last look.
+    """
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
+    return _presence(state.model, _at(state, index, checks.as_rows(stamp_s, len(index), "stamp_s")))
+
+
+def update(
+    state: PhaseBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
+) -> PhaseBelief:
+    """Beliefs after one look at each feature.
+
+    Args:
+        state: beliefs in N features.
+        stamp_s: scalar, (N,) or (len(rows),) times of the looks.
+        detected: 1 or 0, of the same shape.
+        p_miss: `P(no detection | there)`, of the same shape.
+        p_false: `P(detection | not there)`, of the same shape.
+        rows: the rows looked at, each once; all where None.
+
+    Raises:
+        InputError: a probability outside [0, 1], time running back, or a row that does not exist.
+        DataError: a row twice.
+        NumericalError: a look that is impossible, whether the feature is there or not.
+    """
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
+    time, hit, miss, false = (
+        checks.as_rows(column, len(index), field)
+        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
+    )
+    checks.check_detected(hit, index)
+    checks.check_probability(miss, "p_miss", index)
+    checks.check_probability(false, "p_false", index)
+    there, gone = np.where(hit == 1.0, 1.0 - miss, miss), np.where(hit == 1.0, false, 1.0 - false)
+    weighed = _at(state, index, time) * np.where(state.model.present, there[:, None], gone[:, None])
+    likelihood = weighed.sum(1)
+    checks.check_possible(np.where(likelihood > 0.0, likelihood, np.nan), index)
+
+    phases, stamps, evidence = state.phases.copy(), state.stamp_s.copy(), state.log_evidence.copy()
+    phases[index] = weighed / likelihood[:, None]
+    stamps[index] = time
+    evidence[index] += np.log(likelihood)
+    return replace(state, phases=phases, stamp_s=stamps, log_evidence=evidence)
+
+
+def _at(state: PhaseBelief, index: IntArray, time: FloatArray) -> FloatArray:
+    """(K, n) phases of some rows at a later time."""
+    from evermap.recurrence.phase_kernels import travel_rows
+
+    checks.check_times(time, state.stamp_s[index], index)
+    phases = state.phases[index]
+    travel_rows(phases, state.model.chain, state.stamp_s[index], time)
+    return phases
+
+
+def _presence(model: PhaseType, phases: FloatArray) -> FloatArray:
+    """Probability of presence of (K, n) phases."""
+    return np.asarray(np.minimum(phases[:, model.present].sum(1), 1.0), dtype=np.float64)
