@@ -14,7 +14,7 @@ from evermap.persistence.one import PersistenceFilter
 from evermap.recurrence import phase_belief
 from evermap.recurrence.exponentials import exponential_mixture_of
 from evermap.recurrence.phase_kernels import leap, transition
-from evermap.recurrence.phase_times import expected_time_to_leave, expected_time_to_return
+from evermap.recurrence.phase_times import time_to_leave, time_to_return
 from evermap.recurrence.phase_type import PhaseType
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel
 from evermap.recurrence.rhythm import BIN_S, BINS, WEEK_S, Rhythm
@@ -218,29 +218,32 @@ def test_an_unknown_rate_is_a_mixture_of_a_few() -> None:
         exponential_mixture_of(Weibull(10.0, 2.0))
 
 
+def believed(model: PhaseType, *phases: Any, stamp_s: float = 0.0) -> phase_belief.PhaseBelief:
+    n = len(phases)
+    return phase_belief.PhaseBelief(model, np.array(phases, dtype=float), np.full(n, stamp_s), np.zeros(n))
+
+
 def test_mean_times_without_a_rhythm() -> None:
     model = PhaseType.two_state(1 / 300.0, 1 / 50.0)
-    assert expected_time_to_leave(model, [0.0, 1.0]) == pytest.approx(300.0)
-    assert expected_time_to_return(model, [0.2, 0.8]) == pytest.approx(50.0)  # given that it is away
+    np.testing.assert_allclose(time_to_leave(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0])), [300, 300, np.nan])
+    np.testing.assert_allclose(time_to_return(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0])), [np.nan, 50, 50])
     three = PhaseType.from_mixtures(Exponential(0.1), Mixture.of([Exponential(0.1), Exponential(0.01)], [0.5, 0.5]))
-    assert expected_time_to_return(three, [0.25, 0.75, 0.0]) == pytest.approx(0.25 * 10.0 + 0.75 * 100.0)
+    np.testing.assert_allclose(time_to_return(believed(three, [0.1, 0.3, 0.6])), [0.25 * 10.0 + 0.75 * 100.0])
     gone = PhaseType.two_state(0.1, 0.0, p_present=1.0)
-    assert expected_time_to_return(gone, [1.0, 0.0]) == np.inf
-    with pytest.raises(ConfigError, match="certainly in the other state"):
-        expected_time_to_return(gone, [0.0, 1.0])
+    np.testing.assert_allclose(time_to_return(believed(gone, [0.5, 0.5])), [np.inf])
+    np.testing.assert_allclose(time_to_leave(believed(gone, [0.5, 0.5])), [10.0])
 
 
 def test_mean_times_with_a_rhythm_are_integrals_of_survival() -> None:
     model = random_chain(10, n=4, rhythm=True, pace_hz=2e-5)
-    at, weights = MONDAY_S + 987654.0, np.array([0.6, 0.1, 0.3, 0.0])
+    at, weights = MONDAY_S + 987654.0, [0.6, 0.1, 0.3, 0.0]
     stays = model.rates_hz.copy()
     stays[model.present] = 0.0  # presence holds what arrives: what is not there has not yet returned
     held = PhaseType(model.present, stays, np.array([2 / 3, 0, 1 / 3, 0]), model.rhythms, model.rhythm_of)
     t = at + np.arange(0.0, 6 * WEEK_S, 60.0)
     absent = 1.0 - held.track(NO_LOOKS, Instants.same_for_all(1, t)).p_present
-    assert expected_time_to_return(model, weights, at) == pytest.approx(np.trapezoid(absent, t), rel=1e-4)
-    with pytest.raises(ConfigError, match="time of the week"):
-        expected_time_to_return(model, weights)
+    found = time_to_return(believed(model, weights, stamp_s=at))
+    np.testing.assert_allclose(found, [np.trapezoid(absent, t)], rtol=1e-4)
 
 
 @pytest.mark.parametrize("rhythm", [False, True])
@@ -256,6 +259,9 @@ def test_step_by_step_is_the_whole(rhythm: bool) -> None:
                 state, one.stamp_s[k], one.detected[k], one.p_miss[k], one.p_false[k], rows=np.array([f])
             )
     np.testing.assert_allclose(phase_belief.predict(state, 1e6 + 450.0), track.p_present, rtol=1e-11)
+    at_once = phase_belief.after(model, looks)
+    np.testing.assert_allclose(at_once.phases, state.phases, rtol=1e-11)
+    np.testing.assert_array_equal(at_once.stamp_s, state.stamp_s)
     np.testing.assert_allclose(state.log_evidence, track.log_evidence, rtol=1e-11)
     with pytest.raises(InputError, match=r"row 0: time 3\.0 s lies before"):
         phase_belief.predict(state, 3.0)

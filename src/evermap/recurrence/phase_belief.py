@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from evermap.errors import InputError
 from evermap.persistence import checks
 from evermap.recurrence.phase_type import PhaseType
+from evermap.recurrence.protocol import Instants, Looks
 from evermap.types import FloatArray, IntArray
 
 
@@ -59,6 +61,27 @@ def init(n: int, model: PhaseType, stamp_s: Any) -> PhaseBelief:
         instants, which = np.unique(time, return_inverse=True)
         phases = np.array([model.stationary(float(t)) for t in instants]).reshape(-1, model.n_phases)[which]
     return PhaseBelief(model, phases, time, np.zeros(n))
+
+
+def after(model: PhaseType, looks: Looks) -> PhaseBelief:
+    """Beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
+
+    Args:
+        model: how features come and go.
+        looks: at F features.
+
+    Raises:
+        InputError: no look at all.
+        NumericalError: a look that is impossible, whether the feature is there or not.
+    """
+    if not len(looks.stamp_s):
+        raise InputError("there is no look", field="looks", hint="init(), which needs none")
+    # asked at the last look: presence is not wanted, but it is where a feature without looks begins
+    stamp_s = np.full(looks.n_features, looks.stamp_s.max())
+    looked = np.diff(looks.first) > 0
+    stamp_s[looked] = looks.stamp_s[looks.first[1:][looked] - 1]
+    _, evidence, phases = model.filtered(looks, Instants(np.arange(looks.n_features + 1), stamp_s))
+    return PhaseBelief(model, phases, stamp_s, evidence)
 
 
 def predict(state: PhaseBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:

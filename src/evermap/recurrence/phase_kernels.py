@@ -221,13 +221,17 @@ def track_feature(
     gone: FloatArray,
     asked_s: FloatArray,
     p_present: FloatArray,
+    belief: FloatArray,
 ) -> tuple[float, int]:
-    """One feature's looks and instants, both in order; evidence, and the look that is impossible or -1."""
+    """One feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
+
+    `belief`, (n,), is filled in with what is believed at the last of them all.
+    """
     looks, asks = look_s.size, asked_s.size
     if looks + asks == 0:
         return 0.0, -1
     n = chain.present.size
-    belief, spare = np.empty(n), np.empty((3, n))
+    spare = np.empty((3, n))
     begin = look_s[0] if looks else asked_s[0]
     if asks and not fixed:
         begin = min(begin, asked_s[0])
@@ -266,12 +270,13 @@ def track_all(
     asked_s: FloatArray,
     p_present: FloatArray,
     evidence: FloatArray,
+    beliefs: FloatArray,
 ) -> int:
     """Every feature in turn; the first look that is impossible, or -1."""
     for f in range(evidence.size):
         a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
         evidence[f], bad = track_feature(
-            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d]
+            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
         )
         if bad >= 0:
             return int(a + bad)
@@ -291,13 +296,14 @@ def track_all_parallel(
     asked_s: FloatArray,
     p_present: FloatArray,
     evidence: FloatArray,
+    beliefs: FloatArray,
 ) -> int:
     """`track_all`, the features spread over all threads."""
     bads = np.full(evidence.size, -1)
     for f in prange(evidence.size):
         a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
         evidence[f], bad = track_feature(
-            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d]
+            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
         )
         bads[f] = a + bad if bad >= 0 else -1
     for f in range(evidence.size):

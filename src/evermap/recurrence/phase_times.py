@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from evermap.errors import ConfigError
+from evermap.recurrence.phase_belief import PhaseBelief
 from evermap.recurrence.phase_type import PhaseType
 from evermap.recurrence.rhythm import BIN_S, BINS, WEEK_S, bin_of_week
 from evermap.types import BoolArray, FloatArray
@@ -13,52 +12,52 @@ from evermap.types import BoolArray, FloatArray
 _MONDAY_S = 4.0 * 86400.0
 
 
-def expected_time_to_return(model: PhaseType, belief: ArrayLike, stamp_s: float | None = None) -> float:
-    """Mean time in seconds until a feature that is away now is there again; inf where it may stay away for ever.
+def time_to_leave(state: PhaseBelief) -> FloatArray:
+    """Expected time until each feature leaves, if it is there.
 
-    Args:
-        model: how it comes and goes.
-        belief: (n,) probability of each phase; only those of absence count, in proportion.
-        stamp_s: now, in local wall time; needed where the model has a rhythm.
-
-    Raises:
-        ConfigError: a belief in no absence at all, or a rhythm without a time.
+    Returns:
+        (N,) seconds from `state.stamp_s` on; `inf` where some stay for ever, NaN where the feature is certainly away.
     """
-    return _mean_time_in(model, ~model.present, belief, stamp_s)
+    return _time_in(state, state.model.present)
 
 
-def expected_time_to_leave(model: PhaseType, belief: ArrayLike, stamp_s: float | None = None) -> float:
-    """Mean time in seconds until a feature that is there now leaves; as `expected_time_to_return`."""
-    return _mean_time_in(model, model.present, belief, stamp_s)
+def time_to_return(state: PhaseBelief) -> FloatArray:
+    """Expected time until each feature returns, if it is away.
+
+    Returns:
+        (N,) seconds from `state.stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.
+    """
+    return _time_in(state, ~state.model.present)
 
 
-def _mean_time_in(model: PhaseType, inside: BoolArray, belief: ArrayLike, stamp_s: float | None) -> float:
-    """Mean time until some phases are left, from a belief within them."""
-    values = np.asarray(belief, dtype=np.float64)
-    if values.shape != model.present.shape or not (values >= 0.0).all():
-        raise ConfigError(f"{model.n_phases} probabilities are needed", field="belief")
-    weights = values[inside]
-    if not weights.sum() > 0.0:
-        raise ConfigError("it is certainly in the other state", field="belief")
+def _time_in(state: PhaseBelief, inside: BoolArray) -> FloatArray:
+    """Mean time until some phases are left, given that they hold now."""
+    model = state.model
     rates = model.rates_by_bin
-    if len(rates) > 1 and stamp_s is None:
-        raise ConfigError("with a rhythm it depends on the time of the week", field="stamp_s")
-    if not _always_left(model, inside, weights > 0.0):
-        return float("inf")
-    generators = rates[:, inside][:, :, inside] - np.eye(int(inside.sum())) * rates[:, inside].sum(2)[:, :, None]
-    if len(rates) == 1:
-        times = np.linalg.solve(-generators[0], np.ones(len(weights)))
-    else:
-        times = _with_rhythm(generators, float(stamp_s or 0.0))
-    return float(weights @ times / weights.sum())
+    for_ever = _may_last(model, inside)
+    kept = np.flatnonzero(inside)[~for_ever]  # from these nothing leads to where one stays for ever
+    times = np.full((len(state), model.n_phases), np.inf)
+    if kept.size:
+        generators = rates[:, kept][:, :, kept] - np.eye(kept.size) * rates[:, kept].sum(2)[:, :, None]
+        if len(rates) == 1:
+            times[:, kept] = np.linalg.solve(-generators[0], np.ones(kept.size))
+        else:
+            instants, which = np.unique(state.stamp_s, return_inverse=True)
+            times[:, kept] = _with_rhythm(generators, instants)[which]
+    weights = np.where(inside, state.phases, 0.0)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(weights > 0.0, weights * times, 0.0).sum(1) / weights.sum(1), dtype=np.float64)
 
 
-def _with_rhythm(generators: FloatArray, stamp_s: float) -> FloatArray:
+def _with_rhythm(generators: FloatArray, stamp_s: FloatArray) -> FloatArray:
     """Mean time from each phase: `m(bin) = c(bin) + P(bin) m(next bin)`, closed after a week.
 
     Args:
         generators: (1008, k, k) of the phases that are to be left, rows of sum <= 0.
-        stamp_s: now.
+        stamp_s: (T,) now.
+
+    Returns:
+        (T, k) seconds.
     """
     k = generators.shape[1]
     survive, spent = _bin_terms(generators, BIN_S)
@@ -66,13 +65,16 @@ def _with_rhythm(generators: FloatArray, stamp_s: float) -> FloatArray:
     for b in range(BINS):
         total += week @ spent[b]
         week = week @ survive[b]
-    later = np.linalg.solve(np.eye(k) - week, total)  # at the begin of the week
-    here = int(bin_of_week(stamp_s))
-    for b in range(BINS - 1, here, -1):
-        later = spent[b] + survive[b] @ later
-    rest_s = (here + 1) * BIN_S - (stamp_s - _MONDAY_S) % WEEK_S
-    survive, spent = _bin_terms(generators[here : here + 1], rest_s)
-    return np.asarray(spent[0] + survive[0] @ later)
+    begin = np.empty((BINS + 1, k))  # from the begin of each bin
+    begin[BINS] = np.linalg.solve(np.eye(k) - week, total)
+    for b in range(BINS - 1, -1, -1):
+        begin[b] = spent[b] + survive[b] @ begin[b + 1]
+    times = np.empty((len(stamp_s), k))
+    for row, (now_s, b) in enumerate(zip(stamp_s, bin_of_week(stamp_s), strict=True)):
+        rest_s = (b + 1) * BIN_S - (now_s - _MONDAY_S) % WEEK_S
+        survived, meanwhile = _bin_terms(generators[b : b + 1], rest_s)
+        times[row] = meanwhile[0] + survived[0] @ begin[b + 1]
+    return times
 
 
 def _bin_terms(generators: FloatArray, span_s: float) -> tuple[FloatArray, FloatArray]:
@@ -87,13 +89,14 @@ def _bin_terms(generators: FloatArray, span_s: float) -> tuple[FloatArray, Float
     return whole[:, :k, :k], whole[:, :k, k] * span_s
 
 
-def _always_left(model: PhaseType, inside: BoolArray, reached: BoolArray) -> bool:
-    """Whether every phase that can be reached from the given ones has a way out."""
+def _may_last(model: PhaseType, inside: BoolArray) -> BoolArray:
+    """Of the phases inside, those from which one may come to where nothing leads outside."""
     changes = model.rates_hz > 0.0
     within = changes[np.ix_(inside, inside)]
-    for _ in range(len(reached)):
-        reached = reached | (reached @ within)
     leaves = changes[np.ix_(inside, ~inside)].any(1)
-    for _ in range(len(reached)):
+    for _ in range(len(leaves)):
         leaves = leaves | (within @ leaves)
-    return bool(leaves[reached].all())
+    stuck = ~leaves
+    for _ in range(len(stuck)):
+        stuck = stuck | (within @ stuck)
+    return np.asarray(stuck, dtype=np.bool_)

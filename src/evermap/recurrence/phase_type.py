@@ -126,23 +126,31 @@ class PhaseType:
         Raises:
             NumericalError: a look that is impossible, whether the feature is there or not.
         """
+        asked = Instants.of_looks(looks) if instants is None else instants
+        p_present, evidence, _ = self.filtered(looks, asked, threads=threads)
+        return Track(p_present, evidence, np.zeros(looks.n_features))
+
+    def filtered(
+        self, looks: Looks, asked: Instants, *, threads: bool = False
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each feature."""
         from evermap.recurrence import phase_kernels
 
-        asked = Instants.of_looks(looks) if instants is None else instants
         there, gone = likelihoods(looks)
         p_present, evidence = np.empty(len(asked.stamp_s)), np.zeros(looks.n_features)
+        last = np.empty((looks.n_features, self.n_phases))
         run = phase_kernels.track_all_parallel if threads else phase_kernels.track_all
         start, fixed = self._starts, self.start is not None
         bad = run(
             self.chain, start, fixed, looks.first, looks.stamp_s, there, gone, asked.first, asked.stamp_s,
-            p_present, evidence,
+            p_present, evidence, last,
         )  # fmt: skip
         if bad >= 0:
             feature = int(np.searchsorted(looks.first, bad, side="right")) - 1
             raise NumericalError(
                 impossible(f"feature {feature} at {looks.stamp_s[bad]} s"), hint="P_M and P_F strictly between 0 and 1"
             )
-        return Track(p_present, evidence, np.zeros(looks.n_features))
+        return p_present, evidence, last
 
     def stationary(self, stamp_s: float | None = None) -> FloatArray:
         """(n,) probability of each phase in the long run; at this local time of the week where there is a rhythm.
