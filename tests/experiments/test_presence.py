@@ -26,7 +26,7 @@ from evermap.experiments.presence_scores import (
     room_scores,
     week_scores,
 )
-from evermap.experiments.presence_tasks import NOISE_SEEDS, TASKS, Door, Stretch, read_door, read_room, trial
+from evermap.experiments.presence_tasks import NOISE_SEEDS, TASKS, Door, Stretch, read_door, read_home, read_room, trial
 from evermap.persistence.one import PersistenceFilter
 from evermap.recurrence.protocol import Instants, Looks
 from evermap.survival import Exponential
@@ -335,6 +335,23 @@ def test_files_are_read_as_written_and_the_truth_of_the_training_is_not_used(mad
     looks, _, present = room_looks(21)
     assert np.array_equal(read_room(made_up)[1].test.detected, looks.detected)
     assert np.array_equal(read_room(made_up)[1].present, present)
+
+
+def test_rooms_of_a_home_are_doors_of_ten_weeks_and_what_follows(tmp_path: Path) -> None:
+    """A person who sleeps, lives, and is in the hall once in a thousand; thirteen weeks and a day, every half hour."""
+    assert read_home(tmp_path) == {}
+    minutes = np.arange(0, (13 * 7 + 1) * 1440, 30)
+    rooms = np.where(np.mod(minutes, 1440) < 480, "bed", "living")
+    rooms[::1000] = "hall"
+    rows = "".join(f"{60 * minute},{room}\n" for minute, room in zip(minutes, rooms, strict=True))
+    (tmp_path / "aruba_person_room.csv.gz").write_bytes(gzip.compress(f"stamp_s,room\n{rows}".encode()))
+    home = read_home(tmp_path)
+    assert list(home) == ["bed", "living"]
+    bed = home["bed"]
+    assert len(bed.train.stamp_s) == 70 * 48
+    assert [len(week.stamp_s) for week in bed.tests] == [7 * 48] * 3
+    assert bed.tests[0].stamp_s[0] == 70 * DAY_S
+    assert np.array_equal(bed.train.present, (rooms == "bed")[: 70 * 48])
 
 
 def test_a_missing_recording_is_one_line(made_up: Path, tmp_path: Path) -> None:
