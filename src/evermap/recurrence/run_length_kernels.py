@@ -192,7 +192,7 @@ def _look(weight: FloatArray, count: IntArray, absent: float, present: float) ->
     A state that the look rules out keeps no hypotheses.
     """
     mass = (absent * _sum(weight, 0, count[0]), present * _sum(weight, 1, count[1]))
-    total = mass[0] + mass[1]
+    total: float = mass[0] + mass[1]
     for s in range(2):
         if mass[s] == 0.0:
             count[s] = 0
@@ -220,7 +220,8 @@ def _present(
             scratch[s, j] = -weight[s, j] * expm1(-scratch[s, j])
     absent, there = _sum(weight, 0, count[0]), _sum(weight, 1, count[1])
     present = there - _sum(scratch, 1, count[1]) + _sum(scratch, 0, count[0])
-    return min(max(present / (absent + there), 0.0), 1.0)
+    share: float = present / (absent + there)
+    return min(max(share, 0.0), 1.0)
 
 
 @kernel
