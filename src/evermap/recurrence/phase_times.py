@@ -93,10 +93,10 @@ def _may_last(model: PhaseType, inside: BoolArray) -> BoolArray:
     """Of the phases inside, those from which one may come to where nothing leads outside."""
     changes = model.rates_hz > 0.0
     within = changes[np.ix_(inside, inside)]
-    leaves = changes[np.ix_(inside, ~inside)].any(1)
-    for _ in range(len(leaves)):
-        leaves = leaves | (within @ leaves)
+    leaves = np.asarray(changes[np.ix_(inside, ~inside)].any(1), dtype=np.bool_)
+    for _ in range(len(within)):
+        leaves |= within @ leaves
     stuck = ~leaves
-    for _ in range(len(stuck)):
-        stuck = stuck | (within @ stuck)
-    return np.asarray(stuck, dtype=np.bool_)
+    for _ in range(len(within)):
+        stuck |= within @ stuck
+    return stuck
