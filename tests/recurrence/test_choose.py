@@ -23,17 +23,17 @@ def looks_of(durations: list[float], step_s: float, seed: int) -> Looks:
 
 def test_a_clockwork_is_told_from_chance() -> None:
     rng = np.random.default_rng(1)
-    clockwork = looks_of(list(np.tile([60.0, 300.0], 30) * rng.normal(1.0, 0.01, 60)), 2.0, 2)
+    clockwork = looks_of(list(np.tile([60.0, 300.0], 20) * rng.normal(1.0, 0.01, 40)), 6.0, 2)
     choice = choose(clockwork, ["two-state", "run-length"])
     assert choice.kind == "run-length"
     assert choice.scores["run-length"] > choice.scores["two-state"] + 10.0
-    chance = looks_of(list(rng.exponential(np.tile([60.0, 300.0], 30))), 2.0, 3)
+    chance = looks_of(list(rng.exponential(np.tile([60.0, 300.0], 20))), 6.0, 3)
     scores = choose(chance, ["two-state", "run-length"]).scores
     assert scores["run-length"] < scores["two-state"] + 3.0
 
 
 def test_score_is_the_density_of_the_last_fifth_given_the_rest() -> None:
-    looks = looks_of([200.0, 100.0] * 10, 5.0, 4)
+    looks = looks_of([200.0, 100.0] * 5, 10.0, 4)
     choice = choose(looks, ["two-state", "run-length"])
     cut = looks.stamp_s[-1] - choice.held_out_s
     assert choice.held_out_s == pytest.approx(0.2 * np.ptp(looks.stamp_s))

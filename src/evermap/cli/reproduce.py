@@ -129,5 +129,5 @@ def _reference(data: Path | None) -> Path | None:
 
 def _one_core() -> None:
     """Libraries read these when they are loaded, which they are not yet. What the user has set stands."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

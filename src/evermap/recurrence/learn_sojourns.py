@@ -19,6 +19,7 @@ from evermap.recurrence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns
 from evermap.survival import Exponential
 
 _WARM_UP_ROUNDS = 4
+_TRIAL_ROUNDS = 8
 _MOST_ROUNDS = 20
 
 Progress = Callable[[float], None]
@@ -137,14 +138,31 @@ def learn(
     ascents = [climb(data, simple.model, ("exponential",), _MOST_ROUNDS)]
     tell(0.5)
     if rhythm or allowed != ("exponential",):
-        calendar = Data.of(looks, step, half_life_s, rhythm=rhythm)
-        ascents.append(climb(calendar, ascents[0].model, allowed, _MOST_ROUNDS))
+        # what a model of one family counts looks like that family: each has to be tried from its own counts
+        calendar = Data.of(looks, step, half_life_s, rhythm=True) if rhythm else data
+        trials = []
+        for number, name in enumerate(allowed):
+            trials.append(climb(calendar, ascents[0].model, (name,), _TRIAL_ROUNDS))
+            tell(0.5 + 0.3 * (number + 1) / len(allowed))
+        # hours that look like habits, and habits that look like hours: where there is a rhythm, each start goes on
+        best_first = sorted(trials, key=lambda ascent: -ascent.score)
+        finals = [climb(calendar, trial.model, allowed, _MOST_ROUNDS) for trial in best_first[: 2 if rhythm else 1]]
+        ascents = [*finals, *trials] if rhythm else [*ascents, *trials, *finals]
     tell(1.0)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
-    # a rhythm that was asked for is not a candidate among others
-    best = ascents[-1] if rhythm else ranked[0]
-    candidates = tuple(_candidate(ascent) for ascent in ranked)
-    return Learned(best.model, best.expected.log_evidence, candidates, allowed, half_life_s, data.last_s, best.expected)
+    best = ranked[0]
+    candidates: dict[str, Candidate] = {}
+    for ascent in ranked:  # the best of each kind
+        candidates.setdefault(ascent.name, _candidate(ascent))
+    return Learned(
+        best.model,
+        best.expected.log_evidence,
+        tuple(candidates.values()),
+        allowed,
+        half_life_s,
+        data.last_s,
+        best.expected,
+    )
 
 
 def _candidate(ascent: Ascent) -> Candidate:

@@ -115,6 +115,15 @@ def fit(
         week: basis of the J times of the week; None where there is no rhythm (then J may be 1).
         start: where to begin: an earlier fit of the same bases.
     """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):  # for matrices this small, threads only get in each other's way
+        return _fit(events, exposure, age, week, start)
+
+
+def _fit(
+    events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None
+) -> SmoothRates:
     total = exposure.sum()
     if total <= 0.0:
         none = np.zeros(0)

@@ -13,6 +13,7 @@ from math import exp
 
 import numpy as np
 
+from evermap.recurrence.hazard_table import CERTAIN
 from evermap.recurrence.rhythm import Rhythm
 from evermap.recurrence.smooth_rates import HALF_AN_EVENT, SmoothRates, age_basis, constant, fit, week_basis
 from evermap.survival import Exponential, Gamma, LogNormal, Mixture, PiecewiseConstantHazard, Weibull
@@ -99,8 +100,10 @@ class Fitted:
 
 def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
     """(A,) mean hazard of a lifetime in each bin of age."""
-    survived = prior.log_conditional_survival(edge_s[:-1], edge_s[1:])
-    return np.asarray(np.minimum(-survived, 800.0) / np.diff(edge_s), dtype=np.float64)
+    cumulative = prior.cumulative_hazard(edge_s)
+    with np.errstate(invalid="ignore"):
+        within = np.where(np.isfinite(cumulative[1:]), np.minimum(np.diff(cumulative), CERTAIN), CERTAIN)
+    return np.asarray(within / np.diff(edge_s), dtype=np.float64)
 
 
 def exponential(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
@@ -212,7 +215,7 @@ def _mixture(counts: Sojourns, n: int) -> Fitted:
     from scipy.special import ndtr
 
     events = counts.events.sum(1)
-    used = np.flatnonzero((events > 1e-9) | (counts.open_ended > 1e-9))
+    used = np.flatnonzero((events > 1e-6) | (counts.open_ended > 1e-6))
     if counts.n_events < 2.0:
         return exponential(counts)
     x = np.log(counts.age_s[used])
