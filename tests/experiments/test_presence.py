@@ -387,7 +387,6 @@ def test_the_command_writes_what_it_prints_and_the_same_again(made_up: Path, tmp
 TARGETS = [f"room: {what}" for what in ("MAE", "accuracy", "Brier", "Brier, those that leave")]
 TARGETS += [f"door ({one.name}) {one.title}: {s}" for one in TASKS for s in ("Brier", "log loss", "calibration error")]
 SHORT = {
-    "room: ac": ("accuracy",),
     "door (a)": ("Brier", "log loss"),
     "door (b)": ("Brier",),
     "door (c)": ("Brier", "log loss"),
