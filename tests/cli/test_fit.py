@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
+from evermap.recurrence.choose import KINDS
 from evermap.recurrence.protocol import Looks
 from evermap.recurrence.storage import model_of
 
@@ -110,3 +111,9 @@ def test_a_model_that_lacks_a_feature_says_which(table: Path, tmp_path: Path) ->
     result = run("persist", other, "--model", model, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "feature 'tree' of class 'plant'" in result.stderr
+
+
+def test_help_of_persist_lists_every_kind() -> None:
+    shown = run("persist", "--help").stdout.partition("Features that come back")[2].partition("Examples")[0]
+    listed = {word.rstrip(",") for line in shown.splitlines() for word in line.split("  ")[1:] for word in word.split()}
+    assert {*KINDS, "auto"} <= listed

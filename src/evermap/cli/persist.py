@@ -90,10 +90,18 @@ def persist(
     summary.json, figures and report.html.
 
     \b
+    Features that come back need --recurrent:
+      two-state                               stays and absences without typical duration
+      phase-type, phase-type-rhythm           brief and long ones; with the hours of the local week
+      run-length, run-length-rhythm           any typical duration; with the hours of the local week
+      auto                                    whichever foretells looks that were held out
+
+    \b
     Examples:
       evermap persist --init looks.csv
       evermap persist looks.csv --out out/looks
       evermap persist looks.csv --prior unknown:1h..1y --prior cart=exponential:half-life=1d --horizon 2d
+      evermap persist looks.csv --recurrent auto
     """
     if init is not None:
         from evermap.presence.example import write_example
