@@ -2,6 +2,7 @@
 #   make demo    set up and run the demonstration       make test    set up and run the tests
 #   make lint    style, formatting and types            make docs-check    run the commands of the documents
 #   make bench   compare with the committed baseline    make clean   remove what make made
+#   make experiments    whole experiments on the recordings in ../shared/data, minutes long
 # Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
 PYTHON ?= python3
 VENV ?= .venv
@@ -11,10 +12,10 @@ RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test test-all lint format docs-check bench lock clean
+.PHONY: help setup setup-dev demo test test-all experiments lint format docs-check bench lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 5
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 6
 
 setup: $(RUNTIME)
 setup-dev: $(DEVELOPMENT)
@@ -27,6 +28,9 @@ test: $(DEVELOPMENT)
 
 test-all: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest -m "slow or not slow"
+
+experiments: $(DEVELOPMENT)
+	$(VENV)/bin/python -m pytest -m experiment
 
 lint: $(DEVELOPMENT)
 	$(VENV)/bin/ruff check .

@@ -403,6 +403,7 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return presence.reproduce(DATA, tmp_path_factory.mktemp("real") / "out")
 
 
+@pytest.mark.experiment
 @pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize(
@@ -418,6 +419,7 @@ def test_the_default_models_do_what_is_expected(what: str, real: dict[str, Any])
     assert row["met"], row
 
 
+@pytest.mark.experiment
 @pytest.mark.slow
 @needs_data
 def test_what_is_short_is_short_by_little(real: dict[str, Any]) -> None:
@@ -426,6 +428,7 @@ def test_what_is_short_is_short_by_little(real: dict[str, Any]) -> None:
             assert row["measured"] == pytest.approx(row["limit"], abs=0.002), row
 
 
+@pytest.mark.experiment
 @pytest.mark.slow
 @needs_data
 def test_the_default_models_are_the_best_by_proper_scores(real: dict[str, Any]) -> None:
