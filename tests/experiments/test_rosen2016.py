@@ -130,6 +130,7 @@ def test_some_reference_numbers_are_met() -> None:
     assert [value for value in values if abs(value["z"]) > 3.0] == []
 
 
+@pytest.mark.experiment
 @pytest.mark.slow
 @needs_golden
 def test_all_reference_numbers_are_met(tmp_path: Path) -> None:
