@@ -27,8 +27,7 @@ from evermap.viz.style import (
     ODOMETRY,
     house_style,
     new_figure,
-    save_png,
-    save_svg,
+    save_all,
     settle,
 )
 from evermap.viz.time_axis import TimeAxis
@@ -63,9 +62,7 @@ def draw_all(room: Sequence[RoomFeature], found: Found, path: Callable[[str], Pa
     returned = _a_return(room)
     if returned is not None:
         figures["return"] = _draw_return(room, found, *returned)
-    for name, figure in figures.items():
-        save_png(figure, path(f"{name}.png"), dpi=130)
-        save_svg(figure, path(f"{name}.svg"))
+    save_all(figures, path)
 
 
 def _draw_reliability(found: Found) -> Figure:

@@ -18,8 +18,7 @@ from evermap.viz.style import (
     ODOMETRY,
     house_style,
     new_figure,
-    save_png,
-    save_svg,
+    save_all,
     settle,
 )
 
@@ -50,9 +49,7 @@ def draw_all(settings: Settings, values: Sequence[Value], path: Callable[[str], 
     }
     if any(value.get("z") is not None for value in values):
         figures["agreement"] = _draw_agreement(values)
-    for name, figure in figures.items():
-        save_png(figure, path(f"{name}.png"), dpi=130)
-        save_svg(figure, path(f"{name}.svg"))
+    save_all(figures, path)
 
 
 def _draw_errors(values: Sequence[Value]) -> Figure:

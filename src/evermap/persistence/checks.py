@@ -76,6 +76,44 @@ def check_possible(inverse_odds: FloatArray, rows: IntArray | None = None, noun:
         raise NumericalError(impossible(f"{noun} {row}"), hint="P_M and P_F strictly between 0 and 1")
 
 
+def check_looks(
+    time_s: FloatArray,
+    detected: FloatArray,
+    p_miss: FloatArray,
+    p_false: FloatArray,
+    last_s: FloatArray,
+    rows: IntArray | None = None,
+) -> None:
+    """Raise `InputError` unless times do not run back, detections are 0 or 1, and error rates are probabilities."""
+    check_times(time_s, last_s, rows)
+    check_detected(detected, rows)
+    check_probability(p_miss, "p_miss", rows)
+    check_probability(p_false, "p_false", rows)
+
+
+def as_looks(
+    stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, last_s: FloatArray, rows: IntArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Looks at as many rows as `last_s` has: their times, and their likelihoods if the feature is there and if not.
+
+    Raises:
+        InputError: shapes, or numbers that `check_looks` refuses.
+    """
+    n = len(last_s)
+    time, hit, miss, false = (
+        as_rows(column, n, field)
+        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
+    )
+    check_looks(time, hit, miss, false, last_s, rows)
+    return time, *likelihoods(hit, miss, false)
+
+
+def likelihoods(detected: FloatArray, p_miss: FloatArray, p_false: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Likelihood of each look if the feature is there, and if it is not."""
+    seen = detected == 1.0
+    return np.where(seen, 1.0 - p_miss, p_miss), np.where(seen, p_false, 1.0 - p_false)
+
+
 def impossible(who: str) -> str:
     """The one sentence for an observation that neither state of the feature can have caused."""
     return f"{who}: this observation is impossible, whether the feature is there or gone"

@@ -67,12 +67,9 @@ def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any
         index = index[looked]
         values = [column[looked] for column in values]
     time, hit, miss, false = values
-    checks.check_times(time, state.stamp_s[index], index)
-    checks.check_detected(hit, index)
-    checks.check_probability(miss, "p_miss", index)
-    checks.check_probability(false, "p_false", index)
+    checks.check_looks(time, hit, miss, false, state.stamp_s[index], index)
 
-    there, gone = _likelihoods(hit, miss, false)
+    there, gone = checks.likelihoods(hit, miss, false)
     predicted = _gap(state, index, time)
     observed = _observe(predicted, there, gone)
     checks.check_possible(observed, index)
@@ -119,14 +116,7 @@ def run(
     wrong = np.flatnonzero((entry < 0) | (entry >= len(state)))
     if wrong.size:
         raise InputError(f"row {wrong[0]}: feature {entry[wrong[0]]} of {len(state)} does not exist", field="feature")
-    time, hit, miss, false = (
-        checks.as_rows(column, m, field)
-        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
-    )
-    checks.check_times(time, state.stamp_s[entry])
-    checks.check_detected(hit)
-    checks.check_probability(miss, "p_miss")
-    checks.check_probability(false, "p_false")
+    time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[entry])
 
     order = np.lexsort((time, entry))
     entry, time = entry[order], time[order]
@@ -140,8 +130,7 @@ def run(
     inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
     evidence = np.zeros(len(state)) if state.log_evidence is None else state.log_evidence.copy()
     posterior = np.empty(m)
-    there, gone = _likelihoods(hit[order], miss[order], false[order])
-    bad = int(stream(entry, odds, there, gone, inverse_odds, evidence, posterior))
+    bad = int(stream(entry, odds, there[order], gone[order], inverse_odds, evidence, posterior))
     if bad >= 0:
         row = int(order[bad])
         raise NumericalError(
@@ -153,12 +142,6 @@ def run(
     unsorted[order] = posterior
     kept = None if state.log_evidence is None else evidence
     return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=kept), unsorted
-
-
-def _likelihoods(hit: FloatArray, miss: FloatArray, false: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Likelihood of each observation if the feature is there, and if it is gone."""
-    seen = hit == 1.0
-    return np.where(seen, 1.0 - miss, miss), np.where(seen, false, 1.0 - false)
 
 
 def _gap(state: Belief, index: IntArray, time: FloatArray) -> FloatArray:

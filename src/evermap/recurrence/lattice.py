@@ -26,10 +26,8 @@ class Lattice(NamedTuple):
 
 def lattice(looks: Looks, step_s: float) -> Lattice:
     """One feature's looks, with whole steps after each and a shorter one before the next, as the filter takes them."""
-    from evermap.recurrence.run_length import likelihoods
-
     stamp, first = np.unique(looks.stamp_s, return_index=True)
-    absent, present = (np.multiply.reduceat(values, first) for values in likelihoods(looks))
+    present, absent = (np.multiply.reduceat(values, first) for values in looks.likelihoods())
     steps = np.maximum(np.ceil(np.diff(stamp) / step_s * (1.0 - 1e-12)).astype(np.int64), 1)
     place = np.concatenate([[0], np.cumsum(steps)])
     times = np.repeat(stamp[:-1], steps) + step_s * (np.arange(place[-1]) - np.repeat(place[:-1], steps))

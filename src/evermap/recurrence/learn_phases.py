@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.persistence.checks import impossible
-from evermap.recurrence.phase_type import PhaseType, likelihoods
+from evermap.errors import ConfigError, DataError
+from evermap.recurrence.phase_type import PhaseType
 from evermap.recurrence.protocol import Looks
 from evermap.recurrence.rhythm import BINS, Rhythm
 from evermap.recurrence.structures import Structure, structure_of
@@ -247,7 +246,7 @@ class _Data(NamedTuple):
 
     @classmethod
     def of(cls, looks: Looks, end_s: float, half_life_s: float) -> _Data:
-        there, gone = likelihoods(looks)
+        there, gone = looks.likelihoods()
         begin_s = np.append(looks.stamp_s, end_s)[looks.first[:-1]]
         return cls(looks, there, gone, begin_s, end_s, half_life_s)
 
@@ -284,10 +283,7 @@ def _expect(data: _Data, model: PhaseType, start: FloatArray) -> _Expected:
         data.looks.stamp_s, data.there, data.gone, data.end_s, data.half_life_s, integrals, smoothed, last,
     )  # fmt: skip
     if bad >= 0:
-        feature = int(np.searchsorted(data.looks.first, bad, side="right")) - 1
-        raise NumericalError(
-            impossible(f"feature {feature} at {data.looks.stamp_s[bad]} s"), hint="P_M and P_F strictly between 0 and 1"
-        )
+        raise data.looks.impossible(bad)
     exposure = np.einsum("bii->bi", integrals).copy()
     return _Expected(evidence, Statistics(rates * integrals, exposure, data.end_s), smoothed, last)
 

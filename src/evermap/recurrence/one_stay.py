@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from evermap.errors import ConfigError, NumericalError
-from evermap.persistence.checks import impossible
+from evermap.persistence.checks import impossible, likelihoods
 from evermap.persistence.death import log_death_odds
 from evermap.recurrence.protocol import Instants, Looks, Track
 from evermap.survival.protocol import LifetimePrior
@@ -64,9 +64,7 @@ class OneStay:
         there, gone = np.ones(len(time)), np.ones(len(time))
         says = look > birth_row[feature]
         row = look[says]
-        hit = looks.detected[row] == 1.0
-        there[says] = np.where(hit, 1.0 - looks.p_miss[row], looks.p_miss[row])
-        gone[says] = np.where(hit, looks.p_false[row], 1.0 - looks.p_false[row])
+        there[says], gone[says] = likelihoods(looks.detected[row], looks.p_miss[row], looks.p_false[row])
 
         age_s = time - birth_s[feature]
         before_s = np.zeros(len(time))

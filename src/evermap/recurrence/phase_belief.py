@@ -118,14 +118,7 @@ def update(
         NumericalError: a look that is impossible, whether the feature is there or not.
     """
     index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
-    time, hit, miss, false = (
-        checks.as_rows(column, len(index), field)
-        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
-    )
-    checks.check_detected(hit, index)
-    checks.check_probability(miss, "p_miss", index)
-    checks.check_probability(false, "p_false", index)
-    there, gone = np.where(hit == 1.0, 1.0 - miss, miss), np.where(hit == 1.0, false, 1.0 - false)
+    time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[index], index)
     weighed = _at(state, index, time) * np.where(state.model.present, there[:, None], gone[:, None])
     likelihood = weighed.sum(1)
     checks.check_possible(np.where(likelihood > 0.0, likelihood, np.nan), index)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from evermap.recurrence.compiled import kernel
-from evermap.recurrence.phase_kernels import _MONDAY_S, NEGLIGIBLE, advance, observe
-from evermap.recurrence.rhythm import BIN_S, BINS, WEEK_S
+from evermap.recurrence.phase_kernels import NEGLIGIBLE, advance, observe
+from evermap.recurrence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
 PIECE = 16.0
@@ -122,7 +122,7 @@ def _cut(from_s: float, to_s: float, exits: FloatArray, spans: FloatArray, bins:
     b = 0
     part = np.inf
     if len(exits) > 1:
-        phase = (from_s - _MONDAY_S) % WEEK_S
+        phase = (from_s - MONDAY_S) % WEEK_S
         b = min(int(phase / BIN_S), BINS - 1)
         part = (b + 1) * BIN_S - phase
     while left > 0.0:

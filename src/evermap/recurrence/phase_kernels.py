@@ -14,10 +14,9 @@ import numpy as np
 from numba import prange
 
 from evermap.recurrence.compiled import inlined, kernel, parallel_kernel
-from evermap.recurrence.rhythm import BIN_S, BINS, DAY_S, WEEK_S
+from evermap.recurrence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
-_MONDAY_S = 4.0 * DAY_S
 LONG = 16.0
 """Jumps in a gap above which squaring a matrix is cheaper than a row times its powers."""
 NEGLIGIBLE = 1e-17
@@ -169,7 +168,7 @@ def travel(belief: FloatArray, chain: Any, from_s: float, to_s: float, spare: Fl
     if len(chain.rates_hz) == 1:
         leap(belief, chain.rates_hz[0], chain.exit_hz[0], left, spare)
         return
-    phase = (from_s - _MONDAY_S) % WEEK_S
+    phase = (from_s - MONDAY_S) % WEEK_S
     b = min(int(phase / BIN_S), BINS - 1)
     part = (b + 1) * BIN_S - phase
     while left > 0.0:
@@ -205,7 +204,7 @@ def first_belief(start: FloatArray, chain: Any, at_s: float, belief: FloatArray,
     if len(start) == 1:
         belief[:] = start[0]
         return
-    phase = (at_s - _MONDAY_S) % WEEK_S
+    phase = (at_s - MONDAY_S) % WEEK_S
     b = min(int(phase / BIN_S), BINS - 1)
     belief[:] = start[b]
     leap(belief, chain.rates_hz[b], chain.exit_hz[b], phase - b * BIN_S, spare)

@@ -6,10 +6,8 @@ import numpy as np
 
 from evermap.recurrence.phase_belief import PhaseBelief
 from evermap.recurrence.phase_type import PhaseType
-from evermap.recurrence.rhythm import BIN_S, BINS, WEEK_S, bin_of_week
+from evermap.recurrence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S, bin_of_week
 from evermap.types import BoolArray, FloatArray
-
-_MONDAY_S = 4.0 * 86400.0
 
 
 def time_to_leave(state: PhaseBelief) -> FloatArray:
@@ -71,7 +69,7 @@ def _with_rhythm(generators: FloatArray, stamp_s: FloatArray) -> FloatArray:
         begin[b] = spent[b] + survive[b] @ begin[b + 1]
     times = np.empty((len(stamp_s), k))
     for row, (now_s, b) in enumerate(zip(stamp_s, bin_of_week(stamp_s), strict=True)):
-        rest_s = (b + 1) * BIN_S - (now_s - _MONDAY_S) % WEEK_S
+        rest_s = (b + 1) * BIN_S - (now_s - MONDAY_S) % WEEK_S
         survived, meanwhile = _bin_terms(generators[b : b + 1], rest_s)
         times[row] = meanwhile[0] + survived[0] @ begin[b + 1]
     return times

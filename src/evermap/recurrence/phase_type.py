@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from evermap.errors import ConfigError, NumericalError
-from evermap.persistence.checks import impossible
+from evermap.errors import ConfigError
 from evermap.recurrence.exponentials import exponential_mixture_of
 from evermap.recurrence.protocol import Instants, Looks, Track
 from evermap.recurrence.rhythm import BIN_S, BINS, Rhythm
@@ -136,7 +135,7 @@ class PhaseType:
         """Presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each feature."""
         from evermap.recurrence import phase_kernels
 
-        there, gone = likelihoods(looks)
+        there, gone = looks.likelihoods()
         p_present, evidence = np.empty(len(asked.stamp_s)), np.zeros(looks.n_features)
         last = np.empty((looks.n_features, self.n_phases))
         run = phase_kernels.track_all_parallel if threads else phase_kernels.track_all
@@ -146,10 +145,7 @@ class PhaseType:
             p_present, evidence, last,
         )  # fmt: skip
         if bad >= 0:
-            feature = int(np.searchsorted(looks.first, bad, side="right")) - 1
-            raise NumericalError(
-                impossible(f"feature {feature} at {looks.stamp_s[bad]} s"), hint="P_M and P_F strictly between 0 and 1"
-            )
+            raise looks.impossible(bad)
         return p_present, evidence, last
 
     def stationary(self, stamp_s: float | None = None) -> FloatArray:
@@ -241,10 +237,3 @@ class PhaseType:
         for matrix in chain.whole[:-1]:
             rows.append(rows[-1] @ matrix)
         return np.array(rows)
-
-
-def likelihoods(looks: Looks) -> tuple[FloatArray, FloatArray]:
-    """(M,) likelihood of each look if the feature is there, and if it is not."""
-    hit = looks.detected == 1.0
-    there = np.where(hit, 1.0 - looks.p_miss, looks.p_miss)
-    return there, np.where(hit, looks.p_false, 1.0 - looks.p_false)

@@ -7,7 +7,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, NumericalError
+from evermap.persistence import checks
 from evermap.types import FloatArray, IntArray
 
 
@@ -39,6 +40,16 @@ class Looks:
         rows = slice(int(self.first[feature]), int(self.first[feature + 1]))
         first = np.array([0, rows.stop - rows.start])
         return Looks(first, self.stamp_s[rows], self.detected[rows], self.p_miss[rows], self.p_false[rows])
+
+    def likelihoods(self) -> tuple[FloatArray, FloatArray]:
+        """(M,) likelihood of each look if the feature is there, and if it is not."""
+        return checks.likelihoods(self.detected, self.p_miss, self.p_false)
+
+    def impossible(self, row: int) -> NumericalError:
+        """The error of a look that is impossible, whether the feature is there or not."""
+        feature = int(np.searchsorted(self.first, row, side="right")) - 1
+        who = f"feature {feature} at {self.stamp_s[row]} s"
+        return NumericalError(checks.impossible(who), hint="P_M and P_F strictly between 0 and 1")
 
     @classmethod
     def from_rows(

@@ -17,7 +17,7 @@ BIN_S = 600.0
 """A rhythm is constant for ten minutes at a time."""
 BINS_OF_DAY = round(DAY_S / BIN_S)
 BINS = 7 * BINS_OF_DAY
-_MONDAY_S = 4.0 * DAY_S
+MONDAY_S = 4.0 * DAY_S
 """1970-01-05 was a Monday."""
 
 
@@ -61,5 +61,5 @@ class Rhythm:
 
 def bin_of_week(stamp_s: ArrayLike) -> IntArray:
     """Which ten minutes of the week an instant lies in, 0 from Monday 00:00, stamps in local wall time."""
-    phase = np.mod(np.asarray(stamp_s, dtype=np.float64) - _MONDAY_S, WEEK_S)
+    phase = np.mod(np.asarray(stamp_s, dtype=np.float64) - MONDAY_S, WEEK_S)
     return np.minimum((phase / BIN_S).astype(np.int64), BINS - 1)

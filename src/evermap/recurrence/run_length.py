@@ -73,12 +73,13 @@ class RunLength:
         n = looks.n_features
         answer, evidence, moved = np.empty(len(asked.stamp_s)), np.empty(n), np.empty(n)
         bad = np.empty(n, dtype=np.int64)
+        there, gone = looks.likelihoods()
         kernels.track(
-            looks.first, looks.stamp_s, *likelihoods(looks), asked.first, asked.stamp_s, self.slots, self.law,
+            looks.first, looks.stamp_s, gone, there, asked.first, asked.stamp_s, self.slots, self.law,
             self.first, answer, evidence, moved, bad,
         )  # fmt: skip
         for feature in np.flatnonzero(bad >= 0)[:1]:
-            raise impossible_look(looks, int(looks.first[feature] + bad[feature]))
+            raise looks.impossible(int(looks.first[feature] + bad[feature]))
         return Track(answer, evidence, moved)
 
     @property
@@ -124,11 +125,11 @@ class RunLength:
         count = np.full((1, 2), self.slots - 1)
         if self.law.factor.shape[1] == 1:
             return First(age, weight, count)
-        from evermap.recurrence.rhythm import DAY_S
+        from evermap.recurrence.rhythm import MONDAY_S
 
         ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, 2, self.slots))
         counts = np.zeros((BINS, 2), dtype=np.int64)
-        week_of_beliefs(4.0 * DAY_S - age[0], weight[0], count[0], self.law, ages, weights, counts)
+        week_of_beliefs(MONDAY_S - age[0], weight[0], count[0], self.law, ages, weights, counts)
         return First(ages, weights, counts)
 
     def to_dict(self) -> dict[str, Any]:
@@ -162,20 +163,6 @@ class RunLength:
             bool(data["newborn"]),
             int(data["hypotheses"]),
         )
-
-
-def impossible_look(looks: Looks, row: int) -> NumericalError:
-    """The error that names a look which neither state of the feature can have caused."""
-    feature = int(np.searchsorted(looks.first, row, side="right")) - 1
-    return NumericalError(
-        impossible(f"feature {feature} at {looks.stamp_s[row]} s"), hint="P_M and P_F strictly between 0 and 1"
-    )
-
-
-def likelihoods(looks: Looks) -> tuple[FloatArray, FloatArray]:
-    """Likelihood of each look if the feature is absent, and if it is present."""
-    seen = looks.detected == 1.0
-    return np.where(seen, looks.p_false, 1.0 - looks.p_false), np.where(seen, 1.0 - looks.p_miss, looks.p_miss)
 
 
 def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
@@ -290,15 +277,7 @@ def update(
     from evermap.recurrence.run_length_kernels import look_rows
 
     index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
-    time, hit, miss, false = (
-        checks.as_rows(column, len(index), field)
-        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
-    )
-    checks.check_times(time, state.stamp_s[index], index)
-    checks.check_detected(hit, index)
-    checks.check_probability(miss, "p_miss", index)
-    checks.check_probability(false, "p_false", index)
-    seen = hit == 1.0
+    time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[index], index)
     after = replace(
         state,
         start_s=state.start_s.copy(),
@@ -309,8 +288,8 @@ def update(
         merged_mass=state.merged_mass.copy(),
     )
     bad = look_rows(
-        index, after.start_s, after.weight, after.count, after.stamp_s, time, np.where(seen, false, 1.0 - false),
-        np.where(seen, 1.0 - miss, miss), state.model.law, after.log_evidence, after.merged_mass, np.empty(len(index)),
+        index, after.start_s, after.weight, after.count, after.stamp_s, time, gone, there, state.model.law,
+        after.log_evidence, after.merged_mass, np.empty(len(index)),
     )  # fmt: skip
     if bad >= 0:
         raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")

@@ -18,9 +18,7 @@ from evermap.recurrence.run_length import (
     PRESENT,
     RunLength,
     RunLengthBelief,
-    impossible_look,
     init,
-    likelihoods,
 )
 from evermap.types import FloatArray
 
@@ -49,12 +47,13 @@ def after(model: RunLength, looks: Looks) -> RunLengthBelief:
     began[looked] = looks.stamp_s[looks.first[:-1][looked]]
     state = init(model, began)
     rows = np.repeat(np.arange(looks.n_features), number)
+    there, gone = looks.likelihoods()
     bad = look_rows(
-        rows, state.start_s, state.weight, state.count, state.stamp_s, looks.stamp_s, *likelihoods(looks), model.law,
+        rows, state.start_s, state.weight, state.count, state.stamp_s, looks.stamp_s, gone, there, model.law,
         state.log_evidence, state.merged_mass, np.empty(len(rows)),
     )  # fmt: skip
     if bad >= 0:
-        raise impossible_look(looks, bad)
+        raise looks.impossible(bad)
     return state
 
 

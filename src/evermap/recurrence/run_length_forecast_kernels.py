@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.recurrence.compiled import exp, expm1, kernel
-from evermap.recurrence.rhythm import BIN_S, WEEK_S
-from evermap.recurrence.run_length_kernels import _MONDAY_S, MOST, Law, _hazards, _sum, _week_bin
+from evermap.recurrence.rhythm import BIN_S, MONDAY_S, WEEK_S
+from evermap.recurrence.run_length_kernels import MOST, Law, _hazards, _sum, _week_bin
 from evermap.types import FloatArray, IntArray
 
 _NOTHING = 1e-10
@@ -18,7 +18,7 @@ _SLIVER_S = 1e-3
 @kernel
 def _step_end(now: float, law: Law) -> float:
     """End of a step that begins now: as the filter's, but within one ten minutes of the week."""
-    rest = BIN_S - (now - _MONDAY_S) % BIN_S
+    rest = BIN_S - (now - MONDAY_S) % BIN_S
     return now + min(law.step_s, rest if rest > _SLIVER_S else rest + BIN_S)
 
 

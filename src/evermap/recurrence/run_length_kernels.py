@@ -16,14 +16,13 @@ from numba import prange
 
 from evermap.recurrence.compiled import exp, expm1, inlined, kernel, parallel_kernel
 from evermap.recurrence.hazard_table import SHIFT
-from evermap.recurrence.rhythm import BIN_S, BINS, DAY_S, WEEK_S
+from evermap.recurrence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
 MOST = 700.0
 """Integrated hazard that nobody survives."""
 NO_MERGE = -1
 AS_THEY_ARE = (1.0, 1.0)
-_MONDAY_S = 4.0 * DAY_S
 _POSITION = 0xFFFFF
 _HIGHEST = 0x7FFFFFFFFFFFFFFF
 
@@ -99,7 +98,7 @@ def _week_bin(stamp_s: Any, n: Any) -> Any:
     """The ten minutes of the week; 0 where there is no rhythm."""
     if n == 1:
         return 0
-    phase = (stamp_s - _MONDAY_S) % WEEK_S
+    phase = (stamp_s - MONDAY_S) % WEEK_S
     return min(np.int64(phase / BIN_S), BINS - 1)
 
 
@@ -403,9 +402,9 @@ def week_of_beliefs(
 ) -> None:
     """Let a belief run for two weeks from a Monday 00:00, and keep it at every ten minutes of the second."""
     scratch, merged = np.zeros((2, start.shape[1])), np.zeros(2, dtype=np.int64)
-    now = _MONDAY_S
+    now = MONDAY_S
     for i in range(2 * BINS):
-        at = _MONDAY_S + i * BIN_S
+        at = MONDAY_S + i * BIN_S
         now, _ = advance(start, weight, count, now, at, law, scratch, merged, False)
         _look(weight, count, 1.0, 1.0)
         if i >= BINS:

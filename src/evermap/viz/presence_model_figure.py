@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel
+from evermap.recurrence.rhythm import MONDAY_S
 from evermap.types import FloatArray
 from evermap.viz.style import ALERT, ESTIMATE, MUTED, SHADE, house_style, new_figure, settle
 from evermap.viz.time_axis import DURATIONS
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MOST_ROWS = 8
-_MONDAY_S = 4.0 * 86400.0
 _NOON_S = 12.0 * 3600.0
 _WEEK_STEP_S = 600.0
 _DAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
@@ -59,7 +59,7 @@ def week_of_presence(model: PresenceModel) -> tuple[FloatArray, FloatArray]:
     time_s = np.arange(0.0, 7.0 * 86400.0 + 1.0, _WEEK_STEP_S)
     nothing = np.zeros(0)
     unseen = Looks(np.zeros(2, dtype=np.int64), nothing, nothing, nothing, nothing)
-    return time_s, model.track(unseen, Instants.same_for_all(1, _MONDAY_S + time_s)).p_present
+    return time_s, model.track(unseen, Instants.same_for_all(1, MONDAY_S + time_s)).p_present
 
 
 def has_rhythm(model: PresenceModel) -> bool:
@@ -69,7 +69,7 @@ def has_rhythm(model: PresenceModel) -> bool:
 
 def _after_a_look(axes: Axes, model: PresenceModel, name: str, *, last: bool, legend: bool) -> None:
     """Presence ahead of a look that is certain, on a logarithmic axis until it makes no difference."""
-    start = _MONDAY_S + _NOON_S
+    start = MONDAY_S + _NOON_S
     ahead = np.geomspace(1e-2, 60.0 * 86400.0, 240)
     curves = []
     for seen in (1, 0):

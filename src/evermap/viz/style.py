@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,6 +128,13 @@ def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
     """Writes a stand-alone SVG on white paper; the same figure gives the same bytes."""
     with house_style():
         figure.savefig(path, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
+
+
+def save_all(figures: Mapping[str, Figure], path: Callable[[str], Path]) -> None:
+    """Writes every figure as PNG and SVG, to where `path` puts a file of its name."""
+    for name, figure in figures.items():
+        save_png(figure, path(f"{name}.png"), dpi=130)
+        save_svg(figure, path(f"{name}.svg"))
 
 
 def inline_svg(figure: Figure, name: str) -> str:
