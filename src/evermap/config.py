@@ -42,8 +42,39 @@ class CalibrationConfig(Section):
     )
 
 
+class ModesConfig(Section):
+    """Landmarks with several positions (Nielsen and Hendeby 2024): gates, switching, selectors."""
+
+    gate_probability: Probability = Field(
+        default=0.95, description="a detection outside this confidence region of all modes starts a new mode"
+    )
+    switch_probability: Probability = Field(
+        default=1e-4, description="of a landmark to be in another mode at the next look; ignored with a lifetime"
+    )
+    lifetime: str | None = Field(
+        default=None, description="prior of how long a mode lasts, e.g. 'exponential(half_life=30d)'; unset: constant"
+    )
+    rounds: int = Field(default=10, ge=1, le=100, description="of selecting modes and relinearising, at most")
+    mcts_budget: int = Field(default=200, ge=1, description="iterations of the tree search for every decision")
+    mcts_window_s: Positive | None = Field(
+        default=40.0, description="the tree search looks back this far [s]; unset: to the start"
+    )
+
+
+class ChangesConfig(Section):
+    """The joint search over changes."""
+
+    p_moved: float = Field(default=0.01, gt=0, lt=1, description="prior probability that anything moved at all")
+    move_sigma_m: Positive = Field(default=0.7, description="standard deviation of a displacement, each axis [m]")
+    p_rotated: Probability = Field(default=0.1, description="share of moves that also turn the group")
+
+
 class SlamConfig(Section):
     """The estimator."""
+
+    method: Literal["nohyp", "max-mixture", "nn", "em", "mcts", "viterbi", "joint"] = Field(
+        default="joint", description="how landmarks that moved are explained; 'nohyp' takes the world to be static"
+    )
 
     sensor_model: Literal["calibrated", "plain"] = Field(
         default="calibrated",
@@ -62,6 +93,12 @@ class SlamConfig(Section):
     seed: int = Field(default=0, ge=0, description="seed of everything random")
     calibration: CalibrationConfig = Field(
         default_factory=CalibrationConfig, description="which calibration states are estimated"
+    )
+    modes: ModesConfig = Field(
+        default_factory=ModesConfig, description="methods 'max-mixture' to 'viterbi': landmarks with several positions"
+    )
+    changes: ChangesConfig = Field(
+        default_factory=ChangesConfig, description="method 'joint': which landmarks moved together"
     )
 
 

@@ -316,6 +316,54 @@ class Innovations:
         return len(self.stamp_s)
 
 
+class ChangeKind(StrEnum):
+    """What happened to a group of landmarks."""
+
+    MOVED = "moved"
+    """All members by the same displacement."""
+    ROTATED = "rotated"
+    """Like a rigid body: turned about their centroid, and moved."""
+    SWAPPED = "swapped"
+    """Two landmarks carry each other's identity."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapChange:
+    """One way in which the world differs from the map: some landmarks moved together.
+
+    Attributes:
+        landmark_ids: the group, sorted.
+        kind: what happened to it.
+        stamp_from_s, stamp_to_s: it happened between these two; nan and the first stamp for 'before the session'.
+        displacement_m: (x, y) of the group's centroid, in the map's frame.
+        rotation_rad: about the centroid, counter-clockwise; 0 where it did not turn.
+        probability: of this very group at this time, over all hypotheses that were weighed.
+    """
+
+    landmark_ids: tuple[int, ...]
+    kind: ChangeKind
+    stamp_from_s: float
+    stamp_to_s: float
+    displacement_m: tuple[float, float]
+    rotation_rad: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """Another explanation that the recording cannot rule out.
+
+    Attributes:
+        changes: what would have happened instead.
+        probability: its weight among all hypotheses.
+        landmarks: the map as it would be then.
+    """
+
+    changes: tuple[MapChange, ...]
+    probability: float
+    landmarks: Landmarks
+
+
 @dataclass(frozen=True, slots=True)
 class SlamResult:
     """Everything a run estimated.
@@ -331,6 +379,8 @@ class SlamResult:
         dead_reckoning: odometry alone from the first pose, at the stamps of `trajectory`.
         warnings: counted remarks of the estimator.
         interrupted: True where the run was stopped before the end of the recording.
+        changes: how the world differs from the map that was given, or changed during the run.
+        alternatives: other explanations nearly as probable as `changes`, the most probable first.
     """
 
     trajectory: Trajectory
@@ -343,3 +393,5 @@ class SlamResult:
     dead_reckoning: Trajectory
     warnings: tuple[str, ...] = ()
     interrupted: bool = False
+    changes: tuple[MapChange, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
