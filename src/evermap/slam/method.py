@@ -1,0 +1,87 @@
+"""How a landmark that is not where it was is explained: the seam between the estimator and the methods.
+
+A *place* is one row of the problem's landmarks. The first L places are the landmarks themselves, in the order in which
+the session was prepared; a landmark that moved has further places, behind them. Which place a detection belongs to
+stands in `Problem.landmark_row`, and nothing else tells the estimator of moves: it stays plain least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.types import FloatArray, IntArray, MapChange
+
+Compare = Callable[[IntArray, IntArray], tuple[FloatArray, FloatArray]]
+"""`compare(detections, places)`, both (k,): squared Mahalanobis distance of every detection if it were of that place,
+with `S = H P H' + R` of pose and place together, and `log |S|`; nan where the place has no position yet."""
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """What a method makes of all that was measured so far.
+
+    Attributes:
+        problem: the same measurements, with other places and priors, or the very object that was given.
+        estimate: the values of that problem, its places included.
+        current: (L,) the place where each landmark is now.
+        changes: what moved: landmarks by their rows, stamps on the problem's clock, displacements in its metres.
+    """
+
+    problem: Problem
+    estimate: Estimate
+    current: IntArray
+    changes: tuple[MapChange, ...] = ()
+
+
+class Method(Protocol):
+    """Decides for every frame to which places its detections belong, and thinks again when stock is taken."""
+
+    def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
+        """Places (k,) of the detections of pose `row`, before they are used.
+
+        Args:
+            problem: the measurements, with the places decided so far; `landmark_row[detections]` still says whose
+                detections they are.
+            row: the pose that is about to be added.
+            detections: (k,) rows of the problem's detections.
+            compare: how far each is from a place.
+
+        Returns:
+            (k,) rows of places. One without position starts where the detection points; rows from the number of
+            places on are new ones, in their order.
+        """
+        ...
+
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+        """The best explanation of everything so far.
+
+        Args:
+            problem: the measurements so far, with the places decided so far.
+            estimate: its optimum.
+            noise: the noise levels.
+            heavy: outliers have the Cauchy's tails, as while the estimate may still be far off.
+            final: the session ends here.
+        """
+        ...
+
+
+class Static:
+    """`nohyp`: the world is as it is, every detection belongs to the one place of its landmark."""
+
+    def __init__(self, n_landmarks: int) -> None:
+        self._current = np.arange(n_landmarks)
+
+    def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
+        """The place of each detection's landmark."""
+        del row, compare
+        return problem.landmark_row[detections]
+
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+        """Nothing to think about."""
+        del noise, heavy, final
+        return Revision(problem, estimate, self._current)
