@@ -13,6 +13,7 @@ import pytest
 from evermap import runfolder
 from evermap.config import load_config
 from evermap.errors import ConfigError, MissingExtraError
+from evermap.io.landmarks import read_prior_map
 from evermap.io.tum import read_tum
 from evermap.runfolder import RunFolder, RunInfo, check_replaceable, write_run
 from evermap.runsummary import summary_dict, timing_dict
@@ -232,12 +233,35 @@ def test_configuration_switches_outputs_off_and_sets_the_rate(run, tmp_path):
     assert not [name for name in summary["outputs"] if name.endswith((".png", ".html", ".rrd"))]
 
 
-def test_changes_are_written_a_line_each(run, tmp_path):
-    quick(
-        tmp_path / "run", run, changes=[{"landmark_id": 3, "change": "vanished"}, {"landmark_id": 6, "change": "moved"}]
-    )
+def test_changes_and_alternatives_are_kept_in_every_form(run, tmp_path):
+    from synthetic_run import with_changes
+
+    recording, result = run[0], with_changes(run[1])
+    summary = quick(tmp_path / "run", (recording, result))
+    ids = [list(change.landmark_ids) for change in result.changes]
+    assert [change["landmarks"] for change in summary["changes"]] == ids
+    first, second = summary["changes"][:2]
+    assert first == {
+        "landmarks": ids[0],
+        "kind": "moved",
+        "stamp_from_s": None,
+        "stamp_to_s": result.trajectory.stamp_s[0],
+        "displacement_m": [-1.0, 0.0],
+        "rotation_rad": 0.0,
+        "probability": 0.97,
+    }
+    assert (second["kind"], second["stamp_from_s"], second["rotation_rad"]) == ("rotated", 150.0, 0.35)
     lines = (tmp_path / "run" / "changes.jsonl").read_text().splitlines()
-    assert [json.loads(line)["landmark_id"] for line in lines] == [3, 6]
+    assert [json.loads(line) for line in lines] == summary["changes"]
+    assert [a["probability"] for a in summary["alternatives"]] == [a.probability for a in result.alternatives]
+    for rank, alternative in enumerate(result.alternatives, start=1):
+        there = read_prior_map(tmp_path / "run" / f"alternative_{rank}.geojson")
+        np.testing.assert_array_equal(there.position_m, alternative.landmarks.position_m)
+        assert f"alternative_{rank}.geojson" in summary["outputs"]
+    plain = quick(tmp_path / "run", run)
+    assert (plain["changes"], plain["alternatives"]) == ([], [])
+    assert (tmp_path / "run" / "changes.jsonl").read_text() == ""
+    assert not (tmp_path / "run" / "alternative_1.geojson").exists()
 
 
 def test_summary_of_an_interrupted_run_counts_what_was_done(run):

@@ -144,3 +144,14 @@ def test_functions_broadcast_over_leading_axes() -> None:
         se2.transform(b, points), [se2.transform(row, point) for row, point in zip(b, points, strict=True)]
     )
     np.testing.assert_array_equal(se2.rotation(b[:, 2]), [se2.rotation(angle) for angle in b[:, 2]])
+
+
+@given(st.floats(-np.pi, np.pi), st.tuples(st.floats(-9, 9), st.floats(-9, 9)).map(np.array))
+def test_what_moves_together_keeps_its_shape_and_can_be_moved_back(turn: float, displacement: np.ndarray) -> None:
+    point = np.random.default_rng(3).normal(size=(4, 2))
+    moved = se2.move_together(point, displacement, turn)
+    assert moved.mean(axis=0) - point.mean(axis=0) == pytest.approx(displacement, abs=1e-12)
+    sides, before = moved[1:] - moved[0], point[1:] - point[0]
+    as_complex = (sides @ [1, 1j]) / (before @ [1, 1j])
+    assert as_complex == pytest.approx(np.full(3, np.exp(1j * turn)), abs=1e-9)
+    assert se2.move_together(moved, -displacement, -turn) == pytest.approx(point, abs=1e-12)

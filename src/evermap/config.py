@@ -80,6 +80,9 @@ class SlamConfig(Section):
         default="calibrated",
         description="'calibrated' estimates sensor and odometry errors with the map, 'plain' believes all readings",
     )
+    unknown_ids: bool = Field(
+        default=False, description="ignore the identities that detections carry; associate by geometry"
+    )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
     outlier_log_odds: float = Field(
         default=7.0,

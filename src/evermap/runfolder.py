@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from evermap.errors import ConfigError
-from evermap.runsummary import SUMMARY_SCHEMA_VERSION, RunInfo, summary_dict, timing_dict
+from evermap.runsummary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, summary_dict, timing_dict
 from evermap.types import Innovations, Recording, SlamResult
 
 if TYPE_CHECKING:
@@ -148,7 +148,6 @@ def write_run(
     *,
     info: RunInfo | None = None,
     sections: Sequence[ReportSection] = (),
-    changes: Sequence[Mapping[str, Any]] = (),
     figures: bool | None = None,
     report: bool | None = None,
     scene: bool | None = None,
@@ -163,7 +162,6 @@ def write_run(
         config: a `Config`, or any mapping that JSON can hold; None if there is none.
         info: what the numbers alone cannot say: command, seeds, measured times.
         sections: parts that the caller adds to the report.
-        changes: what is known to have changed in the world, one JSON object a line of `changes.jsonl`.
         figures: whether to draw; None leaves it to `config.output.figures`, or draws.
         report: likewise `report.html`, `config.output.report`.
         scene: likewise `scene.rrd`, `config.output.rerun`; on None it is left out with a warning where rerun-sdk is
@@ -182,7 +180,7 @@ def write_run(
     with RunFolder(out, force=force) as folder:
         evaluation = compare_with_truth(recording, result, rate_hz=rate_hz)
         timing = timing_dict(recording, result, info)
-        _write_estimates(folder, result, changes)
+        _write_estimates(folder, result)
         drawn: tuple[NamedFigure, ...] = ()
         draw = _choose(figures, wanted, "figures")
         tell = _choose(report, wanted, "report")
@@ -230,7 +228,7 @@ def _plain(config: Any) -> Any:
     return config.model_dump(mode="json") if hasattr(config, "model_dump") else json.loads(json.dumps(config))
 
 
-def _write_estimates(folder: RunFolder, result: SlamResult, changes: Sequence[Mapping[str, Any]]) -> None:
+def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     from evermap.io.geojson import write_map_geojson
     from evermap.io.landmarks import write_map_parquet
     from evermap.io.tum import write_tum
@@ -239,8 +237,10 @@ def _write_estimates(folder: RunFolder, result: SlamResult, changes: Sequence[Ma
     write_tum(result.online, folder.path("online.tum"))
     write_map_parquet(result.landmarks, folder.path("map.parquet"))
     write_map_geojson(result.landmarks, folder.path("map.geojson"))
+    for rank, alternative in enumerate(result.alternatives, start=1):
+        write_map_geojson(alternative.landmarks, folder.path(f"alternative_{rank}.geojson"))
     _write_innovations(result.innovations, folder.path("innovations.parquet"))
-    lines = "".join(json.dumps(change, sort_keys=True, ensure_ascii=False) + "\n" for change in changes)
+    lines = "".join(json.dumps(change_dict(change), allow_nan=False) + "\n" for change in result.changes)
     folder.path("changes.jsonl").write_text(lines, encoding="utf-8")
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import ParameterEstimate, Recording, SlamResult
+from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult
 
 SUMMARY_SCHEMA_VERSION = "1"
 
@@ -90,10 +90,25 @@ def summary_dict(
         "metrics": dict(metrics),
         "timing": dict(timing),
         "counts": _counts(recording, result),
+        "changes": [change_dict(change) for change in result.changes],
+        "alternatives": [_alternative(alternative) for alternative in result.alternatives],
         "parameters": [_parameter(parameter) for parameter in result.parameters],
         "warnings": [*recording.warnings, *result.warnings, *warnings],
         "outputs": list(outputs),
         "interrupted": bool(result.interrupted),
+    }
+
+
+def change_dict(change: MapChange) -> dict[str, Any]:
+    """A change as in `summary.json` and in a line of `changes.jsonl`: stable keys, null where a stamp is not known."""
+    return {
+        "landmarks": [int(identity) for identity in change.landmark_ids],
+        "kind": change.kind.value,
+        "stamp_from_s": _number(change.stamp_from_s),
+        "stamp_to_s": _number(change.stamp_to_s),
+        "displacement_m": [_number(metres) for metres in change.displacement_m],
+        "rotation_rad": _number(change.rotation_rad),
+        "probability": _number(change.probability),
     }
 
 
@@ -167,6 +182,13 @@ def _counts(recording: Recording, result: SlamResult) -> dict[str, Any]:
         "true_landmarks": None if recording.true_landmarks is None else len(recording.true_landmarks),
         "truth_poses": None if recording.truth is None else len(recording.truth),
         "robot_sightings": 0 if sightings is None else len(sightings),
+    }
+
+
+def _alternative(alternative: Alternative) -> dict[str, Any]:
+    return {
+        "changes": [change_dict(change) for change in alternative.changes],
+        "probability": _number(alternative.probability),
     }
 
 

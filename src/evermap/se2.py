@@ -49,6 +49,16 @@ def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
     return np.stack([x, y], axis=-1)
 
 
+def move_together(point: ArrayLike, displacement: ArrayLike, turn_rad: float = 0.0) -> FloatArray:
+    """Points (N, 2) moved as one rigid body: turned about their centroid, which itself moves by `displacement`.
+
+    `move_together(moved, -displacement, -turn_rad)` undoes it.
+    """
+    point = np.asarray(point, dtype=np.float64)
+    centroid = point.mean(axis=0)
+    return np.asarray(centroid + displacement + (point - centroid) @ rotation(turn_rad).T, dtype=np.float64)
+
+
 def exp(twist: ArrayLike) -> FloatArray:
     """Motion along a constant twist (forward, left, turn) for unit time. Shape (..., 3)."""
     twist = np.asarray(twist, dtype=np.float64)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from evermap import se2
 from evermap.types import (
+    Alternative,
+    ChangeKind,
     Detections,
     Frames,
     Innovations,
     Landmarks,
+    MapChange,
     Misses,
     Odometry,
     ParameterEstimate,
@@ -152,3 +157,22 @@ def make_run(seed=0, duration_s=300.0, frame_rate_hz=5.0, n_landmarks=14, sigma=
         warnings=("12 detections treated as outliers",),
     )
     return recording, result
+
+
+def with_changes(result):
+    """The result with three changes (moved before the session, turned within it, exchanged) and two alternatives."""
+    ids = result.landmarks.landmark_id.tolist()
+    start_s = float(result.trajectory.stamp_s[0])
+    nan = float("nan")
+    changes = (
+        MapChange(tuple(ids[:3]), ChangeKind.MOVED, nan, start_s, (-1.0, 0.0), 0.0, 0.97),
+        MapChange(tuple(ids[3:6]), ChangeKind.ROTATED, 150.0, 158.0, (0.3, -0.5), 0.35, 0.8),
+        MapChange(tuple(ids[6:8]), ChangeKind.SWAPPED, nan, start_s, (0.0, 0.0), 0.0, 0.999),
+    )
+    moved = result.landmarks.position_m + [1.0, 0.0]  # the map as it is if the first three stayed where they were
+    complement = MapChange(tuple(ids[3:]), ChangeKind.MOVED, nan, start_s, (1.0, 0.0), 0.0, 0.12)
+    alternatives = (
+        Alternative((complement,), 0.12, replace(result.landmarks, position_m=moved)),
+        Alternative((), 0.001, result.landmarks),
+    )
+    return replace(result, changes=changes, alternatives=alternatives)

@@ -26,6 +26,18 @@ class SensorModel(StrEnum):
     PLAIN = "plain"
 
 
+class Method(StrEnum):
+    """How landmarks that moved are explained; the choices of `slam.method`."""
+
+    NOHYP = "nohyp"
+    MAX_MIXTURE = "max-mixture"
+    NN = "nn"
+    EM = "em"
+    MCTS = "mcts"
+    VITERBI = "viterbi"
+    JOINT = "joint"
+
+
 def slam(
     recording_path: Annotated[
         Path | None,
@@ -50,13 +62,30 @@ def slam(
         SensorModel | None,
         typer.Option(help="Estimate sensor and odometry errors, or believe the readings.", show_default="calibrated"),
     ] = None,
+    method: Annotated[
+        Method | None,
+        typer.Option(
+            help="How landmarks that moved are explained; nohyp: the world is static.", show_default=Method.JOINT.value
+        ),
+    ] = None,
+    unknown_ids: Annotated[
+        bool, typer.Option("--unknown-ids", help="Ignore the landmark ids of the detections; associate by geometry.")
+    ] = False,
     prior_map: Annotated[
         str | None,
         typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
     ] = None,
     prior_sigma: Annotated[
-        float, typer.Option(min=1e-6, help="Standard deviation of a prior map without sigmas of its own [m].")
+        float,
+        typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
     ] = 0.02,
+    shift: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="IDS:DX[,DY[,TURN]]",
+            help="Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
+        ),
+    ] = None,
     realtime: Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
@@ -77,6 +106,7 @@ def slam(
       evermap slam --init my-recording
       evermap slam my-recording --out out/mine
       evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
+      evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
     """
     if init is not None:
         _write_template(init)
@@ -84,6 +114,8 @@ def slam(
     from evermap.config import load_config, to_toml
 
     shortcuts = [] if sensor_model is None else [f"slam.sensor_model={sensor_model.value}"]
+    shortcuts += [] if method is None else [f"slam.method={method.value}"]
+    shortcuts += ["slam.unknown_ids=true"] if unknown_ids else []
     config = load_config(config_file, [*(settings or []), *shortcuts])
     if show_config:
         typer.echo(to_toml(config), nl=False)
@@ -92,16 +124,19 @@ def slam(
         raise ConfigError(
             "a recording is needed", field="INPUT", hint="a folder or zip; --init DIR shows what to put in"
         )
-    from evermap.io import read_recording
+    from evermap.io import parse_shift, read_recording, shifted
     from evermap.runfolder import check_replaceable
 
+    shifts = [parse_shift(text) for text in shift or []]
+    if shifts and prior_map is None:
+        raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force)
     recording = read_recording(recording_path, robot=robot)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force)
-    prior = None if prior_map is None else _prior_landmarks(prior_map, prior_sigma, recording)
+    prior = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
     run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force)
 
 
@@ -118,6 +153,7 @@ def run_and_write(
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
     from evermap.runfolder import RunInfo, write_run
+    from evermap.viz.change_words import explanations
 
     warm_up()
     start = time.perf_counter()
@@ -133,7 +169,7 @@ def run_and_write(
     summary = write_run(out, recording, result, config, info=info, force=force)
     for remark in summary["warnings"]:
         warn(remark)
-    show_run(summary, out, as_json=as_json)
+    show_run(summary, out, as_json=as_json, findings=explanations(result))
     if result.interrupted:
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
 

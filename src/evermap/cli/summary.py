@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import typer
 
 from evermap.cli.terminal import print_json, print_table
 
@@ -21,8 +23,8 @@ _ROWS = (
 )
 
 
-def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool) -> None:
-    """The summary as JSON, or its main numbers as a table with the files to look at."""
+def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool, findings: Sequence[str] = ()) -> None:
+    """The summary as JSON, or its main numbers as a table with the files to look at, and what was found, in words."""
     if as_json:
         print_json(summary)
         return
@@ -34,3 +36,5 @@ def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool) -> None:
     files = (out / name for name in ("report.html", "summary.json"))
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(str(summary.get("recording", {}).get("name", "run")), rows)
+    for finding in findings:
+        typer.echo(finding)

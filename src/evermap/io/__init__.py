@@ -8,13 +8,16 @@ from evermap.io.mrclam import read_mrclam
 from evermap.io.native import read_native
 from evermap.io.native_write import write_native
 from evermap.io.registry import READERS, Reader, list_robots, read_recording, reader_for
+from evermap.io.shifts import Shift, parse_shift, shifted
 from evermap.io.template import write_template
 from evermap.io.tum import read_tum, write_tum
 
 __all__ = [
     "READERS",
     "Reader",
+    "Shift",
     "list_robots",
+    "parse_shift",
     "read_landmarks",
     "read_mrclam",
     "read_native",
@@ -22,6 +25,7 @@ __all__ = [
     "read_recording",
     "read_tum",
     "reader_for",
+    "shifted",
     "write_map_geojson",
     "write_map_parquet",
     "write_native",

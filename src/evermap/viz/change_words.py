@@ -1,0 +1,79 @@
+"""What changed, in words: for the terminal, the report and the legends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from evermap.types import Alternative, ChangeKind, MapChange, SlamResult
+
+NATS = 5.0
+"""An alternative is worth telling when its log probability is this close to that of the best explanation."""
+_MAX_IDS = 12
+
+
+def explanations(result: SlamResult) -> list[str]:
+    """One line for each change, then 'or: ...' for each alternative worth telling; [] where nothing is in question."""
+    start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
+    near = near_alternatives(result)
+    lines = [f"{describe(change, start_s)}, {probability(change.probability)}" for change in result.changes]
+    if near and not lines:
+        lines = ["most probably nothing moved"]
+    return lines + [
+        f"or: {describe_all(alternative.changes, start_s)}, {probability(alternative.probability)}"
+        for alternative in near
+    ]
+
+
+def near_alternatives(result: SlamResult) -> tuple[Alternative, ...]:
+    """Alternatives within `NATS` of the best explanation, which has at most the probability of each of its changes."""
+    rest = 1.0 - sum(alternative.probability for alternative in result.alternatives)
+    best = min((change.probability for change in result.changes), default=rest)
+    return tuple(other for other in result.alternatives if other.probability >= math.exp(-NATS) * best)
+
+
+def describe_all(changes: Sequence[MapChange], start_s: float) -> str:
+    """All changes of one explanation in one line."""
+    return "; ".join(describe(change, start_s) for change in changes) or "nothing moved"
+
+
+def describe(change: MapChange, start_s: float) -> str:
+    """'landmarks 11, 12, 13 moved by (+1.00, 0.00) m before the session'; times count from `start_s`."""
+    return f"{what(change)} {_when(change, start_s)}"
+
+
+def what(change: MapChange) -> str:
+    """The change without its time."""
+    if change.kind is ChangeKind.SWAPPED:
+        return f"{_group(change)} exchanged their identities"
+    moved = f"moved by ({_signed(change.displacement_m[0])}, {_signed(change.displacement_m[1])}) m"
+    if change.kind is ChangeKind.ROTATED:
+        return f"{_group(change)} turned by {_signed(math.degrees(change.rotation_rad), 1)}° and {moved}"
+    return f"{_group(change)} {moved}"
+
+
+def probability(value: float) -> str:
+    """'probability 97 %'; never certain."""
+    percent = f"{100 * value:.0f} %"
+    return "probability " + ("> 99 %" if value > 0.99 else "< 1 %" if value < 0.01 else percent)
+
+
+def _group(change: MapChange) -> str:
+    ids = [str(identity) for identity in change.landmark_ids]
+    shown = ", ".join(ids[:_MAX_IDS]) + (f" and {len(ids) - _MAX_IDS} more" if len(ids) > _MAX_IDS else "")
+    return f"landmark{'s' if len(ids) != 1 else ''} {shown}"
+
+
+def _when(change: MapChange, start_s: float) -> str:
+    if math.isnan(change.stamp_from_s):
+        return "before the session"
+    early, late = change.stamp_from_s - start_s, change.stamp_to_s - start_s
+    if round(early) == round(late):
+        return f"{late:.0f} s after the start"
+    return f"between {early:.0f} s and {late:.0f} s after the start"
+
+
+def _signed(value: float, digits: int = 2) -> str:
+    """'+1.00', '-0.50', and '0.00' without a sign."""
+    rounded = round(value, digits)
+    return f"{rounded:+.{digits}f}" if rounded else f"{0.0:.{digits}f}"
