@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.cli.slam import default_out
-from evermap.io import read_landmarks, read_recording, read_tum, write_native
+from evermap.cli.slam import Method, default_out
+from evermap.config import SlamConfig
+from evermap.io import parse_shift, read_landmarks, read_recording, read_tum, write_native
 
 # pictures have tests of their own, and take most of the time
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
@@ -121,6 +123,90 @@ def test_prior_map_puts_the_run_into_its_frame(template: Path, tmp_path: Path) -
         assert landmarks.position_m[known] == pytest.approx(expected, abs=0.004)
         positions.append(landmarks.position_m)
     np.testing.assert_allclose(*positions, atol=1e-9)
+
+
+def test_the_covariances_of_a_prior_map_count(template: Path, tmp_path: Path) -> None:
+    """A landmark whose own covariance is small stays where the file says, one with a large one goes where it is."""
+    survey = read_recording(template).true_landmarks
+    assert survey is not None
+    wrong_m = 0.2
+    written = {}
+    for sigma_m in (1e-3, 3.0):
+        path = tmp_path / f"map-{sigma_m}.csv"
+        rows = [
+            f"{i},{x + (wrong_m if row == 0 else 0.0)},{y},{(sigma_m if row == 0 else 1e-3) ** 2},0,{1e-6}"
+            for row, (i, (x, y)) in enumerate(zip(survey.landmark_id, survey.position_m, strict=True))
+        ]
+        path.write_text("\n".join(["landmark_id,x_m,y_m,cov_xx_m2,cov_xy_m2,cov_yy_m2", *rows]), encoding="utf-8")
+        out = tmp_path / "run"
+        result = run("slam", template, "--out", out, "--prior-map", path, "--method", "nohyp", "--json", *QUICK)
+        assert result.exit_code == 0, result.stderr
+        landmarks = read_landmarks(out / "map.parquet")
+        row = int(np.searchsorted(landmarks.landmark_id, survey.landmark_id[0]))
+        written[sigma_m] = landmarks.position_m[row, 0] - survey.position_m[0, 0]
+    assert written[1e-3] == pytest.approx(wrong_m, abs=0.01)
+    assert abs(written[3.0]) < 0.5 * wrong_m
+
+
+def test_shift_moves_landmarks_of_the_prior_map(
+    template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the estimator is given, and that the words of what it found close the output."""
+    import evermap.pipeline
+
+    survey = read_recording(template).true_landmarks
+    assert survey is not None
+    first, second = survey.landmark_id[:2].tolist()
+    whole, given = evermap.pipeline.run_slam, []
+
+    def found(recording: Any, config: Any, **options: Any) -> Any:
+        given.append((config, options["prior_map"]))
+        result = whole(recording, config, **options)
+        change = parse_shift(f"{first}:1,-0.5").undone(result.trajectory.stamp_s[0])
+        return replace(result, changes=(replace(change, probability=0.99),))
+
+    monkeypatch.setattr("evermap.pipeline.run_slam", found)
+    shifts = ["--shift", f"{first}:1,-0.5", "--shift", f"{second}:0.25"]
+    result = run(
+        "slam", template, "--out", tmp_path / "run", "--prior-map", "truth", *shifts, "--method", "nohyp", *QUICK
+    )
+    assert result.exit_code == 0, result.stderr
+    ((config, prior),) = given
+    assert (config.slam.method, config.slam.unknown_ids) == ("nohyp", False)
+    moved = prior.position_m - survey.position_m
+    assert moved[:2] == pytest.approx(np.array([[1.0, -0.5], [0.25, 0.0]]))
+    assert not moved[2:].any()
+    words = f"landmark {first} moved by (-1.00, +0.50) m before the session, probability 99 %"
+    assert result.stdout.splitlines()[-1] == words
+
+
+def test_shortcuts_are_settings() -> None:
+    shown = run("slam", "--method", "viterbi", "--unknown-ids", "--show-config")
+    settings = tomllib.loads(shown.stdout)["slam"]
+    assert (settings["method"], settings["unknown_ids"]) == ("viterbi", True)
+    plain = tomllib.loads(run("slam", "--show-config").stdout)["slam"]
+    assert (plain["method"], plain["unknown_ids"]) == (SlamConfig().method, False)
+    choices = [method.value for method in Method]
+    assert choices == list(get_args(SlamConfig.model_fields["method"].annotation))
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--shift", "1:1.0"], "there is no map to shift"),
+        (["--prior-map", "truth", "--shift", "one:1.0"], "'one' is no landmark id"),
+        (["--prior-map", "truth", "--shift", "987654:1.0"], "no landmark 987654 in the prior map"),
+        (["--method", "guess"], "'guess' is not one of 'nohyp'"),
+    ],
+)
+def test_wrong_shifts_and_methods_are_one_line(
+    options: list[str], problem: str, template: Path, tmp_path: Path
+) -> None:
+    result = run("slam", template, "--out", tmp_path / "run", *options)
+    assert result.exit_code == 2
+    assert problem in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
 
 
 def test_prior_map_of_a_recording_without_survey_is_the_users_mistake(template: Path, tmp_path: Path) -> None:

@@ -163,3 +163,17 @@ def test_runs_worse_than_odometry_are_not_praised(run):
     assert "off: no worse." in page
     still = dataclasses.replace(result, step_s=np.zeros(0))
     assert "× real time" not in page_of(recording, still)[0]
+
+
+def test_what_changed_is_told_in_words_and_numbers(run):
+    from synthetic_run import with_changes
+
+    recording, result = run
+    page, _ = page_of(recording, with_changes(result))
+    text = " ".join("".join(check(page).text).split())
+    assert "landmarks 3, 6, 9 moved by (-1.00, 0.00) m before the session, probability 97 %" in text
+    assert "or: landmarks 12, 15, 18" in text
+    assert "alternative_1.geojson" in text
+    assert page.index("What changed") < page.index("Where it was")
+    assert "nan" not in text
+    assert "What changed" not in page_of(recording, result)[0]

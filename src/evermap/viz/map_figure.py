@@ -10,6 +10,7 @@ from evermap import se2
 from evermap.metrics.alignment import rotate_covariance
 from evermap.metrics.summary import Evaluation
 from evermap.types import FloatArray, Recording, SlamResult
+from evermap.viz.change_layer import draw_moves, moves
 from evermap.viz.style import ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, NamedFigure, new_figure
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 
 
 def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
-    """Plan view in the frame of the truth where there is one, else in the map's own."""
+    """Plan view in the frame of the truth where there is one, else in the map's own; what changed, with arrows."""
     pose_truth_map = _alignment(evaluation)
     poses = se2.compose(pose_truth_map, result.trajectory.pose_world_robot)
     points = se2.transform(pose_truth_map, result.landmarks.position_m)
@@ -31,31 +32,37 @@ def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -
     if evaluation.poses is None and evaluation.landmarks_own is None:
         truth = survey = None  # nothing ties the frames together
 
-    low, high = _frame([poses[:, :2], points, *(part[:, :2] for part in (truth, survey) if part is not None)])
+    changed = moves(result, pose_truth_map)
+    places = [poses[:, :2], points, *(part for move in changed for part in (move.before_m, move.after_m))]
+    low, high = _frame([*places, *(part[:, :2] for part in (truth, survey) if part is not None)])
     size = high - low
-    height_in = float(np.clip(6.6 * size[1] / size[0], 2.6, 7.2)) + 0.9
+    height_in = float(np.clip(6.6 * size[1] / size[0], 2.6, 7.2)) + 0.9 + 0.17 * len(changed)
     figure = new_figure(7.2, height_in)
     axes = figure.add_subplot()
 
+    faint = 0.5 if changed else 1.0  # paths step back behind what changed
     odometry = evaluation.dead_reckoning
     pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
     drifted = _thin(se2.compose(pose_truth_odometry, result.dead_reckoning.pose_world_robot)[:, :2])
     leaves = bool(np.any((drifted < low) | (drifted > high)))
     label = "odometry alone" + (" (leaves the picture)" if leaves else "")
-    axes.plot(*drifted.T, color=ODOMETRY, lw=0.8, alpha=0.65, label=label, zorder=1)
+    axes.plot(*drifted.T, color=ODOMETRY, lw=0.8, alpha=0.65 * faint, label=label, zorder=1)
     if truth is not None:
-        axes.plot(*_thin(truth[:, :2]).T, color=INK, lw=1.6, alpha=0.35, label="true path", zorder=2)
-    axes.plot(*_thin(poses[:, :2]).T, color=ESTIMATE, lw=0.9, label="estimated path", zorder=3)
+        axes.plot(*_thin(truth[:, :2]).T, color=INK, lw=1.6, alpha=0.35 * faint, label="true path", zorder=2)
+    axes.plot(*_thin(poses[:, :2]).T, color=ESTIMATE, lw=0.9, alpha=faint, label="estimated path", zorder=3)
     if survey is not None:
         axes.plot(*survey.T, "s", mfc="none", mec=INK, ms=6.5, mew=0.9, label="surveyed landmark", zorder=4)
     _draw_landmarks(axes, points, covariance, result.landmarks.landmark_id, size)
     if len(poses):
         axes.plot(*poses[0, :2], "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6, label="start", zorder=7)
+    moved = draw_moves(axes, changed)
 
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.spines[["top", "right"]].set_visible(True)
-    figure.legend(loc="outside upper center", ncols=3)
-    return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    if moved:
+        figure.legend(handles=moved, loc="outside lower left", ncols=1, handlelength=3.2)
+    return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, bool(changed)))
 
 
 def _alignment(evaluation: Evaluation) -> FloatArray:
@@ -121,7 +128,17 @@ def _draw_landmarks(
             )
 
 
-def _caption(recording: Recording, evaluation: Evaluation) -> str:
+def _caption(recording: Recording, evaluation: Evaluation, changed: bool) -> str:
+    if changed:
+        arrows = (
+            " Arrows lead from where a landmark was (diamond) to where it is now; dashed: another explanation. The"
+            " displacements are in the map's own frame."
+        )
+        return _frame_caption(recording, evaluation) + arrows
+    return _frame_caption(recording, evaluation)
+
+
+def _frame_caption(recording: Recording, evaluation: Evaluation) -> str:
     poses, odometry = evaluation.poses, evaluation.dead_reckoning
     if poses is None and evaluation.landmarks_own is None:
         return "Frame of the first pose: the map's origin is where the robot stood at the start, x ahead of it."

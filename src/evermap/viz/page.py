@@ -9,13 +9,13 @@ STYLE = """
 :root {
   --paper:#fffffe; --card:#f6f8fa; --ink:#1b1f24; --muted:#636c76; --grid:#d8dde3; --shade:#e9ecf0;
   --estimate:#0072b2; --estimate-band:#cfe3f1; --odometry:#e69f00; --landmark:#009e73; --alert:#d55e00;
-  --online:#cc79a7; color-scheme:light dark;
+  --online:#cc79a7; --group:#7a4fb5; color-scheme:light dark;
 }
 @media screen and (prefers-color-scheme:dark) {
   :root {
     --paper:#14181d; --card:#1c2229; --ink:#e7ebef; --muted:#9aa5b1; --grid:#323a44; --shade:#262d36;
     --estimate:#56b4e9; --estimate-band:#1d3b50; --odometry:#e6a823; --landmark:#2fc39a; --alert:#ff8a4c;
-    --online:#dd97bd;
+    --online:#dd97bd; --group:#b794f0;
   }
 }
 * { box-sizing:border-box }

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 from evermap.metrics.summary import Evaluation
 from evermap.types import Recording, SlamResult
+from evermap.viz.change_words import explanations, near_alternatives
 from evermap.viz.headline import headline_cards
 from evermap.viz.page import PAGE, STYLE
 from evermap.viz.style import NamedFigure, house_style, inline_svg
-from evermap.viz.tables import calibration_table, landmark_table, noise_table, table
+from evermap.viz.tables import calibration_table, change_table, landmark_table, noise_table, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,7 +55,7 @@ def render_report(
         figures: `draw_figures(...)`, may be empty.
         sections: what the caller adds.
     """
-    parts = [headline_cards(summary), _interrupted(summary)]
+    parts = [headline_cards(summary), _interrupted(summary), _changes(result)]
     parts += [_section(section, number) for number, section in enumerate(sections)]
     parts += [
         _warnings(summary),
@@ -98,6 +99,21 @@ def _warnings(summary: Mapping[str, Any]) -> str:
         return ""
     items = "".join(f"<li>{escape(text)}</li>" for text in summary["warnings"])
     return f'<div class="note"><strong>Worth knowing</strong><ul>{items}</ul></div>'
+
+
+def _changes(result: SlamResult) -> str:
+    """What differs from the map, in words and numbers, and what else it may be; '' where nothing is in question."""
+    lines = explanations(result)
+    if not lines:
+        return ""
+    items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    note = ""
+    if near_alternatives(result):
+        note = (
+            "<p>The recording cannot rule out what follows an 'or'. The maps as they would be then are in"
+            " <code>alternative_1.geojson</code> and so on, the most probable first.</p>"
+        )
+    return f"<h2>What changed</h2><ul>{items}</ul>{change_table(result)}{note}"
 
 
 def _figures(title: str, figures: Sequence[NamedFigure], names: tuple[str, ...], html: str) -> str:

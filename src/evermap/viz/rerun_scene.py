@@ -17,6 +17,7 @@ from evermap.errors import MissingExtraError
 from evermap.metrics.consistency import chi2_interval
 from evermap.metrics.summary import Evaluation, compare_with_truth
 from evermap.types import FloatArray, IntArray, Recording, SlamResult, Trajectory
+from evermap.viz.change_layer import moves
 from evermap.viz.style import ALERT, ESTIMATE, LANDMARK, MUTED, ODOMETRY
 
 TIMELINE = "stamp_s"
@@ -30,7 +31,7 @@ Float32Array = NDArray[np.float32]
 def write_scene(
     recording: Recording, result: SlamResult, path: str | Path, *, evaluation: Evaluation | None = None
 ) -> Path:
-    """Writes `path` (.rrd): robot, path so far, landmarks as they appear, rays of detections, truth, NIS and latency.
+    """Writes `path` (.rrd): robot, path so far, landmarks as they appear, what changed, rays of detections, truth, NIS.
 
     Everything is in the frame of the truth where there is one, else in the map's. Time is the recording's own,
     in seconds on the timeline `stamp_s`.
@@ -55,6 +56,7 @@ def write_scene(
     _send_odometry(stream, result, evaluation)
     _send_robot(stream, result.trajectory, pose_truth_map)
     _send_landmarks(stream, result, pose_truth_map)
+    _send_changes(stream, result, pose_truth_map)
     _send_rays(stream, recording, result, pose_truth_map)
     _send_numbers(stream, recording, result, evaluation)
     stream.flush()
@@ -193,6 +195,24 @@ def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray)
         )
         stream.log(entity, marks)
         stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=_rgb(LANDMARK), radii=0.008))
+    stream.reset_time()
+
+
+def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -> None:
+    """Arrows from where landmarks were to where they are, from the time on at which the change is over."""
+    import rerun as rr
+
+    for number, move in enumerate(moves(result, pose_truth_map), start=1):
+        arrows = rr.Arrows3D(
+            origins=_flat(move.before_m, 0.02),
+            vectors=_flat(move.after_m - move.before_m),
+            colors=_rgb(move.colour),
+            radii=0.01 if move.alternative else 0.02,
+            labels=[move.label] * len(move.before_m),
+            show_labels=False,
+        )
+        stream.set_time(TIMELINE, duration=move.change.stamp_to_s)
+        stream.log(f"world/changes/{number}", arrows)
     stream.reset_time()
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Okabe and Ito (2008), told apart with every common kind of colour blindness
+# Okabe and Ito (2008), told apart with every common kind of colour blindness; the violet of a third group is darker
 INK = "#1b1f24"
 MUTED = "#636c76"
 GRID = "#d8dde3"
@@ -29,6 +29,7 @@ ODOMETRY = "#e69f00"
 LANDMARK = "#009e73"
 ALERT = "#d55e00"
 ONLINE = "#cc79a7"
+GROUP = "#7a4fb5"
 
 CSS_ROLES = {
     INK: "--ink",
@@ -42,6 +43,7 @@ CSS_ROLES = {
     LANDMARK: "--landmark",
     ALERT: "--alert",
     ONLINE: "--online",
+    GROUP: "--group",
 }
 
 _RC: Any = {

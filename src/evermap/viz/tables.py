@@ -65,6 +65,31 @@ def _learned(parameter: ParameterEstimate) -> str:
     return f"{parameter.prior_sigma / parameter.sigma:.3g} ×"
 
 
+def change_table(result: SlamResult) -> str:
+    """Every change with its numbers; stamps as in the recording. '' if there is none."""
+    if not result.changes:
+        return ""
+    rows = [
+        (
+            ", ".join(map(str, change.landmark_ids)),
+            change.kind.value,
+            _stamp(change.stamp_from_s),
+            _stamp(change.stamp_to_s),
+            f"{change.displacement_m[0]:.3f}",
+            f"{change.displacement_m[1]:.3f}",
+            f"{math.degrees(change.rotation_rad):.2f}",
+            f"{change.probability:.4f}",
+        )
+        for change in result.changes
+    ]
+    head = ("landmarks", "kind", "not before [s]", "not after [s]", "Δx [m]", "Δy [m]", "turn [°]", "probability")
+    return table(head, rows, numbers=(2, 3, 4, 5, 6, 7))
+
+
+def _stamp(stamp_s: float) -> str:
+    return f"{stamp_s:.1f}" if math.isfinite(stamp_s) else "–"
+
+
 def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
     """The map, landmark by landmark, with its error where surveyed; '' if it is empty."""
     landmarks, errors = result.landmarks, evaluation.landmarks or evaluation.landmarks_own
