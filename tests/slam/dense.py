@@ -69,10 +69,13 @@ class DensePosterior:
     def prior_residuals(self, estimate: Estimate) -> np.ndarray:
         problem, prior = self.problem, self.problem.prior
         out = [((estimate.states - prior.mean) / prior.sigma)[self.free]]
-        for j in self.known:
-            information = problem.landmark_information[j]
-            if information.any():
-                out.append(np.linalg.cholesky(information).T @ (estimate.landmark[j] - problem.landmark_mean[j]))
+        # the joint prior of the known landmarks by way of the covariance of all; a singular value of zero is no prior
+        mapped = np.flatnonzero(problem.landmark_information.any(axis=0))
+        covariance = np.linalg.inv(problem.landmark_information[np.ix_(mapped, mapped)])
+        seen = np.isin(mapped // 2, self.known)
+        information = np.linalg.inv(covariance[np.ix_(seen, seen)])
+        moved = (estimate.landmark - problem.landmark_mean).ravel()[mapped[seen]]
+        out.append(np.linalg.cholesky(information).T @ moved)
         out.append(np.sqrt(problem.start_information) * se2.between(problem.start_pose, estimate.pose[0]))
         return np.concatenate(out)
 

@@ -10,7 +10,7 @@ import scipy.linalg
 from evermap import se2
 from evermap.slam.calibration import N_STATES, CalibrationPrior
 from evermap.slam.kernels import integrate_odometry
-from evermap.slam.problem import Drive, Estimate, Noise, Problem
+from evermap.slam.problem import Drive, Estimate, Noise, Problem, independent
 
 QUIET = Noise(
     detection=np.array([0.05, 0.02]),
@@ -177,7 +177,7 @@ def make_world(
         start_pose=np.zeros(3),
         start_information=start_information,
         landmark_mean=landmark + noisy * sigma_map_m * rng.normal(size=landmark.shape),
-        landmark_information=information,
+        landmark_information=independent(information),
     )
     problem = replace(problem, landmark_mean=np.where(information.any(axis=(1, 2))[:, None], problem.landmark_mean, 0))
     return World(problem, noise, Estimate(pose, landmark, states))

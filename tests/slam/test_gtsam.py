@@ -40,7 +40,7 @@ def graph_of(problem: Problem, noise: Noise, *, heavy: bool) -> gtsam.NonlinearF
     held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
     graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*problem.start_pose), held))
     for j in range(len(problem.landmark_mean)):
-        information = problem.landmark_information[j]
+        information = problem.landmark_information[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
         if information.any():
             noise_model = gtsam.noiseModel.Gaussian.Information(information)
             graph.add(gtsam.PriorFactorPoint2(landmark_key(j), problem.landmark_mean[j], noise_model))

@@ -26,7 +26,9 @@ def with_unknown_landmark(world: World) -> World:
         problem,
         landmark_row=row,
         landmark_mean=np.insert(problem.landmark_mean, 2, 0.0, axis=0),
-        landmark_information=np.insert(problem.landmark_information, 2, 0.0, axis=0),
+        landmark_information=np.insert(
+            np.insert(problem.landmark_information, [4, 4], 0.0, axis=0), [4, 4], 0.0, axis=1
+        ),
     )
     truth = replace(world.truth, landmark=np.insert(world.truth.landmark, 2, np.nan, axis=0))
     return World(problem, world.noise, truth)
@@ -63,15 +65,38 @@ def elsewhere(world: World) -> World:
     moved = Estimate(
         se2.compose(pose_map_world, truth.pose), se2.transform(pose_map_world, truth.landmark), truth.states
     )
-    given = problem.landmark_information.any(axis=(1, 2))
+    every = np.kron(np.eye(len(problem.landmark_mean)), turn)
     problem = replace(
         problem,
         start_pose=moved.pose[0],
         start_information=1e-2,
-        landmark_mean=np.where(given[:, None], se2.transform(pose_map_world, problem.landmark_mean), 0.0),
-        landmark_information=turn @ problem.landmark_information @ turn.T,
+        landmark_mean=np.where(problem.mapped[:, None], se2.transform(pose_map_world, problem.landmark_mean), 0.0),
+        landmark_information=every @ problem.landmark_information @ every.T,
     )
     return World(problem, world.noise, moved)
+
+
+def tied(world: World) -> World:
+    """Landmarks 0, 2 and 3 of the map share a displacement, and so does 4, which nobody saw."""
+    problem = world.problem
+    members = np.array([0, 2, 3, 4])
+    shared = np.zeros((5, 2, 2))
+    shared[members] = np.eye(2)
+    shared = shared.reshape(10, 2)
+    covariance = 0.05**2 * np.eye(10) + 0.6**2 * shared @ shared.T
+    seen = problem.landmark_row != 4
+    problem = replace(
+        problem,
+        pose_row=problem.pose_row[seen],
+        landmark_row=problem.landmark_row[seen],
+        reading=problem.reading[seen],
+        sigma_given=problem.sigma_given[seen],
+        landmark_mean=world.truth.landmark + np.where(np.isin(np.arange(5), members)[:, None], [0.4, -0.3], 0.0),
+        landmark_information=np.linalg.inv(covariance),
+    )
+    landmark = world.truth.landmark.copy()
+    landmark[4] = np.nan
+    return World(problem, world.noise, replace(world.truth, landmark=landmark))
 
 
 CASES = {
@@ -84,6 +109,7 @@ CASES = {
     "plain": lambda: make_world(5, prior=replace(default_prior(), free=np.zeros(9, dtype=bool))),
     "never seen": lambda: with_unknown_landmark(make_world(6)),
     "duplicates": lambda: with_duplicates(make_world(7)),
+    "tied": lambda: elsewhere(tied(make_world(9, n_mapped=5))),
     "own sigmas": lambda: with_own_sigmas(make_world(8, p_outlier=0.05)),
 }
 
@@ -227,7 +253,7 @@ def test_problems_that_fit_into_no_memory_are_refused():
         world.problem,
         stamp_s=np.arange(many, dtype=float),
         landmark_mean=np.zeros((200, 2)),
-        landmark_information=np.zeros((200, 2, 2)),
+        landmark_information=np.zeros((400, 400)),
     )
     with pytest.raises(DataError, match="400000 poses with 200 landmarks"):
         Smoother(problem, QUIET)

@@ -25,7 +25,7 @@ from evermap.slam.kernels import (
     wrapped,
 )
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.types import FloatArray
+from evermap.types import BoolArray, FloatArray
 
 MEMORY_LIMIT_GB = 4.0
 COST_SLACK = 0.5
@@ -173,15 +173,13 @@ def assemble(
         corner[at_states + k, at_states + k] += precision
         right_shared[at_states + k] -= precision * off_mean
         cost += 0.5 * precision * off_mean * off_mean
-    for j in range(count):
-        block = landmark_information[j]
-        moved = landmark[j] - landmark_mean[j]
-        pull2 = block @ moved
-        corner[2 * j : 2 * j + 2, 2 * j : 2 * j + 2] += block
-        corner[2 * j, 2 * j] += HELD
-        corner[2 * j + 1, 2 * j + 1] += HELD
-        right_shared[2 * j : 2 * j + 2] -= pull2
-        cost += 0.5 * np.dot(moved, pull2)
+    moved = (landmark - landmark_mean).reshape(2 * count)
+    prior_pull = landmark_information @ moved
+    corner[:at_states, :at_states] += landmark_information
+    right_shared[:at_states] -= prior_pull
+    cost += 0.5 * np.dot(moved, prior_pull)
+    for k in range(at_states):
+        corner[k, k] += HELD
     # the first pose is held at `start`, in its own frame
     c, s = np.cos(pose[0, 2]), np.sin(pose[0, 2])
     dx, dy, dt = pose[0, 0] - start[0], pose[0, 1] - start[1], wrapped(pose[0, 2] - start[2])
@@ -283,6 +281,8 @@ class Smoother:
         self._heavy = heavy
         self._log_odds = noise.outlier_log_odds if robust else np.inf
         self._robust = robust
+        self._known = np.zeros(len(problem.landmark_mean), dtype=bool)
+        self._information = np.zeros((0, 0))
         size_gb = 5e-8 * len(problem.stamp_s) * (len(problem.landmark_mean) * 2 + 9)
         if size_gb > MEMORY_LIMIT_GB:
             raise DataError(
@@ -341,6 +341,12 @@ class Smoother:
         root: FloatArray = cholesky(information, lower=False)
         return root, solve_triangular(root, right, trans="T")
 
+    def _prior_information(self, known: BoolArray) -> FloatArray:
+        """The prior of the known landmarks, worked out anew only when others are known."""
+        if not np.array_equal(known, self._known):
+            self._known, self._information = known, self.problem.prior_information(known)
+        return self._information
+
     def _normal(self, estimate: Estimate) -> Normal:
         problem, noise = self.problem, self.noise
         known = estimate.known
@@ -365,7 +371,7 @@ class Smoother:
             problem.start_pose,
             problem.start_information,
             problem.landmark_mean[known],
-            problem.landmark_information[known],
+            self._prior_information(known),
             self._log_odds,
             self._heavy and self._robust,
         )

@@ -17,7 +17,7 @@ from evermap import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.frame_factor import whitened_detections, whitened_odometry
 from evermap.slam.kernels import detection_residual
-from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.problem import ConditionalPrior, Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
 STATES_KEY = gtsam.symbol("c", 0)
@@ -195,19 +195,40 @@ class IncrementalSmoother:
         problem = self._problem
         values.insert(_pose_key(row), gtsam.Pose2(*pose))
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-        mapped = problem.mapped
         for j in dict.fromkeys(problem.landmark_row[detections].tolist()):
             if j in self._known:
                 continue
-            self._known.add(j)
             values.insert(_landmark_key(j), landmark[j])
-            if mapped[j]:
-                noise = gtsam.noiseModel.Gaussian.Information(problem.landmark_information[j])
-                graph.add(gtsam.PriorFactorPoint2(_landmark_key(j), problem.landmark_mean[j], noise))
+            # chain rule: the joint prior is the product of each landmark's, given those before it
+            known = np.zeros(len(problem.landmark_mean), dtype=bool)
+            known[list(self._known)] = True
+            prior = problem.conditional_prior(j, known)
+            if prior.information.any():
+                graph.add(landmark_factor(j, prior, problem.landmark_mean))
+            self._known.add(j)
         # the first pose of the tree has no odometry: the summary holds it, or the start does
         before = row > self._first_pose
         if before or len(detections):
             graph.add(frame_factor(problem, self._noise, row, detections, before=before, heavy=self._robust))
+
+
+def landmark_factor(row: int, prior: ConditionalPrior, landmark_mean: FloatArray) -> Any:
+    """The gtsam factor of a landmark's prior, given those that it is tied to."""
+    keys = [_landmark_key(row), *(_landmark_key(int(j)) for j in prior.given)]
+    noise = gtsam.noiseModel.Gaussian.Information(prior.information)
+    if len(keys) == 1:
+        return gtsam.PriorFactorPoint2(keys[0], prior.mean, noise)
+
+    def error(_this: Any, values: Any, jacobians: Any) -> FloatArray:
+        tied = np.concatenate([values.atPoint2(key) for key in keys[1:]]) - landmark_mean[prior.given].ravel()
+        if jacobians is not None:
+            jacobians[0] = np.eye(2)
+            for k in range(len(keys) - 1):
+                jacobians[1 + k] = -prior.gain[:, 2 * k : 2 * k + 2]
+        residual: FloatArray = values.atPoint2(keys[0]) - prior.mean - prior.gain @ tied
+        return residual
+
+    return gtsam.CustomFactor(noise, keys, error)
 
 
 def _summary_factor(row: int, landmarks: IntArray, at: Estimate, root: FloatArray, right: FloatArray) -> Any:

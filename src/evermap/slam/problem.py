@@ -47,6 +47,28 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True)
+class ConditionalPrior:
+    """A landmark is at `mean + gain (landmark[given] - landmark_mean[given])`, to within `information`.
+
+    Attributes:
+        mean: (2,) prior position.
+        information: (2, 2) inverse covariance once the others are known; zeros where the prior says nothing.
+        given: (k,) rows of the landmarks it depends on.
+        gain: (2, 2 k) how far it goes with them.
+    """
+
+    mean: FloatArray
+    information: FloatArray
+    given: IntArray
+    gain: FloatArray
+
+    def place(self, landmark: FloatArray, landmark_mean: FloatArray) -> FloatArray:
+        """(2,) where the landmark is expected with the others at `landmark` (L, 2)."""
+        place: FloatArray = self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel()
+        return place
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """Everything measured and believed beforehand.
 
@@ -61,7 +83,8 @@ class Problem:
         start_pose: (3,) where the first pose is held.
         start_information: how firmly, [1/m^2] and [1/rad^2].
         landmark_mean: (L, 2) prior positions, zeros where there is none.
-        landmark_information: (L, 2, 2) inverse prior covariances, zeros where there is none.
+        landmark_information: (2 L, 2 L) inverse of their joint prior covariance, zeros where there is none. Blocks off
+            the diagonal tie landmarks to each other, for example those that may have moved together.
     """
 
     stamp_s: FloatArray
@@ -80,8 +103,40 @@ class Problem:
     @property
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""
-        held: BoolArray = self.landmark_information[:, 0, 0] > 0.0
+        held: BoolArray = np.diag(self.landmark_information)[::2] > 0.0
         return held
+
+    def prior_information(self, known: BoolArray) -> FloatArray:
+        """(2 K, 2 K) what the prior says about the K `known` landmarks alone, the others marginalised out.
+
+        Leaving rows out of an information matrix would hold the others at their means; out of a covariance it is exact,
+        which in terms of information is the Schur complement.
+        """
+        rows = np.repeat(known, 2)
+        kept = self.landmark_information[np.ix_(rows, rows)]
+        ties = self.landmark_information[np.ix_(rows, ~rows)]
+        if not ties.any():
+            return kept
+        # pseudo-inverse: landmarks may be tied to each other but to no place
+        rest = np.linalg.pinv(self.landmark_information[np.ix_(~rows, ~rows)], hermitian=True)
+        marginal: FloatArray = kept - ties @ rest @ ties.T
+        return marginal
+
+    def conditional_prior(self, row: int, known: BoolArray) -> ConditionalPrior:
+        """What the prior says about landmark `row`, given the `known` ones (of which it is none)."""
+        column = slice(2 * row, 2 * row + 2)
+        own = self.landmark_information[column, column]
+        if np.count_nonzero(self.landmark_information[column]) == np.count_nonzero(own):
+            return ConditionalPrior(self.landmark_mean[row], own, np.zeros(0, dtype=np.int64), np.zeros((2, 0)))
+        among = known.copy()
+        among[row] = True
+        information = self.prior_information(among)
+        at = 2 * int(known[:row].sum())
+        own = information[at : at + 2, at : at + 2]
+        gain = -np.linalg.pinv(own, hermitian=True) @ np.delete(information[at : at + 2], [at, at + 1], axis=1)
+        tied = gain.reshape(2, -1, 2).any(axis=(0, 2))
+        given: IntArray = np.flatnonzero(known)[tied]
+        return ConditionalPrior(self.landmark_mean[row], own, given, gain[:, np.repeat(tied, 2)])
 
     def until(self, n_poses: int, *, last_is_blind: bool = False) -> Problem:
         """The problem as it stood after `n_poses` poses; landmarks keep their rows.
@@ -97,6 +152,15 @@ class Problem:
             reading=self.reading[:stop],
             sigma_given=self.sigma_given[:stop],
         )
+
+
+def independent(blocks: FloatArray) -> FloatArray:
+    """(2 L, 2 L) with the (L, 2, 2) blocks on its diagonal: the joint information of landmarks that nothing ties."""
+    count = len(blocks)
+    joint = np.zeros((count, 2, count, 2))
+    rows = np.arange(count)
+    joint[rows, :, rows, :] = blocks
+    return joint.reshape(2 * count, 2 * count)
 
 
 @dataclass(frozen=True, slots=True)

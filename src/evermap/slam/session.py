@@ -12,7 +12,7 @@ from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START
-from evermap.slam.problem import Drive, Problem
+from evermap.slam.problem import Drive, Problem, independent
 from evermap.slam.streaming import Outcome, PriorMap, StreamingSlam
 from evermap.types import (
     UNKNOWN,
@@ -95,7 +95,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepare
         start_pose=np.zeros(3),
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
-        landmark_information=np.zeros((len(landmark_id), 2, 2)),
+        landmark_information=np.zeros((2 * len(landmark_id), 2 * len(landmark_id))),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
@@ -239,7 +239,7 @@ def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
             given[k] = True
             mean[k] = prior_map.position_m[row]
             information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
-    return PriorMap(mean, information, given)
+    return PriorMap(mean, independent(information), given)
 
 
 def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> FloatArray:

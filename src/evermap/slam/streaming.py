@@ -43,7 +43,7 @@ NOISE_CONVERGED = 0.01
 
 @dataclass(frozen=True, slots=True)
 class PriorMap:
-    """A map to localise in, in rows of the problem's landmarks: mean (L, 2), information (L, 2, 2), given (L,)."""
+    """A map to localise in, in rows of the problem's landmarks: mean (L, 2), information (2 L, 2 L), given (L,)."""
 
     mean: FloatArray
     information: FloatArray
@@ -220,7 +220,8 @@ class StreamingSlam:
             if np.isfinite(self._landmark[j, 0]):
                 continue
             if self._problem.mapped[j]:
-                self._landmark[j] = self._problem.landmark_mean[j]
+                prior = self._problem.conditional_prior(j, np.isfinite(self._landmark[:, 0]))
+                self._landmark[j] = prior.place(self._landmark, self._problem.landmark_mean)
             else:
                 self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 

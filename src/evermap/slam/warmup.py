@@ -33,7 +33,7 @@ def warm_up() -> None:
         start_pose=np.zeros(3),
         start_information=1e8,
         landmark_mean=np.zeros((1, 2)),
-        landmark_information=np.zeros((1, 2, 2)),
+        landmark_information=np.zeros((2, 2)),
     )
     slam = StreamingSlam(problem, START, prior)
     for _ in range(count):
