@@ -1,0 +1,180 @@
+"""Which mode holds when, and where everything is, in turns until neither changes (Nielsen 2024 sections 5 and 7).
+
+Given poses and modes, a selector chooses the mode of every look; given those, the problem is plain least squares. No
+indicator changes any more after a few rounds, or the rounds come back to a selection that was there before: then the
+best one seen counts. Bayes' rule would have poses and indicators sought together; what this alternation cannot find is
+why `joint` exists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.config import ModesConfig
+from evermap.slam.arrow import Smoother
+from evermap.slam.modes.gating import gate_threshold, with_births
+from evermap.slam.modes.looks import Looks, look_at_modes, news_in_a_miss
+from evermap.slam.modes.places import FREE, Modes, at_places
+from evermap.slam.modes.tidying import merged, pruned
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.selectors.chain import ModeChain
+from evermap.slam.selectors.protocol import Selection, Selector, selector_by_name
+from evermap.survival.text import parse_prior
+from evermap.types import IntArray, Sensor
+
+SOLVER_ITERATIONS = 10
+SOLVER_TOLERANCE = 1e-4
+"""Of every round: the next one starts where it ended [m, rad]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModeModel:
+    """How landmarks are believed to change their modes, and how the modes are selected.
+
+    Attributes:
+        selector: chooses modes, given poses and positions.
+        chain: how modes change from look to look.
+        sensor: field of view and detection probability.
+        gate: squared Mahalanobis distance from which a detection is none of a mode.
+        significance: of the difference between two modes, below which they are two.
+        rounds: of selecting and solving, at most.
+        chained: whether the selector knows the chain, or takes every look by itself.
+        negative_information: whether misses count in the selection.
+        robust: explain outliers, in the selection as in the least squares.
+    """
+
+    selector: Selector
+    chain: ModeChain
+    sensor: Sensor
+    gate: float
+    significance: float
+    rounds: int
+    chained: bool
+    negative_information: bool
+    robust: bool
+
+    @classmethod
+    def from_settings(cls, method: str, settings: ModesConfig, sensor: Sensor, *, robust: bool = True) -> ModeModel:
+        """By the name of a method, as in `slam.method`; `max-mixture` neither iterates nor looks at misses.
+
+        Raises:
+            ConfigError: no such method, or a lifetime that cannot be read.
+        """
+        plain = method == "max-mixture"
+        lifetime = None if settings.lifetime is None else parse_prior(settings.lifetime)
+        return cls(
+            selector=selector_by_name(method, mcts_budget=settings.mcts_budget, mcts_window_s=settings.mcts_window_s),
+            chain=ModeChain(switch_probability=settings.switch_probability, lifetime=lifetime),
+            sensor=sensor,
+            gate=gate_threshold(settings.gate_probability),
+            significance=settings.switch_probability,
+            rounds=1 if plain else settings.rounds,
+            chained=method not in {"max-mixture", "nn"},
+            negative_information=not plain,
+            robust=robust,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What is where, and which mode held at every look.
+
+    Attributes:
+        problem: with every detection at its mode.
+        estimate: its optimum.
+        modes: whose mode each place is.
+        looks: at the landmarks that have several modes.
+        selection: their modes.
+        settled: no indicator changed in the last round; False where they went in circles or the rounds ran out.
+    """
+
+    problem: Problem
+    estimate: Estimate
+    modes: Modes
+    looks: Looks
+    selection: Selection
+    settled: bool
+
+
+def explain_with_modes(
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    modes: Modes,
+    model: ModeModel,
+    rng: np.random.Generator,
+    *,
+    heavy: bool = False,
+) -> Explanation:
+    """Births, the alternation, and the alternation again as long as modes have to be merged or pruned.
+
+    Args:
+        problem: the measurements, with every detection at some mode of its landmark.
+        estimate: its optimum.
+        noise: the noise levels.
+        modes: whose mode each place is.
+        model: how modes change and are selected.
+        rng: for selectors that draw.
+        heavy: outliers have the Cauchy's tails in the least squares.
+    """
+    estimate = _with_map(problem, estimate, modes)
+    marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
+    miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
+    problem, estimate, modes, lost = with_births(problem, estimate, marginals, noise, modes, model.gate)
+    # what a selector with a window may keep: detections that gated with the mode that they were given
+    kept = np.where(lost, FREE, problem.landmark_row)
+    while True:
+        found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, heavy=heavy)
+        problem, estimate, tidy = pruned(found.problem, found.estimate, modes)
+        marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
+        problem, estimate, tidy = merged(problem, estimate, marginals, tidy, model.significance)
+        if tidy is modes:
+            return found
+        modes, kept = tidy, problem.landmark_row
+
+
+def _with_map(problem: Problem, estimate: Estimate, modes: Modes) -> Estimate:
+    """Where the prior map holds a landmark that was seen, but never there, that place is one of its modes too."""
+    seen = np.zeros(modes.n_landmarks, dtype=np.bool_)
+    seen[modes.landmark[problem.landmark_row]] = True
+    unseen = np.flatnonzero(seen & (problem.mapped & ~estimate.known)[: modes.n_landmarks])
+    return at_places(estimate, unseen, problem.landmark_mean[unseen]) if len(unseen) else estimate
+
+
+def _alternate(
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    modes: Modes,
+    model: ModeModel,
+    rng: np.random.Generator,
+    miss_weight: float,
+    kept: IntArray,
+    *,
+    heavy: bool,
+) -> Explanation:
+    """Select, solve, and so on with the same modes; the best of all if it does not settle."""
+    best, best_score = None, -np.inf
+    seen: set[bytes] = set()
+    for round_ in range(1, model.rounds + 1):
+        looks = look_at_modes(
+            problem, estimate, noise, modes, model.sensor, miss_weight=miss_weight, robust=model.robust
+        )
+        previous = looks.columns_of(kept) if round_ == 1 else None
+        selection = model.selector.select(looks.evidence, model.chain, rng, previous=previous)
+        before, problem = problem, looks.assigned(problem, selection.indicator)
+        if round_ > 1 and np.array_equal(problem.landmark_row, before.landmark_row):
+            return Explanation(before, estimate, modes, looks, selection, settled=True)
+        smoother = Smoother(problem, noise, heavy=heavy, robust=model.robust)
+        estimate = smoother.optimum(estimate, iterations=SOLVER_ITERATIONS, tolerance=SOLVER_TOLERANCE)
+        score = looks.prior_score(selection.indicator, selection.log_joint) - smoother.cost(estimate)
+        if best is None or score > best_score:
+            best = Explanation(problem, estimate, modes, looks, selection, settled=False)
+            best_score = score
+        if problem.landmark_row.tobytes() in seen:
+            break
+        seen.add(problem.landmark_row.tobytes())
+    assert best is not None
+    return best

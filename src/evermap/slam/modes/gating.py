@@ -1,0 +1,169 @@
+"""Which detections a mode can explain, and new modes for those that none explains (Nielsen 2024 section 7.1).
+
+A detection gates with a mode when its squared Mahalanobis distance, with the covariance of pose and mode together and
+the sensor's noise, is below the chi-square quantile of two degrees of freedom.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from evermap.slam.kernels import detection_residual, kernel
+from evermap.slam.modes.places import FREE, Modes, at_places, grown
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.triangulate import sighted_at
+from evermap.types import BoolArray, FloatArray, IntArray
+
+
+def gate_threshold(gate_probability: float) -> float:
+    """Squared Mahalanobis distance that range and bearing of a true detection stay below with this probability."""
+    return math.inf if gate_probability >= 1.0 else -2.0 * math.log1p(-gate_probability)
+
+
+def distances(
+    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, detections: IntArray, places: IntArray
+) -> FloatArray:
+    """(k,) squared Mahalanobis distance of detections (k,), were they of these places (k,), with `S = H P H' + R`.
+
+    For a detection that the estimate already used, `S` is larger than its residual's covariance: the gate is wider.
+    """
+    found: FloatArray = _distances(
+        estimate.pose,
+        estimate.landmark,
+        estimate.states,
+        problem.pose_row[detections],
+        places,
+        problem.reading[detections],
+        noise.of_detections(problem.sigma_given[detections]),
+        problem.mount,
+        problem.prior.free,
+        marginals.pose,
+        marginals.pose_shared,
+        marginals.shared,
+    )
+    return found
+
+
+def explained(
+    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, modes: Modes, threshold: float
+) -> BoolArray:
+    """(M, K) which detections gate with which columns of their landmark's modes (`Modes.table`)."""
+    table = modes.table(estimate)
+    places = table[modes.landmark[problem.landmark_row]]
+    detections, columns = np.nonzero(places != FREE)
+    gates = np.zeros(places.shape, dtype=np.bool_)
+    distance = distances(problem, estimate, marginals, noise, detections, places[detections, columns])
+    gates[detections, columns] = distance < threshold
+    return gates
+
+
+def with_births(
+    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, modes: Modes, threshold: float
+) -> tuple[Problem, Estimate, Modes, BoolArray]:
+    """New modes for detections that gate with none of their landmark's, in order of time.
+
+    The first of them starts a mode where it points to, and those that gate with it need no other. All detections stay
+    where they are, for a selector to decide.
+
+    Returns:
+        Problem, estimate and modes, with the new ones; and (M,) which detections gated with none before.
+    """
+    gated = explained(problem, estimate, marginals, noise, modes, threshold)
+    lost: BoolArray = np.logical_not(gated.any(axis=1))
+    born: dict[int, list[tuple[FloatArray, FloatArray]]] = {}
+    starts: list[int] = []
+    for m in np.flatnonzero(lost).tolist():
+        of_landmark = born.setdefault(int(modes.landmark[problem.landmark_row[m]]), [])
+        own = _at_sighting(problem, estimate, noise, m)
+        cov_pose = marginals.pose[problem.pose_row[m]]
+        if any(_distance_to(problem, estimate, noise, m, cov_pose, *mode) < threshold for mode in of_landmark):
+            continue
+        of_landmark.append((own[0], own[1] @ cov_pose @ own[1].T + own[2]))
+        starts.append(m)
+    if not starts:
+        return problem, estimate, modes, lost
+    started = np.array(starts)
+    place = modes.rows_for(len(started))
+    owner = modes.landmark[problem.landmark_row[started]]
+    problem, estimate = grown(problem, estimate, int(place.max()) + 1)
+    at = sighted_at(estimate.pose[problem.pose_row[started]], problem.reading[started], estimate.states, problem.mount)
+    return problem, at_places(estimate, place, at), modes.with_owner(place, owner), lost
+
+
+def _at_sighting(
+    problem: Problem, estimate: Estimate, noise: Noise, m: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Where a detection points to, the derivative (2, 3) of that by its pose, and the covariance that is the sensor's.
+
+    By the implicit function: the residual stays zero when pose, landmark and reading move together.
+    """
+    pose = estimate.pose[problem.pose_row[m]]
+    at = sighted_at(pose, problem.reading[m], estimate.states, problem.mount)
+    _, by_pose, by_place = _residual(problem, estimate, m, at)
+    back = np.linalg.inv(by_place)
+    sigma = noise.of_detections(problem.sigma_given[m])
+    return at, -back @ by_pose, back @ np.diag(sigma**2) @ back.T
+
+
+def _distance_to(
+    problem: Problem, estimate: Estimate, noise: Noise, m: int, cov_pose: FloatArray, at: FloatArray, cov: FloatArray
+) -> float:
+    """Squared distance of a detection to a mode that was just born, as independent of the pose."""
+    e, by_pose, by_place = _residual(problem, estimate, m, at)
+    sigma = noise.of_detections(problem.sigma_given[m])
+    s = by_pose @ cov_pose @ by_pose.T + by_place @ cov @ by_place.T + np.diag(sigma**2)
+    return float(e @ np.linalg.solve(s, e))
+
+
+def _residual(
+    problem: Problem, estimate: Estimate, m: int, at: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    pose = estimate.pose[problem.pose_row[m]]
+    range_m, bearing_rad = problem.reading[m]
+    detection_residual(pose, at, estimate.states, problem.mount, range_m, bearing_rad, e, jx, jl, jc)
+    return e, jx, jl
+
+
+@kernel
+def _distances(
+    pose: FloatArray,
+    landmark: FloatArray,
+    states: FloatArray,
+    pose_row: Any,
+    place: Any,
+    reading: FloatArray,
+    sigma: FloatArray,
+    mount: FloatArray,
+    free: Any,
+    cov_pose: FloatArray,
+    cov_cross: FloatArray,
+    cov_shared: FloatArray,
+) -> FloatArray:
+    at_states = len(cov_shared) - 9
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    rows = np.zeros(7, dtype=np.int64)
+    j, cov = np.zeros((2, 10)), np.zeros((10, 10))
+    out = np.zeros(len(place))
+    for m in range(len(place)):
+        i = pose_row[m]
+        detection_residual(pose[i], landmark[place[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
+        rows[0], rows[1] = 2 * place[m], 2 * place[m] + 1
+        for k in range(5):
+            rows[2 + k] = at_states + k
+            if not free[k]:
+                jc[:, k] = 0.0
+        j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
+        cov[:3, :3] = cov_pose[i]
+        for a in range(7):
+            for b in range(3):
+                cov[3 + a, b] = cov[b, 3 + a] = cov_cross[i, b, rows[a]]
+            for b in range(7):
+                cov[3 + a, 3 + b] = cov_shared[rows[a], rows[b]]
+        s = j @ cov @ j.T
+        s00, s01, s11 = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
+        out[m] = (s11 * e[0] ** 2 - 2.0 * s01 * e[0] * e[1] + s00 * e[1] ** 2) / (s00 * s11 - s01 * s01)
+    return out

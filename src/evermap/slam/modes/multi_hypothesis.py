@@ -1,0 +1,96 @@
+"""Nielsen's methods behind the estimator's seam: causal at every frame, thought over when stock is taken.
+
+At its frame a detection goes to the mode that is most probable by all looks so far, of those that it gates with; where
+it gates with none, it starts a mode. Whenever stock is taken, births, selection and least squares alternate over the
+whole session.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evermap.slam.method import Compare, Revision
+from evermap.slam.modes.alternation import Explanation, ModeModel, explain_with_modes
+from evermap.slam.modes.changes import switches
+from evermap.slam.modes.places import FREE, Modes
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.types import FloatArray, IntArray
+
+LEAST_SWITCH = 1e-300
+"""A switch that is ruled out still leaves a filter that can recover."""
+
+
+class MultiHypothesis:
+    """A `Method` with the multi-hypothesis map and one of the selectors.
+
+    Args:
+        n_landmarks: landmarks of the session, with or without a prior map.
+        model: how modes change and are selected.
+        seed: of selectors that draw.
+    """
+
+    def __init__(self, n_landmarks: int, model: ModeModel, *, seed: int = 0) -> None:
+        self._model = model
+        self._rng = np.random.default_rng(seed)
+        self._modes = Modes.one_each(n_landmarks)
+        self._log_belief = np.zeros(n_landmarks)
+        """(P,) log probability of each place to be where its landmark is, by all looks so far."""
+
+    def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
+        """The most probable mode that each detection gates with, else a new one."""
+        del row
+        place = problem.landmark_row[detections]
+        candidates = [np.flatnonzero(self._modes.landmark == landmark) for landmark in place]
+        which = np.repeat(np.arange(len(detections)), [len(mine) for mine in candidates])
+        distance, log_volume = compare(detections[which], np.concatenate([*candidates, np.empty(0, np.int64)]))
+        for k, mine in enumerate(candidates):
+            place[k] = self._best_of(mine, distance[which == k], log_volume[which == k])
+        return place
+
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+        """Births and the alternation over everything so far."""
+        del final
+        found = explain_with_modes(problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy)
+        self._modes = found.modes
+        current = self._current(found)
+        self._log_belief = np.full(len(found.modes.landmark), self._log_switch)
+        self._log_belief[current] = 0.0
+        return Revision(found.problem, found.estimate, current, switches(found, self._model.chain))
+
+    @property
+    def _log_switch(self) -> float:
+        """Of a landmark to be elsewhere at the next look; between frames it is the constant, lifetime or not."""
+        return math.log(max(self._model.significance, LEAST_SWITCH))
+
+    def _best_of(self, places: IntArray, distance: FloatArray, log_volume: FloatArray) -> int:
+        """One step of the forward filter over the modes of one landmark, and where its detection belongs."""
+        there = np.isfinite(distance)
+        first = int(places[0])
+        if not there.any():  # never seen, and not in the prior map
+            self._log_belief[first] = 0.0
+            return first
+        places, distance, log_volume = places[there], distance[there], log_volume[there]
+        before = self._log_belief[places] - np.logaddexp.reduce(self._log_belief[places])
+        before = np.logaddexp(before, self._log_switch)
+        said = -0.5 * (distance + log_volume)
+        self._log_belief[places] = before + said if self._model.chained else said
+        gates = distance < self._model.gate
+        if gates.any():
+            return int(places[np.argmax(np.where(gates, self._log_belief[places], -np.inf))])
+        landmark = int(self._modes.landmark[first])
+        new = int(self._modes.rows_for(1)[0])
+        self._modes = self._modes.with_owner(np.array([new]), landmark)
+        self._log_belief = np.append(self._log_belief, np.zeros(len(self._modes.landmark) - len(self._log_belief)))
+        self._log_belief[new] = self._log_belief[places].max() + self._log_switch
+        return new
+
+    def _current(self, found: Explanation) -> IntArray:
+        """(L,) the mode of every landmark at its last look; its only one where it has no other."""
+        current = found.looks.table[:, 0].copy()
+        current[current == FREE] = np.flatnonzero(current == FREE)
+        looks = found.looks
+        last = looks.evidence.first[1:] - 1
+        current[looks.several] = looks.table[looks.several, found.selection.indicator[last]]
+        return current

@@ -1,0 +1,90 @@
+"""The multi-hypothesis map: whose mode each place is (Nielsen 2024 section 3.1).
+
+A mode's position stands in the estimate and its covariance in the marginals, as those of every place. What is kept
+here is only what the estimator does not know: which landmark a place belongs to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.slam.problem import Estimate, Problem
+from evermap.types import FloatArray, IntArray
+
+FREE = -1
+"""Owner of a row of places that belongs to nobody (any more), and column of a landmark with fewer modes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Modes:
+    """Whose mode each place is.
+
+    Attributes:
+        landmark: (P,) row of the landmark, or `FREE`. Row `l < L` is the first mode of landmark `l`: what a prior map
+            says, or where it was first seen. It stays reserved when it has no position.
+        n_landmarks: L.
+    """
+
+    landmark: IntArray
+    n_landmarks: int
+
+    @classmethod
+    def one_each(cls, n_landmarks: int) -> Modes:
+        """The static world."""
+        return cls(np.arange(n_landmarks), n_landmarks)
+
+    def table(self, estimate: Estimate) -> IntArray:
+        """(L, K) places with a position of every landmark, in order; `FREE` where it has fewer than K."""
+        owned = np.flatnonzero((self.landmark != FREE) & estimate.known)
+        order = owned[np.argsort(self.landmark[owned], kind="stable")]
+        owner = self.landmark[order]
+        column = np.arange(len(order)) - np.searchsorted(owner, owner)
+        table = np.full((self.n_landmarks, max(1, int(column.max(initial=0)) + 1)), FREE, dtype=np.int64)
+        table[owner, column] = order
+        return table
+
+    def rows_for(self, count: int) -> IntArray:
+        """(count,) rows for new modes: free ones first, then new ones at the end."""
+        free = np.flatnonzero(self.landmark == FREE)[:count]
+        return np.append(free, len(self.landmark) + np.arange(count - len(free)))
+
+    def with_owner(self, place: IntArray, landmark: IntArray | int) -> Modes:
+        """These places belong to these landmarks (or are `FREE`); rows are appended as needed."""
+        missing = max(0, int(np.max(place, initial=-1)) + 1 - len(self.landmark))
+        owner = np.append(self.landmark, np.full(missing, FREE))
+        owner[place] = landmark
+        return replace(self, landmark=owner)
+
+
+def grown(problem: Problem, estimate: Estimate, count: int) -> tuple[Problem, Estimate]:
+    """Room for `count` places; those that are new have neither prior nor position."""
+    missing = count - len(problem.landmark_mean)
+    if missing <= 0:
+        return problem, estimate
+    pad = ((0, missing), (0, 0))
+    problem = replace(
+        problem,
+        landmark_mean=np.pad(problem.landmark_mean, pad),
+        landmark_information=np.pad(problem.landmark_information, (0, 2 * missing)),
+    )
+    return problem, replace(estimate, landmark=np.pad(estimate.landmark, pad, constant_values=np.nan))
+
+
+def at_places(estimate: Estimate, place: IntArray, position_m: FloatArray | float) -> Estimate:
+    """The estimate with some places elsewhere, or nowhere (nan)."""
+    landmark = estimate.landmark.copy()
+    landmark[place] = position_m
+    return replace(estimate, landmark=landmark)
+
+
+def intervals_s(problem: Problem) -> FloatArray:
+    """(P, 2) first and last stamp at which each place was seen: when its mode certainly held; nan where never."""
+    stamps = problem.stamp_s[problem.pose_row]
+    first = np.full(len(problem.landmark_mean), np.inf)
+    last = np.full(len(problem.landmark_mean), -np.inf)
+    np.minimum.at(first, problem.landmark_row, stamps)
+    np.maximum.at(last, problem.landmark_row, stamps)
+    both = np.column_stack([first, last])
+    return np.where(np.isfinite(both), both, np.nan)
