@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.errors import ConfigError, InputError
+from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.persistence.death import log_death_odds
 from evermap.survival import Exponential
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -93,3 +94,71 @@ class ModeChain:
     def memoryless(self) -> bool:
         """Leaving does not depend on how long a mode has held: a Markov chain over the looks."""
         return self.lifetime is None or isinstance(self.lifetime, Exponential)
+
+    def log_transitions(self, held_s: FloatArray, until_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log probabilities that a mode that has held for `held_s` holds until `until_s`, and that it does not.
+
+        Args:
+            held_s: (N,) age of the mode at one look, seconds since its first.
+            until_s: (N,) its age at the next, `held_s <= until_s`.
+        """
+        if self.lifetime is None:
+            with np.errstate(divide="ignore"):
+                stay, leave = np.log1p(-self.switch_probability), np.log(self.switch_probability)
+            return np.full(len(held_s), stay), np.full(len(held_s), leave)
+        odds = log_death_odds((self.lifetime,), np.zeros(len(held_s), dtype=np.int64), held_s, until_s)
+        return 0.0 - np.logaddexp(0.0, odds), 0.0 - np.logaddexp(0.0, -odds)
+
+    def log_gaps(self, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same for the gap before each of (N,) looks, of a memoryless chain; nothing is before the first."""
+        gap_s = np.diff(stamp_s, prepend=stamp_s[:1])
+        return self.log_transitions(np.zeros(len(gap_s)), gap_s)
+
+    def log_start(self, exists: BoolArray) -> FloatArray:
+        """(..., K) log probabilities of the modes at the first look; `exists`: (..., K) as `ModeLooks.exists`."""
+        possible = exists.copy()
+        if self.gone:
+            possible[..., -1] = False
+        with np.errstate(divide="ignore"):
+            return np.where(possible, -np.log(possible.sum(axis=-1, keepdims=True)), -np.inf)
+
+    def gone_column(self, modes: int) -> int:
+        """Which of so many columns is 'gone', or -1."""
+        return modes - 1 if self.gone else -1
+
+
+def log_joint(looks: ModeLooks, chain: ModeChain, indicator: IntArray) -> FloatArray:
+    """(L,) log of the chain's prior times the likelihoods of one sequence of modes for every landmark.
+
+    Args:
+        looks: what every look says.
+        chain: how modes change.
+        indicator: (R,) the mode at every look.
+    """
+    rows = np.arange(len(indicator))
+    landmark, exists = looks.landmark, looks.exists
+    begins = np.zeros(len(rows), dtype=np.bool_)
+    begins[looks.first[:-1][np.diff(looks.first) > 0]] = True
+    before = np.maximum(rows - 1, 0)
+    changed = ~begins & (indicator != indicator[before])
+    stay_row = np.maximum.accumulate(np.where(begins | changed, rows, 0))[before]
+    stay_row[begins] = rows[begins]
+    before[begins] = rows[begins]
+    since_s = looks.stamp_s[before if chain.memoryless else stay_row]
+    stay, leave = chain.log_transitions(looks.stamp_s[before] - since_s, looks.stamp_s - since_s)
+    others = exists.sum(axis=1)[landmark] - 1
+    with np.errstate(divide="ignore", invalid="ignore"):
+        prior = np.where(changed, leave - np.log(others), np.where(others > 0, stay, 0.0))
+    if chain.gone:
+        was_gone = indicator[before] == exists.shape[1] - 1
+        prior = np.where(was_gone, np.where(changed, -np.inf, 0.0), prior)
+    prior = np.where(begins, chain.log_start(exists)[landmark, indicator], prior)
+    prior = np.where(exists[landmark, indicator], prior, -np.inf)
+    each = prior + looks.log_likelihood[rows, indicator]
+    return np.bincount(landmark, each, minlength=looks.n_landmarks).astype(np.float64)
+
+
+def impossible(landmark: int) -> NumericalError:
+    """The error of a landmark whose looks no sequence of modes can explain."""
+    problem = f"landmark {landmark}: no sequence of modes is possible"
+    return NumericalError(problem, field="log_likelihood", hint="a finite value for one mode at every look")

@@ -62,7 +62,7 @@ def selector_by_name(name: str, *, mcts_budget: int = 200, mcts_window_s: float 
         ConfigError: no such selector.
     """
     from evermap.slam.selectors.nearest import Nearest
-    from evermap.slam.selectors.smoothed import MostProbableModes, MostProbableSequence
+    from evermap.slam.selectors.posterior import MostProbableModes, MostProbableSequence
     from evermap.slam.selectors.tree_search import TreeSearch
 
     if name in {"max-mixture", "nn"}:
