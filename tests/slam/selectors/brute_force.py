@@ -85,7 +85,7 @@ def random_looks(rng, counts, modes, *, gap_s=4.0, born_late=False, scale=3.0):
         gap = np.where(rng.random(count) < 0.15, 0.0, rng.exponential(gap_s, count))
         stamps.append(rng.uniform(0, 1000) + np.cumsum(gap))
         value = rng.normal(0.0, scale, (count, modes))
-            if born_late and count:
+        if born_late and count:
             value[: rng.integers(0, count), 1] = -np.inf
         likelihoods.append(value)
     return ModeLooks(first, np.concatenate(stamps), np.concatenate(likelihoods))
