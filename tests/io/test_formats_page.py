@@ -11,7 +11,20 @@ import pyarrow.parquet as pq
 
 from evermap.io import read_recording, write_map_parquet
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
-from evermap.types import Landmarks
+from evermap.runsummary import RunInfo, change_dict, summary_dict
+from evermap.types import (
+    ChangeKind,
+    Detections,
+    Frames,
+    Innovations,
+    Landmarks,
+    MapChange,
+    Misses,
+    Odometry,
+    Recording,
+    SlamResult,
+    Trajectory,
+)
 
 
 def page(repository: Path) -> str:
@@ -50,3 +63,23 @@ def test_all_map_columns_are_listed(repository: Path, tmp_path: Path) -> None:
     listed = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
     written = pq.read_table(write_map_parquet(Landmarks.at([1], [[0, 0]]), tmp_path / "map.parquet")).column_names
     assert listed == written
+
+
+def test_all_keys_of_summaries_and_changes_are_listed(repository: Path) -> None:
+    empty = Trajectory(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    none = np.zeros(0, dtype=np.int64)
+    nothing = Innovations(np.zeros(0), none, none, np.zeros(0), np.zeros(0))
+    result = SlamResult(
+        empty, empty, Landmarks.at([], []), (), nothing, Misses(none, none, np.zeros(0)), np.zeros(0), empty
+    )
+    recording = Recording("", Odometry(*np.zeros((4, 0))), Frames(np.zeros(0)), Detections(*[none] * 8))
+    summary = summary_dict(recording, result, {}, config={}, info=RunInfo(), timing={}, outputs=[])
+    section = page(repository).split("## Summary and changes")[1].split("\n## ")[0]
+    listed = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in section.splitlines() if line[:3] == "| `"))
+    assert sorted([*listed, "schema_version"]) == sorted(summary)
+
+    change = change_dict(MapChange((1,), ChangeKind.MOVED, 0.0, 1.0, (0.0, 0.0), 0.0, 1.0))
+    assert set(re.findall(r"`(\w+)`", section.split("Their keys")[1])) == set(change)
+    told = (repository / "docs" / "changes.md").read_text(encoding="utf-8").split("| key |")[1].split("\n\n")[0]
+    rows = [line.split("|")[1] for line in told.splitlines() if line.startswith("| `")]
+    assert re.findall(r"`(\w+)`", "".join(rows)) == list(change)
