@@ -293,12 +293,12 @@ class Smoother:
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
         """Damped Gauss-Newton from `start` until no step moves anything by more than `tolerance` (m or rad)."""
         estimate = start
-        normal = self._normal(estimate)
+        normal = self.normal(estimate)
         damping = 0.0
         for _ in range(iterations):
             step = solve(normal, damping, False)
             trial = _moved(estimate, step.pose, step.shared)
-            following = self._normal(trial)
+            following = self.normal(trial)
             if np.isfinite(following.cost) and following.cost <= normal.cost + COST_SLACK:
                 estimate, normal = trial, following
                 damping = 0.0 if damping < 1e-6 else damping / 10.0
@@ -314,16 +314,16 @@ class Smoother:
 
     def cost(self, estimate: Estimate) -> float:
         """Negative log posterior up to a constant."""
-        return float(self._normal(estimate).cost)
+        return float(self.normal(estimate).cost)
 
     def inlier_probability(self, estimate: Estimate) -> FloatArray:
         """(M,) probability of every detection to be no outlier, given the estimate."""
-        return self._normal(estimate).weights
+        return self.normal(estimate).weights
 
     def marginals(self, estimate: Estimate) -> Marginals:
         """Covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero."""
         known = np.append(np.repeat(estimate.known, 2), np.ones(9, dtype=bool))
-        solved = solve(self._normal(estimate), 0.0, True)
+        solved = solve(self.normal(estimate), 0.0, True)
         shared = np.zeros((len(known), len(known)))
         shared[np.ix_(known, known)] = solved.cov_shared
         cross = np.zeros((len(estimate.pose), 3, len(known)))
@@ -337,7 +337,7 @@ class Smoother:
             `R` upper triangular (n, n) and `d` (n,), n = 3 + 2 known landmarks + 9: the cost of a step `x` is
             `|R x - d|^2 / 2` up to a constant.
         """
-        information, right = eliminate_chain(self._normal(estimate))
+        information, right = eliminate_chain(self.normal(estimate))
         root: FloatArray = cholesky(information, lower=False)
         return root, solve_triangular(root, right, trans="T")
 
@@ -347,7 +347,8 @@ class Smoother:
             self._known, self._information = known, self.problem.prior_information(known)
         return self._information
 
-    def _normal(self, estimate: Estimate) -> Normal:
+    def normal(self, estimate: Estimate) -> Normal:
+        """The problem linearised at `estimate`; landmarks without position are left out."""
         problem, noise = self.problem, self.noise
         known = estimate.known
         rank = np.cumsum(known) - 1
