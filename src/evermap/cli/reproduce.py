@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -20,12 +20,14 @@ class Experiment(StrEnum):
     MRCLAM = "mrclam"
     ROSEN2016 = "rosen2016"
     PRESENCE = "presence"
+    NIELSEN2024 = "nielsen2024"
 
 
 DATA = {
     Experiment.MRCLAM: Path("../shared/data/mrclam"),
     Experiment.ROSEN2016: Path("../shared/golden"),
     Experiment.PRESENCE: Path("../shared/data/presence"),
+    Experiment.NIELSEN2024: Path("../shared/data/mrclam"),
 }
 """Where the data of each experiment are looked for."""
 
@@ -35,7 +37,7 @@ def reproduce(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with the recordings (mrclam, presence) or with rosen2016.json, the numbers to compare with.",
+            help="Folder with the recordings; for rosen2016 with rosen2016.json, the numbers to compare with.",
             show_default="../shared/data/mrclam, ../shared/data/presence or ../shared/golden",
         ),
     ] = None,
@@ -45,11 +47,29 @@ def reproduce(
     everything: Annotated[
         bool, typer.Option("--all", help="mrclam: also the recordings of which only a part of the truth is known.")
     ] = False,
-    seed: Annotated[
-        int | None, typer.Option(help="rosen2016, presence: same seed, same numbers.", show_default="0")
-    ] = None,
+    seed: Annotated[int | None, typer.Option(help="All but mrclam: same seed, same numbers.", show_default="0")] = None,
     sequences: Annotated[
         int | None, typer.Option(help="rosen2016: sequences drawn for every setting.", show_default="10000")
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="nielsen2024: only this part (simulation, recordings, during, search); repeatable. Rows of an older "
+            "run of other parts, data sets and methods in --out stay.",
+            show_default=False,
+        ),
+    ] = None,
+    dataset: Annotated[
+        list[int] | None, typer.Option(help="nielsen2024: only this data set; repeatable.", show_default=False)
+    ] = None,
+    method: Annotated[
+        list[str] | None, typer.Option(help="nielsen2024: only this method; repeatable.", show_default=False)
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="nielsen2024: one robot and three displacements, minutes instead of hours.")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(help="nielsen2024: runs at a time; 1 for timings that mean something.", min=1)
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
     force: Annotated[
@@ -60,18 +80,30 @@ def reproduce(
 
     mrclam: all robots of the UTIAS recordings against the truth. rosen2016: figures 1 to 4 of the persistence filter's
     paper against reference numbers. presence: models of things that come and go against simple and published ones, in
-    a room and at a door. Runs follow one another on one core, so that the timings mean something.
+    a room and at a door. nielsen2024: landmarks that moved, by all methods, in simulation and in the UTIAS recordings.
+    Runs follow one another on one core, so that the timings mean something.
 
     \b
     Example:
       evermap reproduce mrclam --data ~/recordings/mrclam
       evermap reproduce rosen2016 --seed 1
       evermap reproduce presence --out out/presence
+      evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
     """
     _one_core()
     from evermap.runfolder import check_replaceable
 
-    _refuse_options(experiment, {"--all": everything, "--seed": seed is not None, "--sequences": sequences is not None})
+    given = {
+        "--all": everything,
+        "--seed": seed is not None,
+        "--sequences": sequences is not None,
+        "--part": part is not None,
+        "--dataset": dataset is not None,
+        "--method": method is not None,
+        "--quick": quick,
+        "--jobs": jobs is not None,
+    }
+    _refuse_options(experiment, given)
     target = out or Path("evermap-out") / experiment.value
     check_replaceable(target, force=force)
     with progress_bar(experiment.value, speed=experiment is not Experiment.PRESENCE) as progress:
@@ -86,6 +118,16 @@ def reproduce(
 
             table = presence.reproduce(data or DATA[experiment], target, seed=seed or 0, progress=progress, force=force)
             as_text = presence.as_markdown
+        elif experiment is Experiment.NIELSEN2024:
+            from evermap.experiments import nielsen2024
+
+            lists = {"parts": part, "datasets": dataset, "methods": method}
+            chosen: dict[str, Any] = {name: tuple(values) for name, values in lists.items() if values}
+            default = nielsen2024.QUICK if quick else nielsen2024.Settings()
+            wanted = replace(default, seed=seed or 0, processes=jobs or 1, **chosen)
+            folder = data or DATA[experiment]
+            table = nielsen2024.reproduce(folder, target, wanted, progress=progress, force=force)
+            as_text = nielsen2024.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -111,6 +153,7 @@ def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
         Experiment.MRCLAM: {"--all"},
         Experiment.ROSEN2016: {"--seed", "--sequences"},
         Experiment.PRESENCE: {"--seed"},
+        Experiment.NIELSEN2024: {"--seed", "--part", "--dataset", "--method", "--quick", "--jobs"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))

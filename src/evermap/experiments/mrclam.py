@@ -126,7 +126,7 @@ def reproduce(
             "evermap": __version__,
             "experiment": "mrclam",
             "scoring": SCORING,
-            "machine": _machine(ledger.cpu_s / ledger.wall_s),
+            "machine": machine(ledger.cpu_s / ledger.wall_s),
             "processing_s": ledger.wall_s,
             "expected": verdicts(ledger.rows, MAIN),
             "means": means(ledger.rows),
@@ -241,21 +241,25 @@ def _warm_up(recording: Recording) -> None:
     """The beginning of a recording in every setting: compiles what is compiled once, so that no timing contains it."""
     from evermap.pipeline import run_slam
 
-    frames, detections = recording.frames, recording.detections
-    count = min(_WARM_UP_FRAMES, len(frames))
-    rows = detections.frame < count
-    columns = {item.name: getattr(detections, item.name)[rows] for item in fields(detections)}
-    short = replace(
-        recording,
-        frames=replace(frames, stamp_s=frames.stamp_s[:count]),
-        detections=replace(detections, **columns),
-    )
+    short = first_frames(recording, _WARM_UP_FRAMES)
     for setting in SETTINGS:
         with suppress(EvermapError):  # too little to say anything; what is wrong with all of it will show
             run_slam(short, setting.config(), prior_map=_survey(recording) if setting.given_map else None)
 
 
-def _machine(cores_used: float) -> dict[str, Any]:
+def first_frames(recording: Recording, count: int) -> Recording:
+    """The beginning of a recording."""
+    frames, detections = recording.frames, recording.detections
+    rows = detections.frame < count
+    columns = {item.name: getattr(detections, item.name)[rows] for item in fields(detections)}
+    return replace(
+        recording,
+        frames=replace(frames, stamp_s=frames.stamp_s[:count]),
+        detections=replace(detections, **columns),
+    )
+
+
+def machine(cores_used: float) -> dict[str, Any]:
     """Where the timings come from; `cores_used` is processor time over wall time, 1 at most on one core."""
     from evermap.runsummary import versions
 
@@ -279,4 +283,4 @@ def _processor() -> str:
     return next(names, platform.machine())
 
 
-__all__ = ["SETTINGS", "Setting", "as_markdown", "find_dataset", "reproduce"]
+__all__ = ["SETTINGS", "Setting", "as_markdown", "find_dataset", "first_frames", "machine", "reproduce"]

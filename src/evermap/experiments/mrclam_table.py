@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from evermap.experiments.markdown import markdown_table, number
+
 Row = Mapping[str, Any]
 
 SETTING_NAMES = {
@@ -103,8 +105,8 @@ def _expected(table: Mapping[str, Any]) -> str:
         verdict = "–" if row["met"] is None else "yes" if row["met"] else "**no**"
         form = "{:.0f}" if row["unit"] == "x" else "{:.3f}" if row["unit"] == "m" else "{:.2f}"
         unit = {"x": "× real time", "deg": "°"}.get(row["unit"], row["unit"])
-        lines.append((row["what"], f"{bound} {unit}", f"{_number(form, row['measured'])} {unit}", verdict))
-    return _table(("Dataset 6, all robots", "expected", "measured", "met"), lines)
+        lines.append((row["what"], f"{bound} {unit}", f"{number(form, row['measured'])} {unit}", verdict))
+    return markdown_table(("Dataset 6, all robots", "expected", "measured", "met"), lines)
 
 
 def _errors(rows: Sequence[Row], averages: Sequence[Row]) -> str:
@@ -155,9 +157,9 @@ def _by_setting(columns: Sequence[tuple[str, str, str]], rows: Sequence[Row], av
     for setting, title in SETTING_NAMES.items():
         group = [row for row in (*rows, *averages) if row["setting"] == setting]
         for row in group:
-            cells = (_number(form, _value(row, key)) for _, key, form in known)
+            cells = (number(form, _value(row, key)) for _, key, form in known)
             lines.append((title, str(row.get("robot", "mean")), *cells))
-    return _table(("setting", "robot", *(title for title, _, _ in known)), lines)
+    return markdown_table(("setting", "robot", *(title for title, _, _ in known)), lines)
 
 
 def _value(row: Row, key: str) -> float | None:
@@ -180,13 +182,3 @@ def _machine(table: Mapping[str, Any]) -> str:
 def _statistic(name: str, rows: Sequence[Row], key: str) -> float | None:
     values = [float(row[key]) for row in rows if row.get(key) is not None]
     return _STATISTICS[name](values) if values else None
-
-
-def _number(form: str, value: float | None) -> str:
-    return "–" if value is None else form.format(value)
-
-
-def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; numbers to the right, words of the first column to the left."""
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *lines))

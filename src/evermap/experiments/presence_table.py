@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from evermap.experiments.markdown import markdown_table
 from evermap.experiments.presence_tasks import TASKS
 
 Row = Mapping[str, Any]
@@ -94,7 +95,7 @@ def _targets(targets: Sequence[Row]) -> str:
         ]
         for row in targets
     )
-    return _table(("default models", "expected", "measured", "met"), lines)
+    return markdown_table(("default models", "expected", "measured", "met"), lines)
 
 
 def _room(rows: Sequence[Row], published: Sequence[Row]) -> str:
@@ -111,7 +112,7 @@ def _room(rows: Sequence[Row], published: Sequence[Row]) -> str:
     for row in published:
         names = ("mae", "accuracy", None, None, "brier", None, "semi_mae", "semi_brier", None)
         lines.append([f"*{row['label']} (published)*", *(_number(row[n] if n else None) for n in names), "–"])
-    return _table(header, lines, words=(0, len(header) - 1))
+    return markdown_table(header, lines, words=(0, len(header) - 1))
 
 
 def _door(rows: Sequence[Row]) -> str:
@@ -134,7 +135,7 @@ def _door(rows: Sequence[Row]) -> str:
         ]
         for row in rows
     ]
-    return _table(header, lines, words=(0, len(header) - 1))
+    return markdown_table(header, lines, words=(0, len(header) - 1))
 
 
 def _home(rows: Sequence[Row]) -> str:
@@ -144,7 +145,7 @@ def _home(rows: Sequence[Row]) -> str:
         for row in rows
     ]
     header = ("task", "contender", "Brier", "log loss", "calibration error", "MAE", "balanced accuracy", "rooms")
-    return _table(header, sorted(lines, key=lambda line: line[0]), words=(0, 1))
+    return markdown_table(header, sorted(lines, key=lambda line: line[0]), words=(0, 1))
 
 
 def _label(row: Row) -> str:
@@ -167,9 +168,3 @@ def _number(value: float | None, digits: int = 4) -> str:
 
 def _with_error(value: float | None, error: float | None) -> str:
     return f"{_number(value)} ± {error:.4f}" if error and error >= _SMALLEST else _number(value)
-
-
-def _table(header: Sequence[str], lines: Iterable[Sequence[str]], words: tuple[int, ...] = (0,)) -> str:
-    """A Markdown table; numbers to the right, columns of words to the left."""
-    rule = ["---" if column in words else "---:" for column in range(len(header))]
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *lines))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+from evermap.experiments.markdown import markdown_table, number
 
 Value = Mapping[str, Any]
 
@@ -69,7 +71,7 @@ def _summary(table: Mapping[str, Any]) -> str:
     cells = "Cells are *ours ± standard error (reference, z)*." if judged else "Cells are *ours ± standard error*."
     if judged is None:
         return made + "Compared with nothing: no reference numbers. " + cells
-    z_rms, largest = _number("{:.2f}", judged["z_rms"]), _number("{:+.2f}", judged["z_largest"])
+    z_rms, largest = number("{:.2f}", judged["z_rms"]), number("{:+.2f}", judged["z_largest"])
     agreement = (
         f"{judged['compared']} of {judged['in_reference']} reference numbers compared; "
         f"**{judged['outside']} further than {judged['limit']:g} standard errors** of the difference. "
@@ -94,7 +96,7 @@ def _errors(values: Sequence[Value], settings: tuple[str, ...]) -> str:
         [*(f"{number:g}" for number in where), *(_cell(row[name]) for name in NAMES), _cell(row[None], "{:.2f}")]
         for where, row in rows.items()
     )
-    return _table(header, lines)
+    return markdown_table(header, lines)
 
 
 def _removal(values: Sequence[Value]) -> str:
@@ -105,29 +107,19 @@ def _removal(values: Sequence[Value]) -> str:
     lines = (
         [
             NAMES[name],
-            _number("{:g}", threshold),
+            number("{:g}", threshold),
             *(_cell(row[metric], "{:.4f}") for metric in ("precision", "recall", "precision_known")),
         ]
         for (name, threshold), row in rows.items()
     )
-    return _table(header, lines)
+    return markdown_table(header, lines)
 
 
 def _cell(value: Value, form: str = "{:.4f}") -> str:
     """`ours ± s.e. (reference, z)`."""
-    ours = f"{_number(form, value['value'])} ± {_number(form, value['se'])}"
+    ours = f"{number(form, value['value'])} ± {number(form, value['se'])}"
     if "z" not in value:
         return ours
-    z = _number("{:+.1f}", value["z"])
+    z = number("{:+.1f}", value["z"])
     far = value["z"] is None or abs(value["z"]) > LIMIT
     return f"{ours} ({form.format(value['reference'])}, {f'**{z}**' if far else z})"
-
-
-def _number(form: str, value: float | None) -> str:
-    return "–" if value is None else form.format(value)
-
-
-def _table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; numbers to the right, words of the first column to the left."""
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in (header, rule, *lines))
