@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import log_ndtr
 
 from evermap import se2
 from evermap.types import Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
@@ -35,10 +35,30 @@ def detection_probability(pose_world_robot: FloatArray, position_m: FloatArray, 
     offset = position_m[None, :, :] - pose[:, None, :2]
     range_m = np.hypot(offset[..., 0], offset[..., 1])
     bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - pose[:, None, 2])
-    inside = _within(range_m, sensor.range_min_m, sensor.range_max_m, RANGE_MARGIN_M)
+    return sensor.p_detect * np.exp(log_in_view(range_m, bearing, sensor))
+
+
+def log_in_view(
+    range_m: FloatArray,
+    bearing_rad: FloatArray,
+    sensor: Sensor,
+    *,
+    range_margin_m: FloatArray | float = RANGE_MARGIN_M,
+    bearing_margin_rad: FloatArray | float = BEARING_MARGIN_RAD,
+) -> FloatArray:
+    """`log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
+
+    Args:
+        range_m: from the sensor, of any shape.
+        bearing_rad: from the sensor's x axis, in [-pi, pi), of the same shape.
+        sensor: limits.
+        range_margin_m: standard deviation of the range, of the same shape or a number.
+        bearing_margin_rad: standard deviation of the bearing, likewise.
+    """
+    inside = _log_within(range_m, sensor.range_min_m, sensor.range_max_m, range_margin_m)
     if sensor.bearing_max_rad - sensor.bearing_min_rad < 2 * math.pi - 1e-6:
-        inside *= _within(bearing, sensor.bearing_min_rad, sensor.bearing_max_rad, BEARING_MARGIN_RAD)
-    return sensor.p_detect * inside
+        inside += _log_within(bearing_rad, sensor.bearing_min_rad, sensor.bearing_max_rad, bearing_margin_rad)
+    return inside
 
 
 def find_misses(
@@ -83,7 +103,11 @@ def find_misses(
     )
 
 
-def _within(value: FloatArray, low: float, high: float, margin: float) -> FloatArray:
-    """Probability that a value known to `margin` lies between two limits."""
-    above = ndtr((value - low) / margin) if low > -math.inf else np.ones_like(value)
-    return above * (ndtr((high - value) / margin) if high < math.inf else 1.0)
+def _log_within(value: FloatArray, low: float, high: float, margin: FloatArray | float) -> FloatArray:
+    """`log P(low < x)` and `log P(x < high)` in sum, of a value known to `margin`."""
+    inside = np.zeros_like(value)
+    if low > -math.inf:
+        inside += log_ndtr((value - low) / margin)
+    if high < math.inf:
+        inside += log_ndtr((high - value) / margin)
+    return inside

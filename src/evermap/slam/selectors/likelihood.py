@@ -2,7 +2,16 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.sensing.visibility import log_in_view
 from evermap.types import FloatArray, IntArray, Sensor
+
+MOST_CERTAIN = 1.0 - 1e-6
+"""No sensor detects more reliably than this: a miss is always possible."""
 
 
 def log_psi(
@@ -42,17 +51,130 @@ def log_psi(
         gone: append a column for 'gone': nothing but outliers is seen, nothing is missed.
 
     Returns:
-        (R, K) or (R, K + 1) log likelihoods; -inf for modes that the landmark does not have.
+        (R, K) or (R, K + 1) log likelihoods; -inf for modes that the landmark does not have, and for a detection of
+        what is gone where there are no outliers.
     """
-    raise NotImplementedError
+    predicted = predict(
+        pose_world_robot,
+        landmark,
+        mode_position_m,
+        reading,
+        sigma,
+        sensor,
+        states=states,
+        pose_covariance=pose_covariance,
+        mode_covariance_m2=mode_covariance_m2,
+    )
+    has_mode = np.isfinite(mode_position_m[landmark, :, 0])
+    in_view = log_in_view(
+        np.where(has_mode, predicted.range_m, 0.0),
+        np.where(has_mode, predicted.bearing_rad, 0.0),
+        sensor,
+        range_margin_m=np.where(has_mode, predicted.range_sigma_m, 1.0),
+        bearing_margin_rad=np.where(has_mode, predicted.bearing_sigma_rad, 1.0),
+    )
+    missed = np.isnan(reading[:, 0])
+    with np.errstate(divide="ignore"):
+        log_outlier = np.log(outlier_density)
+        log_p_detect = np.log(sensor.p_detect) + in_view
+    seen = np.logaddexp(log_p_detect + predicted.log_density, log_outlier)
+    unseen = miss_weight * np.log1p(-np.minimum(np.exp(log_p_detect), MOST_CERTAIN))
+    value = np.where(has_mode, np.where(missed[:, None], unseen, seen), -np.inf)
+    if gone:
+        value = np.column_stack([value, np.where(missed, 0.0, log_outlier)])
+    return value
+
+
+class Predicted(NamedTuple):
+    """What every look would read under every mode; all (R, K), nan where the landmark has no such mode.
+
+    Attributes:
+        range_m, bearing_rad: the reading that is expected.
+        range_sigma_m, bearing_sigma_rad: its standard deviations, measurement noise included.
+        squared_distance: squared Mahalanobis distance of the reading, nan for misses.
+        log_density: `log N(z; h(x, m), S)`, nan for misses.
+    """
+
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    range_sigma_m: FloatArray
+    bearing_sigma_rad: FloatArray
+    squared_distance: FloatArray
+    log_density: FloatArray
+
+
+def predict(
+    pose_world_robot: FloatArray,
+    landmark: IntArray,
+    mode_position_m: FloatArray,
+    reading: FloatArray,
+    sigma: FloatArray,
+    sensor: Sensor,
+    *,
+    states: FloatArray | None = None,
+    pose_covariance: FloatArray | None = None,
+    mode_covariance_m2: FloatArray | None = None,
+) -> Predicted:
+    """Expected readings and how the actual ones compare; arguments as in `log_psi`."""
+    from evermap.slam.selectors.likelihood_kernels import predict_rows
+
+    rows, modes = len(landmark), mode_position_m.shape[1]
+    out = Predicted(*(np.full((rows, modes), np.nan) for _ in Predicted._fields))
+    predict_rows(
+        np.ascontiguousarray(pose_world_robot, dtype=np.float64),
+        np.asarray(landmark, dtype=np.int64),
+        np.ascontiguousarray(mode_position_m, dtype=np.float64),
+        np.ascontiguousarray(reading, dtype=np.float64),
+        np.ascontiguousarray(sigma, dtype=np.float64),
+        np.asarray(sensor.mount_robot_sensor, dtype=np.float64),
+        np.zeros(9) if states is None else np.ascontiguousarray(states, dtype=np.float64),
+        np.zeros((rows, 3, 3)) if pose_covariance is None else np.ascontiguousarray(pose_covariance),
+        np.zeros((*mode_position_m.shape, 2))
+        if mode_covariance_m2 is None
+        else np.ascontiguousarray(mode_covariance_m2),
+        *out,
+    )
+    return out
 
 
 def miss_weight_from(detected: FloatArray, first: IntArray, p_detect: float) -> float:
     """Share of a miss that is news, from a session's own looks at landmarks that were in view.
 
+    A detector that has just missed a landmark (it is turned away, hidden, blurred) misses it again at the next look
+    more often than its rate `P_D` says: on real recordings it hits with 0.7 after a hit and with 0.2 after a miss.
+    Taken as independent, a landmark that is hidden for five seconds would be gone beyond all doubt. In the two-state
+    Markov chain of the detector a further miss of a landmark that is there has probability `1 - P(hit | miss)`, so it
+    tells against its presence by the log of that and not by `log(1 - P_D)`; the weight is the ratio of the two. It is
+    used for the first miss of a series too, where it is too small: that errs on the side of what stands in the map.
+
+    The transition probabilities are posterior means under a uniform prior, so that a short session gives a usable
+    number. A detector whose misses come singly (`P(hit | miss) >= P_D`) has weight 1: no miss counts more than alone.
+
     Args:
         detected: (R,) 1 for a hit, 0 for a miss; sequences of looks at one landmark while it was in view.
         first: (S + 1,) row bounds of the sequences; none spans a time out of view.
-        p_detect: `P_D0` that the weight will be used with.
+        p_detect: `P_D0` that the weight will be used with, between 0 and 1.
+
+    Raises:
+        InputError: a detection that is neither 0 nor 1, or a probability outside (0, 1).
     """
-    raise NotImplementedError
+    _, after_miss = hit_probabilities(detected, first)
+    if not 0.0 < p_detect < 1.0:
+        raise InputError(f"{p_detect} is no probability", field="p_detect", hint="between 0 and 1")
+    return float(min(1.0, np.log1p(-after_miss) / np.log1p(-p_detect)))
+
+
+def hit_probabilities(detected: FloatArray, first: IntArray) -> tuple[float, float]:
+    """`P(hit | hit before)` and `P(hit | miss before)`, posterior means under a uniform prior; arguments as above."""
+    values = np.asarray(detected, dtype=np.float64)
+    wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+    if wrong.size:
+        problem = f"row {wrong[0]}: {values[wrong[0]]} is neither a detection nor a miss"
+        raise InputError(problem, field="detected", hint="1 or 0")
+    follows = np.ones(len(values), dtype=np.bool_)
+    follows[first[:-1][first[:-1] < len(values)]] = False
+    after = np.flatnonzero(follows)
+    before = values[after - 1] == 1.0
+    hits = values[after]
+    after_hit, after_miss = ((hits[state].sum() + 1.0) / (state.sum() + 2.0) for state in (before, ~before))
+    return float(after_hit), float(after_miss)

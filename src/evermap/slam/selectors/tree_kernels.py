@@ -2,7 +2,8 @@
 
 A node is a sequence of modes up to some look, its children are the modes at the next. The value of a sequence is its
 log joint probability; it is normalised to [0, 1] by the lowest and the highest value seen so far in the tree that is
-searched. Sequences that the chain rules out count as 0.
+searched, and a sequence that the chain rules out counts as 0. What is passed back is the best value: the sequence of a
+rollout can be had as it is, so a node is worth its best one and not, as in a game, the mean of them.
 """
 
 from __future__ import annotations
@@ -48,14 +49,12 @@ class Tree(NamedTuple):
 
     Attributes:
         child: (N, K) node of each mode at the next look, or -1.
-        visits, scored: (N,) how often, and how often with a possible sequence.
-        total, low, high: (N,) sum and extremes of the values of those.
+        visits: (N,) how many sequences went through it.
+        low, high: (N,) extremes of the values of those that are possible.
     """
 
     child: IntArray
     visits: IntArray
-    scored: IntArray
-    total: FloatArray
     low: FloatArray
     high: FloatArray
 
@@ -93,8 +92,7 @@ def search(
     )  # fmt: skip
     room = max(min(MAX_NODES, (budget + 1) * count + 1), budget + 2)
     tree = Tree(
-        np.empty((room, modes), dtype=np.int64), np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64),
-        np.empty(room), np.empty(room), np.empty(room),
+        np.empty((room, modes), dtype=np.int64), np.empty(room, dtype=np.int64), np.empty(room), np.empty(room),
     )  # fmt: skip
     random = np.array([seed], dtype=np.uint64)
     path = np.empty(count + 1, dtype=np.int64)
@@ -180,18 +178,15 @@ def _iterate(
 
 @kernel
 def _upper_confidence(tree: Tree, node: int, low: float, spread: float, exploration: float) -> int:
-    """The child of largest mean value plus confidence bound, -1 where there is none."""
+    """The child of largest value plus confidence bound, -1 where there is none."""
     log_visits = math.log(tree.visits[node])
     best, choice = -math.inf, -1
     for k in range(tree.child.shape[1]):
         child = tree.child[node, k]
         if child < 0:
             continue
-        visits = tree.visits[child]
-        mean = 0.5
-        if spread > 0.0:
-            mean = (tree.total[child] - tree.scored[child] * low) / (spread * visits)
-        bound = mean + exploration * math.sqrt(log_visits / visits)
+        worth = max((tree.high[child] - low) / spread, 0.0) if spread > 0.0 else 0.5
+        bound = worth + exploration * math.sqrt(log_visits / tree.visits[child])
         if bound > best:
             best, choice = bound, k
     return choice
@@ -199,15 +194,14 @@ def _upper_confidence(tree: Tree, node: int, low: float, spread: float, explorat
 
 @kernel
 def _most_visited(tree: Tree, root: int) -> int:
-    """The decision: the child visited most; of equals the one of larger mean."""
+    """The decision: the child visited most; of equals the one of larger value."""
     choice, most, best = -1, -1, -math.inf
     for k in range(tree.child.shape[1]):
         child = tree.child[root, k]
         if child < 0:
             continue
-        mean = tree.total[child] / tree.scored[child] if tree.scored[child] > 0 else -math.inf
-        if tree.visits[child] > most or (tree.visits[child] == most and mean > best):
-            choice, most, best = k, tree.visits[child], mean
+        if tree.visits[child] > most or (tree.visits[child] == most and tree.high[child] > best):
+            choice, most, best = k, tree.visits[child], tree.high[child]
     return choice
 
 
@@ -278,8 +272,6 @@ def _clear(tree: Tree, node: int) -> None:
     """A node that nobody has visited."""
     tree.child[node] = -1
     tree.visits[node] = 0
-    tree.scored[node] = 0
-    tree.total[node] = 0.0
     tree.low[node] = math.inf
     tree.high[node] = -math.inf
 
@@ -288,8 +280,6 @@ def _clear(tree: Tree, node: int) -> None:
 def _score(tree: Tree, node: int, value: float) -> None:
     tree.visits[node] += 1
     if value > -math.inf:
-        tree.scored[node] += 1
-        tree.total[node] += value
         tree.low[node] = min(tree.low[node], value)
         tree.high[node] = max(tree.high[node], value)
 

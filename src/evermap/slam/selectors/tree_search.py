@@ -28,7 +28,7 @@ class TreeSearch:
         budget: iterations (selection, expansion, rollout, back-propagation) for every decision.
         window_s: looks that are older than the last look of all by more than this keep the mode that they had [s];
             None decides all anew.
-        exploration: weight of the confidence bound; values are normalised to [0, 1].
+        exploration: weight of the confidence bound `sqrt(log N / n)`; values are normalised to [0, 1].
         rollouts: sequences sampled from every new node.
         threads: None for as many as there are processors.
 
@@ -38,7 +38,7 @@ class TreeSearch:
 
     budget: int = 200
     window_s: float | None = 40.0
-    exploration: float = 2.0**0.5
+    exploration: float = 0.5**0.5
     rollouts: int = 1
     threads: int | None = None
 
