@@ -25,7 +25,7 @@ from evermap.experiments.mrclam import machine
 from evermap.experiments.nielsen2024_figures import draw_all
 from evermap.experiments.nielsen2024_plan import METHODS, PARTS, QUICK, Settings, jobs
 from evermap.experiments.nielsen2024_runs import Job, Reference, reference_of, run_job, warm_up
-from evermap.experiments.nielsen2024_simulation import selector_rows, slam_rows
+from evermap.experiments.nielsen2024_simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap.experiments.nielsen2024_table import as_markdown, verdicts
 from evermap.types import SlamResult
 
@@ -80,7 +80,7 @@ def reproduce(
         simulation = earlier["simulation"]
         if "simulation" in settings.parts:
             asked = (settings.noises_m2, settings.runs, settings.modes, settings.seed)
-            simulation = [*selector_rows(*asked), *slam_rows(*asked)]
+            simulation = [*selector_rows(*asked), *slam_rows(*asked), *budget_rows(BUDGET_NOISE_M2, *asked[1:])]
         done: list[Row] = []
         interrupted = False
         try:
@@ -99,7 +99,7 @@ def reproduce(
             "evermap": __version__,
             "experiment": EXPERIMENT,
             "scoring": SCORING,
-            "settings": asdict(settings),
+            "settings": json.loads(json.dumps(asdict(settings))),
             "machine": machine(cpu / wall),
             "processing_s": wall,
             "expected": verdicts(simulation, runs),

@@ -18,6 +18,10 @@ from evermap.types import FloatArray, IntArray
 Row = dict[str, Any]
 
 SELECTORS = ("nn", "em", "mcts", "viterbi")
+BUDGET_NOISE_M2 = 0.2
+"""The noise that the paper shows a run of."""
+BUDGETS = (20, 200, 2000, 20000)
+"""Iterations of the tree search for every decision; 200 are the default."""
 ROUNDS = 10
 """Of selecting and solving, at most (section 8.2.2)."""
 GAUSS_NEWTON_STEPS = 4
@@ -57,6 +61,29 @@ def selector_rows(noises_m2: tuple[float, ...], runs: int, config: ModeConfig, s
                 }
             )
     return rows
+
+
+def budget_rows(noise_m2: float, runs: int, config: ModeConfig, seed: int) -> list[Row]:
+    """What the tree search finds with which budget, poses and modes known; the last row is the optimum."""
+    data = simulate_modes(runs, noise_m2, config, seed)
+    looks = _looks(data, data.pose, data.map_m, noise_m2)
+    contenders = {budget: selector_by_name("mcts", mcts_budget=budget, mcts_window_s=None) for budget in BUDGETS}
+    best, seconds = _timed(_selector("viterbi"), looks, config, seed)
+    found = {budget: _timed(selector, looks, config, seed, repeat=1) for budget, selector in contenders.items()}
+    return [
+        {
+            "figure": "budget",
+            "noise_m2": noise_m2,
+            "selector": "mcts" if budget else "viterbi",
+            "budget": budget,
+            "runs": runs,
+            **_mean("wrong_share", _wrong_share(selection, data)),
+            **_mean("below_viterbi", best.log_joint - selection.log_joint),
+            "same_as_viterbi": int(np.sum(selection.log_joint > best.log_joint - 1e-9 * np.abs(best.log_joint))),
+            "us_a_sequence": 1e6 * time_s / runs,
+        }
+        for budget, (selection, time_s) in (*found.items(), (None, (best, seconds)))
+    ]
 
 
 def slam_rows(noises_m2: tuple[float, ...], runs: int, config: ModeConfig, seed: int) -> list[Row]:
@@ -103,11 +130,13 @@ def _select(selector: Selector, looks: ModeLooks, config: ModeConfig, seed: int)
     return selector.select(looks, ModeChain(config.switch_probability), np.random.default_rng(seed))
 
 
-def _timed(selector: Selector, looks: ModeLooks, config: ModeConfig, seed: int) -> tuple[Selection, float]:
-    """A selection and its time [s]: the median of three, the first of which may compile and is not counted."""
+def _timed(
+    selector: Selector, looks: ModeLooks, config: ModeConfig, seed: int, repeat: int = 5
+) -> tuple[Selection, float]:
+    """A selection and its time [s]: the median of several, after one that may compile."""
     selection = _select(selector, looks, config, seed)
     seconds = []
-    for _ in range(3):
+    for _ in range(repeat):
         start = time.perf_counter()
         _select(selector, looks, config, seed)
         seconds.append(time.perf_counter() - start)

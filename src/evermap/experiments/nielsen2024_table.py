@@ -19,6 +19,7 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     parts = [_expected(table["expected"]), _machine(table)]
     if simulation:
         parts += ["### Simulation (figures 6 and 7)", _wrong_modes(simulation), _errors(simulation), _costs(simulation)]
+        parts += [_budgets(simulation)]
     compared = chosen(runs, part="recordings", scenario="group")
     for dataset in _distinct(compared, "dataset"):
         parts += [f"### Dataset {dataset}: the map's group displaced (figure 9)"]
@@ -98,6 +99,22 @@ def _costs(simulation: Rows) -> str:
             )
         )
     return markdown_table(("selector", "µs a sequence", "objective above viterbi's", "equal to viterbi's"), lines)
+
+
+def _budgets(simulation: Rows) -> str:
+    rows = chosen(simulation, figure="budget")
+    lines = [
+        (
+            row["selector"] if row["budget"] is None else f"{row['selector']}, {row['budget']} iterations a decision",
+            number("{:.1f}", row["us_a_sequence"]),
+            f"{row['same_as_viterbi']} of {row['runs']}",
+            _with_error(row, "below_viterbi", "{:.3f}"),
+            _with_error(row, "wrong_share", "{:.4f}"),
+        )
+        for row in rows
+    ]
+    head = ("r = 0.2 m²", "µs a sequence", "equal to viterbi's", "objective below viterbi's [nats]", "wrong modes")
+    return markdown_table(head, lines)
 
 
 def _by_delta(rows: Rows, key: str, cell: Callable[[Rows], str]) -> str:

@@ -98,7 +98,7 @@ def simulate_modes(
     noise = rng.standard_normal((n, config.steps, 2)) * np.sqrt(variance_m2)
     error = rng.standard_normal((n, *place.shape)) * config.map_sigma_m
     pose = np.cumsum(walk, axis=1) if walks else np.zeros((n, config.steps, 3))
-    return ModeRuns(pose, mode, in_robot(pose, place[mode]) + noise, place + (error if walks else 0.0))
+    return ModeRuns(pose, mode, in_robot(pose, place[mode]) + noise, place + (error if walks else np.zeros_like(error)))
 
 
 def in_robot(pose: FloatArray, point_m: FloatArray) -> FloatArray:
