@@ -58,7 +58,7 @@ def log_prior(chain, stamp_s, sequence, n_modes):
 
 def every_sequence(chain, stamp_s, log_likelihood):
     """All sequences (S, T) over the columns, and the log joint probability (S,) of each."""
-    count, modes = log_likelihood.shape
+    count = len(log_likelihood)
     exists = np.isfinite(log_likelihood).any(axis=0)
     n_modes = int(exists.sum())
     assert exists[:n_modes].all(), "columns that do not exist come last"

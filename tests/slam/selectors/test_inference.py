@@ -36,7 +36,7 @@ def test_decoding_finds_the_largest_joint_probability_of_all_sequences(looks, na
 @settings(max_examples=30, deadline=None)
 def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, name):
     chain = CHAINS[name]
-    rows, stamp_s, likelihood = of_landmark(looks, 0)
+    _, stamp_s, likelihood = of_landmark(looks, 0)
     one = ModeLooks(np.array([0, len(stamp_s)]), stamp_s, likelihood)
     sequences, joint = every_sequence(chain, stamp_s, likelihood)
     found = [log_joint(one, chain, sequence)[0] for sequence in sequences]
@@ -82,9 +82,7 @@ def test_one_mode_and_gone_are_the_persistence_filter(prior):
     looks = ModeLooks(np.cumsum([0, *counts]), since_s + offset, np.log(np.column_stack([there, gone])))
 
     beliefs = smoothed(looks, ModeChain(lifetime=prior, gone=True))
-    after, probability = single.run(
-        single.init(3, prior, evidence=True), features, since_s, detected, p_miss, p_false
-    )
+    after, probability = single.run(single.init(3, prior, evidence=True), features, since_s, detected, p_miss, p_false)
     np.testing.assert_allclose(np.exp(beliefs.log_filtered[:, 0]), probability, rtol=1e-9)
     np.testing.assert_allclose(np.exp(beliefs.log_filtered[:, 1]), 1.0 - probability, atol=1e-9)
     np.testing.assert_allclose(beliefs.log_evidence, after.log_evidence, rtol=1e-9)

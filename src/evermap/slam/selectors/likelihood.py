@@ -77,7 +77,7 @@ def log_psi(
     with np.errstate(divide="ignore"):
         log_outlier = np.log(outlier_density)
         log_p_detect = np.log(sensor.p_detect) + in_view
-    seen = np.logaddexp(log_p_detect + predicted.log_density, log_outlier)
+    seen = np.logaddexp(log_p_detect + np.nan_to_num(predicted.log_density), log_outlier)
     unseen = miss_weight * np.log1p(-np.minimum(np.exp(log_p_detect), MOST_CERTAIN))
     value = np.where(has_mode, np.where(missed[:, None], unseen, seen), -np.inf)
     if gone:
