@@ -10,6 +10,8 @@ from evermap.experiments.nielsen2024_expected import Row, Rows, chosen, mean, ve
 from evermap.metrics.belief import belief_scores
 
 SELECTORS = ("nn", "em", "mcts", "viterbi")
+PARTLY_TRUE = 3
+"""Data set of whose true poses a part is known."""
 SENSOR_TITLES = {"ours": "our sensor model", "paper": "the paper's sensor model and limits"}
 
 
@@ -28,7 +30,14 @@ def as_markdown(table: Mapping[str, Any]) -> str:
             if rows:
                 parts += [f"Position / landmark error [m], mean of {_robots(rows)}, {title}:"]
                 parts += [_by_delta(rows, "method", _both)]
-        joint = chosen(compared, dataset=dataset, sensor="ours", method="joint")
+        own = chosen(compared, dataset=dataset, sensor="ours")
+        if own:
+            parts += ["Position error while landmarks were in view [m], our sensor model:"]
+            parts += [_by_delta(own, "method", _mean_of("pose_seen_rmse_m"))]
+        if own and dataset == PARTLY_TRUE:
+            parts += ["Position error against the true poses of the last 466 s [m], our sensor model:"]
+            parts += [_by_delta(own, "method", _mean_of("pose_true_rmse_m"))]
+        joint = chosen(own, method="joint")
         if joint:
             parts += ["Joint search, what was found:", _by_delta(joint, "method", _exact_of)]
     many = chosen(runs, part="recordings", scenario="many modes")
@@ -131,6 +140,10 @@ def _both(rows: Rows) -> str:
     placed = chosen(rows, placed=True)
     text = f"{number('{:.3f}', mean(placed, 'pose_rmse_m'))} / {number('{:.3f}', mean(placed, 'landmark_rmse_m'))}"
     return text if len(placed) == len(rows) else f"{text} ({len(placed)} of {len(rows)})"
+
+
+def _mean_of(key: str) -> Callable[[Rows], str]:
+    return lambda rows: number("{:.3f}", mean(rows, key))
 
 
 def _exact_of(rows: Rows) -> str:
