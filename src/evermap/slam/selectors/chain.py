@@ -62,7 +62,9 @@ class ModeLooks:
     def exists(self) -> BoolArray:
         """(L, K) which columns are modes of which landmark."""
         found = np.zeros((self.n_landmarks, self.log_likelihood.shape[1]), dtype=np.bool_)
-        np.logical_or.at(found, self.landmark, np.isfinite(self.log_likelihood))
+        looked_at = np.flatnonzero(np.diff(self.first))
+        if looked_at.size:
+            found[looked_at] = np.logical_or.reduceat(np.isfinite(self.log_likelihood), self.first[looked_at])
         return found
 
 
