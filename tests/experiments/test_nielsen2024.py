@@ -254,6 +254,27 @@ def test_promises_are_measured_at_their_worst() -> None:
     assert found["data sets 1 to 3, joint: landmark error"]["met"] is None
 
 
+def test_command_runs_what_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from evermap.cli.reproduce import Experiment, reproduce
+
+    asked: dict[str, Any] = {}
+
+    def fake(data: Path, out: Path, settings: nielsen2024.Settings, **options: Any) -> dict[str, Any]:
+        asked.update(data=data, settings=settings, **options)
+        return {"runs": []}
+
+    monkeypatch.setattr(nielsen2024, "reproduce", fake)
+    reproduce(Experiment.NIELSEN2024, tmp_path, tmp_path / "out", part=["search"], dataset=[3], as_json=True)
+    assert json.loads(capsys.readouterr().out) == {"runs": []}
+    assert asked["settings"] == replace(nielsen2024.Settings(), parts=("search",), datasets=(3,))
+    reproduce(Experiment.NIELSEN2024, tmp_path, tmp_path / "out", method=["em"], quick=True, jobs=3, as_json=True)
+    assert asked["settings"] == replace(nielsen2024.QUICK, methods=("em",), processes=3)
+    with pytest.raises(ConfigError, match="--quick"):
+        reproduce(Experiment.MRCLAM, tmp_path, tmp_path / "out", quick=True)
+
+
 @pytest.mark.experiment
 @pytest.mark.slow
 @pytest.mark.data
