@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.config import ModesConfig
 from evermap.slam.arrow import Smoother
-from evermap.slam.modes.gating import gate_threshold, with_births
+from evermap.slam.modes.gating import gate_threshold, with_births, with_map_restored
 from evermap.slam.modes.looks import Looks, look_at_modes, news_in_a_miss
 from evermap.slam.modes.places import FREE, Modes, at_places
 from evermap.slam.modes.tidying import merged, pruned
@@ -122,17 +122,21 @@ def explain_with_modes(
     estimate = _with_map(problem, estimate, modes)
     marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
     miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
+    # what a selector with a window may keep: detections that gate with the mode that they were given
+    given = problem.landmark_row
     problem, estimate, modes, lost = with_births(problem, estimate, marginals, noise, modes, model.gate)
-    # what a selector with a window may keep: detections that gated with the mode that they were given
-    kept = np.where(lost, FREE, problem.landmark_row)
-    while True:
+    kept = np.where(lost, FREE, given)
+    problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.significance)
+    for _ in range(model.rounds):
         found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, heavy=heavy)
         problem, estimate, tidy = pruned(found.problem, found.estimate, modes)
         marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
         problem, estimate, tidy = merged(problem, estimate, marginals, tidy, model.significance)
+        problem, estimate, tidy = with_map_restored(problem, estimate, marginals, tidy, model.significance)
         if tidy is modes:
-            return found
+            break
         modes, kept = tidy, problem.landmark_row
+    return found
 
 
 def _with_map(problem: Problem, estimate: Estimate, modes: Modes) -> Estimate:

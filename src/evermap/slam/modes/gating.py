@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.kernels import detection_residual, kernel
-from evermap.slam.modes.places import FREE, Modes, at_places, grown
+from evermap.slam.modes.places import FREE, Modes, at_places, grown, moved_to
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.triangulate import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -58,6 +58,39 @@ def explained(
     distance = distances(problem, estimate, marginals, noise, detections, places[detections, columns])
     gates[detections, columns] = distance < threshold
     return gates
+
+
+def with_map_restored(
+    problem: Problem, estimate: Estimate, marginals: Marginals, modes: Modes, significance: float
+) -> tuple[Problem, Estimate, Modes]:
+    """The prior map's modes back where the map has them, where detections have dragged them away.
+
+    Least squares settles between the map and detections that contradict it. Where it settled farther from the map than
+    chance explains, that place becomes a mode of its own with all the detections, and the map's own mode is what the
+    map says. (A gate at arrival prevents it; it cannot while the robot has not found its place in the map.)
+
+    With the prior's covariance `P` and what is left of it, `C`, the way from the prior mean to the optimum has
+    covariance `P - C`; its squared distance is that of the map from what the detections alone say.
+    """
+    dragged = []
+    seen = np.bincount(problem.landmark_row, minlength=len(problem.landmark_mean)) > 0
+    for row in np.flatnonzero(problem.mapped & estimate.known & seen):
+        block = slice(2 * row, 2 * row + 2)
+        scatter = np.linalg.inv(problem.landmark_information[block, block]) - marginals.shared[block, block]
+        away = estimate.landmark[row] - problem.landmark_mean[row]
+        if away @ np.linalg.solve(scatter, away) > -2.0 * math.log(significance):
+            dragged.append(row)
+    if not dragged:
+        return problem, estimate, modes
+    place = modes.rows_for(len(dragged))
+    problem, estimate = grown(problem, estimate, int(place.max()) + 1)
+    estimate = at_places(estimate, place, estimate.landmark[dragged])
+    estimate = at_places(estimate, np.array(dragged), problem.landmark_mean[dragged])
+    return (
+        moved_to(problem, np.array(dragged), place),
+        estimate,
+        modes.with_owner(place, modes.landmark[dragged]),
+    )
 
 
 def with_births(

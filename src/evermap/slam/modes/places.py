@@ -79,6 +79,13 @@ def at_places(estimate: Estimate, place: IntArray, position_m: FloatArray | floa
     return replace(estimate, landmark=landmark)
 
 
+def moved_to(problem: Problem, places: IntArray, others: IntArray) -> Problem:
+    """The problem with all detections of some places (k,) at others (k,)."""
+    to = np.arange(len(problem.landmark_mean))
+    to[places] = others
+    return replace(problem, landmark_row=to[problem.landmark_row])
+
+
 def intervals_s(problem: Problem) -> FloatArray:
     """(P, 2) first and last stamp at which each place was seen: when its mode certainly held; nan where never."""
     stamps = problem.stamp_s[problem.pose_row]

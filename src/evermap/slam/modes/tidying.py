@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from evermap.slam.modes.places import FREE, Modes, at_places
+from evermap.slam.modes.places import FREE, Modes, at_places, moved_to
 from evermap.slam.problem import Estimate, Marginals, Problem
 from evermap.types import IntArray
 
@@ -49,13 +47,6 @@ def merged(
     if len(from_) == 0:
         return problem, estimate, modes
     return moved_to(problem, from_, into), at_places(estimate, from_, np.nan), _freed(modes, from_)
-
-
-def moved_to(problem: Problem, places: IntArray, others: IntArray) -> Problem:
-    """The problem with all detections of some places (k,) at others (k,)."""
-    to = np.arange(len(problem.landmark_mean))
-    to[places] = others
-    return replace(problem, landmark_row=to[problem.landmark_row])
 
 
 def _freed(modes: Modes, places: IntArray) -> Modes:
