@@ -151,7 +151,41 @@ def test_a_kept_mode_that_exists_no_more_is_decided_anew():
     assert found.indicator[1] == 0
 
 
+def test_a_tree_without_room_to_grow_still_finds_the_optimum():
+    looks = random_looks(np.random.default_rng(4), [6] * 20, 3, scale=1.0)
+    best = selector_by_name("viterbi").select(looks, CHAINS["constant"], np.random.default_rng(0)).log_joint
+    for max_nodes in (1, 12_000):  # anew at every decision, and now and then
+        search = TreeSearch(budget=10_000, max_nodes=max_nodes)
+        found = search.select(looks, CHAINS["constant"], np.random.default_rng(0))
+        np.testing.assert_allclose(found.log_joint, best, atol=1e-9)
+
+
+def test_a_decision_that_rules_out_what_follows_is_owned_up_to():
+    """At one instant nothing changes: who takes the likelier mode at first has none at the second look."""
+    looks = ModeLooks(np.array([0, 2]), np.zeros(2), np.array([[5.0, 0.0], [-np.inf, 0.0]]))
+    chain = CHAINS["exponential"]
+    nearest = selector_by_name("nn").select(looks, chain, np.random.default_rng(0))
+    assert nearest.indicator.tolist() == [0, 1]
+    assert nearest.log_joint[0] == -np.inf
+    for seed in range(20):
+        hasty = TreeSearch(budget=1).select(looks, chain, np.random.default_rng(seed))
+        possible = hasty.indicator.tolist() == [1, 1]
+        assert possible or hasty.indicator.tolist() == [0, 1]
+        assert np.isfinite(hasty.log_joint[0]) == possible
+        patient = TreeSearch(budget=50).select(looks, chain, np.random.default_rng(seed))
+        assert patient.indicator.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nothing_to_look_at_is_no_error(name):
+    for shape, landmarks in (((0, 2), 3), ((0, 0), 0)):
+        looks = ModeLooks(np.zeros(landmarks + 1, dtype=np.int64), np.empty(0), np.empty(shape))
+        found = selector_by_name(name).select(looks, ModeChain(), np.random.default_rng(0))
+        assert len(found.indicator) == 0
+        np.testing.assert_array_equal(found.log_joint, np.zeros(landmarks))
+
+
 def test_settings_of_the_tree_search_have_bounds():
-    for setting in ({"budget": 0}, {"rollouts": 0}, {"threads": 0}):
+    for setting in ({"budget": 0}, {"rollouts": 0}, {"threads": 0}, {"max_nodes": 0}):
         with pytest.raises(ConfigError, match="1 or more"):
             TreeSearch(**setting)

@@ -32,6 +32,8 @@ class Nearest:
 
 def largest(looks: ModeLooks, chain: ModeChain, score: FloatArray, rng: np.random.Generator) -> Selection:
     """The largest `score` (R, K) of every look among the modes that exist there, ties at random."""
+    if not len(score):
+        return Selection(np.empty(0, dtype=np.int64), np.zeros(looks.n_landmarks))
     possible = np.isfinite(looks.log_likelihood)
     without = np.flatnonzero(~possible.any(axis=1))
     if without.size:

@@ -16,8 +16,6 @@ import numpy as np
 from evermap.slam.selectors.compiled import kernel
 from evermap.types import FloatArray, IntArray
 
-MAX_NODES = 2_000_000
-"""Nodes in memory; a tree that would outgrow them starts anew at the next decision."""
 _STEP = np.uint64(0x9E3779B97F4A7C15)
 _MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
 _MIX_2 = np.uint64(0x94D049BB133111EB)
@@ -70,6 +68,7 @@ def search(
     budget: int,
     rollouts: int,
     exploration: float,
+    max_nodes: int,
     seed: Any,
     indicator: IntArray,
 ) -> bool:
@@ -77,7 +76,8 @@ def search(
 
     The looks and the chain are those of `tree_search._Task`, `gone` the column that is never left, or -1. Every
     decision between two modes or more takes `budget` iterations with `rollouts` sampled sequences each; `exploration`
-    weighs the confidence bound, `seed` (uint64) is that of the random numbers. Fills `indicator` (M,).
+    weighs the confidence bound. The tree keeps within `max_nodes`, or what one decision needs. `seed` (uint64) is that
+    of the random numbers. Fills `indicator` (M,).
     """
     count, modes = log_likelihood.shape
     psi = np.zeros((count, modes))
@@ -90,7 +90,7 @@ def search(
         log_likelihood, log_start, log_stay, log_leave, gone, psi,
         np.exp(log_start), np.exp(log_stay), np.exp(log_leave),
     )  # fmt: skip
-    room = max(min(MAX_NODES, (budget + 1) * count + 1), budget + 2)
+    room = max(min(max_nodes, budget * count + 1), budget + 1)
     tree = Tree(
         np.empty((room, modes), dtype=np.int64), np.empty(room, dtype=np.int64), np.empty(room), np.empty(room),
     )  # fmt: skip
@@ -114,7 +114,8 @@ def search(
             for _ in range(budget):
                 used = _iterate(chain, tree, root, used, i, held, stay, value, rollouts, exploration, random, path)
             choice = _most_visited(tree, root)
-        value += _step(chain, i, held, stay, choice)
+        if possible > 0:
+            value += _step(chain, i, held, stay, choice)
         if tree.child[root, choice] >= 0:
             root = tree.child[root, choice]
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -30,10 +29,11 @@ class TreeSearch:
             None decides all anew.
         exploration: weight of the confidence bound `sqrt(log N / n)`; values are normalised to [0, 1].
         rollouts: sequences sampled from every new node.
-        threads: None for as many as there are processors.
+        threads: at most; None for as many as suit the machine.
+        max_nodes: of each landmark's tree; one that would outgrow them starts anew at the next decision.
 
     Raises:
-        ConfigError: a budget, number of rollouts or of threads below 1.
+        ConfigError: a budget or a number of rollouts, threads or nodes below 1.
     """
 
     budget: int = 200
@@ -41,9 +41,10 @@ class TreeSearch:
     exploration: float = 0.5**0.5
     rollouts: int = 1
     threads: int | None = None
+    max_nodes: int = 2_000_000
 
     def __post_init__(self) -> None:
-        for field in ("budget", "rollouts", "threads"):
+        for field in ("budget", "rollouts", "threads", "max_nodes"):
             value = getattr(self, field)
             if value is not None and value < 1:
                 raise ConfigError(f"{value} is too few", field=field, hint="1 or more")
@@ -68,17 +69,16 @@ class TreeSearch:
             task = _task(one, done, indicator[one.rows])
             return bool(
                 search(
-                    *task, one.gone, self.budget, self.rollouts, self.exploration,
+                    *task, one.gone, self.budget, self.rollouts, self.exploration, self.max_nodes,
                     seeds[one.number], indicator[one.rows][done:],
                 )
             )  # fmt: skip
 
         stretches = list(landmarks(looks, chain))
-        threads = self.threads or len(os.sched_getaffinity(0))
-        if threads == 1 or len(stretches) < 2:
+        if self.threads == 1 or len(stretches) < 2:
             found = [run(one) for one in stretches]
         else:
-            with ThreadPoolExecutor(threads) as pool:
+            with ThreadPoolExecutor(self.threads) as pool:
                 found = list(pool.map(run, stretches))
         for one, possible in zip(stretches, found, strict=True):
             if not possible:
