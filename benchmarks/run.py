@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import persistence
+from benchmarks import persistence, selectors
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -31,10 +31,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     "batch_speed_ratio": ("higher", 0.25, "speed of Smoother (optimum and marginals) over gtsam LM and Marginals"),
     "batch_memory_ratio": ("lower", 0.25, "memory that it adds, over gtsam LM and Marginals"),
     **persistence.METRICS,
+    **selectors.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence")
+PARTS = ("slam", "persistence", "selectors")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -74,6 +75,9 @@ def run(
             shown[race] = speeds | memory
     if only in (None, "persistence"):
         ratios, shown["persistence"] = persistence.run(n_features, seconds)
+        measured |= ratios
+    if only in (None, "selectors"):
+        ratios, shown["selectors"] = selectors.run()
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -149,6 +153,9 @@ def as_text(measured: Mapping[str, Any]) -> str:
             lines.append(f"  {race:<6} {contender:<8} {pace:>8.0f} poses/s  {memory:>6.1f} MB")
     if "persistence" in shown:
         lines += ["", persistence.as_markdown(shown["persistence"])]
+    if "selectors" in shown:
+        took = ", ".join(f"{name} {ms:.2f} ms" for name, ms in shown["selectors"]["ms"].items())
+        lines += ["", f"{shown['selectors']['n_looks']} looks at each of {selectors.N_LANDMARKS} landmarks: {took}"]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

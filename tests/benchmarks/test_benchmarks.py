@@ -77,6 +77,17 @@ def test_one_feature_and_rosen_s_algorithm_believe_the_same(run: ModuleType) -> 
         assert case.work() == pytest.approx(case.peers["Python"](), abs=1e-9)
 
 
+def test_selectors_of_the_race_are_after_the_same_sequence(run: ModuleType) -> None:
+    looks = run.selectors.landmarks(30)
+    joint = {
+        name: selector.select(looks, run.selectors.CHAIN, np.random.default_rng(0)).log_joint
+        for name, selector in run.selectors.contenders().items()
+    }
+    for name in ("em", "mcts"):
+        assert (joint[name] <= joint["viterbi"] + 1e-9).all()
+        assert np.mean(joint[name] >= joint["viterbi"] - 1e-9) >= 0.5
+
+
 def test_worlds_are_what_they_say(worlds: dict[bool, Any]) -> None:
     world = worlds[True]
     assert world.problem.stamp_s.shape == (SMALL,)
