@@ -17,7 +17,7 @@ from evermap.slam.arrow import Smoother
 from evermap.slam.modes.gating import gate_threshold, with_births, with_map_restored
 from evermap.slam.modes.looks import Looks, look_at_modes, news_in_a_miss
 from evermap.slam.modes.places import FREE, Modes, at_places
-from evermap.slam.modes.tidying import merged, pruned
+from evermap.slam.modes.tidying import merged, pruned, without_empty
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.selectors.chain import ModeChain
 from evermap.slam.selectors.protocol import Selection, Selector, selector_by_name
@@ -27,6 +27,10 @@ from evermap.types import IntArray, Sensor
 SOLVER_ITERATIONS = 10
 SOLVER_TOLERANCE = 1e-4
 """Of every round: the next one starts where it ended [m, rad]."""
+PASSES = 4
+"""Births and alternations, at most; two are enough where the trajectory is not far off."""
+SETTLED_M = 0.01
+"""A pass that moves no pose farther than this changes no gate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +112,10 @@ def explain_with_modes(
     *,
     heavy: bool = False,
 ) -> Explanation:
-    """Births, the alternation, and the alternation again as long as modes have to be merged or pruned.
+    """Births, the alternation and the tidying, again and again until a pass changes nothing.
+
+    A pass that ends where it began may still have straightened the trajectory, and then other gates fail: what moved
+    together shows when the others have let go of it.
 
     Args:
         problem: the measurements, with every detection at some mode of its landmark.
@@ -120,23 +127,43 @@ def explain_with_modes(
         heavy: outliers have the Cauchy's tails in the least squares.
     """
     estimate = _with_map(problem, estimate, modes)
-    marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
+    for _ in range(PASSES):
+        before, given = estimate, problem.landmark_row
+        marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
+        problem, estimate, modes, lost = with_births(problem, estimate, marginals, noise, modes, model.gate)
+        problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.significance)
+        # what a selector with a window may keep: detections that gate with the mode that they were given
+        kept = np.where(lost, FREE, given)
+        found = _tidied(problem, estimate, noise, modes, model, rng, kept, heavy=heavy)
+        problem, estimate, modes = found.problem, found.estimate, found.modes
+        moved = np.abs(estimate.pose[:, :2] - before.pose[:, :2]).max()
+        if moved < SETTLED_M and np.array_equal(problem.landmark_row, given):
+            break
+    return found
+
+
+def _tidied(
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    modes: Modes,
+    model: ModeModel,
+    rng: np.random.Generator,
+    kept: IntArray,
+    *,
+    heavy: bool,
+) -> Explanation:
+    """The alternation, again and again until no mode has to be pruned or merged: every time there are fewer."""
     miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
-    # what a selector with a window may keep: detections that gate with the mode that they were given
-    given = problem.landmark_row
-    problem, estimate, modes, lost = with_births(problem, estimate, marginals, noise, modes, model.gate)
-    kept = np.where(lost, FREE, given)
-    problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.significance)
-    for _ in range(model.rounds):
+    while True:
         found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, heavy=heavy)
+        modes = found.modes
         problem, estimate, tidy = pruned(found.problem, found.estimate, modes)
         marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
         problem, estimate, tidy = merged(problem, estimate, marginals, tidy, model.significance)
-        problem, estimate, tidy = with_map_restored(problem, estimate, marginals, tidy, model.significance)
         if tidy is modes:
-            break
+            return found
         modes, kept = tidy, problem.landmark_row
-    return found
 
 
 def _with_map(problem: Problem, estimate: Estimate, modes: Modes) -> Estimate:
@@ -171,6 +198,7 @@ def _alternate(
         before, problem = problem, looks.assigned(problem, selection.indicator)
         if round_ > 1 and np.array_equal(problem.landmark_row, before.landmark_row):
             return Explanation(before, estimate, modes, looks, selection, settled=True)
+        estimate, modes = without_empty(problem, estimate, modes)  # never selected, never again
         smoother = Smoother(problem, noise, heavy=heavy, robust=model.robust)
         estimate = smoother.optimum(estimate, iterations=SOLVER_ITERATIONS, tolerance=SOLVER_TOLERANCE)
         score = looks.prior_score(selection.indicator, selection.log_joint) - smoother.cost(estimate)

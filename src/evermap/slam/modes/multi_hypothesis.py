@@ -12,9 +12,9 @@ import math
 import numpy as np
 
 from evermap.slam.method import Compare, Revision
-from evermap.slam.modes.alternation import Explanation, ModeModel, explain_with_modes
+from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
-from evermap.slam.modes.places import FREE, Modes
+from evermap.slam.modes.places import Modes
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
@@ -54,7 +54,7 @@ class MultiHypothesis:
         del final
         found = explain_with_modes(problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy)
         self._modes = found.modes
-        current = self._current(found)
+        current = self._current(found.problem)
         self._log_belief = np.full(len(found.modes.landmark), self._log_switch)
         self._log_belief[current] = 0.0
         return Revision(found.problem, found.estimate, current, switches(found, self._model.chain))
@@ -86,11 +86,10 @@ class MultiHypothesis:
         self._log_belief[new] = self._log_belief[places].max() + self._log_switch
         return new
 
-    def _current(self, found: Explanation) -> IntArray:
-        """(L,) the mode of every landmark at its last look; its only one where it has no other."""
-        current = found.looks.table[:, 0].copy()
-        current[current == FREE] = np.flatnonzero(current == FREE)
-        looks = found.looks
-        last = looks.evidence.first[1:] - 1
-        current[looks.several] = looks.table[looks.several, found.selection.indicator[last]]
+    def _current(self, problem: Problem) -> IntArray:
+        """(L,) the mode of every landmark's last detection; its first one where it has none yet."""
+        current = np.arange(self._modes.n_landmarks)
+        current[self._modes.landmark[problem.landmark_row]] = (
+            problem.landmark_row
+        )  # sorted by pose: the last one stands
         return current

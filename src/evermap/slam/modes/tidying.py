@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from itertools import combinations
+
 import numpy as np
 
 from evermap.slam.modes.places import FREE, Modes, at_places, moved_to
@@ -9,26 +12,31 @@ from evermap.slam.problem import Estimate, Marginals, Problem
 from evermap.types import IntArray
 
 
-def pruned(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Problem, Estimate, Modes]:
-    """Without the modes that no detection holds, and without those that a single one held and later ones did not.
+def without_empty(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Estimate, Modes]:
+    """Without the modes that no detection holds; what the prior map holds stays, seen or not."""
+    count = np.bincount(problem.landmark_row, minlength=len(modes.landmark))
+    empty = np.flatnonzero((modes.landmark != FREE) & estimate.known & ~problem.mapped & (count == 0))
+    if len(empty) == 0:
+        return estimate, modes
+    return at_places(estimate, empty, np.nan), _freed(modes, empty)
 
-    A mode whose only detection is its landmark's last may be the beginning of something and stays. So does what the
-    prior map holds, seen or not. Detections of a mode that goes move to the landmark's most frequent one.
+
+def pruned(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Problem, Estimate, Modes]:
+    """Without the modes that a single detection held and later ones did not: it goes to the most frequent mode.
+
+    A mode whose only detection is its landmark's last may be the beginning of something and stays.
     """
     count = np.bincount(problem.landmark_row, minlength=len(modes.landmark))
-    hopeless = (modes.landmark != FREE) & estimate.known & ~problem.mapped & (count < 2)
-    owner = modes.landmark[problem.landmark_row]
     newest = np.full(modes.n_landmarks, FREE)
-    newest[owner] = problem.landmark_row  # the last assignment stands: detections are sorted by pose
-    single = np.flatnonzero(hopeless & (count == 1))
-    hopeless[single] = newest[modes.landmark[single]] != single
-    goes = np.flatnonzero(hopeless)
+    newest[modes.landmark[problem.landmark_row]] = problem.landmark_row  # sorted by pose: the last one stands
+    single = np.flatnonzero((modes.landmark != FREE) & ~problem.mapped & (count == 1))
+    goes = single[newest[modes.landmark[single]] != single]
     if len(goes) == 0:
         return problem, estimate, modes
+    places = np.argsort(count, kind="stable")
     frequent = np.zeros(modes.n_landmarks, dtype=np.int64)
-    stays = np.flatnonzero((modes.landmark != FREE) & ~hopeless)
-    stays = stays[np.argsort(count[stays], kind="stable")]
-    frequent[modes.landmark[stays]] = stays
+    owned = places[modes.landmark[places] != FREE]
+    frequent[modes.landmark[owned]] = owned
     problem = moved_to(problem, goes, frequent[modes.landmark[goes]])
     return problem, at_places(estimate, goes, np.nan), _freed(modes, goes)
 
@@ -38,10 +46,10 @@ def merged(
 ) -> tuple[Problem, Estimate, Modes]:
     """With modes of a landmark united whose difference is not significant under their joint covariance.
 
-    A mode more needs a switch more, which the chain grants with its switching probability: a difference that chance
-    explains more often than that is none. With two degrees of freedom `P(chi2 > d^2) = exp(-d^2 / 2)`, so this also is
-    where the gain in likelihood outweighs one switch. Pairs unite at once, the nearest first; a mode that a prior map
-    holds, else the older row, gives the place.
+    Two modes need a switch at least, and as many as there are between them, which the chain grants with its switching
+    probability each: a difference that chance explains more often than that is none. With two degrees of freedom
+    `P(chi2 > d^2) = exp(-d^2 / 2)`, so this is where the gain in likelihood outweighs the switches. Pairs unite at
+    once, the nearest first; a mode that a prior map holds, else the older row, gives the place.
     """
     from_, into = _same(problem, estimate, marginals, modes, -2.0 * np.log(significance))
     if len(from_) == 0:
@@ -57,17 +65,15 @@ def _freed(modes: Modes, places: IntArray) -> Modes:
 def _same(
     problem: Problem, estimate: Estimate, marginals: Marginals, modes: Modes, limit: float
 ) -> tuple[IntArray, IntArray]:
-    """Places to give up and those to unite them with, by squared Mahalanobis distance below a limit."""
-    table = modes.table(estimate)
+    """Places to give up and those to unite them with: squared Mahalanobis distance below `limit` for every switch."""
+    switches = _switches(problem, modes)
     pairs: list[tuple[float, int, int]] = []
-    for row in table[(table != FREE).sum(axis=1) > 1]:
-        places = row[row != FREE]
-        for k, a in enumerate(places):
-            for b in places[k + 1 :]:
-                distance = _squared_distance(estimate, marginals, int(a), int(b))
-                if distance < limit:
-                    keep, leave = (b, a) if problem.mapped[b] and not problem.mapped[a] else (a, b)
-                    pairs.append((distance, int(leave), int(keep)))
+    for row in modes.table(estimate):
+        for a, b in combinations(row[row != FREE].tolist(), 2):
+            distance = _squared_distance(estimate, marginals, a, b) / max(1, switches[min(a, b), max(a, b)])
+            if distance < limit:
+                keep, leave = (b, a) if problem.mapped[b] and not problem.mapped[a] else (a, b)
+                pairs.append((distance, leave, keep))
     touched: set[int] = set()
     from_, into = [], []
     for _, leave, keep in sorted(pairs):
@@ -76,6 +82,16 @@ def _same(
             from_.append(leave)
             into.append(keep)
     return np.array(from_, dtype=np.int64), np.array(into, dtype=np.int64)
+
+
+def _switches(problem: Problem, modes: Modes) -> Counter[tuple[int, int]]:
+    """How often consecutive detections of a landmark are at two different places, by both, the lower row first."""
+    owner = modes.landmark[problem.landmark_row]
+    order = np.argsort(owner, kind="stable")
+    before, after = problem.landmark_row[order[:-1]], problem.landmark_row[order[1:]]
+    changed = (owner[order[:-1]] == owner[order[1:]]) & (before != after)
+    low, high = np.minimum(before, after)[changed], np.maximum(before, after)[changed]
+    return Counter(zip(low.tolist(), high.tolist(), strict=True))
 
 
 def _squared_distance(estimate: Estimate, marginals: Marginals, a: int, b: int) -> float:
