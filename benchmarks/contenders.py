@@ -15,6 +15,7 @@ from evermap import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.isam import RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD, IncrementalSmoother
 from evermap.slam.problem import Estimate
+from evermap.slam.solver import Motion
 from evermap.types import FloatArray
 
 CAUCHY_SCALE = 3.0
@@ -42,13 +43,14 @@ def stream_evermap(world: World) -> Answer:
     smoother = IncrementalSmoother(world.problem, world.noise)
     landmark = _first_sightings(world)
     start = time.perf_counter()
-    pose = np.zeros(3)
+    pose, motion = np.zeros(3), None
     for row in range(len(world.pose)):
         if row > 0:
-            pose = se2.compose(smoother.last_pose(), world.increment[row - 1])
-        smoother.add(row, pose, _placed(landmark, world, row, pose))
+            motion = Motion(world.increment[row - 1], np.zeros((3, 4)), np.zeros((3, 3)))
+            pose = se2.compose(smoother.last_pose(), motion.increment)
+        smoother.add(row, motion, _placed(landmark, world, row, pose))
     elapsed_s = time.perf_counter() - start
-    estimate = smoother.estimate(np.zeros((0, 3)))
+    estimate = smoother.estimate()
     return Answer(estimate.pose, estimate.landmark, np.zeros((0, 3, 3)), elapsed_s)
 
 

@@ -94,6 +94,7 @@ def _estimator(prepared: Prepared, prior: CalibrationPrior, noise: Noise, config
         prior_map=prepared.prior_map,
         robust=config.slam.robust,
         estimate_noise=config.slam.estimate_noise,
+        solver=config.slam.solver,
     )
 
 

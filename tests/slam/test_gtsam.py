@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -13,11 +14,12 @@ from recordings import building, first_seconds
 
 from evermap import se2
 from evermap.slam.arrow import Smoother
+from evermap.slam.border import BorderFilter
 from evermap.slam.isam import STATES_KEY, IncrementalSmoother, frame_factor
-from evermap.slam.kernels import integrate_odometry
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.session import prepare
+from evermap.slam.solver import Motion, compare
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import Recording
 
@@ -92,11 +94,17 @@ def solve_both(recording: Recording, *, robust: bool, with_map: bool = False) ->
     """Stream, smooth, and hand the same graph to gtsam."""
     prepared = prepare(recording, recording.true_landmarks if with_map else None)
     slam = StreamingSlam(
-        prepared.problem, NOISE, default_prior(), prior_map=prepared.prior_map, robust=robust, estimate_noise=False
+        prepared.problem,
+        NOISE,
+        default_prior(),
+        prior_map=prepared.prior_map,
+        robust=robust,
+        estimate_noise=False,
+        solver="gtsam",
     )
     for _ in prepared.problem.stamp_s:
         slam.step()
-    streamed = slam._estimate()
+    streamed = slam._solver.estimate()
     outcome = slam.finish()
     assert outcome.aligned == with_map
     problem = outcome.problem
@@ -177,9 +185,16 @@ def test_streaming_ends_near_the_batch_optimum(run):
     assert np.sqrt((gap[:, :2] ** 2).sum(axis=1).mean()) < 0.05
 
 
-@pytest.mark.parametrize("keep", [1000, 10])
+SOLVERS = {
+    "gtsam, all poses": partial(IncrementalSmoother, kept=1000),
+    "gtsam, last poses": partial(IncrementalSmoother, kept=10),
+    "arrow": BorderFilter,
+}
+
+
+@pytest.mark.parametrize("name", SOLVERS)
 @pytest.mark.parametrize("robust", [False, True])
-def test_innovations_are_those_of_gtsams_marginals(robust, keep):
+def test_innovations_are_those_of_gtsams_marginals(robust, name):
     """S of the next frame from the marginals of the graph with the next pose in it, derivatives by differences."""
     recording = building(5, patrol_s=25.0).sessions[0]
     whole = replace(prepare(recording).problem, prior=default_prior().without_scale())
@@ -189,26 +204,19 @@ def test_innovations_are_those_of_gtsams_marginals(robust, keep):
     slam = StreamingSlam(whole, NOISE, default_prior(), robust=robust, estimate_noise=False)
     for _ in range(row):
         slam.step()
-    optimum = Smoother(problem, NOISE, heavy=robust, robust=robust).optimum(slam._estimate(), tolerance=1e-9)
-    smoother = IncrementalSmoother(whole, NOISE, robust=robust)
-    smoother.restart(optimum, NOISE, whole, keep=keep)
+    optimum = Smoother(problem, NOISE, heavy=robust, robust=robust).optimum(slam._solver.estimate(), tolerance=1e-9)
+    solver = SOLVERS[name](whole, NOISE, robust=robust)
+    solver.restart(optimum, NOISE, whole)
     detections = np.flatnonzero((whole.pose_row == row) & np.isin(whole.landmark_row, known))
     assert len(detections) >= 2
-    increment, motion, kinds, covariance = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
-    drive, stamps = whole.drive, whole.stamp_s
-    integrate_odometry(
-        drive.stamp_s, drive.velocity, drive.unknown, stamps[row - 1], stamps[row], optimum.states,
-        increment, motion, kinds, covariance,
-    )  # fmt: skip
-    covariance += np.tensordot(NOISE.odometry**2, kinds, 1)
-    motion *= whole.prior.free[5:]
-    nis = smoother.innovations(row, increment, motion, covariance, detections)
+    motion = Motion.between(whole, NOISE, row, optimum.states)
+    nis, log_det = compare(solver, NOISE, motion, detections, whole.landmark_row[detections])
 
     graph = graph_of(problem, NOISE, heavy=robust)
     graph.add(frame_factor(whole, NOISE, row, np.arange(0), before=True, heavy=robust))
-    pose = se2.compose(optimum.pose[-1], increment)
+    pose = se2.compose(optimum.pose[-1], motion.increment)
     marginals = gtsam.Marginals(graph, as_values(replace(optimum, pose=np.vstack([optimum.pose, pose]))))
-    assert_same_covariance(smoother.last_covariance(), marginals.marginalCovariance(pose_key(row - 1)))
+    assert_same_covariance(solver.last_covariance(), marginals.marginalCovariance(pose_key(row - 1)))
     for k, m in enumerate(detections):
         j = int(whole.landmark_row[m])
         keys = [pose_key(row), landmark_key(j), STATES_KEY]
@@ -225,3 +233,8 @@ def test_innovations_are_those_of_gtsams_marginals(robust, keep):
         innovation = whole.reading[m] - predicted(np.zeros(14))
         innovation[1] = se2.wrap(innovation[1])
         assert nis[k] == pytest.approx(innovation @ np.linalg.solve(s, innovation), rel=1e-3)
+        assert log_det[k] == pytest.approx(np.linalg.slogdet(s)[1], abs=1e-3)
+    everything = solver.joint_covariance(known)
+    keys = [pose_key(row - 1), STATES_KEY, *map(landmark_key, known.tolist())]
+    joint = marginals.jointMarginalCovariance(gtsam.KeyVector(keys))
+    assert_same_covariance(everything, np.block([[joint.at(a, b) for b in keys] for a in keys]))

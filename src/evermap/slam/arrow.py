@@ -341,6 +341,11 @@ class Smoother:
         root: FloatArray = cholesky(information, lower=False)
         return root, solve_triangular(root, right, trans="T")
 
+    def newest(self, estimate: Estimate) -> FloatArray:
+        """(3 + 2 K + 9,) squared: joint covariance of the last pose, the known landmarks and the states."""
+        information, _ = eliminate_chain(self.normal(estimate))
+        return inverse_of(information)
+
     def _prior_information(self, known: BoolArray) -> FloatArray:
         """The prior of the known landmarks, worked out anew only when others are known."""
         if not np.array_equal(known, self._known):

@@ -16,11 +16,13 @@ import numpy as np
 from evermap import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.frame_factor import whitened_detections, whitened_odometry
-from evermap.slam.kernels import detection_residual
 from evermap.slam.problem import ConditionalPrior, Estimate, Noise, Problem
+from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
 
 STATES_KEY = gtsam.symbol("c", 0)
+KEPT = 100
+"""Poses that stay in the tree after a restart; older ones are summed up in one factor."""
 RELINEARIZE_SKIP = 10
 RELINEARIZE_THRESHOLD = 0.1
 """How far (m, rad, or 1) a value may drift from where it was linearised; the batch smoother takes out the rest."""
@@ -35,34 +37,36 @@ def _landmark_key(row: int) -> int:
 
 
 class IncrementalSmoother:
-    """iSAM2 over the first poses of a `Problem`; pose after pose is added with `add`.
+    """The incremental solver to compare others with; see `solver.IncrementalSolver` for its methods.
+
+    The tree holds the last poses only. What the older ones say about them, about the landmarks and the states is one
+    linear factor, so that a step costs what the map costs, whatever the age of the recording.
 
     Args:
-        problem: the measurements; rows beyond those added are not looked at.
+        problem: the measurements.
         noise: standard deviations.
         robust: down-weight outliers (Cauchy, which never lets go of what may be right after all).
+        kept: poses that stay in the tree after a restart.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
-        self._problem = problem
-        self._robust = robust
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True, kept: int = KEPT) -> None:
+        self.problem = problem
+        self._robust, self._kept = robust, kept
         self._noise = noise
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._isam = gtsam.ISAM2(_parameters())
         self._n_poses = self._first_pose = 0
         self._known: set[int] = set()
-        self._last_pose = np.zeros(3)
+        self._older = np.zeros((0, 3))
+        self._last_pose = problem.start_pose
 
-    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, *, keep: int) -> None:
-        """Throw the tree away and build it anew at `estimate`, with other noise or other priors.
-
-        Only the last `keep` poses go into the new tree; what the others say about them, about the landmarks and the
-        states becomes one linear factor, so that a step costs what the map costs, whatever the age of the recording.
-        """
-        self._problem, self._noise = problem, noise
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
+        """Throw the tree away and build it anew at `estimate`."""
+        self.problem, self._noise = problem, noise
         self._isam = gtsam.ISAM2(_parameters())
+        self._older = estimate.pose
         self._n_poses = len(estimate.pose)
-        self._first_pose = max(self._n_poses - keep, 0)
+        self._first_pose = max(self._n_poses - self._kept, 0)
         self._known = set()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         values.insert(STATES_KEY, estimate.states)
@@ -75,18 +79,15 @@ class IncrementalSmoother:
         self._isam.update(graph, values)
         self._last_pose = self._newest_pose()
 
-    def add(self, row: int, pose: FloatArray, landmark: FloatArray) -> None:
-        """Add pose `row` with its odometry and detections, and update the tree.
-
-        Args:
-            row: the pose to add, one more than the last.
-            pose: (3,) its prediction, where it is linearised first.
-            landmark: (L, 2) positions of landmarks, used for those that are seen for the first time.
-        """
+    def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
+        """Add pose `row` with its odometry and detections, and update the tree."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if row == 0:
+        if motion is None:
+            pose = self._last_pose
             self._insert_priors(graph)
-            values.insert(STATES_KEY, self._problem.prior.mean)
+            values.insert(STATES_KEY, self.problem.prior.mean)
+        else:
+            pose = se2.compose(self._last_pose, motion.increment)
         self._insert_frame(graph, values, row, pose, landmark)
         self._isam.update(graph, values)
         self._n_poses = row + 1
@@ -106,6 +107,8 @@ class IncrementalSmoother:
 
     def states(self) -> FloatArray:
         """(9,) calibration states."""
+        if self._n_poses == 0:
+            return self.problem.prior.mean
         return np.asarray(self._isam.calculateEstimateVector(STATES_KEY))
 
     def landmark(self, row: int) -> FloatArray:
@@ -114,62 +117,27 @@ class IncrementalSmoother:
             return np.full(2, np.nan)
         return np.asarray(self._isam.calculateEstimatePoint2(_landmark_key(row)))
 
-    def estimate(self, older: FloatArray) -> Estimate:
-        """Values of all that is in the tree, behind the poses (n, 3) that no longer are."""
+    def estimate(self) -> Estimate:
+        """Values of all that is in the tree, behind the poses that no longer are."""
         values = self._isam.calculateBestEstimate()
         pose = np.empty((self._n_poses, 3))
-        pose[: self._first_pose] = older[: self._first_pose]
+        pose[: self._first_pose] = self._older[: self._first_pose]
         for row in range(self._first_pose, self._n_poses):
             at = values.atPose2(_pose_key(row))
             pose[row] = at.x(), at.y(), at.theta()
-        landmark = np.full((len(self._problem.landmark_mean), 2), np.nan)
+        landmark = np.full((len(self.problem.landmark_mean), 2), np.nan)
         for j in self._known:
             landmark[j] = values.atPoint2(_landmark_key(j))
         return Estimate(pose, landmark, np.asarray(values.atVector(STATES_KEY)))
 
-    def innovations(
-        self, row: int, increment: FloatArray, motion: FloatArray, covariance: FloatArray, detections: IntArray
-    ) -> FloatArray:
-        """What the next frame's detections of known landmarks say before they are used.
-
-        Args:
-            row: the pose that is about to be added, at least 1.
-            increment: (3,) odometry since the pose before.
-            motion: (3, 4) its Jacobian by delay, scales and slip.
-            covariance: (3, 3) its noise.
-            detections: (k,) rows of the problem's detections, of landmarks in the graph.
-
-        Returns:
-            (k,) squared Mahalanobis distances with `S = H P H' + R`.
-        """
-        problem = self._problem
-        landmarks = [int(x) for x in dict.fromkeys(problem.landmark_row[detections].tolist())]
-        keys = [_pose_key(row - 1), STATES_KEY, *map(_landmark_key, landmarks)]
-        joint = np.asarray(self._isam.jointMarginalCovariance(gtsam.KeyVector(keys)).fullMatrix())
-        offset = {landmark: 12 + 2 * k for k, landmark in enumerate(landmarks)}
-        states = self.states()
-        pose = se2.compose(self.last_pose(), increment)
-        # the new pose in terms of the old one and the states
-        carry = np.zeros((3, len(joint)))
-        carry[:, :3] = se2.adjoint(se2.inverse(increment))
-        carry[:, 8:12] = motion
-        nis = np.empty(len(detections))
-        sigma = self._noise.of_detections(problem.sigma_given[detections])
-        e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-        for k, m in enumerate(detections):
-            landmark = int(problem.landmark_row[m])
-            at = self.landmark(landmark)
-            range_m, bearing_rad = problem.reading[m]
-            detection_residual(pose, at, states, problem.mount, range_m, bearing_rad, e, jx, jl, jc)
-            h = jx @ carry
-            h[:, 3:8] += jc * problem.prior.free[:5]
-            h[:, offset[landmark] : offset[landmark] + 2] += jl
-            s = h @ joint @ h.T + jx @ covariance @ jx.T + np.diag(sigma[k] ** 2)
-            nis[k] = e @ np.linalg.solve(s, e)
-        return nis
+    def joint_covariance(self, places: IntArray) -> FloatArray:
+        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
+        keys = [_pose_key(self._n_poses - 1), STATES_KEY, *(_landmark_key(int(j)) for j in places)]
+        joint = self._isam.jointMarginalCovariance(gtsam.KeyVector(keys))
+        return np.block([[joint.at(a, b) for b in keys] for a in keys])
 
     def _insert_priors(self, graph: Any) -> None:
-        problem = self._problem
+        problem = self.problem
         prior = problem.prior
         graph.add(gtsam.PriorFactorVector(STATES_KEY, prior.mean, gtsam.noiseModel.Diagonal.Sigmas(prior.sigma)))
         held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
@@ -178,7 +146,7 @@ class IncrementalSmoother:
     def _insert_summary(self, graph: Any, values: Any, estimate: Estimate) -> None:
         """One factor for everything before the first pose of the tree, priors included."""
         row = self._first_pose
-        before = self._problem.until(row + 1, last_is_blind=True)
+        before = self.problem.until(row + 1, last_is_blind=True)
         seen = np.zeros(len(estimate.landmark), dtype=bool)
         seen[before.landmark_row] = True
         linearised = Estimate(
@@ -192,7 +160,7 @@ class IncrementalSmoother:
         graph.add(_summary_factor(row, landmarks, linearised, *smoother.summary(linearised)))
 
     def _insert_frame(self, graph: Any, values: Any, row: int, pose: FloatArray, landmark: FloatArray) -> None:
-        problem = self._problem
+        problem = self.problem
         values.insert(_pose_key(row), gtsam.Pose2(*pose))
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
         for j in dict.fromkeys(problem.landmark_row[detections].tolist()):

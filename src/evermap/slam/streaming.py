@@ -1,6 +1,6 @@
 """Landmark SLAM of one recording, frame after frame.
 
-Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental smoother.
+Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental solver.
 Whenever the number of poses has doubled, the batch smoother takes stock: it finds the optimum of all so far,
 re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments.
 """
@@ -8,26 +8,26 @@ re-estimates the noise levels and hands both back, so the whole costs a constant
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from evermap import se2
 from evermap.slam.align import consensus
 from evermap.slam.arrow import Smoother
+from evermap.slam.border import BorderFilter
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.isam import IncrementalSmoother
-from evermap.slam.kernels import integrate_odometry
 from evermap.slam.noise import NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.solver import IncrementalSolver, Motion, compare
 from evermap.slam.triangulate import outvoted, sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_STOCK = 40
 """Poses before the batch smoother takes stock for the first time."""
-KEPT = 100
-"""Poses that stay in the incremental smoother after a stock-taking; older ones are summed up in one factor."""
-LONGEST_TREE = 400
-"""Poses in the tree after which the older ones are summed up; in long recordings a 16th of all poses."""
+SHORTEST_SPELL = 5
+LONGEST_SPELL = 1 / 8
+"""Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
 SURPRISING_NIS = 50.0
 DISPUTED_AT = (2, 4, 8, 16)
 """Comparisons of a landmark after which it is asked whether most of them were surprising."""
@@ -87,6 +87,7 @@ class StreamingSlam:
         prior_map: where to localise; None maps from scratch.
         robust: explain outliers instead of believing every identity.
         estimate_noise: learn noise levels from the recording, else keep `noise`.
+        solver: of the steps between two stock-takings.
     """
 
     def __init__(
@@ -98,6 +99,7 @@ class StreamingSlam:
         prior_map: PriorMap | None = None,
         robust: bool = True,
         estimate_noise: bool = True,
+        solver: Literal["arrow", "gtsam"] = "arrow",
     ) -> None:
         self._prior = prior
         self._prior_map = prior_map
@@ -105,20 +107,17 @@ class StreamingSlam:
         self._start_noise = self._noise = noise
         self._robust = robust
         self._estimate_noise = estimate_noise
-        self._graph = IncrementalSmoother(self._problem, noise, robust=robust)
+        self._solver = _solver(solver, self._problem, noise, robust=robust)
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._n_surprising = np.zeros(len(problem.landmark_mean), dtype=np.int64)
-        self._older = np.zeros((0, 3))
         self._n_poses = 0
         self._next_stock = FIRST_STOCK
-        self._tree_since = 0
+        self._relinearised_at = 0
         self._align_tried = 0
         self._scale = 1.0
         self._aligned = False
-        self._increment, self._motion = np.zeros(3), np.zeros((3, 4))
-        self._odometry_noise, self._odometry_covariance = np.zeros((5, 3, 3)), np.zeros((3, 3))
         self.online_pose = np.full((len(problem.stamp_s), 3), np.nan)
         """(N, 3) causal poses, as soon as each frame was processed."""
         self.online_covariance = np.full((len(problem.stamp_s), 3, 3), np.nan)
@@ -130,31 +129,32 @@ class StreamingSlam:
         """Process the next pose: predict, compare, add, and take stock when it is time."""
         row = self._n_poses
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-        states = self._graph.states() if row > 0 else self._problem.prior.mean
-        predicted = self._predict(row, states)
-        self._compare(row, detections)
-        self._meet_new_landmarks(predicted, states, detections)
-        self._graph.add(row, predicted, self._landmark)
+        states = self._solver.states()
+        motion = Motion.between(self._problem, self._noise, row, states) if row > 0 else None
+        if motion is not None:
+            self._compare(motion, detections)
+        self._meet_new_landmarks(motion, states, detections)
+        self._solver.add(row, motion, self._landmark)
         self._n_poses += 1
         if self._n_poses == self._next_stock:
             self._take_stock()
             self._next_stock *= 2
         elif self._robust and self._is_disputed(detections):
             self._take_stock()
-        elif self._n_poses - self._tree_since >= max(LONGEST_TREE, self._n_poses // 16):
-            self._sum_up()
+        elif self._n_poses - self._relinearised_at >= max(SHORTEST_SPELL, int(LONGEST_SPELL * self._n_poses)):
+            self._relinearise()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
         stretch = np.array([self._scale, self._scale, 1.0])
-        self.online_pose[row] = self._graph.last_pose() * stretch
-        self.online_covariance[row] = self._graph.last_covariance() * np.outer(stretch, stretch)
+        self.online_pose[row] = self._solver.last_pose() * stretch
+        self.online_covariance[row] = self._solver.last_covariance() * np.outer(stretch, stretch)
 
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
         problem = self._problem.until(self._n_poses)
-        estimate = self._estimate()
+        estimate = self._solver.estimate()
         noise, fit = self._noise, None
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
@@ -176,35 +176,15 @@ class StreamingSlam:
         marginals = smoother.marginals(estimate)
         return self._divided(problem, estimate, marginals, replace(fit, noise=noise), smoother)
 
-    def _predict(self, row: int, states: FloatArray) -> FloatArray:
-        """The next pose by odometry; what it knows of its uncertainty stays in the buffers for `_compare`."""
-        if row == 0:
-            return np.zeros(3)
-        drive, stamp = self._problem.drive, self._problem.stamp_s
-        integrate_odometry(
-            drive.stamp_s,
-            drive.velocity,
-            drive.unknown,
-            stamp[row - 1],
-            stamp[row],
-            states,
-            self._increment,
-            self._motion,
-            self._odometry_noise,
-            self._odometry_covariance,
-        )
-        self._odometry_covariance += np.tensordot(self._noise.odometry**2, self._odometry_noise, 1)
-        return se2.compose(self._graph.last_pose(), self._increment)
-
-    def _compare(self, row: int, detections: IntArray) -> None:
-        known = detections[np.isfinite(self._landmark[self._problem.landmark_row[detections], 0])]
-        if row == 0 or len(known) == 0:
+    def _compare(self, motion: Motion, detections: IntArray) -> None:
+        landmark = self._problem.landmark_row[detections]
+        known = np.isfinite(self._landmark[landmark, 0])
+        if not known.any():
             return
-        motion = self._motion * self._problem.prior.free[5:]
-        self.nis[known] = self._graph.innovations(row, self._increment, motion, self._odometry_covariance, known)
-        landmark = self._problem.landmark_row[known]
+        detections, landmark = detections[known], landmark[known]
+        self.nis[detections], _ = compare(self._solver, self._noise, motion, detections, landmark)
         np.add.at(self._n_compared, landmark, 1)
-        np.add.at(self._n_surprising, landmark, self.nis[known] > SURPRISING_NIS)
+        np.add.at(self._n_surprising, landmark, self.nis[detections] > SURPRISING_NIS)
 
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
@@ -213,8 +193,8 @@ class StreamingSlam:
         young = np.isin(self._n_compared[seen], DISPUTED_AT)
         return bool(np.any(young & (2 * self._n_surprising[seen] > self._n_compared[seen])))
 
-    def _meet_new_landmarks(self, pose: FloatArray, states: FloatArray, detections: IntArray) -> None:
-        """Where a landmark that is seen for the first time must be, by this one sighting."""
+    def _meet_new_landmarks(self, motion: Motion | None, states: FloatArray, detections: IntArray) -> None:
+        """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
         for m in detections:
             j = self._problem.landmark_row[m]
             if np.isfinite(self._landmark[j, 0]):
@@ -223,13 +203,16 @@ class StreamingSlam:
                 prior = self._problem.conditional_prior(j, np.isfinite(self._landmark[:, 0]))
                 self._landmark[j] = prior.place(self._landmark, self._problem.landmark_mean)
             else:
+                pose = self._solver.last_pose()
+                if motion is not None:
+                    pose = se2.compose(pose, motion.increment)
                 self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 
     def _take_stock(self) -> None:
-        """Optimum and noise levels of everything so far, then a new tree around them."""
+        """Optimum and noise levels of everything so far, from where the solver goes on."""
         problem = self._problem.until(self._n_poses)
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        estimate = self._estimate()
+        estimate = self._solver.estimate()
         if self._robust:
             voted = outvoted(problem, estimate, smoother.inlier_probability(estimate))
             # what was compared with a place that was never the landmark's own says nothing about consistency
@@ -245,19 +228,16 @@ class StreamingSlam:
         self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
         self._restart(estimate)
 
-    def _sum_up(self) -> None:
-        """A new tree of the last poses, with all before them relinearised into one factor."""
+    def _relinearise(self) -> None:
+        """Relinearise everything, the solver's steps from here on included."""
         problem = self._problem.until(self._n_poses)
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        self._restart(smoother.optimum(self._estimate(), iterations=2))
+        self._restart(smoother.optimum(self._solver.estimate(), iterations=2))
 
     def _restart(self, estimate: Estimate) -> None:
-        self._landmark, self._older = estimate.landmark, estimate.pose
-        self._tree_since = self._n_poses
-        self._graph.restart(estimate, self._noise, self._problem, keep=KEPT)
-
-    def _estimate(self) -> Estimate:
-        return self._graph.estimate(self._older)
+        self._landmark = estimate.landmark
+        self._relinearised_at = self._n_poses
+        self._solver.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
         """Most of the prior map's landmarks seen so far stand to each other as in the map; two must do at the end."""
@@ -270,7 +250,7 @@ class StreamingSlam:
             return False
         self._align_tried = count
         at = self._prior_map.mean[both]
-        _, agree = consensus(self._estimate().landmark[both], at)
+        _, agree = consensus(self._solver.estimate().landmark[both], at)
         if final:
             return bool(agree.sum() >= 2)
         enough = agree.sum() >= MIN_ALIGN_LANDMARKS and 2 * agree.sum() > count
@@ -280,7 +260,7 @@ class StreamingSlam:
         """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
         prior_map = self._prior_map
         assert prior_map is not None
-        estimate = self._estimate()
+        estimate = self._solver.estimate()
         both = prior_map.given & estimate.known
         pose_map_world, _ = consensus(estimate.landmark[both], prior_map.mean[both])
         moved = Estimate(
@@ -327,6 +307,14 @@ class StreamingSlam:
             log_scale_sigma=log_sigma,
             aligned=self._aligned,
         )
+
+
+def _solver(name: Literal["arrow", "gtsam"], problem: Problem, noise: Noise, *, robust: bool) -> IncrementalSolver:
+    if name == "arrow":
+        return BorderFilter(problem, noise, robust=robust)
+    from evermap.slam.isam import IncrementalSmoother  # loads gtsam
+
+    return IncrementalSmoother(problem, noise, robust=robust)
 
 
 def _settled(before: Noise, after: Noise) -> bool:

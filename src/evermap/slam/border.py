@@ -1,0 +1,283 @@
+"""Between two stock-takings: one Gaussian of the newest pose and the border, step by step.
+
+The border, that is the calibration states and the places of landmarks, is small, and given the newest pose the older
+ones say nothing more about the next detection. So a step predicts the newest pose by its odometry, marginalises the
+one before, and updates with the detections of the frame: an iterated extended Kalman filter (Bell and Cathey 1993)
+whose measurement noise is re-weighted like the smoother's. A step costs `O(G^2)` for G numbers in the border, whatever
+the number of poses; the batch smoother relinearises the old ones.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from evermap.slam.arrow import Smoother
+from evermap.slam.kernels import detection_residual, inlier_weight, kernel, wrapped
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.solver import Motion
+from evermap.types import FloatArray, IntArray
+
+AT_PLACES = 12
+"""Where places begin in the joint covariance: behind the pose (3) and the calibration states (9)."""
+UNKNOWN_VARIANCE = 1e4
+"""Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
+ITERATIONS = 10
+SMALL_STEP = 1e-4
+"""Iterations of an update at most, and the step (m, rad or 1) that ends them."""
+
+
+class BorderFilter:
+    """The incremental solver that needs no graph; see `solver.IncrementalSolver` for its methods.
+
+    Args:
+        problem: the measurements.
+        noise: standard deviations.
+        robust: down-weight outliers (Cauchy, decided when the detection comes).
+    """
+
+    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
+        self.problem = problem
+        self._robust = robust
+        self._noise = noise
+        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._pose = problem.start_pose.copy()
+        self._states = problem.prior.mean.copy()
+        self._place = np.zeros((0, 2))
+        self._slot: dict[int, int] = {}
+        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
+        self._covariance[:3, :3] = np.eye(3) / problem.start_information
+        self._covariance[3:, 3:] = np.diag(problem.prior.sigma**2)
+        self._old_pose = np.zeros((0, 3))
+        self._new_pose: list[FloatArray] = []
+
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
+        """Begin anew at an optimum of all poses so far."""
+        self.problem, self._noise = problem, noise
+        smoother = Smoother(problem.until(len(estimate.pose)), noise, heavy=True, robust=self._robust)
+        covariance = smoother.newest(estimate)
+        places = np.flatnonzero(estimate.known)
+        self._slot = {int(row): slot for slot, row in enumerate(places)}
+        n_border = 2 * len(places)
+        order = np.concatenate([np.arange(3), 3 + n_border + np.arange(9), 3 + np.arange(n_border)])
+        self._covariance = covariance[np.ix_(order, order)]
+        self._pose, self._states = estimate.pose[-1].copy(), estimate.states.copy()
+        self._place = estimate.landmark[places]
+        self._old_pose, self._new_pose = estimate.pose[:-1], [self._pose.copy()]
+
+    def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
+        """Add pose `row` with its odometry and its detections."""
+        problem = self.problem
+        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        rows = problem.landmark_row[detections]
+        for j in dict.fromkeys(rows.tolist()):
+            if j not in self._slot:
+                self._meet(j, landmark)
+        if motion is not None:
+            _predict(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
+        _update(
+            self._pose,
+            self._states,
+            self._place,
+            self._covariance,
+            np.array([self._slot[j] for j in rows.tolist()], dtype=np.int64),
+            problem.reading[detections],
+            self._noise.of_detections(problem.sigma_given[detections]),
+            problem.mount,
+            problem.prior.free,
+            self._robust,
+        )
+        self._new_pose.append(self._pose.copy())
+
+    def last_pose(self) -> FloatArray:
+        """(3,) the newest pose."""
+        return self._pose.copy()
+
+    def last_covariance(self) -> FloatArray:
+        """(3, 3) its covariance, in its own frame."""
+        return self._covariance[:3, :3].copy()
+
+    def states(self) -> FloatArray:
+        """(9,) calibration states."""
+        return self._states.copy()
+
+    def landmark(self, row: int) -> FloatArray:
+        """(2,) one place; nan where it is not known yet."""
+        slot = self._slot.get(row)
+        return np.full(2, np.nan) if slot is None else self._place[slot].copy()
+
+    def estimate(self) -> Estimate:
+        """Values of everything so far; poses since the last restart as they were when they were added."""
+        landmark = np.full((len(self.problem.landmark_mean), 2), np.nan)
+        landmark[list(self._slot)] = self._place
+        return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self._states.copy())
+
+    def joint_covariance(self, places: IntArray) -> FloatArray:
+        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
+        slots = np.array([self._slot[j] for j in places.tolist()], dtype=np.int64)
+        columns = AT_PLACES + (2 * slots[:, None] + [0, 1]).ravel()
+        rows = np.concatenate([np.arange(AT_PLACES), columns])
+        joint: FloatArray = self._covariance[np.ix_(rows, rows)]
+        return joint
+
+    def _meet(self, row: int, landmark: FloatArray) -> None:
+        """A place that was not known: at its prior given those that are, or anywhere."""
+        problem = self.problem
+        known = np.zeros(len(problem.landmark_mean), dtype=bool)
+        known[list(self._slot)] = True
+        prior = problem.conditional_prior(row, known)
+        size = len(self._covariance)
+        gain = np.zeros((2, size))
+        for k, j in enumerate(prior.given.tolist()):
+            at = AT_PLACES + 2 * self._slot[j]
+            gain[:, at : at + 2] = prior.gain[:, 2 * k : 2 * k + 2]
+        grown = np.empty((size + 2, size + 2))
+        grown[:size, :size] = self._covariance
+        grown[size:, :size] = gain @ self._covariance
+        grown[:size, size:] = grown[size:, :size].T
+        given = bool(prior.information.any())
+        spread = np.linalg.inv(prior.information) if given else UNKNOWN_VARIANCE * np.eye(2)
+        grown[size:, size:] = gain @ self._covariance @ gain.T + spread
+        self._covariance = grown
+        known_places = np.full_like(problem.landmark_mean, np.nan)
+        known_places[list(self._slot)] = self._place
+        place = prior.place(known_places, problem.landmark_mean) if given else landmark[row]
+        self._slot[row] = len(self._place)
+        self._place = np.vstack([self._place, place])
+
+
+@kernel
+def _predict(
+    pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
+) -> None:
+    """Drive on: the newest pose becomes the next one, in place."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    pose[0] += c * increment[0] - s * increment[1]
+    pose[1] += s * increment[0] + c * increment[1]
+    pose[2] = wrapped(pose[2] + increment[2])
+    size = len(covariance)
+    # what happened before, seen from the end of the increment
+    c, s = np.cos(increment[2]), np.sin(increment[2])
+    lever_x, lever_y = s * increment[0] - c * increment[1], c * increment[0] + s * increment[1]
+    for k in range(3, size):
+        x, y, turn = covariance[0, k], covariance[1, k], covariance[2, k]
+        covariance[0, k] = c * x + s * y + lever_x * turn
+        covariance[1, k] = -s * x + c * y + lever_y * turn
+    block = covariance[:3, :3].copy()
+    carry = np.array([[c, s, lever_x], [-s, c, lever_y], [0.0, 0.0, 1.0]])
+    cross = covariance[:3, 8:12].copy() @ by_states.T
+    covariance[:3, :3] = carry @ block @ carry.T + cross + cross.T + noise
+    covariance[:3, :3] += by_states @ covariance[8:12, 8:12].copy() @ by_states.T
+    for a in range(3):
+        for k in range(3, size):
+            for b in range(4):
+                covariance[a, k] += by_states[a, b] * covariance[8 + b, k]
+            covariance[k, a] = covariance[a, k]
+
+
+@kernel
+def _update(
+    pose: FloatArray,
+    states: FloatArray,
+    place: FloatArray,
+    covariance: FloatArray,
+    slot: Any,
+    reading: FloatArray,
+    sigma: FloatArray,
+    mount: FloatArray,
+    free: Any,
+    robust: bool,
+) -> None:
+    """All detections of a frame at once, relinearised and re-weighted until nothing moves; all in place."""
+    size, count = len(covariance), len(reading)
+    if count == 0:
+        return
+    start, start_states, start_place = pose.copy(), states.copy(), place.copy()
+    step, weight = np.zeros(size), np.ones(count)
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    residual, jacobian = np.zeros(2 * count), np.zeros((2 * count, 10))
+    column = np.zeros((count, 10), dtype=np.int64)
+    spread, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
+    for iteration in range(ITERATIONS):
+        turn_c, turn_s = np.cos(step[2]), np.sin(step[2])
+        for m in range(count):
+            detection_residual(pose, place[slot[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
+            for k in range(2):
+                row = 2 * m + k
+                residual[row] = e[k]
+                # by the step of the pose, which is told in the frame of where it started
+                jacobian[row, 0] = turn_c * jx[k, 0] - turn_s * jx[k, 1]
+                jacobian[row, 1] = turn_s * jx[k, 0] + turn_c * jx[k, 1]
+                jacobian[row, 2] = jx[k, 2]
+                for a in range(5):
+                    jacobian[row, 3 + a] = jc[k, a] if free[a] else 0.0
+                jacobian[row, 8], jacobian[row, 9] = jl[k, 0], jl[k, 1]
+            for a in range(8):
+                column[m, a] = a
+            column[m, 8], column[m, 9] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
+            if iteration > 0:
+                squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
+                weight[m] = inlier_weight(squared, 0.0, True) if robust else 1.0
+        for row in range(2 * count):
+            at = row // 2
+            for k in range(size):
+                total = 0.0
+                for a in range(10):
+                    total += jacobian[row, a] * covariance[column[at, a], k]
+                gain[row, k] = total
+        for row in range(2 * count):
+            for other in range(2 * count):
+                total = 0.0
+                for a in range(10):
+                    total += gain[row, column[other // 2, a]] * jacobian[other, a]
+                spread[row, other] = total
+        if iteration == 0 and robust:
+            # before anything is known of this frame: as surprising as its innovation is
+            for m in range(count):
+                a = spread[2 * m, 2 * m] + sigma[m, 0] ** 2
+                b = spread[2 * m, 2 * m + 1]
+                d = spread[2 * m + 1, 2 * m + 1] + sigma[m, 1] ** 2
+                x, y = residual[2 * m], residual[2 * m + 1]
+                weight[m] = inlier_weight((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b), 0.0, True)
+        for m in range(count):
+            for k in range(2):
+                spread[2 * m + k, 2 * m + k] += sigma[m, k] ** 2 / weight[m]
+        # innovation at the step so far, told at the start
+        for row in range(2 * count):
+            for a in range(10):
+                residual[row] -= jacobian[row, a] * step[column[row // 2, a]]
+        pull: Any = np.linalg.solve(spread, residual)
+        moved = 0.0
+        for k in range(size):
+            total = 0.0
+            for row in range(2 * count):
+                total -= gain[row, k] * pull[row]
+            moved = max(moved, abs(total - step[k]))
+            step[k] = total
+        c, s = np.cos(start[2]), np.sin(start[2])
+        pose[0] = start[0] + c * step[0] - s * step[1]
+        pose[1] = start[1] + s * step[0] + c * step[1]
+        pose[2] = wrapped(start[2] + step[2])
+        states[:] = start_states + step[3:AT_PLACES]
+        place[:] = start_place + step[AT_PLACES:].reshape(-1, 2)
+        if moved < SMALL_STEP:
+            break
+    root: Any = np.linalg.cholesky(spread)
+    white: Any = np.linalg.solve(root, gain)
+    for i in range(size):
+        for k in range(i, size):
+            total = 0.0
+            for row in range(2 * count):
+                total += white[row, i] * white[row, k]
+            covariance[i, k] -= total
+            if k > i:
+                covariance[k, i] = covariance[i, k]
+    # the covariance of the pose belongs to its own frame, which has turned
+    c, s = np.cos(step[2]), np.sin(step[2])
+    for k in range(size):
+        x, y = covariance[0, k], covariance[1, k]
+        covariance[0, k], covariance[1, k] = c * x + s * y, -s * x + c * y
+    for k in range(size):
+        x, y = covariance[k, 0], covariance[k, 1]
+        covariance[k, 0], covariance[k, 1] = c * x + s * y, -s * x + c * y

@@ -1,0 +1,177 @@
+"""What the streaming estimator asks of an incremental solver between two stock-takings of the batch smoother."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from evermap import se2
+from evermap.slam.kernels import N_NOISE, detection_residual, integrate_odometry, inverse_of, kernel
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Odometry between two poses.
+
+    Attributes:
+        increment: (3,) the second pose seen from the first.
+        by_states: (3, 4) its derivative, at its end, by delay, scales and slip; zero where these are not free.
+        covariance: (3, 3) its noise.
+    """
+
+    increment: FloatArray
+    by_states: FloatArray
+    covariance: FloatArray
+
+    @classmethod
+    def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
+        """From pose `row - 1` to pose `row`."""
+        drive, stamp = problem.drive, problem.stamp_s
+        increment, by_states = np.zeros(3), np.zeros((3, 4))
+        kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
+        integrate_odometry(
+            drive.stamp_s,
+            drive.velocity,
+            drive.unknown,
+            stamp[row - 1],
+            stamp[row],
+            states,
+            increment,
+            by_states,
+            kinds,
+            covariance,
+        )
+        covariance += np.tensordot(noise.odometry**2, kinds, 1)
+        return cls(increment, by_states * problem.prior.free[5:], covariance)
+
+
+class IncrementalSolver(Protocol):
+    """Pose after pose; the newest pose, the places of landmarks and the calibration states are known jointly.
+
+    Attributes:
+        problem: the measurements; rows beyond those added are not looked at. May be exchanged between two steps for
+            one with the same frames whose coming detections belong to other places, or that has more places at the
+            end; what was added before stays as it was until `restart`.
+    """
+
+    problem: Problem
+
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
+        """Begin anew at `estimate`, an optimum of the first poses, with other noise, other places or other priors."""
+        ...
+
+    def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
+        """Add pose `row` with its odometry and its detections.
+
+        Args:
+            row: the pose to add, one more than the last.
+            motion: odometry since the pose before; None for the first.
+            landmark: (L, 2) positions of places, used for those that are seen for the first time.
+        """
+        ...
+
+    def last_pose(self) -> FloatArray:
+        """(3,) the newest pose."""
+        ...
+
+    def last_covariance(self) -> FloatArray:
+        """(3, 3) its covariance, in its own frame."""
+        ...
+
+    def states(self) -> FloatArray:
+        """(9,) calibration states."""
+        ...
+
+    def landmark(self, row: int) -> FloatArray:
+        """(2,) one place; nan where it is not known yet."""
+        ...
+
+    def estimate(self) -> Estimate:
+        """Values of everything so far; old poses may be from when they were added."""
+        ...
+
+    def joint_covariance(self, places: IntArray) -> FloatArray:
+        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states, and k different known places, in order."""
+        ...
+
+
+def compare(
+    solver: IncrementalSolver, noise: Noise, motion: Motion, detections: IntArray, places: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """What detections of the pose that is about to be added say before they are used, if they were of these places.
+
+    Args:
+        solver: with all poses before.
+        noise: levels of the detections.
+        motion: odometry since the newest pose.
+        detections: (k,) rows of the problem's detections.
+        places: (k,) rows of known places.
+
+    Returns:
+        (k,) squared Mahalanobis distances with `S = H P H' + R`, of pose, place and states together, and (k,)
+        `log |S|`.
+    """
+    problem = solver.problem
+    different, column = np.unique(places, return_inverse=True)
+    nis, log_det = np.empty(len(detections)), np.empty(len(detections))
+    _innovations(
+        solver.joint_covariance(different),
+        se2.compose(solver.last_pose(), motion.increment),
+        solver.states(),
+        np.array([solver.landmark(int(place)) for place in different]).reshape(-1, 2),
+        column,
+        se2.adjoint(se2.inverse(motion.increment)),
+        motion.by_states,
+        motion.covariance,
+        problem.reading[detections],
+        noise.of_detections(problem.sigma_given[detections]),
+        problem.mount,
+        problem.prior.free,
+        nis,
+        log_det,
+    )
+    return nis, log_det
+
+
+@kernel
+def _innovations(
+    joint: FloatArray,
+    pose: FloatArray,
+    states: FloatArray,
+    places: FloatArray,
+    column: Any,
+    carry: FloatArray,
+    by_states: FloatArray,
+    odometry_covariance: FloatArray,
+    reading: FloatArray,
+    sigma: FloatArray,
+    mount: FloatArray,
+    free: Any,
+    nis: FloatArray,
+    log_det: FloatArray,
+) -> None:
+    """Distance and log determinant of every detection by itself; `joint` belongs to the pose before."""
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    h, part, rows = np.zeros((2, 14)), np.zeros((14, 14)), np.arange(14)
+    for m in range(len(reading)):
+        at = places[column[m]]
+        detection_residual(pose, at, states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
+        # the new pose in terms of the old one and the states
+        h[:, :3] = jx @ carry
+        for k in range(5):
+            h[0, 3 + k], h[1, 3 + k] = (jc[0, k], jc[1, k]) if free[k] else (0.0, 0.0)
+        h[:, 8:12] = jx @ by_states
+        h[:, 12:] = jl
+        rows[12], rows[13] = 12 + 2 * column[m], 13 + 2 * column[m]
+        for a in range(14):
+            for b in range(14):
+                part[a, b] = joint[rows[a], rows[b]]
+        s = h @ part @ h.T + jx @ odometry_covariance @ jx.T
+        s[0, 0] += sigma[m, 0] ** 2
+        s[1, 1] += sigma[m, 1] ** 2
+        nis[m] = e @ (inverse_of(s) @ e)
+        log_det[m] = np.log(s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0])
