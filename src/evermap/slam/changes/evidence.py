@@ -1,0 +1,311 @@
+"""What the measurements alone say about the landmarks, and how that compares with a map.
+
+Poses and calibration states are eliminated from the linearised problem. What is left is a Gaussian over the landmarks
+whose freedom to be moved, turned and (within the calibration's prior) stretched as a whole is part of it, so that no
+alignment is ever chosen. So that things may move during the session too, time is cut into windows and every landmark
+has a copy in every window it was seen in; a static landmark is one whose copies coincide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from evermap.slam.arrow import Normal, Smoother, eliminate_chain
+from evermap.slam.calibration import FORWARD, N_STATES, SKEW, SLIP, SLOPE, CalibrationPrior
+from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.triangulate import sighted_at
+from evermap.types import BoolArray, FloatArray, IntArray
+
+FEWEST_SIGHTINGS = 3
+"""Sightings that make a copy: one or two may be wrong identities."""
+TINY_INFORMATION = 1e-6
+"""Of poses at the borders of windows that nothing holds [1/m^2]: a kilometre."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Quadratic log likelihood of the copies: `pull' x - x' information x / 2`, `x` the step from `position`.
+
+    Attributes:
+        landmark: (R,) landmark of every copy.
+        window: (R,) its window.
+        position: (R, 2) where it was linearised [m], sizes as the calibration's prior has them.
+        information: (2 R, 2 R) with poses and calibration eliminated; lets the whole move and turn.
+        pull: (2 R,) gradient.
+        log_scale_sigma: how well the size of the whole is known.
+        log_constant: of the likelihood, for comparing degrees of softness.
+    """
+
+    landmark: IntArray
+    window: IntArray
+    position: FloatArray
+    information: FloatArray
+    pull: FloatArray
+    log_scale_sigma: float
+    log_constant: float = 0.0
+
+    def without(self, copies: BoolArray) -> Evidence:
+        """With some copies (R,) left out, as if their sightings had not been made."""
+        kept = ~copies
+        rows = np.repeat(kept, 2)
+        out = np.repeat(copies, 2)
+        cross = self.information[np.ix_(rows, out)]
+        inner = self.information[np.ix_(out, out)]
+        solved = np.linalg.solve(inner, np.column_stack([cross.T, self.pull[out]]))
+        return replace(
+            self,
+            landmark=self.landmark[kept],
+            window=self.window[kept],
+            position=self.position[kept],
+            information=self.information[np.ix_(rows, rows)] - cross @ solved[:, :-1],
+            pull=self.pull[rows] - cross @ solved[:, -1],
+        )
+
+    def softened(self, sigma_m: float) -> Evidence:
+        """With an error of its own in every copy: what is wrong with sightings is not new at every sighting."""
+        if sigma_m == 0.0:
+            return self
+        factor = cho_factor(self.information + np.eye(len(self.pull)) / sigma_m**2)
+        solved = cho_solve(factor, np.column_stack([self.information, self.pull]))
+        log_determinant = 2.0 * float(np.log(np.diag(factor[0])).sum()) + 2.0 * len(self.pull) * np.log(sigma_m)
+        return replace(
+            self,
+            information=self.information - self.information @ solved[:, :-1],
+            pull=self.pull - self.information @ solved[:, -1],
+            log_constant=self.log_constant + 0.5 * (float(self.pull @ solved[:, -1]) - log_determinant),
+        )
+
+
+class Comparison(NamedTuple):
+    """The evidence seen from a map: `log p(x) = b' x - x' A x / 2` of the copies' displacements from their places.
+
+    The landmarks' places, with the map's uncertainty, and the size of the whole are integrated out.
+
+    Attributes:
+        precision: (2 R, 2 R) `A`.
+        pull: (2 R,) `b`.
+        log_evidence: that nothing moved, up to a constant that is the same for all maps.
+        misfit: `e' A e`: chi-square with `freedom` degrees of freedom if nothing moved.
+        freedom: its degrees of freedom.
+    """
+
+    precision: FloatArray
+    pull: FloatArray
+    log_evidence: float
+    misfit: float
+    freedom: float
+
+
+def landmark_evidence(
+    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, bounds: IntArray
+) -> Evidence:
+    """Eliminate poses and calibration of a linearised problem, window by window.
+
+    Args:
+        problem: the measurements; its priors of start and landmarks are left out.
+        estimate: where to linearise; every landmark that was seen has a position.
+        noise: the noise levels.
+        prior: of the calibration, as the user means it.
+        bounds: (W + 1,) first pose of every window, and the number of poses.
+    """
+    estimate = in_sensor_metres(estimate, prior)
+    held = prior.without_scale()
+    n_windows = len(bounds) - 1
+    pieces = [_piece(problem, estimate, noise, held, *bounds[w : w + 2]) for w in range(n_windows)]
+    count = sum(len(piece.landmark) for piece in pieces)
+    # unknowns: copies, poses between windows, calibration states
+    at_pose, at_states = 2 * count, 2 * count + 3 * (n_windows + 1)
+    information = np.zeros((at_states + N_STATES, at_states + N_STATES))
+    right = np.zeros(at_states + N_STATES)
+    first = 0
+    for w, piece in enumerate(pieces):
+        copies = np.arange(2 * first, 2 * (first + len(piece.landmark)))
+        poses = at_pose + 3 * w + np.arange(3)
+        rows = np.concatenate([poses + 3, poses, copies, at_states + np.arange(N_STATES)])
+        information[np.ix_(rows, rows)] += piece.information
+        right[rows] += piece.right
+        first += len(piece.landmark)
+    states = at_states + np.arange(N_STATES)
+    information[states, states] += 1.0 / held.sigma**2
+    right[states] += (held.mean - estimate.states) / held.sigma**2
+    others = np.arange(at_pose, len(right))
+    information[others, others] += TINY_INFORMATION
+    mine = np.arange(at_pose)
+    solved = cho_solve(
+        cho_factor(information[np.ix_(others, others)]),
+        np.column_stack([information[np.ix_(others, mine)], right[others]]),
+    )
+    cross = information[np.ix_(mine, others)]
+    held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
+    covariance: FloatArray = np.linalg.inv(held_somewhere)[np.ix_(states, states)]
+    _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
+    centre = estimate.landmark[estimate.known].mean(axis=0)
+    position = np.concatenate([piece.position for piece in pieces])
+    return Evidence(
+        landmark=np.concatenate([piece.landmark for piece in pieces]),
+        window=np.repeat(np.arange(n_windows), [len(piece.landmark) for piece in pieces]),
+        position=centre + scale * (position - centre),
+        information=(information[np.ix_(mine, mine)] - cross @ solved[:, :-1]) / scale**2,
+        pull=(right[mine] - cross @ solved[:, -1]) / scale,
+        log_scale_sigma=log_sigma,
+    )
+
+
+def compare(evidence: Evidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
+    """Set the evidence against a map.
+
+    Args:
+        evidence: of the copies.
+        mean: (L, 2) the map.
+        covariance: (L, 2, 2) its uncertainty.
+        mapped: (L,) landmarks that it holds; for the others only what happens during the session shows.
+    """
+    seen = np.unique(evidence.landmark)
+    column = np.searchsorted(seen, evidence.landmark)
+    count, n_seen = len(evidence.landmark), len(seen)
+    anchor = np.where(mapped[seen, None], mean[seen], _first_positions(evidence))
+    spread = np.zeros((2 * count, 2 * n_seen + 1))  # unknowns behind all copies: places and size
+    rows = np.arange(count)
+    spread[2 * rows, 2 * column] = spread[2 * rows + 1, 2 * column + 1] = 1.0
+    offset = evidence.position - anchor[column]
+    spread[:, -1] = evidence.log_scale_sigma * (evidence.position - evidence.position.mean(axis=0)).ravel()
+    prior = np.zeros((2 * n_seen + 1, 2 * n_seen + 1))
+    log_prior_determinant = 0.0
+    for k in np.flatnonzero(mapped[seen]):
+        information = np.linalg.inv(covariance[seen[k]])
+        prior[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = information
+        log_prior_determinant += float(np.linalg.slogdet(information)[1])
+    prior[-1, -1] = 1.0
+    # without a map the whole is free to be anywhere
+    prior[np.diag_indices(2 * n_seen)] += TINY_INFORMATION
+    pull = evidence.pull + evidence.information @ offset.ravel()
+    weighted = evidence.information @ spread
+    inner = cho_factor(spread.T @ weighted + prior)
+    solved = cho_solve(inner, np.column_stack([weighted.T, spread.T @ pull]))
+    precision = evidence.information - weighted @ solved[:, :-1]
+    left = pull - weighted @ solved[:, -1]
+    log_determinant = 2.0 * float(np.log(np.diag(inner[0])).sum()) - log_prior_determinant
+    gained = float((spread.T @ pull) @ solved[:, -1])
+    moved = offset.ravel()
+    offset_term = -float(moved @ evidence.pull + 0.5 * moved @ evidence.information @ moved)
+    held = evidence.information + TINY_INFORMATION * np.eye(2 * count)
+    estimated = np.linalg.solve(held, pull)  # displacements from the map if all of them were free
+    return Comparison(
+        precision=0.5 * (precision + precision.T),
+        pull=left,
+        log_evidence=0.5 * (gained - log_determinant) + evidence.log_constant + offset_term,
+        misfit=float(estimated @ left),
+        freedom=float(2 * count - 2 * np.count_nonzero(~mapped[seen]) - 3),
+    )
+
+
+def _first_positions(evidence: Evidence) -> FloatArray:
+    """(S, 2) position of the first copy of every landmark."""
+    _, first = np.unique(evidence.landmark, return_index=True)
+    positions: FloatArray = evidence.position[first]
+    return positions
+
+
+class _Piece(NamedTuple):
+    """What one window says about the pose after it, the pose it begins with, its copies and the states."""
+
+    landmark: IntArray
+    position: FloatArray
+    information: FloatArray
+    right: FloatArray
+
+
+def _piece(
+    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, start: int, stop: int
+) -> _Piece:
+    last = min(stop + 1, len(problem.stamp_s))
+    low, high = np.searchsorted(problem.pose_row, [start, stop])
+    enough = np.bincount(problem.landmark_row[low:high], minlength=len(problem.landmark_mean)) >= FEWEST_SIGHTINGS
+    used = low + np.flatnonzero(enough[problem.landmark_row[low:high]])
+    landmark, row = np.unique(problem.landmark_row[used], return_inverse=True)
+    pose_row = problem.pose_row[used]
+    count = len(landmark)
+    part = replace(
+        problem,
+        stamp_s=problem.stamp_s[start:last],
+        pose_row=pose_row - start,
+        landmark_row=row.astype(np.int64),
+        reading=problem.reading[used],
+        sigma_given=problem.sigma_given[used],
+        prior=CalibrationPrior(prior.mean, np.full(N_STATES, np.inf), prior.free),
+        start_information=0.0,
+        landmark_mean=np.zeros((count, 2)),
+        landmark_information=np.zeros((2 * count, 2 * count)),
+    )
+    position = _copies(part, estimate, pose_row, landmark)
+    local = Estimate(estimate.pose[start:last], position, estimate.states)
+    normal = Smoother(part, noise).normal(local)
+    information, right = _without_inner_poses(normal)
+    return _Piece(landmark, position, information, right)
+
+
+def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: IntArray) -> FloatArray:
+    """Where the landmarks of a window are, seen from its poses alone: the median of their sightings."""
+    if len(landmark) == 0:
+        return np.zeros((0, 2))
+    points = sighted_at(estimate.pose[pose_row], part.reading, estimate.states, part.mount)
+    order = np.argsort(part.landmark_row, kind="stable")
+    groups = np.split(points[order], np.cumsum(np.bincount(part.landmark_row, minlength=len(landmark)))[:-1])
+    return np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 2)
+
+
+def _without_inner_poses(normal: Normal) -> tuple[FloatArray, FloatArray]:
+    """Information and right side of the last pose, the first pose, the landmarks and the states."""
+    if len(normal.diagonal) == 1:  # a window of one pose: it is the first and there is no other
+        size = len(normal.corner)
+        information = np.zeros((6 + size, 6 + size))
+        information[3:6, 3:6] = normal.diagonal[0]
+        information[3:6, 6:] = normal.border[0]
+        information[6:, 3:6] = normal.border[0].T
+        information[6:, 6:] = normal.corner
+        return information, np.concatenate([np.zeros(3), normal.right_pose[0], normal.right_shared])
+    size = len(normal.corner)
+    border = np.zeros((len(normal.border) - 1, 3, 3 + size))
+    border[:, :, 3:] = normal.border[1:]
+    border[0, :, :3] = normal.off[0]
+    corner = np.zeros((3 + size, 3 + size))
+    corner[:3, :3] = normal.diagonal[0]
+    corner[:3, 3:] = normal.border[0]
+    corner[3:, :3] = normal.border[0].T
+    corner[3:, 3:] = normal.corner
+    kept = Normal(
+        diagonal=np.ascontiguousarray(normal.diagonal[1:]),
+        off=np.ascontiguousarray(normal.off[1:]),
+        border=border,
+        corner=corner,
+        right_pose=np.ascontiguousarray(normal.right_pose[1:]),
+        right_shared=np.concatenate([normal.right_pose[0], normal.right_shared]),
+        cost=normal.cost,
+        weights=normal.weights,
+    )
+    information, right = eliminate_chain(kept)
+    return information, right
+
+
+def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:
+    """The same explanation with the range slope at its mean: what it was goes into the size of everything.
+
+    Only their product is measured; where the odometry's noise is fixed in metres, a likelihood that may choose the size
+    prefers a small world (see `CalibrationPrior.without_scale`).
+    """
+    if prior.without_scale() is prior:
+        return estimate
+    grow = (1.0 + estimate.states[SLOPE]) / (1.0 + prior.mean[SLOPE])
+    states = estimate.states.copy()
+    states[SLOPE] = prior.mean[SLOPE]
+    states[FORWARD] *= grow
+    states[SLIP] *= grow
+    states[SKEW : SKEW + 2] /= grow
+    centre = estimate.landmark[estimate.known].mean(axis=0)
+    pose = estimate.pose.copy()
+    pose[:, :2] = centre + grow * (pose[:, :2] - centre)
+    return Estimate(pose, centre + grow * (estimate.landmark - centre), states)

@@ -1,0 +1,142 @@
+"""From 'these moved together' to a problem that least squares can solve: priors loosened, places added.
+
+A group that moved before the session keeps its places; their prior gains the covariance of the group's motion. A group
+that moved within the session gets a second place for every member, tied to the first by that motion, and its later
+detections go there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap import se2
+from evermap.slam.problem import Estimate, Problem, independent
+from evermap.types import BoolArray, FloatArray, IntArray
+
+SLACK_M = 0.005
+"""Members of a group keep their distances to within this."""
+
+
+@dataclass(frozen=True, slots=True)
+class GivenMap:
+    """What is believed of the landmarks before the session.
+
+    Attributes:
+        mean: (L, 2) positions.
+        covariance: (L, 2, 2) of each.
+        given: (L,) landmarks that it holds.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    given: BoolArray
+
+    @classmethod
+    def empty(cls, count: int) -> GivenMap:
+        """No map of `count` landmarks."""
+        return cls(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count, dtype=np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Landmarks that moved together.
+
+    Attributes:
+        members: (k,) their rows, sorted.
+        turns: whether they also turned.
+        motion: (3,) displacement of the centroid [m], and angle [rad], as far as known.
+        window: from which window of the session on; 0 = before it.
+        since_s: first stamp at the new places, on the problem's clock; None before the session.
+        between_s: the change happened between these two stamps; None before the session.
+    """
+
+    members: IntArray
+    turns: bool
+    motion: FloatArray
+    window: int
+    since_s: float | None = None
+    between_s: tuple[float, float] | None = None
+
+    def same_as(self, other: Group) -> bool:
+        """Same landmarks, same kind of motion, same time."""
+        return (
+            np.array_equal(self.members, other.members)
+            and self.turns == other.turns
+            and (self.since_s is None) == (other.since_s is None)
+            and (self.since_s is None or other.since_s is None or abs(self.since_s - other.since_s) < 1.0)
+        )
+
+    def moved(self, position: FloatArray) -> FloatArray:
+        """(k, 2) the members' positions after the motion."""
+        own = position[self.members]
+        centre = own.mean(axis=0)
+        moved: FloatArray = centre + self.motion[:2] + (own - centre) @ se2.rotation(float(self.motion[2])).T
+        return moved
+
+    def motion_prior(self, position: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (k, 2) and covariance (2 k, 2 k) of the members' displacements, linearised at the angle found."""
+        own = position[self.members] - position[self.members].mean(axis=0)
+        columns = np.tile(np.eye(2), (len(own), 1))
+        mean = np.zeros_like(own)
+        if self.turns:
+            angle = float(self.motion[2])
+            turned = own @ se2.rotation(angle).T
+            tangent = np.column_stack([-turned[:, 1], turned[:, 0]])
+            columns = np.column_stack([columns, tangent.ravel()])
+            mean = turned - own - angle * tangent
+        variance = spread[: columns.shape[1]] ** 2
+        return mean, (columns * variance) @ columns.T
+
+
+def explained(
+    problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[Group, ...], spread: FloatArray
+) -> tuple[Problem, Estimate, IntArray]:
+    """The problem in a world where `groups` moved.
+
+    Args:
+        problem: the measurements; `landmark_row` says which landmark was seen.
+        estimate: values to start from, one row a landmark.
+        given: the map; its covariance as it shall be believed.
+        groups: what moved.
+        spread: (3,) prior standard deviations of displacement and angle.
+
+    Returns:
+        Problem, start values, and (L',) the landmark of every place.
+    """
+    count = len(given.mean)
+    covariance = np.where(given.given[:, None, None], given.covariance, np.eye(2))
+    mean = np.where(given.given[:, None], given.mean, np.nan_to_num(estimate.landmark))
+    information = independent(np.where(given.given[:, None, None], np.linalg.inv(covariance), 0.0))
+    landmark, landmark_row = estimate.landmark.copy(), problem.landmark_row.copy()
+    places: list[int] = list(range(count))
+    stamp_s = problem.stamp_s[problem.pose_row]
+    for group in groups:
+        offset, motion_covariance = group.motion_prior(mean, spread)
+        members = group.members
+        if group.since_s is None:
+            rows = (2 * members[:, None] + np.arange(2)).ravel()
+            own = independent(covariance[members])
+            landmark[members] = group.moved(mean)
+            mean[members] += offset
+            information[np.ix_(rows, rows)] = np.linalg.inv(own + motion_covariance)
+            continue
+        new = len(places) + np.arange(len(members))
+        places.extend(int(j) for j in members)
+        old_rows = (2 * members[:, None] + np.arange(2)).ravel()
+        new_rows = (2 * new[:, None] + np.arange(2)).ravel()
+        tie = np.linalg.inv(motion_covariance + SLACK_M**2 * np.eye(len(old_rows)))
+        information = np.pad(information, (0, len(new_rows)))
+        for first, second, sign in ((old_rows, old_rows, 1), (new_rows, new_rows, 1), (old_rows, new_rows, -1)):
+            information[np.ix_(first, second)] += sign * tie
+        information[np.ix_(new_rows, old_rows)] -= tie
+        mean = np.vstack([mean, mean[members] + offset])
+        landmark = np.vstack([landmark, group.moved(landmark[:count])])
+        for k, j in enumerate(members):
+            landmark_row[(problem.landmark_row == j) & (stamp_s >= group.since_s)] = new[k]
+    return (
+        replace(problem, landmark_row=landmark_row, landmark_mean=mean, landmark_information=information),
+        Estimate(estimate.pose, landmark, estimate.states),
+        np.array(places, dtype=np.int64),
+    )

@@ -1,0 +1,126 @@
+"""The search over sets of changes: from a comparison with the map to hypotheses in the order of their gains."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.slam.changes.climb import WORTH_KEEPING, climb_from_many_starts
+from evermap.slam.changes.evidence import Comparison, Evidence
+from evermap.slam.changes.gain import hypothesis_gain
+from evermap.slam.changes.prior import ChangePrior
+from evermap.types import BoolArray, FloatArray, IntArray
+
+MOST_GROUPS = 4
+"""Groups in one hypothesis, at most."""
+MOST_CANDIDATES = 40
+"""Landmarks that may move in one search; in larger maps those that would gain most alone."""
+MOST_KEPT = 20_000
+
+
+class Hypotheses(NamedTuple):
+    """Hypotheses of the search, the best first.
+
+    Attributes:
+        label: (H, L) group of every landmark, 0 = static; groups are numbered by their first member.
+        onset: (H, G + 1) window from which on a group has moved; row 0 is not used.
+        turns: (H, G + 1) whether a group also turned.
+        motion: (H, G, 3) displacement of each group's centroid [m] and its angle [rad].
+        gain: (H,) log posterior odds against 'nothing moved' [nats].
+    """
+
+    label: IntArray
+    onset: IntArray
+    turns: BoolArray
+    motion: FloatArray
+    gain: FloatArray
+
+
+def find_changes(
+    evidence: Evidence,
+    comparison: Comparison,
+    position: FloatArray,
+    n_windows: int,
+    prior: ChangePrior,
+    *,
+    start: Hypotheses | None = None,
+) -> Hypotheses:
+    """The most probable sets of changes, and all that were weighed on the way.
+
+    Args:
+        evidence: of the copies.
+        comparison: the same, seen from the map.
+        position: (L, 2) mapped positions; groups turn about the centroid of these.
+        n_windows: windows of the evidence.
+        prior: how changes are distributed.
+        start: hypotheses of which the first is one start of the search.
+    """
+    candidates = _candidates(evidence, comparison, len(position), prior, start)
+    quadratic, linear = item_columns(evidence, comparison, position, n_windows, candidates)
+    count = len(candidates)
+    label, onset, turns = (
+        np.zeros(count, np.int64),
+        np.zeros(MOST_GROUPS + 1, np.int64),
+        np.zeros(MOST_GROUPS + 1, bool),
+    )
+    if start is not None:
+        label[:], onset[:], turns[:] = start.label[0, candidates], start.onset[0], start.turns[0]
+    kept_label = np.zeros((MOST_KEPT, count), np.int64)
+    kept_onset = np.zeros((MOST_KEPT, MOST_GROUPS + 1), np.int64)
+    kept_turns = np.zeros((MOST_KEPT, MOST_GROUPS + 1), bool)
+    kept_gain = np.full(MOST_KEPT + 1, -np.inf)
+    tables = (
+        quadratic,
+        linear,
+        position[candidates],
+        prior.spread,
+        prior.log_prior(len(np.unique(evidence.landmark)), count),
+        prior.log_onset(n_windows),
+    )
+    kept = climb_from_many_starts(
+        prior.p_rotated > 0.0, *tables, label, onset, turns, kept_label, kept_onset, kept_turns, kept_gain
+    )
+    rows = np.column_stack([kept_label[:kept], kept_onset[:kept], kept_turns[:kept]])
+    _, first = np.unique(rows, axis=0, return_index=True)
+    first = first[np.argsort(-kept_gain[first], kind="stable")]
+    first = first[kept_gain[first] > kept_gain[first[0]] - WORTH_KEEPING]
+    labels = np.zeros((len(first), len(position)), np.int64)
+    labels[:, candidates] = kept_label[first]
+    motion = np.array([hypothesis_gain(kept_label[k], kept_onset[k], kept_turns[k], *tables)[1] for k in first])
+    return Hypotheses(labels, kept_onset[first], kept_turns[first], motion, kept_gain[first])
+
+
+def _candidates(
+    evidence: Evidence, comparison: Comparison, n_landmarks: int, prior: ChangePrior, start: Hypotheses | None
+) -> IntArray:
+    """Landmarks that may have moved: in a large map those that would gain most alone, and those already suspected."""
+    gain = np.full(n_landmarks, -np.inf)
+    for j in np.unique(evidence.landmark):
+        rows = np.flatnonzero(evidence.landmark == j)
+        both = (2 * rows[:, None] + np.arange(2)).ravel()
+        identity = np.tile(np.eye(2), (len(rows), 1))
+        pull = identity.T @ comparison.pull[both]
+        precision = identity.T @ comparison.precision[np.ix_(both, both)] @ identity
+        gain[j] = pull @ np.linalg.solve(precision + np.eye(2) / prior.spread[0] ** 2, pull)
+    suspected = np.zeros(n_landmarks, bool) if start is None else start.label[0] > 0
+    gain[suspected] = np.inf
+    order = np.argsort(-gain, kind="stable")[:MOST_CANDIDATES]
+    return np.sort(order[gain[order] > -np.inf])
+
+
+def item_columns(
+    evidence: Evidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'."""
+    count = len(candidates)
+    columns = np.zeros((2 * len(evidence.landmark), n_windows, count, 4))
+    rank = np.full(len(position), -1)
+    rank[candidates] = np.arange(count)
+    for row, (j, w) in enumerate(zip(evidence.landmark, evidence.window, strict=True)):
+        if rank[j] >= 0:
+            x, y = position[j]
+            columns[2 * row, : w + 1, rank[j]] = (1.0, 0.0, x, -y)
+            columns[2 * row + 1, : w + 1, rank[j]] = (0.0, 1.0, y, x)
+    flat = columns.reshape(len(columns), -1)
+    return np.ascontiguousarray(flat.T @ (comparison.precision @ flat)), flat.T @ comparison.pull

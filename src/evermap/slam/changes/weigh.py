@@ -1,0 +1,188 @@
+"""All hypotheses under all degrees of belief in map and sightings, weighed against each other.
+
+How far the map is to be believed, and how large the error is that all sightings of one window share, are chosen by
+evidence together with the changes: an unexplained change makes both look bad.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.slam.changes.evidence import Comparison, Evidence, compare
+from evermap.slam.changes.explain import GivenMap, Group
+from evermap.slam.changes.robust import without_transients
+from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.search import Hypotheses, find_changes
+from evermap.types import FloatArray
+
+MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""By which the standard deviations of the map may be wrong."""
+MAP_FACTOR_SPREAD = 0.7
+"""Standard deviation of the logarithm of that factor: a map's own word is right within a factor of two."""
+SOFTNESS_M = (0.005, 0.01, 0.02, 0.04)
+"""Errors that the sightings of one landmark in one window may share."""
+TRANSIENT_SOFTNESS_M = 0.02
+"""The same while it is decided which copies are displaced alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the evidence says.
+
+    Attributes:
+        groups: the most probable changes.
+        probability: of exactly these, among all weighed.
+        alternatives: other sets of changes with their probabilities, the most probable first.
+        map_factor: how much wider the map's standard deviations have to be.
+        softness_m: error shared by the sightings of a window.
+        misfit: chi-square of what the best hypothesis leaves, over its degrees of freedom.
+    """
+
+    groups: tuple[Group, ...]
+    probability: float
+    alternatives: tuple[tuple[tuple[Group, ...], float], ...]
+    map_factor: float
+    softness_m: float
+    misfit: float
+
+
+def weigh(
+    evidence: Evidence,
+    given: GivenMap,
+    prior: ChangePrior,
+    n_windows: int,
+    *,
+    before: Verdict | None = None,
+    thorough: bool = True,
+) -> Verdict:
+    """Search for changes, and weigh what was found.
+
+    Args:
+        evidence: of all copies.
+        given: the map, with its own covariance.
+        prior: how changes are distributed.
+        n_windows: windows of the evidence.
+        before: what was found last time; one start of the search.
+        thorough: try all degrees of belief, else those of `before`.
+    """
+    factor = 1.0 if before is None else before.map_factor
+    softness = 0.0 if n_windows == 1 else (0.01 if before is None else before.softness_m)
+    position = _positions(evidence, given)
+    if n_windows > 1:
+
+        def search(evidence: Evidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
+            soft = evidence.softened(TRANSIENT_SOFTNESS_M)
+            comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
+            return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
+
+        evidence = without_transients(evidence, position, prior, search)
+    trials: dict[tuple[float, float], _Trial] = {}
+
+    def tried(factor: float, softness: float) -> float:
+        if (factor, softness) not in trials:
+            best = max(trials.values(), key=lambda t: t.score, default=None)
+            start = None if best is None else best.hypotheses
+            trials[factor, softness] = _try(evidence, given, position, prior, n_windows, factor, softness, start)
+        return trials[factor, softness].score
+
+    tried(factor, softness)
+    if thorough:
+        for _ in range(2):  # one after the other, until neither gains
+            known = (factor, softness)
+            if n_windows > 1:
+                softness = max(SOFTNESS_M, key=lambda s: tried(factor, s))
+            if given.given.any():
+                factor = max(MAP_FACTORS, key=lambda f: tried(f, softness))
+            if known == (factor, softness):
+                break
+    return _verdict(list(trials.values()), trials[factor, softness])
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    """Hypotheses under one degree of belief; `base` is the log posterior of 'nothing moved' there."""
+
+    factor: float
+    softness: float
+    comparison: Comparison
+    hypotheses: Hypotheses
+    base: float
+
+    @property
+    def score(self) -> float:
+        """Log posterior of the best hypothesis."""
+        return self.base + float(self.hypotheses.gain[0])
+
+
+def _positions(evidence: Evidence, given: GivenMap) -> FloatArray:
+    """(L, 2) the map, and for landmarks that it does not hold where they were seen first."""
+    position = np.zeros_like(given.mean)
+    landmark, first = np.unique(evidence.landmark, return_index=True)
+    position[landmark] = evidence.position[first]
+    return np.where(given.given[:, None], given.mean, position)
+
+
+def _try(
+    evidence: Evidence,
+    given: GivenMap,
+    position: FloatArray,
+    prior: ChangePrior,
+    n_windows: int,
+    factor: float,
+    softness: float,
+    start: Hypotheses | None,
+) -> _Trial:
+    soft = evidence.softened(softness)
+    comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
+    hypotheses = find_changes(soft, comparison, position, n_windows, prior, start=start)
+    base = comparison.log_evidence - 0.5 * (np.log(factor) / MAP_FACTOR_SPREAD) ** 2
+    return _Trial(factor, softness, comparison, hypotheses, base)
+
+
+def _verdict(trials: list[_Trial], best: _Trial) -> Verdict:
+    """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
+    top = max(trial.score for trial in trials)
+    weight: dict[_Key, float] = {}
+    leader: dict[_Key, tuple[float, tuple[Group, ...]]] = {}
+    for trial in trials:
+        for row, gain in enumerate(trial.hypotheses.gain):
+            key, groups = _groups(trial.hypotheses, row)
+            log_weight = trial.base + float(gain) - top
+            weight[key] = weight.get(key, 0.0) + float(np.exp(log_weight))
+            if key not in leader or log_weight > leader[key][0]:
+                leader[key] = (log_weight, groups)
+    total = sum(weight.values())
+    order = sorted(weight, key=lambda key: -weight[key])
+    ranked = [(leader[key][1], weight[key] / total) for key in order]
+    gained = best.comparison.misfit - 2.0 * float(best.hypotheses.gain[0])
+    return Verdict(
+        groups=ranked[0][0],
+        probability=ranked[0][1],
+        alternatives=tuple(ranked[1:]),
+        map_factor=best.factor,
+        softness_m=best.softness,
+        misfit=gained / max(best.comparison.freedom, 1.0),
+    )
+
+
+_Key = tuple[tuple[tuple[int, ...], bool], ...]
+
+
+def _groups(hypotheses: Hypotheses, row: int) -> tuple[_Key, tuple[Group, ...]]:
+    """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
+    label = hypotheses.label[row]
+    groups = []
+    for g in range(1, int(label.max()) + 1):
+        members = np.flatnonzero(label == g)
+        groups.append(
+            Group(
+                members,
+                bool(hypotheses.turns[row, g]),
+                hypotheses.motion[row, g - 1],
+                int(hypotheses.onset[row, g]),
+            )
+        )
+    key = tuple((tuple(int(j) for j in group.members), group.window > 0) for group in groups)
+    return key, tuple(groups)
