@@ -12,7 +12,7 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.experiments.mrclam import SWAPPED, find_dataset
-from evermap.experiments.nielsen2024_runs import BUILDING, Job, recording_of
+from evermap.experiments.nielsen2024_runs import BUILDING, SENSORS, Job, recording_of
 from evermap.io.shifts import Shift
 from evermap.metrics.landmarks import MIN_SIGHTINGS
 from evermap.sim.moved import ModeConfig
@@ -45,6 +45,7 @@ class Settings:
         datasets: of MRCLAM.
         robots: numbers, None for all of every data set.
         methods: of `METHODS`, where a part compares methods.
+        sensors: settings of sensor and modes for the part 'recordings', keys of `SENSORS`.
         deltas_m: displacements of the group, in x.
         runs: of the simulation, for every noise level.
         noises_m2: variances r of the simulation.
@@ -59,6 +60,7 @@ class Settings:
     datasets: tuple[int, ...] = (6, 1, 2, 3)
     robots: tuple[int, ...] | None = None
     methods: tuple[str, ...] = METHODS
+    sensors: tuple[str, ...] = ("ours", "paper", "many-modes")
     deltas_m: tuple[float, ...] = (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.1)
     runs: int = 100
     noises_m2: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0)
@@ -72,6 +74,7 @@ class Settings:
         for name, given, known in (
             ("part", self.parts, PARTS),
             ("method", self.methods, METHODS),
+            ("sensor", self.sensors, tuple(SENSORS)),
             ("dataset", self.datasets, tuple(GROUP)),
         ):
             unknown = [item for item in given if item not in known]
@@ -135,13 +138,12 @@ def _shift(ids: tuple[int, ...], delta_m: float, direction_rad: float = 0.0) -> 
 
 def _compared(settings: Settings, dataset: int, job: Callable[..., Job]) -> Iterator[Job]:
     """Section 8.2: methods and displacements, with the paper's sensor and with ours; section 8.2.4 on data set 1."""
-    for delta in settings.deltas_m:
-        shifts = _shift(GROUP[dataset], delta)
-        for sensor, method in product(("ours", "paper"), settings.methods):
-            yield job("recordings", "group", sensor=sensor, method=method, shifts=shifts, delta_m=delta)
-        for method in ("em", "mcts") if dataset == 1 else ():
-            if method in settings.methods:
-                yield job("recordings", "many modes", sensor="many-modes", method=method, shifts=shifts, delta_m=delta)
+    for delta, sensor, method in product(settings.deltas_m, settings.sensors, settings.methods):
+        many = sensor == "many-modes"
+        if not many or (dataset == 1 and method in {"em", "mcts"}):
+            scenario = "many modes" if many else "group"
+            shifts = _shift(GROUP[dataset], delta)
+            yield job("recordings", scenario, sensor=sensor, method=method, shifts=shifts, delta_m=delta)
 
 
 def _during(settings: Settings, dataset: int, job: Callable[..., Job]) -> Iterator[Job]:
