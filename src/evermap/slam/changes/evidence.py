@@ -141,7 +141,7 @@ def landmark_evidence(
     )
     cross = information[np.ix_(mine, others)]
     held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
-    covariance: FloatArray = np.linalg.inv(held_somewhere)[np.ix_(states, states)]
+    covariance = np.asarray(np.linalg.inv(held_somewhere)[np.ix_(states, states)], dtype=np.float64)
     _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
     centre = estimate.landmark[estimate.known].mean(axis=0)
     position = np.concatenate([piece.position for piece in pieces])

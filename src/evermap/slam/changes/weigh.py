@@ -12,8 +12,8 @@ import numpy as np
 
 from evermap.slam.changes.evidence import Comparison, Evidence, compare
 from evermap.slam.changes.explain import GivenMap, Group
-from evermap.slam.changes.robust import without_transients
 from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.robust import without_transients
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import FloatArray
 
