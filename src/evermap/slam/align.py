@@ -19,16 +19,16 @@ def consensus(source: FloatArray, target: FloatArray) -> tuple[FloatArray, BoolA
             span = np.linalg.norm(target[i] - target[j])
             if span < AGREE_M or abs(span - np.linalg.norm(source[i] - source[j])) > AGREE_M:
                 continue
-            pose = _rigid(source[[i, j]], target[[i, j]])
+            pose = rigid(source[[i, j]], target[[i, j]])
             gap = np.linalg.norm(se2.transform(pose, source) - target, axis=1)
             agree = gap < AGREE_M
             score = (int(agree.sum()), -float(gap[agree].sum()))
             if score > best_score:
                 best_score, best_pose, best = score, pose, agree
-    return (_rigid(source[best], target[best]) if best.any() else best_pose), best
+    return (rigid(source[best], target[best]) if best.any() else best_pose), best
 
 
-def _rigid(source: FloatArray, target: FloatArray) -> FloatArray:
+def rigid(source: FloatArray, target: FloatArray) -> FloatArray:
     """(3,) rotation and translation that brings points (k, 2) onto others, least squares."""
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())

@@ -1,0 +1,1 @@
+"""Which detection is which landmark, by geometry alone: for recordings without identities."""

@@ -1,0 +1,90 @@
+"""Who is who so far: detections with their landmarks, and where everything is. Values that are never changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.slam.problem import Estimate, Problem
+from evermap.types import BoolArray, FloatArray, IntArray
+
+NOBODY = -1
+"""Landmark row of a detection that belongs to none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Detections, each of one landmark or of nobody, and an estimate of poses, landmarks and states.
+
+    Attributes:
+        measured: the measurements so far; its landmark rows and landmark priors mean nothing.
+        landmark_row: (M,) landmark of every detection, `NOBODY` for none; landmarks in the order they were met.
+        estimate: where everything is; every landmark has a position.
+    """
+
+    measured: Problem
+    landmark_row: IntArray
+    estimate: Estimate
+
+    @property
+    def n_landmarks(self) -> int:
+        """How many landmarks there are."""
+        return len(self.estimate.landmark)
+
+    @property
+    def sightings(self) -> IntArray:
+        """(L,) detections of every landmark."""
+        return np.bincount(self.landmark_row[self.landmark_row >= 0], minlength=self.n_landmarks)
+
+    @property
+    def last_seen_s(self) -> FloatArray:
+        """(L,) stamp of the last detection; -inf where there is none."""
+        last = np.full(self.n_landmarks, -np.inf)
+        seen = self.landmark_row >= 0
+        np.maximum.at(last, self.landmark_row[seen], self.measured.stamp_s[self.measured.pose_row[seen]])
+        return last
+
+    @property
+    def apart(self) -> BoolArray:
+        """(L, L) landmarks that were seen in one frame, and so are two."""
+        seen = self.landmark_row >= 0
+        at = np.zeros((len(self.measured.stamp_s), self.n_landmarks), dtype=np.float32)
+        at[self.measured.pose_row[seen], self.landmark_row[seen]] = 1.0
+        together: BoolArray = at.T @ at > 0.0
+        return together
+
+    def problem(self) -> Problem:
+        """The least-squares problem of the detections that belong to a landmark."""
+        used = np.flatnonzero(self.landmark_row >= 0)
+        count = self.n_landmarks
+        return replace(
+            self.measured,
+            pose_row=self.measured.pose_row[used],
+            landmark_row=self.landmark_row[used],
+            reading=self.measured.reading[used],
+            sigma_given=self.measured.sigma_given[used],
+            landmark_mean=np.zeros((count, 2)),
+            landmark_information=np.zeros((2 * count, 2 * count)),
+        )
+
+    def without(self, landmarks: BoolArray) -> Assignment:
+        """Some landmarks (L,) forgotten, their detections nobody's."""
+        rank = np.where(landmarks, NOBODY, np.cumsum(~landmarks) - 1)
+        return self._renumbered(rank, ~landmarks)
+
+    def merged(self, pairs: list[tuple[int, int]]) -> Assignment:
+        """Pairs (younger, older) made one: the older's place, the detections of both."""
+        becomes = np.arange(self.n_landmarks)
+        for younger, older in sorted(pairs, key=lambda pair: pair[0]):
+            becomes[younger] = becomes[older]  # the older one may have been merged itself, with a still older
+        kept = becomes == np.arange(self.n_landmarks)
+        rank = np.cumsum(kept) - 1
+        return self._renumbered(rank[becomes], kept)
+
+    def _renumbered(self, rank: IntArray, kept: BoolArray) -> Assignment:
+        row = np.full_like(self.landmark_row, NOBODY)
+        seen = self.landmark_row >= 0
+        row[seen] = rank[self.landmark_row[seen]]
+        estimate = Estimate(self.estimate.pose, self.estimate.landmark[kept], self.estimate.states)
+        return Assignment(self.measured, row, estimate)

@@ -1,0 +1,213 @@
+"""Frame after frame, which detection is which landmark, and from time to time which landmarks are one.
+
+A detection is given to a landmark only if no other explanation is nearly as good; in doubt it starts a landmark of its
+own, which can be merged later, when a batch solution knows more. Nothing is decided that cannot be mended: at the end
+every detection is compared once more with the whole map.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.slam.arrow import Smoother
+from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.filter import Belief, pairings_of_frame, predicted, updated, with_landmark
+from evermap.slam.association.jcbb import Pairings, pairing_probability
+from evermap.slam.association.merge import allowed_rise, propose_constellation, propose_merges
+from evermap.slam.association.sighting_noise import SightingNoise, fit_sighting_noise
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.types import FloatArray, IntArray
+
+CAUTION = 2.0
+"""Odometry is taken to be this much worse than where learning would start. It is not learned here: what was associated
+is what agreed with it."""
+SLIP = 3.0
+"""And this much worse in a step after which no landmark is where it should be."""
+
+
+GATE = 0.999
+"""Confidence of the gates of single detections and of whole frames."""
+P_MATCH = 0.95
+"""Probability from which a detection is given to a landmark."""
+P_NEW = 0.1
+"""Probability of being none of the known from which it starts a landmark."""
+P_MERGE = 0.97
+"""Probability from which two landmarks are one."""
+DENSITY = 0.1
+"""Landmarks a square metre that one expects where none is known."""
+MIN_SIGHTINGS = 3
+"""Detections that make a landmark."""
+FORGET_S = 20.0
+"""What has less by then is forgotten."""
+FIRST_STOCK = 40
+"""Poses before the first batch solution; the next come whenever their number grew by a tenth, or by as many."""
+NOISE_FLOOR = 0.5
+"""Share of the start's noise of sightings that imaginary ones vouch for."""
+INFLATION = 1.3
+"""Of the noise of sightings: what was associated is what agreed."""
+LAST_ROUNDS = 5
+"""Comparisons of every detection with the whole map at the end, at most."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A frame compared with the map: rows of `pairings` that are certain, and p (n,) of each to be new."""
+
+    belief: Belief
+    pairings: Pairings
+    derivative: FloatArray
+    taken: IntArray
+    p_new: FloatArray
+    sigma: FloatArray
+
+
+class Associator:
+    """Feed frames in order with `step`, then `finish`.
+
+    Args:
+        problem: the measurements; its `landmark_row` is not looked at.
+        noise: where the noise levels start.
+    """
+
+    def __init__(self, problem: Problem, noise: Noise) -> None:
+        self._problem = problem
+        self._start_noise = noise
+        self.noise = replace(noise, odometry=CAUTION * noise.odometry)
+        """Noise levels that everything is solved with; detections carry their own."""
+        self._slipping = replace(noise, odometry=SLIP * self.noise.odometry)
+        self._first = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
+        self._pose = np.zeros((len(problem.stamp_s), 3))
+        self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
+        self._sighting_noise = SightingNoise.constant(noise.detection)
+        self._belief = Belief.first(problem)
+        self._done = 0
+        self._next_stock = FIRST_STOCK
+
+    def step(self) -> None:
+        """Associate the next frame."""
+        row = self._done
+        detections = np.arange(self._first[row], self._first[row + 1])
+        before = self._belief
+        frame = self._match(predicted(before, self._problem, self.noise, row), detections)
+        if row > 0 and len(frame.taken) == 0:  # the wheels slipped, or stamps jittered in a turn?
+            slipped = self._match(predicted(before, self._problem, self._slipping, row), detections)
+            frame = slipped if len(slipped.taken) else frame
+        self._use(frame, detections)
+        self._pose[row] = self._belief.pose
+        self._done += 1
+        if self._done == self._next_stock:
+            self._take_stock()
+            self._next_stock = self._done + max(FIRST_STOCK, self._done // 10)
+
+    def finish(self) -> Assignment:
+        """Settle everything processed so far."""
+        assignment, marginals = self._settled(self._assignment())
+        for _ in range(LAST_ROUNDS):
+            again = self._reconsidered(assignment, marginals)
+            if np.array_equal(again.landmark_row, assignment.landmark_row):
+                break
+            assignment, marginals = self._settled(again)
+        return assignment.without(assignment.sightings < MIN_SIGHTINGS)
+
+    def _match(self, belief: Belief, detections: IntArray) -> _Frame:
+        """The frame's detections weighed against the landmarks known so far."""
+        sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
+        pairings, derivative = pairings_of_frame(
+            belief, self._problem, sigma, detections, confidence=GATE, density=DENSITY
+        )
+        probability, _ = pairing_probability(pairings, confidence=GATE)
+        known = np.zeros(len(detections))
+        np.add.at(known, pairings.source, probability)
+        taken = np.flatnonzero(probability >= P_MATCH)
+        return _Frame(belief, pairings, derivative, taken, 1.0 - known, sigma)
+
+    def _use(self, frame: _Frame, detections: IntArray) -> None:
+        """Update with the certain pairings, and start landmarks where none is near enough."""
+        belief, pairings, taken = frame.belief, frame.pairings, frame.taken
+        self._row[detections[pairings.source[taken]]] = pairings.target[taken]
+        if len(taken):
+            belief = updated(belief, pairings, frame.derivative, taken)
+        for m in detections[frame.p_new >= P_NEW]:
+            self._row[m] = len(belief.landmark)
+            belief = with_landmark(belief, self._problem, frame.sigma, m)
+        self._belief = belief
+
+    def _take_stock(self) -> None:
+        """Solve everything so far, merge what is one, and go on from there."""
+        assignment, marginals = self._settled(self._without_chance(self._assignment()))
+        self._row[: len(assignment.landmark_row)] = assignment.landmark_row
+        self._pose[: self._done] = assignment.estimate.pose
+        self._belief = Belief.at(assignment.estimate, marginals, self._done - 1)
+
+    def _assignment(self) -> Assignment:
+        measured = self._problem.until(self._done)
+        sigma = INFLATION * self._sighting_noise.of_detections(measured)
+        measured = replace(measured, sigma_given=sigma)
+        estimate = Estimate(self._pose[: self._done].copy(), self._belief.landmark, self._belief.states)
+        return Assignment(measured, self._row[: len(measured.pose_row)].copy(), estimate)
+
+    def _without_chance(self, assignment: Assignment) -> Assignment:
+        """Landmarks that were seen once or twice, long ago, were none."""
+        age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
+        few = assignment.sightings < MIN_SIGHTINGS
+        return assignment.without(few & (age > FORGET_S))
+
+    def _settled(self, assignment: Assignment) -> tuple[Assignment, Marginals]:
+        """The batch solution, merged as long as there is something to merge."""
+        assignment, marginals = self._solved(assignment)
+        refused: set[tuple[int, int]] = set()
+        while True:
+            pairs = propose_merges(assignment, marginals, density=DENSITY, probability=P_MERGE)
+            pairs = [pair for pair in pairs if pair not in refused]
+            if not pairs:
+                pairs = propose_constellation(
+                    assignment, marginals, density=DENSITY, probability=P_MERGE,
+                    refused=refused,
+                )  # fmt: skip
+            if not pairs:
+                return assignment, marginals
+            trial = assignment.merged(pairs)
+            cost_before, _ = self._cost(assignment)
+            cost_after, estimate = self._cost(trial)
+            if cost_after - cost_before < allowed_rise(len(pairs)):
+                assignment, marginals = self._solved(Assignment(trial.measured, trial.landmark_row, estimate))
+                refused.clear()
+            else:
+                refused.update(pairs)
+
+    def _solved(self, assignment: Assignment) -> tuple[Assignment, Marginals]:
+        """Optimum and covariances; learns the noise on the way."""
+        problem = assignment.problem()
+        smoother = Smoother(problem, self.noise, heavy=True)
+        estimate = smoother.optimum(assignment.estimate, iterations=10, tolerance=1e-4)
+        marginals = smoother.marginals(estimate)
+        measured = assignment.measured
+        given = self._problem.sigma_given[: len(measured.pose_row)]
+        unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
+        self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection)
+        return Assignment(assignment.measured, assignment.landmark_row, estimate), marginals
+
+    def _cost(self, assignment: Assignment) -> tuple[float, Estimate]:
+        """Cost at the optimum, outliers decided."""
+        problem = assignment.problem()
+        estimate = Smoother(problem, self.noise, heavy=True).optimum(assignment.estimate, iterations=10, tolerance=1e-3)
+        smoother = Smoother(problem, self.noise)
+        estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-3)
+        return smoother.cost(estimate), estimate
+
+    def _reconsidered(self, assignment: Assignment, marginals: Marginals) -> Assignment:
+        """Every detection compared with the whole map once more, and given to whom it most probably belongs."""
+        problem = assignment.measured
+        sigma = problem.sigma_given
+        row = np.full_like(assignment.landmark_row, NOBODY)
+        for i in range(self._done):
+            detections = np.arange(self._first[i], self._first[i + 1])
+            belief = Belief.at(assignment.estimate, marginals, i)
+            pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=DENSITY)
+            probability, _ = pairing_probability(pairings, confidence=GATE)
+            taken = np.flatnonzero(probability > 0.5)
+            row[detections[pairings.source[taken]]] = pairings.target[taken]
+        again = Assignment(problem, row, assignment.estimate)
+        return again.without(again.sightings == 0)

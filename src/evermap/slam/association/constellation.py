@@ -1,0 +1,205 @@
+"""One map laid over another by its shape: which landmarks of a local map are which of a larger one.
+
+After a long blind stretch, or in a given map, the local map may be turned far beyond what a linear gate can follow. Two
+of its landmarks with the right distance from each other fix a motion; around every such motion the difference of the
+maps is linear again, and joint compatibility tells how many landmarks agree. Motions are weighed by the evidence of
+what they explain, so that a chance agreement of two does not beat the right one of five.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap import se2
+from evermap.slam.align import rigid
+from evermap.slam.association.jcbb import Pairings, most_pairings
+from evermap.types import BoolArray, FloatArray
+
+CONFIDENCE = 0.999
+MIN_SPAN_M = 0.5
+"""Two landmarks fix a motion if they are this far apart."""
+MAX_SEEDS = 12
+"""Landmarks of the local map that seeds are made of, the best known."""
+MAX_MOTIONS = 20
+"""Motions, those under which most landmarks come near one of the map, that are weighed exactly."""
+NEAR_M = 0.5
+CERTAIN_NATS = 7.0
+"""By how much an overlay must beat 'all new' and its best rival: 1000 to 1."""
+MOTION_SIGMA = np.array([5.0, 5.0, 2.0])
+"""Prior of the motion around a seed [m, m, rad]: as good as none."""
+SHARED_ERROR_M = 0.03
+"""Errors of sightings from one place are alike and don't average out: landmarks agree if they do to within this."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalMap:
+    """Landmarks and how well they are known: place (n, 2), covariance (2 n, 2 n)."""
+
+    place: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """A motion and what it explains.
+
+    Attributes:
+        motion: (3,) from the source's frame to the target's.
+        pairs: (source, target) of landmarks that agree.
+        log_evidence: of the pairs being the same, over being different.
+    """
+
+    motion: FloatArray
+    pairs: tuple[tuple[int, int], ...]
+    log_evidence: float
+
+
+def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float) -> list[Overlay]:
+    """Ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
+
+    Args:
+        source: the local map, its landmarks in order of trust.
+        target: the map.
+        allowed: (n, m) which pairs may be the same at all.
+        density: landmarks a square metre that one expects where they are not the same.
+    """
+    found: dict[tuple[tuple[int, int], ...], Overlay] = {}
+    for motion in _motions(source, target, allowed):
+        overlay = _weighed(motion, source, target, allowed, density)
+        known = found.get(overlay.pairs)
+        if known is None or known.log_evidence < overlay.log_evidence:
+            found[overlay.pairs] = overlay
+    return sorted(found.values(), key=lambda overlay: -overlay.log_evidence)
+
+
+def agreed_pairs(
+    source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float, probability: float
+) -> list[tuple[int, int]]:
+    """Pairs (source, target) that are certain: of an overlay far better than any other, without doubt in it.
+
+    Empty where the maps can be laid over each other in several ways, or in none.
+
+    Args:
+        source: the local map, its landmarks in order of trust.
+        target: the map.
+        allowed: (n, m) which pairs may be the same at all.
+        density: landmarks a square metre that one expects where they are not the same.
+        probability: least probability of a pair beside all overlays that differ in it alone.
+    """
+    found = [overlay for overlay in overlays(source, target, allowed, density=density) if len(overlay.pairs) > 1]
+    if not found or found[0].log_evidence < CERTAIN_NATS:
+        return []
+    best = found[0]
+    rivals = [other for other in found[1:] if not set(other.pairs) & set(best.pairs)]
+    if rivals and best.log_evidence - rivals[0].log_evidence < CERTAIN_NATS:
+        return []
+    sure = _without_doubt(best, source, target, allowed, density, math.log(probability / (1.0 - probability)))
+    return sure if len(sure) > 1 else []
+
+
+def _without_doubt(
+    best: Overlay, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float, margin: float
+) -> list[tuple[int, int]]:
+    """Pairs that are better by `margin` nats than any change of the overlay by one: none, another, or exchanged."""
+    pairings = _pairings(best.motion, source, target, allowed, density)
+    row_of = {(int(a), int(b)): k for k, (a, b) in enumerate(zip(pairings.source, pairings.target, strict=True))}
+    chosen = dict(best.pairs)
+    whole = _evidence(pairings, [row_of[pair] for pair in chosen.items()], density)
+    sure = []
+    for mine, place in best.pairs:
+        others = {a: b for a, b in chosen.items() if a != mine}
+        changes = [others]
+        for other in pairings.target[pairings.source == mine]:
+            if other == place:
+                continue
+            evicted = next((a for a, b in others.items() if b == other), None)
+            kept = {a: b for a, b in others.items() if a != evicted} | {mine: int(other)}
+            changes.append(kept)
+            if evicted is not None and (evicted, place) in row_of:
+                changes.append(kept | {evicted: place})
+        evidence = [_evidence(pairings, [row_of[pair] for pair in change.items()], density) for change in changes]
+        if whole - max(evidence) > margin:
+            sure.append((mine, place))
+    return sure
+
+
+def _evidence(pairings: Pairings, rows: list[int], density: float) -> float:
+    """Of some pairs (rows) being the same, over being different [nats]."""
+    if not rows:
+        return 0.0
+    columns = np.array([[2 * k, 2 * k + 1] for k in rows]).ravel()
+    covariance, innovation = pairings.covariance[np.ix_(columns, columns)], pairings.innovation[rows].ravel()
+    log_det = np.linalg.slogdet(2.0 * np.pi * covariance)[1]
+    distance = innovation @ np.linalg.solve(covariance, innovation)
+    return float(-0.5 * (distance + log_det) - len(rows) * np.log(density))
+
+
+def _motions(source: LocalMap, target: LocalMap, allowed: BoolArray) -> list[FloatArray]:
+    """Motions by two landmarks each, those that bring most landmarks near some other first; alike ones once."""
+    between = np.linalg.norm(target.place[:, None] - target.place[None], axis=2)
+    scored: list[tuple[int, float, FloatArray]] = []
+    seen: set[tuple[tuple[int, int], ...]] = set()
+    for i in range(min(len(source.place), MAX_SEEDS)):
+        for j in range(i):
+            span = float(np.linalg.norm(source.place[i] - source.place[j]))
+            if span < MIN_SPAN_M:
+                continue
+            fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + 6.0 * SHARED_ERROR_M
+            fits &= allowed[i][:, None] & allowed[j][None, :]
+            for a, b in np.argwhere(fits & (between > 0.0)):
+                motion = rigid(source.place[[i, j]], target.place[[a, b]])
+                gap = np.linalg.norm(se2.transform(motion, source.place)[:, None] - target.place[None], axis=2)
+                gap[~allowed] = np.inf
+                nearest, at = gap.argmin(axis=1), gap.min(axis=1)
+                near = np.flatnonzero(at < NEAR_M)
+                key = tuple((int(k), int(nearest[k])) for k in near)
+                if key not in seen:
+                    seen.add(key)
+                    scored.append((-len(np.unique(nearest[near])), float(at[near].sum()), motion))
+    scored.sort(key=lambda item: item[:2])
+    return [motion for *_, motion in scored[:MAX_MOTIONS]]
+
+
+def _sigma_of_span(source: LocalMap, i: int, j: int) -> float:
+    along = source.place[i] - source.place[j]
+    along = along / np.linalg.norm(along)
+    row = np.zeros(len(source.covariance))
+    row[2 * i : 2 * i + 2], row[2 * j : 2 * j + 2] = along, -along
+    return math.sqrt(max(float(row @ source.covariance @ row), 0.0))
+
+
+def _weighed(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Overlay:
+    """The largest jointly compatible set of pairs around a motion, and its evidence."""
+    pairings = _pairings(motion, source, target, allowed, density)
+    found = most_pairings(pairings, confidence=CONFIDENCE)
+    rows = found.pairing[found.pairing >= 0]
+    if len(rows) == 0:
+        return Overlay(motion, (), 0.0)
+    pairs = tuple((int(pairings.source[k]), int(pairings.target[k])) for k in rows)
+    return Overlay(motion, pairs, _evidence(pairings, rows.tolist(), density))
+
+
+def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Pairings:
+    """Pairs that come near each other under the motion, with the covariance of their differences around it."""
+    place = se2.transform(motion, source.place)
+    gap = place[:, None] - target.place[None]
+    s, t = np.nonzero(allowed & (np.linalg.norm(gap, axis=2) < NEAR_M))
+    turn = se2.rotation(motion[2])
+    n = len(s)
+    by_source = np.zeros((2 * n, len(source.covariance)))
+    by_target = np.zeros((2 * n, len(target.covariance)))
+    by_motion = np.zeros((2 * n, 3))
+    lever = place - place.mean(axis=0)
+    for k in range(n):
+        two = slice(2 * k, 2 * k + 2)
+        by_source[two, 2 * s[k] : 2 * s[k] + 2] = turn
+        by_target[two, 2 * t[k] : 2 * t[k] + 2] = np.eye(2)
+        by_motion[two] = [[1.0, 0.0, -lever[s[k], 1]], [0.0, 1.0, lever[s[k], 0]]]
+    covariance = by_source @ source.covariance @ by_source.T + by_target @ target.covariance @ by_target.T
+    covariance += (by_motion * MOTION_SIGMA**2) @ by_motion.T + 2.0 * SHARED_ERROR_M**2 * np.eye(2 * n)
+    return Pairings(
+        s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance, np.full(n, np.log(density)), len(source.place)
+    )

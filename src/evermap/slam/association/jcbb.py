@@ -1,0 +1,222 @@
+"""Joint compatibility: which pairings of detections with landmarks can be true at the same time.
+
+Neira and Tardos: Data Association in Stochastic Mapping Using the Joint Compatibility Test, IEEE T-RA 17(6), 2001.
+Pairings that pass their own gates may contradict each other, since all share the robot's error. A set of pairings is
+jointly compatible if its stacked innovation passes the gate under the stacked covariance. Branch and bound over the
+interpretation tree finds the set with most pairings, and of these the one with the smallest distance. The distance
+grows pairing by pairing with a Cholesky factor that grows along (their incremental form, square-root).
+
+The largest set is not always right: where gates are wide, chance makes pairings. `pairing_probability` therefore weighs
+all compatible sets by Bayes' rule against what is as good an explanation, landmarks that were never met before.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numba import njit
+from scipy.stats import chi2
+
+from evermap.compiled import drop_stale_code
+from evermap.slam import kernels
+from evermap.types import FloatArray, IntArray
+
+MAX_NODES = 200_000
+"""Nodes of the tree that are visited at most; a tenth of a second."""
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+drop_stale_code(__file__, kernels.__file__)
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile a function at its first call, and keep the machine code beside the source."""
+    return cast("_Function", njit(cache=True, error_model="numpy")(function))
+
+
+@dataclass(frozen=True, slots=True)
+class Pairings:
+    """K pairings that pass their own gates; sorted by `source`.
+
+    Attributes:
+        source: (K,) detection, or landmark of a local map, counted from 0.
+        target: (K,) landmark that it may be.
+        innovation: (K, 2) measured minus predicted.
+        covariance: (2 K, 2 K) of all innovations together.
+        log_density_new: (K,) of the innovation, were it a landmark not met before.
+        n_sources: how many sources there are, with pairings or not.
+    """
+
+    source: IntArray
+    target: IntArray
+    innovation: FloatArray
+    covariance: FloatArray
+    log_density_new: FloatArray
+    n_sources: int
+
+
+@dataclass(frozen=True, slots=True)
+class Matching:
+    """What the search found.
+
+    Attributes:
+        pairing: (n_sources,) the row of `Pairings` of every source in the best set, -1 for none.
+        distance: squared Mahalanobis distance of the best set.
+        complete: False where the search was cut short.
+    """
+
+    pairing: IntArray
+    distance: float
+    complete: bool
+
+
+@functools.cache
+def gates(n: int, confidence: float) -> FloatArray:
+    """(n + 1,) chi-square quantiles with 2 k degrees of freedom for k = 0..n pairings."""
+    bounds: FloatArray = np.append(0.0, chi2.ppf(confidence, 2 * np.arange(1, n + 1)))
+    bounds.setflags(write=False)
+    return bounds
+
+
+def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES) -> Matching:
+    """The jointly compatible set with most pairings and, of those, the smallest distance."""
+    found, distance, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
+    return Matching(found, distance, complete)
+
+
+def pairing_probability(
+    pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES
+) -> tuple[FloatArray, bool]:
+    """(K,) probability of every pairing over all jointly compatible sets, and whether all sets were weighed."""
+    _, _, probability, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
+    return probability, complete
+
+
+def _arguments(
+    pairings: Pairings, confidence: float
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    first: IntArray = np.searchsorted(pairings.source, np.arange(pairings.n_sources + 1))
+    return (
+        first,
+        pairings.target,
+        np.ascontiguousarray(pairings.innovation),
+        np.ascontiguousarray(pairings.covariance),
+        pairings.log_density_new,
+        gates(pairings.n_sources, confidence),
+    )
+
+
+@kernel
+def _extend(
+    chosen: Any, n: int, k: int, innovation: FloatArray, covariance: FloatArray, factor: FloatArray, white: FloatArray
+) -> tuple[float, float]:
+    """Append pairing `k` to the `n` chosen: rows of the Cholesky factor and of the whitened innovation.
+
+    Returns:
+        What the squared distance and the log determinant gain.
+    """
+    gain, log_det = 0.0, 0.0
+    for a in range(2):
+        row = 2 * n + a
+        rest = innovation[k, a]
+        for col in range(row + 1):
+            other, b = (chosen[col // 2], col % 2) if col < 2 * n else (k, col - 2 * n)
+            value = covariance[2 * k + a, 2 * other + b]
+            for m in range(col):
+                value -= factor[row, m] * factor[col, m]
+            if col < row:
+                factor[row, col] = value / factor[col, col]
+                rest -= factor[row, col] * white[col]
+            else:
+                factor[row, row] = np.sqrt(max(value, 1e-300))
+        white[row] = rest / factor[row, row]
+        gain += white[row] ** 2
+        log_det += 2.0 * np.log(factor[row, row])
+    return gain, log_det
+
+
+@kernel
+def _search(
+    first: Any,
+    target: Any,
+    innovation: FloatArray,
+    covariance: FloatArray,
+    log_density_new: FloatArray,
+    gate: FloatArray,
+    weigh_all: bool,
+    max_nodes: int,
+) -> tuple[Any, float, FloatArray, bool]:
+    """Depth first over the tree whose level is a source and whose branches are its pairings, and none.
+
+    With `weigh_all` every compatible set is visited and adds its weight to the pairings in it; without, branches that
+    cannot become better than the best set so far are cut.
+    """
+    n_sources, n_pairings = len(first) - 1, len(target)
+    remaining = np.zeros(n_sources + 1, dtype=np.int64)  # sources from here on that have any pairing
+    for level in range(n_sources - 1, -1, -1):
+        remaining[level] = remaining[level + 1] + (1 if first[level + 1] > first[level] else 0)
+    cursor = np.zeros(n_sources + 1, dtype=np.int64)
+    picked = np.full(n_sources, -1, dtype=np.int64)  # by level
+    chosen = np.zeros(n_sources, dtype=np.int64)  # in order of choice
+    count = np.zeros(n_sources + 1, dtype=np.int64)
+    distance, score = np.zeros(n_sources + 1), np.zeros(n_sources + 1)
+    factor, white = np.zeros((2 * n_sources, 2 * n_sources)), np.zeros(2 * n_sources)
+    best, best_count, best_distance = np.full(n_sources, -1, dtype=np.int64), 0, 0.0
+    weight, total, top = np.zeros(n_pairings), 0.0, 0.0
+    level, nodes = 0, 0
+    cursor[0] = first[0] if n_sources else 0
+    while level >= 0:
+        if level == n_sources:
+            better = count[level] > best_count or (count[level] == best_count and distance[level] < best_distance)
+            if better:
+                best[:], best_count, best_distance = picked, count[level], distance[level]
+            if weigh_all:
+                if score[level] > top:
+                    shrink = np.exp(top - score[level])
+                    weight *= shrink
+                    total *= shrink
+                    top = score[level]
+                share = np.exp(score[level] - top)
+                total += share
+                for k in chosen[: count[level]]:
+                    weight[k] += share
+            level -= 1
+            continue
+        k = cursor[level]
+        cursor[level] += 1
+        if k > first[level + 1] or nodes >= max_nodes:
+            picked[level] = -1
+            level -= 1
+            continue
+        n = count[level]
+        if k == first[level + 1]:  # the source is none of the known
+            picked[level] = -1
+            count[level + 1], distance[level + 1], score[level + 1] = n, distance[level], score[level]
+        else:
+            taken = False
+            for other in chosen[:n]:
+                taken |= target[other] == target[k]
+            if taken:
+                continue
+            nodes += 1
+            gain, log_det = _extend(chosen, n, k, innovation, covariance, factor, white)
+            if distance[level] + gain > gate[n + 1]:
+                continue
+            picked[level] = chosen[n] = k
+            count[level + 1] = n + 1
+            distance[level + 1] = distance[level] + gain
+            score[level + 1] = score[level] - 0.5 * (gain + log_det) - np.log(2.0 * np.pi) - log_density_new[k]
+        if not weigh_all:
+            reach = count[level + 1] + remaining[level + 1]
+            if reach < best_count or (reach == best_count and best_count > 0 and distance[level + 1] >= best_distance):
+                continue
+        level += 1
+        if level < n_sources:
+            cursor[level] = first[level]
+    if total > 0.0:
+        weight /= total
+    return best, best_distance, weight, nodes < max_nodes
