@@ -81,10 +81,10 @@ def find_changes(
     kept = climb_from_many_starts(
         prior.p_rotated > 0.0, *tables, label, onset, turns, kept_label, kept_onset, kept_turns, kept_gain
     )
-    rows = np.column_stack([kept_label[:kept], kept_onset[:kept], kept_turns[:kept]])
-    _, first = np.unique(rows, axis=0, return_index=True)
+    worth = np.flatnonzero(kept_gain[:kept] > kept_gain[-1] - WORTH_KEEPING)
+    rows = np.column_stack([kept_label[worth], kept_onset[worth], kept_turns[worth]])
+    first = worth[np.unique(rows, axis=0, return_index=True)[1]]
     first = first[np.argsort(-kept_gain[first], kind="stable")]
-    first = first[kept_gain[first] > kept_gain[first[0]] - WORTH_KEEPING]
     labels = np.zeros((len(first), len(position)), np.int64)
     labels[:, candidates] = kept_label[first]
     motion = np.array([hypothesis_gain(kept_label[k], kept_onset[k], kept_turns[k], *tables)[1] for k in first])
@@ -113,14 +113,26 @@ def item_columns(
     evidence: Evidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'."""
-    count = len(candidates)
-    columns = np.zeros((2 * len(evidence.landmark), n_windows, count, 4))
     rank = np.full(len(position), -1)
-    rank[candidates] = np.arange(count)
-    for row, (j, w) in enumerate(zip(evidence.landmark, evidence.window, strict=True)):
-        if rank[j] >= 0:
-            x, y = position[j]
-            columns[2 * row, : w + 1, rank[j]] = (1.0, 0.0, x, -y)
-            columns[2 * row + 1, : w + 1, rank[j]] = (0.0, 1.0, y, x)
-    flat = columns.reshape(len(columns), -1)
-    return np.ascontiguousarray(flat.T @ (comparison.precision @ flat)), flat.T @ comparison.pull
+    rank[candidates] = np.arange(len(candidates))
+    rows = np.flatnonzero(rank[evidence.landmark] >= 0)
+    x, y = position[evidence.landmark[rows]].T
+    zero, one = np.zeros(len(rows)), np.ones(len(rows))
+    columns = np.array([[one, zero, x, -y], [zero, one, y, x]]).transpose(2, 0, 1)  # (R, 2, 4)
+    both = (2 * rows[:, None] + np.arange(2)).ravel()
+    precision = comparison.precision[np.ix_(both, both)].reshape(len(rows), 2, len(rows), 2)
+    # what a copy says is said by every item that begins in its window or before: sums from the last window backwards
+    size = (n_windows, len(candidates), 4)
+    at = evidence.window[rows], rank[evidence.landmark[rows]]
+    linear = np.zeros(size)
+    linear[at] = np.einsum("rka,rk->ra", columns, comparison.pull[both].reshape(-1, 2))
+    linear = np.cumsum(linear[::-1], axis=0)[::-1]
+    half = np.einsum("rkqm,qmb->rkqb", precision, columns)
+    blocks = np.einsum("rka,rkqb->raqb", columns, half)
+    item = at[0] * len(candidates) + at[1]
+    quadratic = np.zeros((n_windows * len(candidates), 4, n_windows * len(candidates), 4))
+    quadratic[item[:, None], :, item[None, :], :] = blocks.transpose(0, 2, 1, 3)
+    quadratic = quadratic.reshape(*size, *size)
+    for axis in (0, 3):
+        quadratic = np.flip(np.cumsum(np.flip(quadratic, axis), axis=axis), axis)
+    return np.ascontiguousarray(quadratic.reshape(linear.size, linear.size)), linear.ravel()

@@ -88,15 +88,15 @@ def weigh(
         return trials[factor, softness].score
 
     tried(factor, softness)
-    if thorough:
-        for _ in range(2):  # one after the other, until neither gains
-            known = (factor, softness)
-            if n_windows > 1:
-                softness = max(SOFTNESS_M, key=lambda s: tried(factor, s))
-            if given.given.any():
-                factor = max(MAP_FACTORS, key=lambda f: tried(f, softness))
-            if known == (factor, softness):
-                break
+    improved = thorough
+    while improved:  # one step up or down in either, as long as that gains
+        neighbours = [(factor, s) for s in _beside(SOFTNESS_M, softness)] if n_windows > 1 else []
+        if given.given.any():
+            neighbours += [(f, softness) for f in _beside(MAP_FACTORS, factor)]
+        best = max(neighbours, key=lambda trial: tried(*trial))
+        improved = tried(*best) > tried(factor, softness)
+        if improved:
+            factor, softness = best
     return _verdict(list(trials.values()), trials[factor, softness])
 
 
@@ -114,6 +114,12 @@ class _Trial:
     def score(self) -> float:
         """Log posterior of the best hypothesis."""
         return self.base + float(self.hypotheses.gain[0])
+
+
+def _beside(values: tuple[float, ...], value: float) -> tuple[float, ...]:
+    """The neighbours of a value."""
+    at = values.index(value)
+    return values[max(at - 1, 0) : at] + values[at + 1 : at + 2]
 
 
 def _positions(evidence: Evidence, given: GivenMap) -> FloatArray:
