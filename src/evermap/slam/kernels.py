@@ -102,20 +102,22 @@ def integrate_odometry(
     first_w = scale_w * velocity[row, 2]
     v, left, w = first_v, first_l, first_w
     now = begin
-    right = np.zeros((3, 3))
+    ct, st = 1.0, 0.0
+    # all sums are over twists seen from the start: one transformation at the end instead of one a step
+    column, product = np.zeros((3, 3)), np.zeros((3, 3))
     while now < end:
         until = end if row + 1 >= count else min(end, stamp[row + 1])
         if until > now:
             reported_v, reported_l, reported_w = velocity[row, 0], velocity[row, 1], velocity[row, 2]
             turn_abs = abs(reported_w)
-            speed = np.sqrt(reported_v * reported_v + reported_l * reported_l)
+            speed = math.sqrt(reported_v * reported_v + reported_l * reported_l)
             v = scale_v * reported_v - slip * turn_abs
             left = scale_v * reported_l
             w = scale_w * reported_w
-            pieces = max(1, int(np.ceil((until - now) / MAX_STEP_S)))
+            pieces = max(1, math.ceil((until - now) / MAX_STEP_S))
             h = (until - now) / pieces
             turn = w * h
-            c, s = np.cos(turn), np.sin(turn)
+            c, s = math.cos(turn), math.sin(turn)
             if abs(turn) < 1e-4:
                 sin_by = 1.0 - turn * turn / 6.0
                 cos_by = 0.5 * turn
@@ -129,39 +131,51 @@ def integrate_odometry(
             step_x = (sin_by * v - cos_by * left) * h
             step_y = (cos_by * v + sin_by * left) * h
             # right Jacobian of the exponential: from a change of the twist to a change of the step, seen at its end
-            right[0, 0], right[0, 1], right[0, 2] = sin_by, cos_by, (v * sin_by2 - left * cos_by2) * h
-            right[1, 0], right[1, 1], right[1, 2] = -cos_by, sin_by, (v * cos_by2 + left * sin_by2) * h
-            right[2, 2] = 1.0
-            # adjoint of the inverse step: carries what happened before to the end of the step
-            lever_x = s * step_x - c * step_y
-            lever_y = c * step_x + s * step_y
+            by_turn_x, by_turn_y = (v * sin_by2 - left * cos_by2) * h, (v * cos_by2 + left * sin_by2) * h
             for _ in range(pieces):
-                _carry(jacobian, c, s, lever_x, lever_y)
-                for axis in range(3):
-                    jacobian[axis, 1] += (right[axis, 0] * reported_v + right[axis, 1] * reported_l) * h
-                    jacobian[axis, 2] += right[axis, 2] * reported_w * h
-                    jacobian[axis, 3] -= right[axis, 0] * turn_abs * h
-                for kind in range(N_NOISE):
-                    _carry_covariance(noise[kind], c, s, lever_x, lever_y)
-                    driver = _DRIVER[kind]
-                    amount = h if driver == 0 else (h * speed if driver == 1 else h * turn_abs)
-                    _add_column(noise[kind], right, _AXIS[kind], amount)
-                _carry_covariance(floor, c, s, lever_x, lever_y)
-                for axis in range(3):
-                    base = FLOOR_TURN_RAD if axis == 2 else FLOOR_FORWARD_M
-                    _add_column(floor, right, axis, h * (base * base + unknown[row]))
-                ct, st = np.cos(theta), np.sin(theta)
                 x += ct * step_x - st * step_y
                 y += st * step_x + ct * step_y
+                ct, st = ct * c - st * s, st * c + ct * s
                 theta += turn
+                column[0, 0], column[0, 1] = ct * sin_by + st * cos_by, st * sin_by - ct * cos_by
+                column[1, 0], column[1, 1] = ct * cos_by - st * sin_by, st * cos_by + ct * sin_by
+                column[2, 0] = ct * by_turn_x - st * by_turn_y + y
+                column[2, 1] = st * by_turn_x + ct * by_turn_y - x
+                column[2, 2] = 1.0
+                for k in range(2):
+                    jacobian[k, 1] += (column[0, k] * reported_v + column[1, k] * reported_l) * h
+                    jacobian[k, 2] += column[2, k] * reported_w * h
+                    jacobian[k, 3] -= column[0, k] * turn_abs * h
+                jacobian[2, 2] += reported_w * h
+                for axis in range(3):
+                    base = FLOOR_TURN_RAD if axis == 2 else FLOOR_FORWARD_M
+                    always = h * (base * base + unknown[row])
+                    for i in range(3):
+                        for j in range(i + 1):
+                            product[i, j] = column[axis, i] * column[axis, j]
+                            floor[i, j] += always * product[i, j]
+                    for kind in range(N_NOISE):
+                        if _AXIS[kind] != axis:
+                            continue
+                        driver = _DRIVER[kind]
+                        amount = h if driver == 0 else (h * speed if driver == 1 else h * turn_abs)
+                        for i in range(3):
+                            for j in range(i + 1):
+                                noise[kind, i, j] += amount * product[i, j]
         now = until
         if row + 1 < count and until >= stamp[row + 1]:
             row += 1
+    c, s = math.cos(theta), math.sin(theta)
+    # adjoint of the inverse increment: what is seen from the start, seen from the end
+    lever_x, lever_y = s * x - c * y, c * x + s * y
+    _carry(jacobian, c, s, lever_x, lever_y)
+    for kind in range(N_NOISE):
+        _carry_covariance(noise[kind], c, s, lever_x, lever_y)
+    _carry_covariance(floor, c, s, lever_x, lever_y)
     for axis in range(3):
         floor[axis, axis] += FLOOR_VARIANCE
     increment[0], increment[1], increment[2] = x, y, theta
     # a later window gains the last velocity at its end and loses the first at its start
-    c, s = np.cos(theta), np.sin(theta)
     jacobian[0, 0] = v - (c * first_v + s * first_l + (s * x - c * y) * first_w)
     jacobian[1, 0] = left - (-s * first_v + c * first_l + (c * x + s * y) * first_w)
     jacobian[2, 0] = w - first_w
@@ -178,15 +192,12 @@ def _carry(columns: FloatArray, c: float, s: float, lever_x: float, lever_y: flo
 
 @kernel
 def _carry_covariance(p: FloatArray, c: float, s: float, lever_x: float, lever_y: float) -> None:
+    """The same for a covariance of which the lower half is given."""
+    for i in range(3):
+        for j in range(i):
+            p[j, i] = p[i, j]
     _carry(p, c, s, lever_x, lever_y)
     _carry(p.T, c, s, lever_x, lever_y)
-
-
-@kernel
-def _add_column(p: FloatArray, right: FloatArray, axis: int, amount: float) -> None:
-    for i in range(3):
-        for j in range(3):
-            p[i, j] += amount * right[i, axis] * right[j, axis]
 
 
 @kernel

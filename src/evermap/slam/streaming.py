@@ -37,6 +37,10 @@ MIN_ALIGN_SPREAD_M = 1.0
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
 FINAL_ROUNDS = 12
+STEPS_A_ROUND = 3
+"""Gauss-Newton steps between two estimates of the noise."""
+FINAL_TOLERANCE = 1e-5
+"""Step (m, rad or 1) at which the final optimum is reached."""
 NOISE_CONVERGED = 0.01
 """Relative change of every noise level below which the final rounds stop."""
 
@@ -159,7 +163,8 @@ class StreamingSlam:
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
             smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
-            estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
+            # values and noise levels settle together: no need for the optimum of levels that will not stay
+            estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
             marginals = smoother.marginals(estimate)
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
@@ -172,7 +177,7 @@ class StreamingSlam:
                 break
         assert fit is not None
         smoother = Smoother(problem, noise, robust=self._robust)
-        estimate = smoother.optimum(estimate)
+        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE)
         marginals = smoother.marginals(estimate)
         return self._divided(problem, estimate, marginals, replace(fit, noise=noise), smoother)
 
@@ -219,7 +224,7 @@ class StreamingSlam:
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
             estimate = voted
-        estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-4)
+        estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
         if self._estimate_noise:
             marginals = smoother.marginals(estimate)
             weights = smoother.inlier_probability(estimate)
