@@ -13,17 +13,21 @@ import numpy as np
 
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.evidence import Evidence, in_sensor_metres, landmark_evidence
+from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.changes.explain import GivenMap, Group, explained
 from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.swaps import likeliest_swap, with_swap
 from evermap.slam.changes.timing import parting_time
 from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Revision
 from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.triangulate import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
 FREE_INFORMATION = 1e-4
 """Holds the first pose of a free solution to 100 m, so that the linear system stays well conditioned."""
+SWAP_SOFTNESS_M = 0.02
+"""Error that the sightings of a window share, while it is decided which identities are swapped."""
 ROUNDS = 6
 """Searches at the end of a session, at most."""
 POSES_A_WINDOW = 60
@@ -51,6 +55,7 @@ class Joint:
         self._prior = prior
         self._landmark = np.arange(n_landmarks)
         self._groups: tuple[Group, ...] = ()
+        self._swaps: tuple[tuple[int, int, float], ...] = ()
         self.verdict: Verdict | None = None
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
@@ -69,12 +74,13 @@ class Joint:
             return Revision(problem, estimate, self._current())
         given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
         if final:
+            self.verdict = None  # nothing of what was thought on the way is taken for granted
             estimate = self._without_map(base, estimate, noise)
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(problem)
             n_windows = len(bounds) - 1
             evidence = landmark_evidence(base, _one_place(estimate, self._count), noise, self._calibration, bounds)
-            verdict = weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=final)
+            verdict, given = self._weighed(evidence, given, n_windows, thorough=final)
             groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in verdict.groups)
             believed = replace(given, covariance=given.covariance * verdict.map_factor**2)
             before = self.verdict
@@ -101,7 +107,31 @@ class Joint:
             landmark_information=np.zeros((2 * self._count, 2 * self._count)),
         )
         start = in_sensor_metres(_one_place(estimate, self._count), self._calibration)
-        return Smoother(free, noise, heavy=True).optimum(start, iterations=10, tolerance=1e-4)
+        smoother = Smoother(free, noise, heavy=True)
+        # what the map puts in the wrong place is where most of its sightings say
+        start = outvoted(free, start, smoother.inlier_probability(start))
+        return smoother.optimum(start, iterations=10, tolerance=1e-4)
+
+    def _weighed(
+        self, evidence: Evidence, given: GivenMap, n_windows: int, *, thorough: bool
+    ) -> tuple[Verdict, GivenMap]:
+        """The verdict, and the map with the landmarks that carry each other's identity at each other's place."""
+        verdict = weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
+        soft = evidence.softened(SWAP_SOFTNESS_M)
+        while given.given.any():
+            swap = likeliest_swap(soft, compare(soft, given.mean, given.covariance, given.given), given)
+            if swap is None:
+                break
+            other = with_swap(given, swap.first, swap.second)
+            rival = weigh(evidence, other, self._prior, n_windows, before=verdict, thorough=thorough)
+            log_odds = rival.score + swap.log_prior - verdict.score
+            if log_odds <= 0.0:  # moves explain it better
+                break
+            verdict, given = rival, other
+            self._swaps = (*self._swaps, (swap.first, swap.second, float(1.0 / (1.0 + np.exp(-log_odds)))))
+        if given.given.any():
+            self._given = given
+        return verdict, given
 
     def _bounds(self, problem: Problem) -> IntArray:
         """First pose of every window; where something is thought to have moved a new window begins."""
@@ -135,8 +165,24 @@ class Joint:
 
     def _changes(self, base: Problem) -> tuple[MapChange, ...]:
         assert self.verdict is not None
-        probability = self.verdict.probability
-        return tuple(_change(group, probability, float(base.stamp_s[0])) for group in self._groups)
+        first_s = float(base.stamp_s[0])
+        moved = tuple(_change(group, self.verdict.probability, first_s) for group in self._groups)
+        return (*(self._swap_change(swap, first_s) for swap in self._swaps), *moved)
+
+    def _swap_change(self, swap: tuple[int, int, float], first_s: float) -> MapChange:
+        """Two landmarks at each other's place; the displacement is the first one's."""
+        assert self._given is not None
+        first, second, probability = swap
+        step = self._given.mean[first] - self._given.mean[second]
+        return MapChange(
+            landmark_ids=(first, second),
+            kind=ChangeKind.SWAPPED,
+            stamp_from_s=float("nan"),
+            stamp_to_s=first_s,
+            displacement_m=(float(step[0]), float(step[1])),
+            rotation_rad=0.0,
+            probability=probability,
+        )
 
 
 def _change(group: Group, probability: float, first_s: float) -> MapChange:

@@ -112,7 +112,10 @@ def _candidates(
 def item_columns(
     evidence: Evidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'."""
+    """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
+
+    With one window for all of the session's, the items are 'this candidate, always'.
+    """
     rank = np.full(len(position), -1)
     rank[candidates] = np.arange(len(candidates))
     rows = np.flatnonzero(rank[evidence.landmark] >= 0)
@@ -123,15 +126,15 @@ def item_columns(
     precision = comparison.precision[np.ix_(both, both)].reshape(len(rows), 2, len(rows), 2)
     # what a copy says is said by every item that begins in its window or before: sums from the last window backwards
     size = (n_windows, len(candidates), 4)
-    at = evidence.window[rows], rank[evidence.landmark[rows]]
-    linear = np.zeros(size)
-    linear[at] = np.einsum("rka,rk->ra", columns, comparison.pull[both].reshape(-1, 2))
-    linear = np.cumsum(linear[::-1], axis=0)[::-1]
+    window, column = np.minimum(evidence.window[rows], n_windows - 1), rank[evidence.landmark[rows]]
+    item = window * len(candidates) + column
+    linear = np.zeros((n_windows * len(candidates), 4))
+    np.add.at(linear, item, np.einsum("rka,rk->ra", columns, comparison.pull[both].reshape(-1, 2)))
+    linear = np.cumsum(linear.reshape(size)[::-1], axis=0)[::-1]
     half = np.einsum("rkqm,qmb->rkqb", precision, columns)
     blocks = np.einsum("rka,rkqb->raqb", columns, half)
-    item = at[0] * len(candidates) + at[1]
     quadratic = np.zeros((n_windows * len(candidates), 4, n_windows * len(candidates), 4))
-    quadratic[item[:, None], :, item[None, :], :] = blocks.transpose(0, 2, 1, 3)
+    np.add.at(quadratic.transpose(0, 2, 1, 3), (item[:, None], item[None, :]), blocks.transpose(0, 2, 1, 3))
     quadratic = quadratic.reshape(*size, *size)
     for axis in (0, 3):
         quadratic = np.flip(np.cumsum(np.flip(quadratic, axis), axis=axis), axis)

@@ -37,6 +37,7 @@ class Verdict:
         alternatives: other sets of changes with their probabilities, the most probable first.
         map_factor: how much wider the map's standard deviations have to be.
         softness_m: error shared by the sightings of a window.
+        score: log posterior of the best hypothesis under the best degree of belief, for comparing maps [nats].
         misfit: chi-square of what the best hypothesis leaves, over its degrees of freedom.
     """
 
@@ -45,6 +46,7 @@ class Verdict:
     alternatives: tuple[tuple[tuple[Group, ...], float], ...]
     map_factor: float
     softness_m: float
+    score: float
     misfit: float
 
 
@@ -88,6 +90,9 @@ def weigh(
         return trials[factor, softness].score
 
     tried(factor, softness)
+    if thorough and before is None and given.given.any():
+        # a map that is believed little explains everything: the other end must have been looked at
+        factor = max(MAP_FACTORS, key=lambda f: tried(f, softness))
     improved = thorough
     while improved:  # one step up or down in either, as long as that gains
         neighbours = [(factor, s) for s in _beside(SOFTNESS_M, softness)] if n_windows > 1 else []
@@ -169,6 +174,7 @@ def _verdict(trials: list[_Trial], best: _Trial) -> Verdict:
         alternatives=tuple(ranked[1:]),
         map_factor=best.factor,
         softness_m=best.softness,
+        score=best.score,
         misfit=gained / max(best.comparison.freedom, 1.0),
     )
 
