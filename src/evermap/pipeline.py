@@ -14,6 +14,7 @@ from evermap.types import FloatArray, Landmarks, Recording, SlamResult
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.slam.calibration import CalibrationPrior
+    from evermap.slam.method import Method
     from evermap.slam.problem import Noise
     from evermap.slam.session import Prepared
     from evermap.slam.streaming import StreamingSlam
@@ -45,14 +46,17 @@ def run_slam(
         NumericalError: no finite optimum.
     """
     from evermap.config import Config
+    from evermap.slam.association.identify import identified
     from evermap.slam.session import prepare
 
     config = config or Config()
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    prior, noise = _beliefs(recording, config)
+    if config.slam.unknown_ids:
+        recording = identified(recording, prior, noise, prior_map=prior_map)
     prepared = prepare(recording, prior_map)
     warm_up()
-    prior, noise = _beliefs(recording, config)
-    slam = _estimator(prepared, prior, noise, config)
+    slam = _estimator(prepared, prior, noise, recording, config)
     step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
     return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
 
@@ -84,7 +88,23 @@ def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, No
     return prior, replace(START, detection=detection, outlier_log_odds=settings.outlier_log_odds)
 
 
-def _estimator(prepared: Prepared, prior: CalibrationPrior, noise: Noise, config: Config) -> StreamingSlam:
+def _method(n_landmarks: int, recording: Recording, config: Config) -> Method:
+    """How landmarks that moved are explained, by name."""
+    settings = config.slam
+    if settings.method in {"nohyp", "joint"}:
+        from evermap.slam.method import Static
+
+        return Static(n_landmarks)
+    from evermap.slam.modes.alternation import ModeModel
+    from evermap.slam.modes.multi_hypothesis import MultiHypothesis
+
+    model = ModeModel.from_settings(settings.method, settings.modes, recording.sensor, robust=settings.robust)
+    return MultiHypothesis(n_landmarks, model, seed=settings.seed)
+
+
+def _estimator(
+    prepared: Prepared, prior: CalibrationPrior, noise: Noise, recording: Recording, config: Config
+) -> StreamingSlam:
     from evermap.slam.streaming import StreamingSlam
 
     return StreamingSlam(
@@ -95,6 +115,7 @@ def _estimator(prepared: Prepared, prior: CalibrationPrior, noise: Noise, config
         robust=config.slam.robust,
         estimate_noise=config.slam.estimate_noise,
         solver=config.slam.solver,
+        method=_method(len(prepared.landmark_id), recording, config),
     )
 
 
@@ -161,4 +182,5 @@ def _conclude(
         dead_reckoning=session.dead_reckoning(prepared, trajectory),
         warnings=tuple(warnings),
         interrupted=interrupted,
+        changes=session.changes(prepared, outcome),
     )

@@ -106,6 +106,15 @@ class Problem:
         held: BoolArray = np.diag(self.landmark_information)[::2] > 0.0
         return held
 
+    def with_places(self, count: int) -> Problem:
+        """The problem with room for so many places; new ones have no prior."""
+        new = max(0, count - len(self.landmark_mean))
+        return replace(
+            self,
+            landmark_mean=np.pad(self.landmark_mean, ((0, new), (0, 0))),
+            landmark_information=np.pad(self.landmark_information, (0, 2 * new)),
+        )
+
     def prior_information(self, known: BoolArray) -> FloatArray:
         """(2 K, 2 K) what the prior says about the K `known` landmarks alone, the others marginalised out.
 

@@ -20,6 +20,7 @@ from evermap.types import (
     Innovations,
     IntArray,
     Landmarks,
+    MapChange,
     Misses,
     ParameterEstimate,
     Recording,
@@ -127,9 +128,9 @@ def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> Int
 
 def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Landmarks:
     """The map of a session: positions with covariance, and how often and when each landmark was seen."""
-    known = outcome.estimate.known
-    position = outcome.estimate.landmark
-    covariance = outcome.graph_marginals.landmark * outcome.scale**2
+    known = outcome.estimate.known[outcome.current]
+    position = outcome.estimate.landmark[outcome.current]
+    covariance = outcome.graph_marginals.landmark[outcome.current] * outcome.scale**2
     covariance = covariance + outcome.log_scale_sigma**2 * position[:, :, None] * position[:, None, :]
     stamps = recording.frames.stamp_s[recording.detections.frame[prepared.used]]
     count = len(prepared.landmark_id)
@@ -152,6 +153,21 @@ def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame:
         class_names=recording.class_names,
         frame=frame,
         clock=recording.clock,
+    )
+
+
+def changes(prepared: Prepared, outcome: Outcome) -> tuple[MapChange, ...]:
+    """What moved, with the recording's ids and stamps, in metres."""
+    dx_dy = [np.multiply(change.displacement_m, outcome.scale) for change in outcome.changes]
+    return tuple(
+        replace(
+            change,
+            landmark_ids=tuple(sorted(int(prepared.landmark_id[row]) for row in change.landmark_ids)),
+            stamp_from_s=change.stamp_from_s + prepared.start_s,
+            stamp_to_s=change.stamp_to_s + prepared.start_s,
+            displacement_m=(float(moved[0]), float(moved[1])),
+        )
+        for change, moved in zip(outcome.changes, dx_dy, strict=True)
     )
 
 

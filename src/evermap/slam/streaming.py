@@ -2,7 +2,8 @@
 
 Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental solver.
 Whenever the number of poses has doubled, the batch smoother takes stock: it finds the optimum of all so far,
-re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments.
+re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments. A
+method decides which places detections belong to: of a frame before it is used, and of all when stock is taken.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from evermap.slam.align import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.method import Method, Revision, Static
 from evermap.slam.noise import NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import IncrementalSolver, Motion, compare
 from evermap.slam.triangulate import outvoted, sighted_at
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray, MapChange
 
 FIRST_STOCK = 40
 """Poses before the batch smoother takes stock for the first time."""
@@ -43,6 +45,8 @@ FINAL_TOLERANCE = 1e-5
 """Step (m, rad or 1) at which the final optimum is reached."""
 NOISE_CONVERGED = 0.01
 """Relative change of every noise level below which the final rounds stop."""
+FINAL_REVISIONS = 3
+"""Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,8 @@ class Outcome:
         inlier: (M,) probability of every detection to be no outlier.
         scale: factor from the graph's metres to metres; log_scale_sigma: its uncertainty.
         aligned: True if the frame is that of the prior map.
+        current: (L,) the place where each landmark is at the end.
+        changes: what moved: landmarks by their rows, stamps on the problem's clock.
     """
 
     estimate: Estimate
@@ -79,6 +85,8 @@ class Outcome:
     scale: float
     log_scale_sigma: float
     aligned: bool
+    current: IntArray
+    changes: tuple[MapChange, ...]
 
 
 class StreamingSlam:
@@ -92,6 +100,7 @@ class StreamingSlam:
         robust: explain outliers instead of believing every identity.
         estimate_noise: learn noise levels from the recording, else keep `noise`.
         solver: of the steps between two stock-takings.
+        method: how landmarks that moved are explained; None takes the world to be static.
     """
 
     def __init__(
@@ -104,6 +113,7 @@ class StreamingSlam:
         robust: bool = True,
         estimate_noise: bool = True,
         solver: Literal["arrow", "gtsam"] = "arrow",
+        method: Method | None = None,
     ) -> None:
         self._prior = prior
         self._prior_map = prior_map
@@ -111,6 +121,7 @@ class StreamingSlam:
         self._start_noise = self._noise = noise
         self._robust = robust
         self._estimate_noise = estimate_noise
+        self._method = Static(len(problem.landmark_mean)) if method is None else method
         self._solver = _solver(solver, self._problem, noise, robust=robust)
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
@@ -135,6 +146,7 @@ class StreamingSlam:
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
         states = self._solver.states()
         motion = Motion.between(self._problem, self._noise, row, states) if row > 0 else None
+        self._assign(row, motion, detections)
         if motion is not None:
             self._compare(motion, detections)
         self._meet_new_landmarks(motion, states, detections)
@@ -158,8 +170,20 @@ class StreamingSlam:
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
         problem = self._problem.until(self._n_poses)
-        estimate = self._solver.estimate()
-        noise, fit = self._noise, None
+        estimate, fit = self._converged(problem, self._solver.estimate(), self._noise)
+        for _ in range(FINAL_REVISIONS):
+            revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
+            if revision.problem is problem:
+                break
+            problem = revision.problem
+            estimate, fit = self._converged(problem, revision.estimate, fit.noise)
+        smoother = Smoother(problem, fit.noise, robust=self._robust)
+        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE)
+        return self._divided(revision, estimate, smoother.marginals(estimate), fit, smoother)
+
+    def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Estimate, NoiseFit]:
+        """The optimum and its noise levels, in turns until neither changes."""
+        fit = None
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
             smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
@@ -176,10 +200,37 @@ class StreamingSlam:
             if not heavy and _settled(before, noise):
                 break
         assert fit is not None
-        smoother = Smoother(problem, noise, robust=self._robust)
-        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE)
-        marginals = smoother.marginals(estimate)
-        return self._divided(problem, estimate, marginals, replace(fit, noise=noise), smoother)
+        return estimate, replace(fit, noise=noise)
+
+    def _assign(self, row: int, motion: Motion | None, detections: IntArray) -> None:
+        """Ask the method for the places of the coming pose's detections."""
+
+        def distances(of: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
+            squared, log_volume = np.full((2, len(of)), np.nan)
+            known = np.isfinite(self._landmark[places, 0])
+            if motion is not None and known.any():
+                squared[known], log_volume[known] = compare(self._solver, self._noise, motion, of[known], places[known])
+            return squared, log_volume
+
+        places = self._method.assign(self._problem, row, detections, distances)
+        if np.array_equal(places, self._problem.landmark_row[detections]):
+            return
+        landmark_row = self._problem.landmark_row.copy()
+        landmark_row[detections] = places
+        count = max(len(self._landmark), int(places.max()) + 1)
+        new = ((0, count - len(self._landmark)), (0, 0))
+        self._adopt(
+            replace(self._problem, landmark_row=landmark_row).with_places(count),
+            np.pad(self._landmark, new, constant_values=np.nan),
+        )
+        self._solver.problem = self._problem
+
+    def _adopt(self, problem: Problem, landmark: FloatArray) -> None:
+        """Other places from here on, perhaps more of them or fewer; the first are the landmarks as before."""
+        missing = len(landmark) - len(self._n_compared)
+        self._problem, self._landmark = problem, landmark
+        self._n_compared = np.pad(self._n_compared, (0, max(missing, 0)))[: len(landmark)]
+        self._n_surprising = np.pad(self._n_surprising, (0, max(missing, 0)))[: len(landmark)]
 
     def _compare(self, motion: Motion, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
@@ -225,6 +276,18 @@ class StreamingSlam:
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
             estimate = voted
         estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
+        revision = self._method.revise(problem, estimate, self._noise, heavy=True, final=False)
+        if revision.problem is not problem:
+            problem, estimate = revision.problem, revision.estimate
+            smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
+            coming = self._problem.landmark_row[len(problem.landmark_row) :]
+            whole = replace(
+                self._problem,
+                landmark_row=np.append(problem.landmark_row, coming),
+                landmark_mean=problem.landmark_mean,
+                landmark_information=problem.landmark_information,
+            )
+            self._adopt(whole, estimate.landmark)
         if self._estimate_noise:
             marginals = smoother.marginals(estimate)
             weights = smoother.inlier_probability(estimate)
@@ -247,7 +310,7 @@ class StreamingSlam:
     def _can_align(self, *, final: bool = False) -> bool:
         """Most of the prior map's landmarks seen so far stand to each other as in the map; two must do at the end."""
         assert self._prior_map is not None
-        both = self._prior_map.given & np.isfinite(self._landmark[:, 0])
+        both = self._prior_map.given & np.isfinite(self._landmark[: len(self._prior_map.given), 0])
         count = int(both.sum())
         if count < (2 if final else MIN_ALIGN_LANDMARKS):
             return False
@@ -255,7 +318,7 @@ class StreamingSlam:
             return False
         self._align_tried = count
         at = self._prior_map.mean[both]
-        _, agree = consensus(self._solver.estimate().landmark[both], at)
+        _, agree = consensus(self._solver.estimate().landmark[: len(both)][both], at)
         if final:
             return bool(agree.sum() >= 2)
         enough = agree.sum() >= MIN_ALIGN_LANDMARKS and 2 * agree.sum() > count
@@ -266,11 +329,13 @@ class StreamingSlam:
         prior_map = self._prior_map
         assert prior_map is not None
         estimate = self._solver.estimate()
-        both = prior_map.given & estimate.known
-        pose_map_world, _ = consensus(estimate.landmark[both], prior_map.mean[both])
+        new = len(estimate.landmark) - len(prior_map.given)  # places that landmarks have besides their own
+        mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
+        both = given & estimate.known
+        pose_map_world, _ = consensus(estimate.landmark[both], mean[both])
         moved = Estimate(
             se2.compose(pose_map_world, estimate.pose),
-            np.where(both[:, None], prior_map.mean, se2.transform(pose_map_world, estimate.landmark)),
+            np.where(both[:, None], mean, se2.transform(pose_map_world, estimate.landmark)),
             estimate.states,
         )
         self._aligned, self._scale = True, 1.0
@@ -279,8 +344,8 @@ class StreamingSlam:
             prior=self._prior,
             start_pose=moved.pose[0],
             start_information=ALIGNED_INFORMATION,
-            landmark_mean=np.where(prior_map.given[:, None], prior_map.mean, 0.0),
-            landmark_information=prior_map.information,
+            landmark_mean=np.where(given[:, None], mean, 0.0),
+            landmark_information=np.pad(prior_map.information, (0, 2 * new)),
         )
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
@@ -289,7 +354,7 @@ class StreamingSlam:
         self._take_stock()
 
     def _divided(
-        self, problem: Problem, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
+        self, revision: Revision, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
     ) -> Outcome:
         if self._aligned:
             states, covariance, scale, log_sigma = estimate.states, marginals.states.copy(), 1.0, 0.0
@@ -303,7 +368,7 @@ class StreamingSlam:
         return Outcome(
             estimate=stretched,
             states_covariance=covariance,
-            problem=problem,
+            problem=smoother.problem,
             graph_estimate=estimate,
             graph_marginals=marginals,
             noise=fit,
@@ -311,6 +376,8 @@ class StreamingSlam:
             scale=scale,
             log_scale_sigma=log_sigma,
             aligned=self._aligned,
+            current=revision.current,
+            changes=revision.changes,
         )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.slam.method import Compare, Revision
 from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
-from evermap.slam.modes.places import Modes
+from evermap.slam.modes.places import FREE, Modes, at_places, moved_to, trimmed
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
@@ -35,6 +35,7 @@ class MultiHypothesis:
         self._model = model
         self._rng = np.random.default_rng(seed)
         self._modes = Modes.one_each(n_landmarks)
+        self._n_standing = n_landmarks
         self._log_belief = np.zeros(n_landmarks)
         """(P,) log probability of each place to be where its landmark is, by all looks so far."""
 
@@ -52,12 +53,33 @@ class MultiHypothesis:
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Births and the alternation over everything so far."""
         del final
-        found = explain_with_modes(problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy)
-        self._modes = found.modes
+        standing, at, modes = self._without_newborn(problem, estimate)
+        found = explain_with_modes(standing, at, noise, modes, self._model, self._rng, heavy=heavy)
+        self._modes, self._n_standing = found.modes, len(found.modes.landmark)
         current = self._current(found.problem)
         self._log_belief = np.full(len(found.modes.landmark), self._log_switch)
         self._log_belief[current] = 0.0
-        return Revision(found.problem, found.estimate, current, switches(found, self._model.chain))
+        changes = switches(found, self._model.chain)
+        if np.array_equal(found.problem.landmark_row, problem.landmark_row):
+            return Revision(problem, estimate, current, changes)
+        return Revision(found.problem, found.estimate, current, changes)
+
+    def _without_newborn(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate, Modes]:
+        """The modes of the last revision: those born since were for the meantime.
+
+        One detection in twenty is born outside its gate. The estimate bends to fit such a mode, and then needs it; so
+        every revision has births of its own, which a selector must want with all looks in view.
+        """
+        owner = self._modes.landmark
+        newborn = np.arange(self._n_standing, len(owner))
+        if len(newborn) == 0:
+            return problem, estimate, self._modes
+        own = owner[newborn]
+        problem = moved_to(problem, newborn, own)
+        lost = ~estimate.known[own]  # its own place was given up: it begins at a newborn's
+        estimate = at_places(estimate, own[lost], estimate.landmark[newborn[lost]])
+        estimate = at_places(estimate, newborn, np.nan)
+        return trimmed(problem, estimate, self._modes.with_owner(newborn, FREE))
 
     @property
     def _log_switch(self) -> float:
@@ -80,7 +102,7 @@ class MultiHypothesis:
         if gates.any():
             return int(places[np.argmax(np.where(gates, self._log_belief[places], -np.inf))])
         landmark = int(self._modes.landmark[first])
-        new = int(self._modes.rows_for(1)[0])
+        new = len(self._modes.landmark)
         self._modes = self._modes.with_owner(np.array([new]), landmark)
         self._log_belief = np.append(self._log_belief, np.zeros(len(self._modes.landmark) - len(self._log_belief)))
         self._log_belief[new] = self._log_belief[places].max() + self._log_switch

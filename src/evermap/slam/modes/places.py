@@ -63,13 +63,22 @@ def grown(problem: Problem, estimate: Estimate, count: int) -> tuple[Problem, Es
     missing = count - len(problem.landmark_mean)
     if missing <= 0:
         return problem, estimate
-    pad = ((0, missing), (0, 0))
+    landmark = np.pad(estimate.landmark, ((0, missing), (0, 0)), constant_values=np.nan)
+    return problem.with_places(count), replace(estimate, landmark=landmark)
+
+
+def trimmed(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Problem, Estimate, Modes]:
+    """Without the rows at the end that belong to nobody."""
+    count = int(np.flatnonzero(modes.landmark != FREE).max()) + 1
+    if count == len(modes.landmark):
+        return problem, estimate, modes
     problem = replace(
         problem,
-        landmark_mean=np.pad(problem.landmark_mean, pad),
-        landmark_information=np.pad(problem.landmark_information, (0, 2 * missing)),
+        landmark_mean=problem.landmark_mean[:count],
+        landmark_information=problem.landmark_information[: 2 * count, : 2 * count],
     )
-    return problem, replace(estimate, landmark=np.pad(estimate.landmark, pad, constant_values=np.nan))
+    estimate = replace(estimate, landmark=estimate.landmark[:count])
+    return problem, estimate, replace(modes, landmark=modes.landmark[:count])
 
 
 def at_places(estimate: Estimate, place: IntArray, position_m: FloatArray | float) -> Estimate:
