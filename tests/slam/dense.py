@@ -104,12 +104,8 @@ class DensePosterior:
         )
         return self.at(solved.x)
 
-    def linearised(self) -> tuple[np.ndarray, np.ndarray]:
-        """Inverse of `J' W J` at `around`, and the Gauss-Newton step that is left there; J by central differences.
-
-        Both in (3 N + 2 L + 9): poses, all landmarks, all states. Entries of unknown landmarks are zero, fixed states
-        keep the variance of their prior.
-        """
+    def jacobian(self) -> tuple[np.ndarray, np.ndarray]:
+        """`J` by central differences and the residuals at `around`, with the inlier weights of there."""
         root_weight = np.sqrt(self.weights(self.around))[:, None]
 
         def residuals(step: np.ndarray) -> np.ndarray:
@@ -120,6 +116,15 @@ class DensePosterior:
 
         h = 1e-6
         jacobian = np.stack([(residuals(h * d) - residuals(-h * d)) / (2 * h) for d in np.eye(self.size)], axis=1)
+        return jacobian, residuals(np.zeros(self.size))
+
+    def linearised(self) -> tuple[np.ndarray, np.ndarray]:
+        """Inverse of `J' W J` at `around`, and the Gauss-Newton step that is left there; J by central differences.
+
+        Both in (3 N + 2 L + 9): poses, all landmarks, all states. Entries of unknown landmarks are zero, fixed states
+        keep the variance of their prior.
+        """
+        jacobian, residual = self.jacobian()
         # columns scaled to one: the first pose may be held 1e8 times harder than the rest
         scale = 1.0 / np.linalg.norm(jacobian, axis=0)
         triangle = np.linalg.qr(jacobian * scale, mode="r")
@@ -135,5 +140,5 @@ class DensePosterior:
             self.problem.prior.sigma[fixed] ** 2
         )
         whole[np.ix_(rows, rows)] = covariance
-        step[rows] = -covariance @ (jacobian.T @ residuals(np.zeros(self.size)))
+        step[rows] = -covariance @ (jacobian.T @ residual)
         return whole, step

@@ -89,12 +89,14 @@ def slow_detection(pose: np.ndarray, landmark: np.ndarray, states: np.ndarray, m
     return np.stack([states[0] + r * (1 + states[1] + states[2] * b + states[3] * b * b), b + states[4]], axis=-1)
 
 
-def wandering_drive(rng: np.random.Generator, duration_s: float, period_s: float = 0.1) -> Drive:
-    """Velocities of a robot that drives on and turns this way and that."""
+def wandering_drive(
+    rng: np.random.Generator, duration_s: float, period_s: float = 0.1, turn_radps: float = 0.0
+) -> Drive:
+    """Velocities of a robot that drives on and turns this way and that, about `turn_radps`."""
     stamps = np.arange(-1.0, duration_s + 1.0, period_s)
     count = len(stamps)
     turn = np.convolve(rng.normal(size=count + 40), np.hanning(41) / 5.0, mode="valid")[:count]
-    velocity = np.column_stack([0.6 + 0.3 * np.sin(stamps), 0.05 * np.cos(stamps), turn])
+    velocity = np.column_stack([0.6 + 0.3 * np.sin(stamps), 0.05 * np.cos(stamps), turn_radps + turn])
     return Drive.from_rows(stamps, velocity)
 
 
@@ -129,6 +131,7 @@ def make_world(
     start_information: float = 1e8,
     n_mapped: int = 0,
     sigma_map_m: float = 0.1,
+    turn_radps: float = 0.0,
 ) -> World:
     """A robot in the middle of some landmarks, in the frame of its first pose; measured exactly with `noisy=0`.
 
@@ -139,7 +142,7 @@ def make_world(
     if states is None:
         states = prior.mean + 0.3 * prior.sigma * rng.normal(size=N_STATES) * prior.free
     stamps = 0.5 + step_s * np.arange(n_poses) + 0.1 * step_s * rng.random(n_poses)
-    drive = wandering_drive(rng, stamps[-1])
+    drive = wandering_drive(rng, stamps[-1], turn_radps=turn_radps)
     mount = np.array([0.2, -0.1, 0.3])
     pose = np.zeros((n_poses, 3))
     for i in range(n_poses - 1):
