@@ -88,13 +88,23 @@ def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, No
     return prior, replace(START, detection=detection, outlier_log_odds=settings.outlier_log_odds)
 
 
-def _method(n_landmarks: int, recording: Recording, config: Config) -> Method:
+def _method(prepared: Prepared, prior: CalibrationPrior, recording: Recording, config: Config) -> Method:
     """How landmarks that moved are explained, by name."""
-    settings = config.slam
-    if settings.method in {"nohyp", "joint"}:
+    settings, n_landmarks = config.slam, len(prepared.landmark_id)
+    if settings.method == "nohyp":
         from evermap.slam.method import Static
 
         return Static(n_landmarks)
+    if settings.method == "joint":
+        from evermap.slam.changes.joint import Joint
+        from evermap.slam.changes.prior import ChangePrior
+
+        changes = ChangePrior(
+            p_moved=settings.changes.p_moved,
+            move_sigma_m=settings.changes.move_sigma_m,
+            p_rotated=settings.changes.p_rotated,
+        )
+        return Joint(n_landmarks, prior, prepared.given_map(), changes, robust=settings.robust)
     from evermap.slam.modes.alternation import ModeModel
     from evermap.slam.modes.multi_hypothesis import MultiHypothesis
 
@@ -115,7 +125,7 @@ def _estimator(
         robust=config.slam.robust,
         estimate_noise=config.slam.estimate_noise,
         solver=config.slam.solver,
-        method=_method(len(prepared.landmark_id), recording, config),
+        method=_method(prepared, prior, recording, config),
     )
 
 
@@ -167,7 +177,11 @@ def _conclude(
     landmarks = session.with_misses(landmarks, misses)
     warnings = list(prepared.warnings)
     if prepared.prior_map is not None and not outcome.aligned:
-        warnings.append("too few landmarks of the prior map were seen: the map is in the frame of the first pose")
+        warnings.append(
+            "cannot localise in the prior map: too few of its landmarks were seen standing to each other as it says; "
+            "the map is in the frame of the first pose"
+        )
+    warnings.extend(outcome.revision.warnings)
     if interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (trajectory.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
@@ -182,5 +196,6 @@ def _conclude(
         dead_reckoning=session.dead_reckoning(prepared, trajectory),
         warnings=tuple(warnings),
         interrupted=interrupted,
-        changes=session.changes(prepared, outcome),
+        changes=session.changes(prepared, outcome, outcome.revision.changes),
+        alternatives=session.alternatives(prepared, outcome, recording, frame),
     )

@@ -22,6 +22,23 @@ with `S = H P H' + R` of pose and place together, and `log |S|`; nan where the p
 
 
 @dataclass(frozen=True, slots=True)
+class Rival:
+    """Another explanation that the measurements cannot rule out.
+
+    Attributes:
+        changes: what moved then, as in `Revision`.
+        probability: its weight among all explanations.
+        position: (L, 2) where the landmarks would be; nan where never seen.
+        covariance: (L, 2, 2) of each.
+    """
+
+    changes: tuple[MapChange, ...]
+    probability: float
+    position: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class Revision:
     """What a method makes of all that was measured so far.
 
@@ -30,12 +47,16 @@ class Revision:
         estimate: the values of that problem, its places included.
         current: (L,) the place where each landmark is now.
         changes: what moved: landmarks by their rows, stamps on the problem's clock, displacements in its metres.
+        rivals: other explanations nearly as probable, the most probable first.
+        warnings: what the user should know.
     """
 
     problem: Problem
     estimate: Estimate
     current: IntArray
     changes: tuple[MapChange, ...] = ()
+    rivals: tuple[Rival, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 class Method(Protocol):
@@ -55,6 +76,10 @@ class Method(Protocol):
             (k,) rows of places. One without position starts where the detection points; rows from the number of
             places on are new ones, in their order.
         """
+        ...
+
+    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """The problem, and values to start from, on which noise levels are learned before the last revisions."""
         ...
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
@@ -80,6 +105,10 @@ class Static:
         """The place of each detection's landmark."""
         del row, compare
         return problem.landmark_row[detections]
+
+    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """As they are."""
+        return problem, estimate
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Nothing to think about."""

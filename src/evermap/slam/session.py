@@ -10,12 +10,14 @@ from evermap import se2
 from evermap.errors import DataError
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
+from evermap.slam.changes.explain import GivenMap
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem, independent
 from evermap.slam.streaming import Outcome, PriorMap, StreamingSlam
 from evermap.types import (
     UNKNOWN,
+    Alternative,
     FloatArray,
     Innovations,
     IntArray,
@@ -54,6 +56,15 @@ class Prepared:
     landmark_id: IntArray
     prior_map: PriorMap | None
     warnings: tuple[str, ...]
+
+    def given_map(self) -> GivenMap | None:
+        """The prior map as the joint search compares with it: landmark by landmark, with covariances."""
+        if self.prior_map is None:
+            return None
+        given, rows = self.prior_map.given, np.arange(len(self.landmark_id))
+        blocks = self.prior_map.information.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
+        covariance = np.linalg.inv(np.where(given[:, None, None], blocks, np.eye(2)))
+        return GivenMap(self.prior_map.mean, covariance, given)
 
 
 def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepared:
@@ -128,9 +139,37 @@ def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> Int
 
 def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Landmarks:
     """The map of a session: positions with covariance, and how often and when each landmark was seen."""
-    known = outcome.estimate.known[outcome.current]
-    position = outcome.estimate.landmark[outcome.current]
-    covariance = outcome.graph_marginals.landmark[outcome.current] * outcome.scale**2
+    current = outcome.revision.current
+    return _records(
+        prepared, outcome, recording, frame, outcome.graph_estimate.landmark[current],
+        outcome.graph_marginals.landmark[current],
+    )  # fmt: skip
+
+
+def alternatives(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> tuple[Alternative, ...]:
+    """Other explanations of the session, each with its map."""
+    return tuple(
+        Alternative(
+            changes=changes(prepared, outcome, rival.changes),
+            probability=rival.probability,
+            landmarks=_records(prepared, outcome, recording, frame, rival.position, rival.covariance),
+        )
+        for rival in outcome.revision.rivals
+    )
+
+
+def _records(
+    prepared: Prepared,
+    outcome: Outcome,
+    recording: Recording,
+    frame: str,
+    position: FloatArray,
+    covariance: FloatArray,
+) -> Landmarks:
+    """Map records from positions (L, 2) and covariances (L, 2, 2) in the graph's metres."""
+    known = np.isfinite(position[:, 0])
+    position = position * outcome.scale
+    covariance = covariance * outcome.scale**2
     covariance = covariance + outcome.log_scale_sigma**2 * position[:, :, None] * position[:, None, :]
     stamps = recording.frames.stamp_s[recording.detections.frame[prepared.used]]
     count = len(prepared.landmark_id)
@@ -156,18 +195,17 @@ def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame:
     )
 
 
-def changes(prepared: Prepared, outcome: Outcome) -> tuple[MapChange, ...]:
+def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
     """What moved, with the recording's ids and stamps, in metres."""
-    dx_dy = [np.multiply(change.displacement_m, outcome.scale) for change in outcome.changes]
     return tuple(
         replace(
             change,
             landmark_ids=tuple(sorted(int(prepared.landmark_id[row]) for row in change.landmark_ids)),
             stamp_from_s=change.stamp_from_s + prepared.start_s,
             stamp_to_s=change.stamp_to_s + prepared.start_s,
-            displacement_m=(float(moved[0]), float(moved[1])),
+            displacement_m=(change.displacement_m[0] * outcome.scale, change.displacement_m[1] * outcome.scale),
         )
-        for change, moved in zip(outcome.changes, dx_dy, strict=True)
+        for change in moved
     )
 
 

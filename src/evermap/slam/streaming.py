@@ -23,7 +23,7 @@ from evermap.slam.noise import NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import IncrementalSolver, Motion, compare
 from evermap.slam.triangulate import outvoted, sighted_at
-from evermap.types import BoolArray, FloatArray, IntArray, MapChange
+from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_STOCK = 40
 """Poses before the batch smoother takes stock for the first time."""
@@ -71,8 +71,7 @@ class Outcome:
         inlier: (M,) probability of every detection to be no outlier.
         scale: factor from the graph's metres to metres; log_scale_sigma: its uncertainty.
         aligned: True if the frame is that of the prior map.
-        current: (L,) the place where each landmark is at the end.
-        changes: what moved: landmarks by their rows, stamps on the problem's clock.
+        revision: the method's last word: the places where landmarks are, what moved, what may have moved instead.
     """
 
     estimate: Estimate
@@ -85,8 +84,7 @@ class Outcome:
     scale: float
     log_scale_sigma: float
     aligned: bool
-    current: IntArray
-    changes: tuple[MapChange, ...]
+    revision: Revision
 
 
 class StreamingSlam:
@@ -169,8 +167,8 @@ class StreamingSlam:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
-        problem = self._problem.until(self._n_poses)
-        estimate, fit = self._converged(problem, self._solver.estimate(), self._noise)
+        problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._solver.estimate())
+        estimate, fit = self._converged(problem, estimate, self._noise)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
             if revision.problem is problem:
@@ -376,8 +374,7 @@ class StreamingSlam:
             scale=scale,
             log_scale_sigma=log_sigma,
             aligned=self._aligned,
-            current=revision.current,
-            changes=revision.changes,
+            revision=revision,
         )
 
 

@@ -7,6 +7,7 @@ every detection is compared once more with the whole map.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,10 +16,10 @@ from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.filter import Belief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.jcbb import Pairings, pairing_probability
-from evermap.slam.association.merge import allowed_rise, propose_constellation, propose_merges
+from evermap.slam.association.merge import RISE_NATS, propose_constellation, propose_merges
 from evermap.slam.association.sighting_noise import SightingNoise, fit_sighting_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 CAUTION = 2.0
 """Odometry is taken to be this much worse than where learning would start. It is not learned here: what was associated
@@ -31,12 +32,14 @@ GATE = 0.999
 """Confidence of the gates of single detections and of whole frames."""
 P_MATCH = 0.95
 """Probability from which a detection is given to a landmark."""
+TIGHT_M2 = 0.04
+"""Product of a gate's standard deviations, (0.2 m)^2, within which a wrong choice is harmless for a while."""
 P_NEW = 0.1
 """Probability of being none of the known from which it starts a landmark."""
 P_MERGE = 0.97
 """Probability from which two landmarks are one."""
-DENSITY = 0.1
-"""Landmarks a square metre that one expects where none is known."""
+UNMET, SMALLEST_M2 = 2.0, 20.0
+"""Landmarks not met yet that one expects in the area that the known ones span, which is at least this large."""
 MIN_SIGHTINGS = 3
 """Detections that make a landmark."""
 FORGET_S = 20.0
@@ -111,17 +114,40 @@ class Associator:
             assignment, marginals = self._settled(again)
         return assignment.without(assignment.sightings < MIN_SIGHTINGS)
 
+    @property
+    def _density(self) -> float:
+        """Landmarks a square metre that one may still meet."""
+        return density_of_unmet(self._belief.landmark)
+
     def _match(self, belief: Belief, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
         pairings, derivative = pairings_of_frame(
-            belief, self._problem, sigma, detections, confidence=GATE, density=DENSITY
+            belief, self._problem, sigma, detections, confidence=GATE, density=self._density
         )
         probability, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
-        taken = np.flatnonzero(probability >= P_MATCH)
+        taken = np.flatnonzero((probability >= P_MATCH) | self._harmless(belief, pairings, probability, known))
         return _Frame(belief, pairings, derivative, taken, 1.0 - known, sigma)
+
+    def _harmless(self, belief: Belief, pairings: Pairings, probability: FloatArray, known: FloatArray) -> BoolArray:
+        """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
+
+        That is where the gate is small, or where its rivals may well be the same landmark.
+        """
+        best = np.zeros(len(probability), dtype=bool)
+        for s in np.flatnonzero(known >= P_MATCH):
+            rows = np.flatnonzero(pairings.source == s)
+            first = rows[probability[rows].argmax()]
+            rivals = rows[(probability[rows] > 1.0 - P_MATCH) & (rows != first)]
+            own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
+            area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density
+            tight = area_m2 < TIGHT_M2
+            best[first] = tight or all(
+                belief.may_be_one(pairings.target[first], pairings.target[k], GATE) for k in rivals
+            )
+        return best
 
     def _use(self, frame: _Frame, detections: IntArray) -> None:
         """Update with the certain pairings, and start landmarks where none is near enough."""
@@ -159,23 +185,32 @@ class Associator:
         assignment, marginals = self._solved(assignment)
         refused: set[tuple[int, int]] = set()
         while True:
-            pairs = propose_merges(assignment, marginals, density=DENSITY, probability=P_MERGE)
+            honest = replace(marginals, shared=assignment.with_shared_errors(marginals.shared))
+            pairs = propose_merges(assignment, honest, density=self._density, probability=P_MERGE)
             pairs = [pair for pair in pairs if pair not in refused]
             if not pairs:
                 pairs = propose_constellation(
-                    assignment, marginals, density=DENSITY, probability=P_MERGE,
-                    refused=refused,
-                )  # fmt: skip
+                    assignment, honest, density=self._density, probability=P_MERGE, refused=refused
+                )
             if not pairs:
                 return assignment, marginals
-            trial = assignment.merged(pairs)
-            cost_before, _ = self._cost(assignment)
-            cost_after, estimate = self._cost(trial)
-            if cost_after - cost_before < allowed_rise(len(pairs)):
-                assignment, marginals = self._solved(Assignment(trial.measured, trial.landmark_row, estimate))
-                refused.clear()
-            else:
+            merged = self._merged(assignment, pairs)
+            if merged is None:  # not all of them; perhaps some
+                singles = [self._merged(assignment, [pair]) for pair in pairs] if len(pairs) > 1 else []
+                merged = next((single for single in singles if single is not None), None)
+            if merged is None:
                 refused.update(pairs)
+            else:
+                refused.clear()
+                assignment, marginals = self._solved(merged)
+
+    def _merged(self, assignment: Assignment, pairs: list[tuple[int, int]]) -> Assignment | None:
+        """At its optimum with pairs merged; None where the cost says that they are two."""
+        trial = assignment.merged(pairs)
+        cost, estimate = self._cost(trial)
+        if cost - self._cost(assignment)[0] > RISE_NATS * len(pairs):
+            return None
+        return Assignment(trial.measured, trial.landmark_row, estimate)
 
     def _solved(self, assignment: Assignment) -> tuple[Assignment, Marginals]:
         """Optimum and covariances; learns the noise on the way."""
@@ -205,9 +240,15 @@ class Associator:
         for i in range(self._done):
             detections = np.arange(self._first[i], self._first[i + 1])
             belief = Belief.at(assignment.estimate, marginals, i)
-            pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=DENSITY)
+            pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=self._density)
             probability, _ = pairing_probability(pairings, confidence=GATE)
             taken = np.flatnonzero(probability > 0.5)
             row[detections[pairings.source[taken]]] = pairings.target[taken]
         again = Assignment(problem, row, assignment.estimate)
         return again.without(again.sightings == 0)
+
+
+def density_of_unmet(place: FloatArray) -> float:
+    """Landmarks a square metre that one may still meet, by the area that those at `place` (L, 2) span."""
+    area_m2 = float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0
+    return UNMET / max(area_m2, SMALLEST_M2)

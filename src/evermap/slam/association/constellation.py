@@ -30,8 +30,8 @@ CERTAIN_NATS = 7.0
 """By how much an overlay must beat 'all new' and its best rival: 1000 to 1."""
 MOTION_SIGMA = np.array([5.0, 5.0, 2.0])
 """Prior of the motion around a seed [m, m, rad]: as good as none."""
-SHARED_ERROR_M = 0.03
-"""Errors of sightings from one place are alike and don't average out: landmarks agree if they do to within this."""
+SPAN_SLACK_M = 0.2
+"""Distances within both maps are compared to this, beside what is unknown of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +147,7 @@ def _motions(source: LocalMap, target: LocalMap, allowed: BoolArray) -> list[Flo
             span = float(np.linalg.norm(source.place[i] - source.place[j]))
             if span < MIN_SPAN_M:
                 continue
-            fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + 6.0 * SHARED_ERROR_M
+            fits = np.abs(between - span) < 3.0 * _sigma_of_span(source, i, j) + SPAN_SLACK_M
             fits &= allowed[i][:, None] & allowed[j][None, :]
             for a, b in np.argwhere(fits & (between > 0.0)):
                 motion = rigid(source.place[[i, j]], target.place[[a, b]])
@@ -199,7 +199,7 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
         by_target[two, 2 * t[k] : 2 * t[k] + 2] = np.eye(2)
         by_motion[two] = [[1.0, 0.0, -lever[s[k], 1]], [0.0, 1.0, lever[s[k], 0]]]
     covariance = by_source @ source.covariance @ by_source.T + by_target @ target.covariance @ by_target.T
-    covariance += (by_motion * MOTION_SIGMA**2) @ by_motion.T + 2.0 * SHARED_ERROR_M**2 * np.eye(2 * n)
+    covariance += (by_motion * MOTION_SIGMA**2) @ by_motion.T
     return Pairings(
         s.astype(np.int64), t.astype(np.int64), gap[s, t], covariance, np.full(n, np.log(density)), len(source.place)
     )

@@ -57,6 +57,15 @@ class Belief:
         covariance[3:, 3:] = marginals.shared[np.ix_(order, order)]
         return cls(estimate.pose[row], estimate.states, estimate.landmark, covariance)
 
+    def may_be_one(self, a: int, b: int, confidence: float) -> bool:
+        """Whether the difference of two landmarks is insignificant."""
+        rows, others = AT_LANDMARKS + 2 * a + np.arange(2), AT_LANDMARKS + 2 * b + np.arange(2)
+        p = self.covariance
+        cross = p[np.ix_(rows, others)]
+        spread = p[np.ix_(rows, rows)] + p[np.ix_(others, others)] - cross - cross.T + 1e-12 * np.eye(2)
+        gap = self.landmark[a] - self.landmark[b]
+        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, confidence)[1])
+
 
 def predicted(belief: Belief, problem: Problem, noise: Noise, row: int) -> Belief:
     """The belief about pose `row` by odometry from the pose before; the first one as it is."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import Assignment
-from evermap.slam.association.associator import DENSITY, P_MERGE, Associator
+from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.problem import Noise
@@ -81,7 +81,7 @@ def _found_in(
     joint[rows, :, rows, :] = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2)
     target = LocalMap(prior_map.position_m, joint.reshape(2 * count, 2 * count))
     allowed = np.ones((len(trusted), count), dtype=bool)
-    pairs = agreed_pairs(source, target, allowed, density=DENSITY, probability=P_MERGE)
+    pairs = agreed_pairs(source, target, allowed, density=density_of_unmet(source.place), probability=P_MERGE)
     return [(int(trusted[k]), m) for k, m in pairs]
 
 
@@ -90,5 +90,5 @@ def _in_metres(assignment: Assignment, noise: Noise, prior: CalibrationPrior) ->
     marginals = Smoother(assignment.problem(), noise, heavy=True).marginals(assignment.estimate)
     _, _, scale, log_sigma = prior.split_scale(assignment.estimate.states, marginals.states)
     place = assignment.estimate.landmark * scale
-    covariance: FloatArray = marginals.shared[:-9, :-9] * scale**2
+    covariance: FloatArray = assignment.with_shared_errors(marginals.shared)[:-9, :-9] * scale**2
     return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.slam.association.assignment import Assignment
-from evermap.slam.association.constellation import SHARED_ERROR_M, LocalMap, agreed_pairs
+from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.problem import Estimate, Marginals
 from evermap.types import FloatArray, IntArray
@@ -24,8 +24,9 @@ LOOSE_GATE = 60.0
 """Squared distance up to which a pair may be meant at all, though the linearisation is far off."""
 STIFF_M = 0.2
 """Landmarks belong to one stiff part if they are known against each other to this."""
-RISE_NATS = 25.0
-"""Errors of sightings from one place are alike, which the cost does not know; two landmarks cost hundreds."""
+RISE_NATS = 100.0
+"""By how much the cost may rise for every pair that is merged. Errors of sightings from one place are alike, which the
+cost does not know: it rises by some tens for one landmark, by hundreds for two."""
 
 
 def propose_merges(
@@ -72,7 +73,7 @@ def propose_constellation(
     allowed = ~apart[np.ix_(loose, root)]
     for k, m in np.argwhere(allowed):
         pair = _ordered(loose[k], root[m])
-        spread = _spread(joint, *pair) + 2.0 * SHARED_ERROR_M**2 * np.eye(2)
+        spread = _spread(joint, *pair)
         gap = place[pair[0]] - place[pair[1]]
         allowed[k, m] = pair not in refused and gap @ np.linalg.solve(spread, gap) < LOOSE_GATE
     source, target = _local(place, joint, loose), _local(place, joint, root)
@@ -125,7 +126,7 @@ def pairs_in_reach(assignment: Assignment, marginals: Marginals) -> list[tuple[i
             if apart[u, o] or min(sightings[u], sightings[o]) < MIN_SIGHTINGS:
                 continue
             gap = estimate.landmark[u] - estimate.landmark[o]
-            spread = _spread(joint, u, o) + 2.0 * SHARED_ERROR_M**2 * np.eye(2)
+            spread = _spread(joint, u, o)
             if gap @ np.linalg.solve(spread, gap) < gate:
                 found.append((u, o))
     return found
@@ -145,12 +146,7 @@ def differences(estimate: Estimate, marginals: Marginals, pairs: list[tuple[int,
         source.astype(np.int64),
         older,
         estimate.landmark[younger] - estimate.landmark[older],
-        select @ marginals.shared @ select.T + 2.0 * SHARED_ERROR_M**2 * np.eye(2 * n),
+        select @ marginals.shared @ select.T,
         np.full(n, np.log(density)),
         len(sources),
     )
-
-
-def allowed_rise(n_merged: int) -> float:
-    """By how much the cost of the whole problem may rise when `n_merged` pairs become one landmark each [nats]."""
-    return RISE_NATS * n_merged

@@ -101,7 +101,13 @@ class Comparison(NamedTuple):
 
 
 def landmark_evidence(
-    problem: Problem, estimate: Estimate, noise: Noise, prior: CalibrationPrior, bounds: IntArray
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    prior: CalibrationPrior,
+    bounds: IntArray,
+    *,
+    sized: bool = True,
 ) -> Evidence:
     """Eliminate poses and calibration of a linearised problem, window by window.
 
@@ -111,6 +117,8 @@ def landmark_evidence(
         noise: the noise levels.
         prior: of the calibration, as the user means it.
         bounds: (W + 1,) first pose of every window, and the number of poses.
+        sized: divide range slope and size by their priors; else positions stay in the metres of the sensor, which is
+            enough where there is no map to compare with.
     """
     estimate = in_sensor_metres(estimate, prior)
     held = prior.without_scale()
@@ -143,6 +151,8 @@ def landmark_evidence(
     held_somewhere = information + TINY_INFORMATION * np.eye(len(right))
     covariance = np.asarray(np.linalg.inv(held_somewhere)[np.ix_(states, states)], dtype=np.float64)
     _, _, scale, log_sigma = prior.split_scale(estimate.states, covariance)
+    if not sized:
+        scale, log_sigma = 1.0, 0.0
     centre = estimate.landmark[estimate.known].mean(axis=0)
     position = np.concatenate([piece.position for piece in pieces])
     return Evidence(

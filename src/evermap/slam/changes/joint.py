@@ -7,6 +7,7 @@ its solution is where everything is linearised next, until the groups stay.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,13 +20,19 @@ from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.changes.swaps import likeliest_swap, with_swap
 from evermap.slam.changes.timing import parting_time
 from evermap.slam.changes.weigh import Verdict, weigh
-from evermap.slam.method import Compare, Revision
+from evermap.slam.method import Compare, Revision, Rival
+from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.triangulate import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
-FREE_INFORMATION = 1e-4
-"""Holds the first pose of a free solution to 100 m, so that the linear system stays well conditioned."""
+RIVAL_NATS = 5.0
+"""Explanations that are less probable than the best by no more than this are reported beside it."""
+MOST_RIVALS = 2
+DISAGREEMENT = 4.0
+"""Chi-square over its degrees of freedom above which a map without changes does not explain what was seen."""
+HELD_INFORMATION = 1e8
+"""Without a map the first pose is held where it was, to 0.1 mm: where all of it lies is not what is asked."""
 SWAP_SOFTNESS_M = 0.02
 """Error that the sightings of a window share, while it is decided which identities are swapped."""
 ROUNDS = 6
@@ -44,15 +51,25 @@ class Joint:
         calibration: priors of the calibration states as the user means them.
         given: the map to compare with; None where there is none.
         prior: how changes are distributed.
+        robust: explain outliers instead of believing every identity.
     """
 
     def __init__(
-        self, n_landmarks: int, calibration: CalibrationPrior, given: GivenMap | None, prior: ChangePrior
+        self,
+        n_landmarks: int,
+        calibration: CalibrationPrior,
+        given: GivenMap | None,
+        prior: ChangePrior,
+        *,
+        robust: bool = True,
     ) -> None:
         self._count = n_landmarks
         self._calibration = calibration
         self._given = given
         self._prior = prior
+        self._robust = robust
+        self._held: Problem | None = None
+        self._concluded: Revision | None = None
         self._landmark = np.arange(n_landmarks)
         self._groups: tuple[Group, ...] = ()
         self._swaps: tuple[tuple[int, int, float], ...] = ()
@@ -64,53 +81,119 @@ class Joint:
         current: IntArray = self._current()[problem.landmark_row[detections]]
         return current
 
-    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
-        """Search at the present estimate, and again at what it leads to where the session ends."""
-        base = replace(problem, landmark_row=self._landmark[problem.landmark_row])
-        bounds = self._bounds(problem)
-        n_windows = len(bounds) - 1
-        in_map = bool(problem.mapped[: self._count].any()) and self._given is not None
-        if not in_map and n_windows == 1:
-            return Revision(problem, estimate, self._current())
-        given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
-        if final:
-            self.verdict = None  # nothing of what was thought on the way is taken for granted
-            estimate = self._without_map(base, estimate, noise)
-        for _ in range(ROUNDS if final else 1):
-            bounds = self._bounds(problem)
-            n_windows = len(bounds) - 1
-            evidence = landmark_evidence(base, _one_place(estimate, self._count), noise, self._calibration, bounds)
-            verdict, given = self._weighed(evidence, given, n_windows, thorough=final)
-            groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in verdict.groups)
-            believed = replace(given, covariance=given.covariance * verdict.map_factor**2)
-            before = self.verdict
-            settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
-            self.verdict, self._groups = verdict, groups
-            start = _with_copies(_one_place(estimate, self._count), evidence, groups)
-            problem, start, self._landmark = explained(base, start, believed, groups, self._prior.spread)
-            # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
-            estimate = Smoother(problem, noise, heavy=True).optimum(start, iterations=10, tolerance=1e-4)
-            if settled:
-                break
-        if not heavy:
-            estimate = Smoother(problem, noise).optimum(estimate, iterations=10, tolerance=1e-4)
-        return Revision(problem, estimate, self._current(), self._changes(base))
-
-    def _without_map(self, base: Problem, estimate: Estimate, noise: Noise) -> Estimate:
-        """The solution that no prior map has bent, about where it was."""
+    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """Without the prior map: one that is wrong bends the solution, and what it cannot bend looks like noise."""
+        self._held = problem
+        if not self._in_map(problem):
+            return problem, estimate
         free = replace(
-            base,
+            self._base(problem),
             prior=self._calibration.without_scale(),
             start_pose=estimate.pose[0],
-            start_information=FREE_INFORMATION,
+            start_information=HELD_INFORMATION,
             landmark_mean=np.zeros((self._count, 2)),
             landmark_information=np.zeros((2 * self._count, 2 * self._count)),
         )
-        start = in_sensor_metres(_one_place(estimate, self._count), self._calibration)
-        smoother = Smoother(free, noise, heavy=True)
+        start = in_sensor_metres(self._first_places(estimate), self._calibration)
         # what the map puts in the wrong place is where most of its sightings say
-        start = outvoted(free, start, smoother.inlier_probability(start))
-        return smoother.optimum(start, iterations=10, tolerance=1e-4)
+        smoother = Smoother(free, START, heavy=True, robust=self._robust)
+        return free, outvoted(free, start, smoother.inlier_probability(start))
+
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+        """Search at the present estimate, and again at what it leads to where the session ends."""
+        if final and self._concluded is not None:
+            return replace(self._concluded, problem=problem, estimate=estimate)
+        if final:
+            self.verdict = None  # nothing of what was thought on the way is taken for granted
+            problem = problem if self._held is None else self._held
+        in_map = self._in_map(problem)
+        given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
+        base = self._base(problem)
+        if not in_map and len(self._bounds(base)) == 2:  # one window and no map: nothing to compare with
+            return Revision(problem, estimate, self._current())
+        for _ in range(ROUNDS if final else 1):
+            bounds = self._bounds(base)
+            evidence = landmark_evidence(
+                base, self._first_places(estimate), noise, self._calibration, bounds, sized=in_map
+            )
+            if len(evidence.landmark) == 0:
+                return Revision(problem, estimate, self._current())
+            before = self.verdict
+            verdict, given = self._weighed(evidence, given, len(bounds) - 1, thorough=final)
+            groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in verdict.groups)
+            settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
+            self.verdict, self._groups = verdict, groups
+            if not in_map and not groups and len(self._landmark) == self._count:
+                return Revision(problem, estimate, self._current())
+            believed = replace(given, covariance=given.covariance * verdict.map_factor**2)
+            start = _with_copies(self._first_places(estimate), evidence, groups)
+            problem, start, self._landmark = explained(base, start, believed, groups, self._prior.spread)
+            # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
+            smoother = Smoother(problem, noise, heavy=True, robust=self._robust)
+            estimate = smoother.optimum(start, iterations=5, tolerance=1e-4)
+            if settled:
+                break
+        if in_map:
+            self._given = given
+        if not heavy:
+            estimate = Smoother(problem, noise, robust=self._robust).optimum(estimate, iterations=5, tolerance=1e-4)
+        revision = Revision(problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base))
+        if final:
+            revision = replace(
+                revision,
+                rivals=self._rivals(base, evidence, believed, estimate, noise, bounds),
+                warnings=self._warnings(in_map=in_map),
+            )
+            self._concluded = revision
+        return revision
+
+    def _in_map(self, problem: Problem) -> bool:
+        return self._given is not None and bool(problem.mapped[: self._count][self._given.given].any())
+
+    def _base(self, problem: Problem) -> Problem:
+        """The measurements with one place a landmark."""
+        return replace(problem, landmark_row=self._landmark[problem.landmark_row])
+
+    def _first_places(self, estimate: Estimate) -> Estimate:
+        """One place a landmark: the first."""
+        return Estimate(estimate.pose, estimate.landmark[: self._count], estimate.states)
+
+    def _rivals(
+        self,
+        base: Problem,
+        evidence: Evidence,
+        believed: GivenMap,
+        estimate: Estimate,
+        noise: Noise,
+        bounds: IntArray,
+    ) -> tuple[Rival, ...]:
+        """Explanations nearly as probable as the best, each solved on its own."""
+        assert self.verdict is not None
+        rivals = []
+        for found, probability in self.verdict.alternatives[:MOST_RIVALS]:
+            if probability < self.verdict.probability * math.exp(-RIVAL_NATS):
+                break
+            groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in found)
+            start = _with_copies(self._first_places(estimate), evidence, groups)
+            problem, start, landmark = explained(base, start, believed, groups, self._prior.spread)
+            smoother = Smoother(problem, noise, robust=self._robust)
+            solved = smoother.optimum(start, iterations=5, tolerance=1e-4)
+            current = _current(landmark, self._count)
+            rivals.append(
+                Rival(
+                    self._changes(groups, probability, base),
+                    probability,
+                    solved.landmark[current],
+                    smoother.marginals(solved).landmark[current],
+                )
+            )
+        return tuple(rivals)
+
+    def _warnings(self, *, in_map: bool) -> tuple[str, ...]:
+        assert self.verdict is not None
+        if in_map and not self._groups and self.verdict.misfit > DISAGREEMENT:
+            return ("the prior map disagrees with what was seen, and no change explains it: cannot localise in it",)
+        return ()
 
     def _weighed(
         self, evidence: Evidence, given: GivenMap, n_windows: int, *, thorough: bool
@@ -129,8 +212,6 @@ class Joint:
                 break
             verdict, given = rival, other
             self._swaps = (*self._swaps, (swap.first, swap.second, float(1.0 / (1.0 + np.exp(-log_odds)))))
-        if given.given.any():
-            self._given = given
         return verdict, given
 
     def _bounds(self, problem: Problem) -> IntArray:
@@ -144,9 +225,7 @@ class Joint:
 
     def _current(self) -> IntArray:
         """(L,) the last place of every landmark."""
-        current = np.zeros(self._count, dtype=np.int64)
-        current[self._landmark] = np.arange(len(self._landmark))  # later places overwrite earlier ones
-        return current
+        return _current(self._landmark, self._count)
 
     def _timed(self, group: Group, base: Problem, estimate: Estimate, noise: Noise, bounds: IntArray) -> Group:
         """The group with the time of its change, where that was within the session.
@@ -163,10 +242,9 @@ class Joint:
         since_s, between_s = parting_time(base, estimate, noise, group.members, old[group.members], group.moved(old))
         return replace(group, since_s=since_s, between_s=between_s)
 
-    def _changes(self, base: Problem) -> tuple[MapChange, ...]:
-        assert self.verdict is not None
+    def _changes(self, groups: tuple[Group, ...], probability: float, base: Problem) -> tuple[MapChange, ...]:
         first_s = float(base.stamp_s[0])
-        moved = tuple(_change(group, self.verdict.probability, first_s) for group in self._groups)
+        moved = tuple(_change(group, probability, first_s) for group in groups)
         return (*(self._swap_change(swap, first_s) for swap in self._swaps), *moved)
 
     def _swap_change(self, swap: tuple[int, int, float], first_s: float) -> MapChange:
@@ -202,9 +280,11 @@ def _same(groups: tuple[Group, ...], others: tuple[Group, ...]) -> bool:
     return len(groups) == len(others) and all(a.same_as(b) for a, b in zip(groups, others, strict=True))
 
 
-def _one_place(estimate: Estimate, count: int) -> Estimate:
-    """One place a landmark: the first."""
-    return Estimate(estimate.pose, estimate.landmark[:count], estimate.states)
+def _current(landmark: IntArray, count: int) -> IntArray:
+    """(L,) the last place of every landmark, from the landmark of every place."""
+    current = np.zeros(count, dtype=np.int64)
+    current[landmark] = np.arange(len(landmark))  # later places overwrite earlier ones
+    return current
 
 
 def _first_seen(evidence: Evidence, fallback: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from evermap.slam.changes.explain import GivenMap, Group
 from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.changes.robust import without_transients
 from evermap.slam.changes.search import Hypotheses, find_changes
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """By which the standard deviations of the map may be wrong."""
@@ -102,7 +102,7 @@ def weigh(
         improved = tried(*best) > tried(factor, softness)
         if improved:
             factor, softness = best
-    return _verdict(list(trials.values()), trials[factor, softness])
+    return _verdict(list(trials.values()), trials[factor, softness], _first_windows(evidence, len(given.mean)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,14 +152,21 @@ def _try(
     return _Trial(factor, softness, comparison, hypotheses, base)
 
 
-def _verdict(trials: list[_Trial], best: _Trial) -> Verdict:
+def _first_windows(evidence: Evidence, count: int) -> IntArray:
+    """(L,) the window in which every landmark was seen first."""
+    first = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(first, evidence.landmark, evidence.window)
+    return first
+
+
+def _verdict(trials: list[_Trial], best: _Trial, first_window: IntArray) -> Verdict:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
     leader: dict[_Key, tuple[float, tuple[Group, ...]]] = {}
     for trial in trials:
         for row, gain in enumerate(trial.hypotheses.gain):
-            key, groups = _groups(trial.hypotheses, row)
+            key, groups = _groups(trial.hypotheses, row, first_window)
             log_weight = trial.base + float(gain) - top
             weight[key] = weight.get(key, 0.0) + float(np.exp(log_weight))
             if key not in leader or log_weight > leader[key][0]:
@@ -182,19 +189,15 @@ def _verdict(trials: list[_Trial], best: _Trial) -> Verdict:
 _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
-def _groups(hypotheses: Hypotheses, row: int) -> tuple[_Key, tuple[Group, ...]]:
+def _groups(hypotheses: Hypotheses, row: int, first_window: IntArray) -> tuple[_Key, tuple[Group, ...]]:
     """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
     label = hypotheses.label[row]
     groups = []
     for g in range(1, int(label.max()) + 1):
         members = np.flatnonzero(label == g)
-        groups.append(
-            Group(
-                members,
-                bool(hypotheses.turns[row, g]),
-                hypotheses.motion[row, g - 1],
-                int(hypotheses.onset[row, g]),
-            )
-        )
+        window = int(hypotheses.onset[row, g])
+        if np.all(first_window[members] >= window):  # nobody saw them before: as well before the session
+            window = 0
+        groups.append(Group(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window))
     key = tuple((tuple(int(j) for j in group.members), group.window > 0) for group in groups)
     return key, tuple(groups)

@@ -16,7 +16,7 @@ from evermap.config import ModesConfig
 from evermap.slam.arrow import Smoother
 from evermap.slam.modes.gating import gate_threshold, with_births, with_map_restored
 from evermap.slam.modes.looks import Looks, look_at_modes, news_in_a_miss
-from evermap.slam.modes.places import FREE, Modes, at_places, trimmed
+from evermap.slam.modes.places import FREE, Modes, at_places, compacted
 from evermap.slam.modes.tidying import merged, pruned, without_empty
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.selectors.chain import ModeChain
@@ -139,8 +139,9 @@ def explain_with_modes(
         moved = np.abs(estimate.pose[:, :2] - before.pose[:, :2]).max()
         if moved < SETTLED_M and np.array_equal(problem.landmark_row, given):
             break
-    problem, estimate, modes = trimmed(problem, estimate, modes)
-    return replace(found, problem=problem, estimate=estimate, modes=modes)
+    problem, estimate, modes, to = compacted(problem, estimate, modes)
+    table = np.where(found.looks.table != FREE, to[found.looks.table], FREE)
+    return replace(found, problem=problem, estimate=estimate, modes=modes, looks=replace(found.looks, table=table))
 
 
 def _tidied(

@@ -14,7 +14,7 @@ import numpy as np
 from evermap.slam.method import Compare, Revision
 from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
-from evermap.slam.modes.places import FREE, Modes, at_places, moved_to, trimmed
+from evermap.slam.modes.places import FREE, Modes, at_places, compacted, moved_to
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
@@ -35,7 +35,6 @@ class MultiHypothesis:
         self._model = model
         self._rng = np.random.default_rng(seed)
         self._modes = Modes.one_each(n_landmarks)
-        self._n_standing = n_landmarks
         self._log_belief = np.zeros(n_landmarks)
         """(P,) log probability of each place to be where its landmark is, by all looks so far."""
 
@@ -50,12 +49,16 @@ class MultiHypothesis:
             place[k] = self._best_of(mine, distance[which == k], log_volume[which == k])
         return place
 
+    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """As they are."""
+        return problem, estimate
+
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Births and the alternation over everything so far."""
         del final
-        standing, at, modes = self._without_newborn(problem, estimate)
-        found = explain_with_modes(standing, at, noise, modes, self._model, self._rng, heavy=heavy)
-        self._modes, self._n_standing = found.modes, len(found.modes.landmark)
+        static, at, modes = self._static(problem, estimate)
+        found = explain_with_modes(static, at, noise, modes, self._model, self._rng, heavy=heavy)
+        self._modes = found.modes
         current = self._current(found.problem)
         self._log_belief = np.full(len(found.modes.landmark), self._log_switch)
         self._log_belief[current] = 0.0
@@ -64,22 +67,19 @@ class MultiHypothesis:
             return Revision(problem, estimate, current, changes)
         return Revision(found.problem, found.estimate, current, changes)
 
-    def _without_newborn(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate, Modes]:
-        """The modes of the last revision: those born since were for the meantime.
+    def _static(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate, Modes]:
+        """Every detection at its landmark's own place again, at the estimate that the modes so far have led to.
 
-        One detection in twenty is born outside its gate. The estimate bends to fit such a mode, and then needs it; so
-        every revision has births of its own, which a selector must want with all looks in view.
+        One detection in twenty falls outside its gate. The estimate bends to fit the mode that it starts, and then needs
+        it; so every revision has births of its own, which a selector must want with all looks in view.
         """
         owner = self._modes.landmark
-        newborn = np.arange(self._n_standing, len(owner))
-        if len(newborn) == 0:
-            return problem, estimate, self._modes
-        own = owner[newborn]
-        problem = moved_to(problem, newborn, own)
-        lost = ~estimate.known[own]  # its own place was given up: it begins at a newborn's
-        estimate = at_places(estimate, own[lost], estimate.landmark[newborn[lost]])
-        estimate = at_places(estimate, newborn, np.nan)
-        return trimmed(problem, estimate, self._modes.with_owner(newborn, FREE))
+        others = np.flatnonzero(np.arange(len(owner)) >= self._modes.n_landmarks)
+        problem = moved_to(problem, others, owner[others])
+        lost = others[~estimate.known[owner[others]]]  # its own place was given up: it begins at another
+        estimate = at_places(estimate, owner[lost], estimate.landmark[lost])
+        estimate = at_places(estimate, others, np.nan)
+        return compacted(problem, estimate, self._modes.with_owner(others, FREE))[:3]
 
     @property
     def _log_switch(self) -> float:

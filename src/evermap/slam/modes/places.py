@@ -67,18 +67,28 @@ def grown(problem: Problem, estimate: Estimate, count: int) -> tuple[Problem, Es
     return problem.with_places(count), replace(estimate, landmark=landmark)
 
 
-def trimmed(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Problem, Estimate, Modes]:
-    """Without the rows at the end that belong to nobody."""
-    count = int(np.flatnonzero(modes.landmark != FREE).max()) + 1
-    if count == len(modes.landmark):
-        return problem, estimate, modes
+def compacted(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Problem, Estimate, Modes, IntArray]:
+    """Without the rows that belong to nobody, the others in the order in which they were first seen.
+
+    Returns:
+        Problem, estimate and modes, and (P,) the new row of every old one, `FREE` where it is gone.
+    """
+    extra = modes.n_landmarks + np.flatnonzero(modes.landmark[modes.n_landmarks :] != FREE)
+    seen, first = np.unique(problem.landmark_row, return_index=True)
+    when = np.full(len(modes.landmark), len(problem.landmark_row))
+    when[seen] = first
+    rows = np.append(np.arange(modes.n_landmarks), extra[np.argsort(when[extra], kind="stable")])
+    to = np.full(len(modes.landmark), FREE)
+    to[rows] = np.arange(len(rows))
+    axes = (2 * rows[:, None] + [0, 1]).ravel()
     problem = replace(
         problem,
-        landmark_mean=problem.landmark_mean[:count],
-        landmark_information=problem.landmark_information[: 2 * count, : 2 * count],
+        landmark_row=to[problem.landmark_row],
+        landmark_mean=problem.landmark_mean[rows],
+        landmark_information=problem.landmark_information[np.ix_(axes, axes)],
     )
-    estimate = replace(estimate, landmark=estimate.landmark[:count])
-    return problem, estimate, replace(modes, landmark=modes.landmark[:count])
+    estimate = replace(estimate, landmark=estimate.landmark[rows])
+    return problem, estimate, replace(modes, landmark=modes.landmark[rows]), to
 
 
 def at_places(estimate: Estimate, place: IntArray, position_m: FloatArray | float) -> Estimate:
