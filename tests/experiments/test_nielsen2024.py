@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evermap.errors import ConfigError, InputError
+from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.experiments import nielsen2024, nielsen2024_plan
 from evermap.experiments.nielsen2024_expected import PROMISES, verdicts
-from evermap.experiments.nielsen2024_runs import Job, inputs_of, recording_of, reference_of
+from evermap.experiments.nielsen2024_runs import Job, inputs_of, recording_of, reference_of, run_job
 from evermap.experiments.nielsen2024_scores import change_scores, run_scores
 from evermap.io.shifts import Shift
 from evermap.types import ChangeKind, Landmarks, MapChange, Trajectory
@@ -122,6 +122,25 @@ def test_inputs_are_a_wrong_map_or_an_edited_recording(made_up_data: Path) -> No
     paper, _, _ = inputs_of(replace(job, sensor="paper"), recording, reference)
     assert np.abs(paper.detections.bearing_rad).max() <= 0.4
     assert paper.detections.range_m.max() <= 5.0
+
+
+def test_a_method_that_fails_leaves_a_row(made_up_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reference = reference_of(made_up_data, 6, 2)
+    job = Job("recordings", "group", 6, 2, "ours", "nohyp")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise NumericalError("no finite optimum")
+
+    monkeypatch.setattr("evermap.pipeline.run_slam", fail)
+    row, result = run_job(job, made_up_data, reference)
+    assert result is None
+    assert row["failure"] == "no finite optimum"
+    assert not row["placed"]
+    text = nielsen2024.as_markdown(
+        {"simulation": [], "runs": [row], "expected": verdicts([], [row]), "evermap": "0",
+         "machine": {"versions": {"python": "3"}, "processor": "x"}, "settings": {"seed": 0, "processes": 1}}
+    )  # fmt: skip
+    assert "– / – (0 of 1)" in text
 
 
 def change(ids: tuple[int, ...], probability: float = 0.9, at: tuple[float, float] = (np.nan, 0.0)) -> MapChange:

@@ -161,7 +161,7 @@ def _run(job: Job, data: Path, reference: Reference) -> tuple[Row, Row | None]:
     """A row, and what a figure of trajectories needs where the run is in one."""
     row, result = run_job(job, data, reference)
     drawn = job.part == "recordings" and job.delta_m == _DRAWN_DELTA_M[job.dataset]
-    return row, _path(result, reference) if drawn else None
+    return row, _path(result, reference) if drawn and result is not None else None
 
 
 def _path(result: SlamResult, reference: Reference) -> Row:

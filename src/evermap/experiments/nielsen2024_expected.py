@@ -147,13 +147,13 @@ def _during(key: str, datasets: tuple[int, ...]) -> Callable[[Rows, Rows], float
 def _slowest(method: str) -> Callable[[Rows, Rows], float | None]:
     def factor(_: Rows, runs: Rows) -> float | None:
         rows = chosen(runs, part="recordings", scenario="group", sensor="ours", method=method)
-        return min((row["recording_s"] / row["cpu_s"] for row in rows), default=None)
+        return min((row["recording_s"] / row["cpu_s"] for row in rows if row["cpu_s"]), default=None)
 
     return factor
 
 
 def _latency(_: Rows, runs: Rows) -> float | None:
-    return max((row["step_p99_ms"] for row in _joint(runs, MAIN)), default=None)
+    return max((row["step_p99_ms"] for row in _joint(runs, MAIN) if row["cpu_s"]), default=None)
 
 
 def _calibration(_: Rows, runs: Rows) -> float | None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import NumericalError
+from evermap.errors import DataError, NumericalError
 from evermap.experiments.mrclam import PRIOR_SIGMA_M, SWAPPED, find_dataset
 from evermap.experiments.nielsen2024_scores import change_scores, run_scores
 from evermap.io.shifts import Shift, shifted
@@ -45,6 +45,23 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "many-modes": (*_PAPER, "slam.modes.gate_probability=0.8", "slam.modes.switch_probability=0.1"),
 }
 """Settings by name: our defaults, the paper's of section 8.2.2, and those of 8.2.4 that make many modes."""
+
+
+NOTHING: Row = {
+    "failure": None,
+    "placed": False,
+    "exact": False,
+    "changes": [],
+    "alternatives": [],
+    **dict.fromkeys(
+        (
+            "pose_rmse_m", "pose_seen_rmse_m", "pose_max_m", "heading_rmse_deg", "pose_true_rmse_m",
+            "landmark_rmse_m", "landmark_max_m", "truth_rank", "precision", "recall", "displacement_error_m",
+            "time_error_s", "time_off_window_s", "recording_s", "frames", "wall_s", "cpu_s", "step_p99_ms",
+        )
+    ),
+}  # fmt: skip
+"""All scores of a run, none of them known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +138,7 @@ def survey_of(recording: Recording, dataset: int, *, scored: bool) -> Landmarks:
     """
     survey = recording.true_landmarks
     if survey is None:
-        raise NumericalError(f"{recording.name}: no surveyed landmarks")
+        raise DataError(f"{recording.name}: no surveyed landmarks")
     keep = ~np.isin(survey.landmark_id, SWAPPED.get(dataset, ()) if scored else ())
     return Landmarks.at(survey.landmark_id[keep], survey.position_m[keep], sigma_m=PRIOR_SIGMA_M, frame="prior_map")
 
@@ -186,21 +203,30 @@ def true_changes(job: Job, recording: Recording) -> list[MapChange]:
     ]
 
 
-def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult]:
-    """Run, and score; the row holds plain JSON values only."""
+def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult | None]:
+    """Run, and score; the row holds plain JSON values only.
+
+    A method that finds no optimum is a row without scores and with the `failure`, and no result.
+    """
     from evermap.pipeline import run_slam
 
     original = recording_of(data, job.dataset, job.robot)
     recording, prior, landmarks = inputs_of(job, original, reference)
     config = job.config()
     wall, cpu = time.perf_counter(), time.process_time()
-    result = run_slam(replace(recording, truth=None, true_landmarks=None), config, prior_map=prior)
+    try:
+        result = run_slam(replace(recording, truth=None, true_landmarks=None), config, prior_map=prior)
+    except (DataError, NumericalError) as error:
+        return {**job.key, **NOTHING, "failure": error.one_line()}, None
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    if result.interrupted:
+        raise KeyboardInterrupt
     swapped = SWAPPED.get(job.dataset, ())
     scored = ~np.isin(landmarks.landmark_id, swapped)
     at = Landmarks.at(landmarks.landmark_id[scored], landmarks.position_m[scored])
     row = {
         **job.key,
+        **NOTHING,
         **run_scores(recording, result, reference.trajectory, original.truth, at),
         **change_scores(true_changes(job, original), result, original, swapped, job.during),
         "recording_s": float(np.ptp(recording.frames.stamp_s)),

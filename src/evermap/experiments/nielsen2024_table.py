@@ -164,6 +164,7 @@ def _times(rows: Rows) -> str:
 
 
 def _time_of(rows: Rows) -> str:
+    rows = [row for row in rows if row["cpu_s"] is not None]
     if not rows:
         return "–"
     seconds = sum(row["cpu_s"] for row in rows)
