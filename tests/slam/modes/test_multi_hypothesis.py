@@ -40,7 +40,7 @@ def test_a_stream_finds_what_moved_as_if_told(method: str, seed: int):
     found = stream(moving, MultiHypothesis(6, model_of(method)))
     told = stream(moving, Static(7), told=True)
     mine = moving.problem.landmark_row == moving.moved
-    second = found.current[moving.moved]
+    second = found.revision.current[moving.moved]
     late = moving.problem.pose_row >= moving.since
     np.testing.assert_array_equal(found.problem.landmark_row[mine] == second, late[mine])
     np.testing.assert_allclose(found.estimate.landmark[second], told.estimate.landmark[-1], atol=0.05)
@@ -49,7 +49,7 @@ def test_a_stream_finds_what_moved_as_if_told(method: str, seed: int):
         for outcome in (found, told)
     )
     assert np.sqrt((off**2).mean()) < 1.1 * np.sqrt((told_off**2).mean())
-    (change,) = found.changes
+    (change,) = found.revision.changes
     assert change.landmark_ids == (moving.moved,)
     assert change.stamp_from_s < moving.problem.stamp_s[moving.since] <= change.stamp_to_s
 
@@ -74,7 +74,7 @@ def test_a_detection_goes_to_the_mode_it_gates_with_and_starts_one_where_it_gate
     assert method.assign(moving.problem, row, detection, compare).tolist() == [7]
 
 
-def test_modes_born_since_the_last_revision_were_for_the_meantime():
+def test_every_revision_begins_without_the_modes_so_far():
     moving = make_moving_world(5)
     problem, truth = moving.problem, moving.world.truth
     method = MultiHypothesis(6, model_of("viterbi", gate_probability=1.0))
@@ -82,7 +82,7 @@ def test_modes_born_since_the_last_revision_were_for_the_meantime():
     torn = replace(problem.with_places(7), landmark_row=np.where(problem.landmark_row == 2, 6, problem.landmark_row))
     landmark = np.vstack([truth.landmark, truth.landmark[2]])
     landmark[2] = np.nan
-    standing, estimate, modes = method._without_newborn(torn, Estimate(truth.pose, landmark, truth.states))
+    standing, estimate, modes = method._static(torn, Estimate(truth.pose, landmark, truth.states))
     np.testing.assert_array_equal(standing.landmark_row, problem.landmark_row)
     np.testing.assert_array_equal(estimate.landmark, truth.landmark)
     assert len(modes.landmark) == len(standing.landmark_mean) == 6

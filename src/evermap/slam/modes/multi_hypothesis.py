@@ -70,8 +70,8 @@ class MultiHypothesis:
     def _static(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate, Modes]:
         """Every detection at its landmark's own place again, at the estimate that the modes so far have led to.
 
-        One detection in twenty falls outside its gate. The estimate bends to fit the mode that it starts, and then needs
-        it; so every revision has births of its own, which a selector must want with all looks in view.
+        One detection in twenty falls outside its gate. The estimate bends to fit the mode that it starts, and then
+        needs it; so every revision has births of its own, which a selector must want with all looks in view.
         """
         owner = self._modes.landmark
         others = np.flatnonzero(np.arange(len(owner)) >= self._modes.n_landmarks)
