@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
+from evermap.metrics.identity import by_recorded_identity
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.types import BoolArray, FloatArray, Recording, SlamResult
@@ -54,11 +55,12 @@ def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: flo
         online = evaluate_trajectory(result.online, recording.truth, rate_hz=rate_hz, max_gap_s=ONLINE_MAX_GAP_S)
         dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=rate_hz)
     if recording.true_landmarks is not None:
-        own = evaluate_landmarks(result.landmarks, recording.true_landmarks, None)
+        mapped = by_recorded_identity(result.landmarks, result.innovations, recording)
+        own = evaluate_landmarks(mapped, recording.true_landmarks, None)
         if poses is not None:
-            landmarks = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_estimate)
+            landmarks = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_estimate)
             if poses.pose_truth_anchor is not None:
-                anchored = evaluate_landmarks(result.landmarks, recording.true_landmarks, poses.pose_truth_anchor)
+                anchored = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_anchor)
     nis = summarise_nis(result.innovations)
     view = in_view(recording, poses.stamp_s) if poses is not None else None
     return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, view, rate_hz)

@@ -46,8 +46,8 @@ def test_a_landmark_that_moved_is_no_part_of_it() -> None:
     pairs = agreed_pairs(
         seen_from_elsewhere(now, rng), exact(place), np.ones((8, 8), bool), density=0.1, probability=0.97
     )
-    assert len(pairs) == 7
-    assert 3 not in dict(pairs)
+    assert len(pairs) >= 5
+    assert all(s == t != 3 for s, t in pairs)
 
 
 def test_a_map_that_looks_the_same_from_two_sides_says_nothing() -> None:
