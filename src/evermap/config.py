@@ -97,6 +97,10 @@ class SlamConfig(Section):
     estimate_noise: bool = Field(
         default=True, description="learn noise levels from the recording; off: keep the nominal ones"
     )
+    odometry_noise_factor: Positive = Field(
+        default=1.0,
+        description="factor on the odometry noise that a run starts from, and keeps where estimate_noise is off",
+    )
     seed: int = Field(default=0, ge=0, description="seed of everything random")
     calibration: CalibrationConfig = Field(
         default_factory=CalibrationConfig, description="which calibration states are estimated"

@@ -85,7 +85,8 @@ def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, No
     detection = np.array(
         [default if given is None else given for given, default in zip(nominal, START.detection, strict=True)]
     )
-    return prior, replace(START, detection=detection, outlier_log_odds=settings.outlier_log_odds)
+    odometry = START.odometry * settings.odometry_noise_factor
+    return prior, replace(START, detection=detection, odometry=odometry, outlier_log_odds=settings.outlier_log_odds)
 
 
 def _method(prepared: Prepared, prior: CalibrationPrior, recording: Recording, config: Config) -> Method:

@@ -32,6 +32,7 @@ _PAPER = (
     "slam.sensor_model=plain",
     "slam.robust=false",
     "slam.estimate_noise=false",
+    "slam.odometry_noise_factor=3",
     "sensor.sigma_range_m=0.2",
     "sensor.sigma_bearing_rad=0.11",
     "sensor.p_detect=0.6",
@@ -44,7 +45,12 @@ SENSORS: dict[str, tuple[str, ...]] = {
     "paper": (*_PAPER, "slam.modes.gate_probability=0.95", "slam.modes.switch_probability=0.0001"),
     "many-modes": (*_PAPER, "slam.modes.gate_probability=0.8", "slam.modes.switch_probability=0.1"),
 }
-"""Settings by name: our defaults, the paper's of section 8.2.2, and those of 8.2.4 that make many modes."""
+"""Settings by name: our defaults, the paper's of section 8.2.2, and those of 8.2.4 that make many modes.
+
+The paper's odometry noise is not in its text. Three times what a run starts from is about what a static run with the
+paper's sensor model learns from the recordings (0.15 rad for every square root of a radian turned); with less, the
+robot that comes back from a blind stretch is surprised by every landmark.
+"""
 
 
 NOTHING: Row = {
