@@ -52,7 +52,7 @@ class ModesConfig(Section):
         default=1e-4, description="of a landmark to be in another mode at the next look; ignored with a lifetime"
     )
     lifetime: str | None = Field(
-        default=None, description="prior of how long a mode lasts, e.g. 'exponential(half_life=30d)'; unset: constant"
+        default=None, description="prior of how long a mode lasts, e.g. 'exponential:half-life=30d'; unset: constant"
     )
     rounds: int = Field(default=10, ge=1, le=100, description="of selecting modes and relinearising, at most")
     mcts_budget: int = Field(default=200, ge=1, description="iterations of the tree search for every decision")

@@ -24,10 +24,10 @@ from evermap.slam.selectors.protocol import Selection, Selector, selector_by_nam
 from evermap.survival.text import parse_prior
 from evermap.types import IntArray, Sensor
 
-SOLVER_ITERATIONS = 10
+SOLVER_ITERATIONS = 4
 SOLVER_TOLERANCE = 1e-4
 """Of every round: the next one starts where it ended [m, rad]."""
-PASSES = 4
+PASSES = 3
 """Births and alternations, at most; two are enough where the trajectory is not far off."""
 SETTLED_M = 0.01
 """A pass that moves no pose farther than this changes no gate."""
