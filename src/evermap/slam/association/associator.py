@@ -50,6 +50,8 @@ NOISE_FLOOR = 0.5
 """Share of the start's noise of sightings that imaginary ones vouch for."""
 INFLATION = 1.3
 """Of the noise of sightings: what was associated is what agreed."""
+MERGE_ROUNDS = 20
+"""Merges that are tried whenever stock is taken, at most."""
 LAST_ROUNDS = 5
 """Comparisons of every detection with the whole map at the end, at most."""
 
@@ -184,7 +186,7 @@ class Associator:
         """The batch solution, merged as long as there is something to merge."""
         assignment, marginals = self._solved(assignment)
         refused: set[tuple[int, int]] = set()
-        while True:
+        for _ in range(MERGE_ROUNDS):
             honest = replace(marginals, shared=assignment.with_shared_errors(marginals.shared))
             pairs = propose_merges(assignment, honest, density=self._density, probability=P_MERGE)
             pairs = [pair for pair in pairs if pair not in refused]
@@ -193,22 +195,24 @@ class Associator:
                     assignment, honest, density=self._density, probability=P_MERGE, refused=refused
                 )
             if not pairs:
-                return assignment, marginals
-            merged = self._merged(assignment, pairs)
+                break
+            limit = self._cost(assignment)[0] + RISE_NATS
+            merged = self._merged(assignment, pairs, limit + RISE_NATS * (len(pairs) - 1))
             if merged is None:  # not all of them; perhaps some
-                singles = [self._merged(assignment, [pair]) for pair in pairs] if len(pairs) > 1 else []
+                singles = (self._merged(assignment, [pair], limit) for pair in pairs if len(pairs) > 1)
                 merged = next((single for single in singles if single is not None), None)
             if merged is None:
                 refused.update(pairs)
             else:
                 refused.clear()
                 assignment, marginals = self._solved(merged)
+        return assignment, marginals
 
-    def _merged(self, assignment: Assignment, pairs: list[tuple[int, int]]) -> Assignment | None:
-        """At its optimum with pairs merged; None where the cost says that they are two."""
+    def _merged(self, assignment: Assignment, pairs: list[tuple[int, int]], limit: float) -> Assignment | None:
+        """At its optimum with pairs merged; None where a cost above `limit` says that they are two."""
         trial = assignment.merged(pairs)
         cost, estimate = self._cost(trial)
-        if cost - self._cost(assignment)[0] > RISE_NATS * len(pairs):
+        if cost > limit:
             return None
         return Assignment(trial.measured, trial.landmark_row, estimate)
 
