@@ -15,6 +15,7 @@ import pytest
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.experiments import nielsen2024, nielsen2024_plan
 from evermap.experiments.nielsen2024_expected import PROMISES, verdicts
+from evermap.experiments.nielsen2024_figures import draw_all
 from evermap.experiments.nielsen2024_runs import Job, inputs_of, recording_of, reference_of, run_job
 from evermap.experiments.nielsen2024_scores import change_scores, run_scores
 from evermap.io.shifts import Shift
@@ -99,6 +100,21 @@ def test_markdown_is_made_of_whole_tables(made: tuple[dict[str, Any], Path]) -> 
     numbers = row_of(table, part="recordings", sensor="ours", delta_m=0.5)
     assert f"{numbers['pose_rmse_m']:.3f} / {numbers['landmark_rmse_m']:.3f}" in text
     assert not re.search(r"\bnan\b|None", text)
+
+
+def test_figures_are_drawn_of_whatever_was_run(made: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+    runs = made[0]["runs"]
+    path = {"estimate_m": [[0.0, 0.0], [1.0, 0.0]], "reference_m": [[0.0, 0.1], [1.0, 0.1]], "landmarks_m": []}
+    for name, rows, drawn, wanted in (
+        ("nothing", [], {}, set()),
+        ("paper", [r for r in runs if r["sensor"] == "paper"], {"group paper em dataset 6 robot 2": path}, {"fig9"}),
+        ("ours", [r for r in runs if r["sensor"] == "ours"], {"group ours joint dataset 6 robot 2": path},
+         {"fig8", "fig9"}),
+    ):  # fmt: skip
+        folder = tmp_path / name
+        folder.mkdir()
+        draw_all([], rows, drawn, lambda file, folder=folder: folder / file)
+        assert {file.name.partition("-")[0] for file in folder.iterdir()} == wanted
 
 
 def test_inputs_are_a_wrong_map_or_an_edited_recording(made_up_data: Path) -> None:

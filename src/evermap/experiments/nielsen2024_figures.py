@@ -53,8 +53,9 @@ def draw_all(simulation: Rows, runs: Rows, paths: Mapping[str, Row], path: Calla
     figures: dict[str, Figure] = {}
     if simulation:
         figures["fig6-7-selectors"] = _draw_selectors(simulation)
-    if paths:
-        figures["fig8-trajectories"] = _draw_paths(paths)
+    drawn = {key: value for key, value in paths.items() if key.startswith("group ours")}
+    if drawn:
+        figures["fig8-trajectories"] = _draw_paths(drawn)
     compared = chosen(runs, part="recordings", scenario="group")
     if compared:
         figures["fig9-displacement"] = _draw_displacements(compared)
@@ -154,15 +155,14 @@ def _legend(figure: Figure, panels: list[Axes]) -> None:
 
 def _draw_paths(paths: Mapping[str, Row]) -> Figure:
     """One robot of every data set, the group displaced: reference, and what three methods make of it."""
-    drawn = {key: value for key, value in paths.items() if key.startswith("group ours")}
-    datasets = sorted({key.partition(" dataset ")[2] for key in drawn})
+    datasets = sorted({key.partition(" dataset ")[2] for key in paths})
     first = [min((name for name in datasets if name.startswith(number)), default="") for number in "1236"]
     first = [name for name in first if name]
     with house_style():
         figure = new_figure(2.4 * len(first) + 0.4, 3.6)
         panels = figure.subplots(1, len(first), squeeze=False)[0]
         for axes, name in zip(panels, first, strict=True):
-            own = {key.split()[2]: value for key, value in drawn.items() if key.endswith(f" dataset {name}")}
+            own = {key.split()[2]: value for key, value in paths.items() if key.endswith(f" dataset {name}")}
             axes.plot(
                 *np.array(next(iter(own.values()))["reference_m"]).T, color=INK, lw=2.0, alpha=0.3, label="reference"
             )
