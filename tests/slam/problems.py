@@ -132,10 +132,12 @@ def make_world(
     n_mapped: int = 0,
     sigma_map_m: float = 0.1,
     turn_radps: float = 0.0,
+    reach: float = 1.0,
 ) -> World:
     """A robot in the middle of some landmarks, in the frame of its first pose; measured exactly with `noisy=0`.
 
     The motion from pose to pose is drawn from the odometry's own model; the first `n_mapped` landmarks have priors.
+    They stand in a ring, farther out than the trajectory's extent times `reach`.
     """
     rng = np.random.default_rng(seed)
     prior = default_prior() if prior is None else prior
@@ -151,8 +153,8 @@ def make_world(
         pose[i + 1] = se2.compose(se2.compose(pose[i], step.increment), se2.exp(slip))
     middle = pose[:, :2].mean(axis=0)
     angle = 2 * np.pi * (np.arange(n_landmarks) + 0.3 * rng.random(n_landmarks)) / n_landmarks
-    reach = (2.0 + 2.0 * rng.random(n_landmarks))[:, None] + np.ptp(pose[:, :2])
-    landmark = middle + reach * np.column_stack([np.cos(angle), np.sin(angle)])
+    radius = (2.0 + 2.0 * rng.random(n_landmarks))[:, None] + reach * np.ptp(pose[:, :2])
+    landmark = middle + radius * np.column_stack([np.cos(angle), np.sin(angle)])
     seen = rng.random((n_poses, n_landmarks)) < p_seen
     seen[0, :2] = True
     seen[1:, 0] |= ~seen[1:].any(axis=1)

@@ -3,20 +3,77 @@
 Adding groups one after another does not work when several things moved: the first group then explains a part of the
 second. So a hypothesis changes as a whole, from many starts: a landmark joins another group, a new one or the static
 ones, two groups merge, a group is dropped or changes places with the static ones, its time or its turning changes.
+Climbs meet the same hypotheses again and again, so what was weighed is remembered.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.slam.changes.gain import hypothesis_gain
 from evermap.slam.kernels import kernel
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 WORTH_KEEPING = 25.0
 """Hypotheses that are further below the best [nats] weigh nothing."""
+MOST_KEPT = 20_000
+SLOTS = 1 << 17
+
+
+class Tables(NamedTuple):
+    """What the gain is computed from: the arguments of `hypothesis_gain` behind the hypothesis."""
+
+    quadratic: FloatArray
+    linear: FloatArray
+    position: FloatArray
+    spread: FloatArray
+    log_prior: FloatArray
+    log_onset: FloatArray
+
+
+class Weighed(NamedTuple):
+    """All hypotheses weighed so far: a hash table of gains, and those that were worth keeping row by row.
+
+    Attributes:
+        key, value: (SLOTS,) hash of a hypothesis, 0 where the slot is free, and its gain.
+        label, onset, turns, gain: (MOST_KEPT, ...) hypotheses as in `hypothesis_gain`, groups numbered by their first
+            member.
+        used: (2,) rows kept and slots taken.
+        best: (1,) largest gain.
+    """
+
+    key: IntArray
+    value: FloatArray
+    label: IntArray
+    onset: IntArray
+    turns: BoolArray
+    gain: FloatArray
+    used: IntArray
+    best: FloatArray
+
+    @classmethod
+    def nothing(cls, landmarks: int, groups: int) -> Weighed:
+        """Before the search."""
+        return cls(
+            np.zeros(SLOTS, np.int64),
+            np.zeros(SLOTS),
+            np.zeros((MOST_KEPT, landmarks), np.int64),
+            np.zeros((MOST_KEPT, groups + 1), np.int64),
+            np.zeros((MOST_KEPT, groups + 1), np.bool_),
+            np.zeros(MOST_KEPT),
+            np.zeros(2, np.int64),
+            np.full(1, -np.inf),
+        )
+
+    @property
+    def ranked(self) -> IntArray:
+        """Rows that weigh something, the best first."""
+        gain = self.gain[: self.used[0]]
+        worth = np.flatnonzero(gain > self.best[0] - WORTH_KEEPING)
+        order: IntArray = worth[np.argsort(-gain[worth], kind="stable")]
+        return order
 
 
 @kernel
@@ -42,52 +99,87 @@ def _compact(label: IntArray, onset: IntArray, turns: Any) -> None:
 
 
 @kernel
-def _climb(
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
-    may_turn: bool,
-    quadratic: FloatArray,
-    linear: FloatArray,
-    position: FloatArray,
-    spread: FloatArray,
-    log_prior: FloatArray,
-    log_onset: FloatArray,
-    kept_label: IntArray,
-    kept_onset: IntArray,
-    kept_turns: Any,
-    kept_gain: FloatArray,
-    kept: int,
-) -> int:
-    """From one start uphill to a local optimum, in place; all that was weighed is appended to `kept_*`."""
-    count, groups, n_windows = len(label), len(onset) - 1, len(log_onset)
+def _gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> float:
+    gain, _ = hypothesis_gain(
+        label,
+        onset,
+        turns,
+        tables.quadratic,
+        tables.linear,
+        tables.position,
+        tables.spread,
+        tables.log_prior,
+        tables.log_onset,
+    )
+    return gain
+
+
+@kernel
+def _hash(label: IntArray, onset: IntArray, turns: Any) -> int:
+    """FNV-1a over the numbers that make a hypothesis; never 0."""
+    key = 1469598103934665603
+    for i in range(len(label)):
+        key = (key ^ label[i]) * 1099511628211
+    for g in range(len(onset)):
+        key = (key ^ (2 * onset[g] + (1 if turns[g] else 0))) * 1099511628211
+    return key if key != 0 else 1
+
+
+@kernel
+def _weigh(label: IntArray, onset: IntArray, turns: Any, tables: Tables, weighed: Weighed) -> float:
+    """Gain of a hypothesis, whose groups are numbered anew in place; remembered."""
+    _compact(label, onset, turns)
+    key = _hash(label, onset, turns)
+    slot = (key ^ (key >> 32)) & (SLOTS - 1)
+    while weighed.key[slot] != 0:
+        if weighed.key[slot] == key:
+            return float(weighed.value[slot])
+        slot = (slot + 1) & (SLOTS - 1)
+    gain = _gain(label, onset, turns, tables)
+    if 2 * weighed.used[1] < SLOTS:
+        weighed.key[slot] = key
+        weighed.value[slot] = gain
+        weighed.used[1] += 1
+    weighed.best[0] = max(weighed.best[0], gain)
+    row = weighed.used[0]
+    if gain > weighed.best[0] - WORTH_KEEPING and row < len(weighed.gain):
+        weighed.label[row] = label
+        weighed.onset[row] = onset
+        weighed.turns[row] = turns
+        weighed.gain[row] = gain
+        weighed.used[0] += 1
+    return gain
+
+
+@kernel
+def _climb(label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed) -> float:
+    """From one start uphill to a local optimum, in place; its gain."""
+    n_windows = len(tables.log_onset)
     trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
-    best, _ = hypothesis_gain(label, onset, turns, quadratic, linear, position, spread, log_prior, log_onset)
-    kept = _keep(label, onset, turns, best, kept_label, kept_onset, kept_turns, kept_gain, kept)
-    relabels = count * (groups + 1)
-    merges = groups * groups
-    moves = relabels + merges + groups + groups + groups * n_windows + groups
+    best = _weigh(label, onset, turns, tables, weighed)
     improved = True
     while improved:
         improved = False
-        for move in range(moves):
+        for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):
             trial[:] = label
             trial_onset[:] = onset
             trial_turns[:] = turns
             if not _apply(trial, trial_onset, trial_turns, move, n_windows, may_turn):
                 continue
-            gain, _ = hypothesis_gain(
-                trial, trial_onset, trial_turns, quadratic, linear, position, spread, log_prior, log_onset
-            )
-            kept = _keep(trial, trial_onset, trial_turns, gain, kept_label, kept_onset, kept_turns, kept_gain, kept)
+            gain = _weigh(trial, trial_onset, trial_turns, tables, weighed)
             if gain > best + 1e-9:
                 best = gain
                 label[:] = trial
                 onset[:] = trial_onset
                 turns[:] = trial_turns
                 improved = True
-    _compact(label, onset, turns)
-    return kept
+    return best
+
+
+@kernel
+def _count_moves(count: int, groups: int, n_windows: int) -> int:
+    relabels, merges = count * (groups + 1), 2 * groups * groups
+    return relabels + merges + groups + groups + groups * n_windows + groups
 
 
 @kernel
@@ -101,13 +193,16 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
         label[i] = g
         return True
     move -= count * (groups + 1)
-    if move < groups * groups:
-        g, h = 1 + move // groups, 1 + move % groups
-        if g == h or not np.any(label == g) or not np.any(label == h):
+    if move < 2 * groups * groups:
+        # two that turned together are no one group that only moved, so merging and turning is one step
+        turn, pair = move // (groups * groups), move % (groups * groups)
+        g, h = 1 + pair // groups, 1 + pair % groups
+        if g == h or not np.any(label == g) or not np.any(label == h) or (turn and (turns[g] or not may_turn)):
             return False
         label[label == h] = g
+        turns[g] = turns[g] or turn
         return True
-    move -= groups * groups
+    move -= 2 * groups * groups
     if move < groups:
         if not np.any(label == move + 1):
             return False
@@ -139,117 +234,82 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
 
 
 @kernel
-def _keep(
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
-    gain: float,
-    kept_label: IntArray,
-    kept_onset: IntArray,
-    kept_turns: Any,
-    kept_gain: FloatArray,
-    kept: int,
-) -> int:
-    """Write a hypothesis into the next row; the last row remembers the best gain so far."""
-    last = len(kept_gain) - 1
-    kept_gain[last] = max(kept_gain[last], gain)
-    if gain < kept_gain[last] - WORTH_KEEPING or kept >= last:
-        return kept
-    kept_label[kept] = label
-    kept_onset[kept] = onset
-    kept_turns[kept] = turns
-    _compact(kept_label[kept], kept_onset[kept], kept_turns[kept])
-    kept_gain[kept] = gain
-    return kept + 1
-
-
-@kernel
-def _best_pair(
-    landmark: int,
-    quadratic: FloatArray,
-    linear: FloatArray,
-    position: FloatArray,
-    spread: FloatArray,
-    log_prior: FloatArray,
-    log_onset: FloatArray,
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
+def _add_best_pair(
+    landmark: int, group: int, may_turn: bool, tables: Tables, label: IntArray, onset: IntArray, turns: Any
 ) -> None:
-    """One group of a landmark and the one that goes with it best, at the best time, into `label`, `onset`, `turns`.
+    """A new group of a static landmark and the static one that goes with it best, at the best time, in place.
 
-    What moved with others may lose by moving alone, whenever that was.
+    What moved with others may lose by moving alone, whenever that was; and what turned has no displacement in common.
     """
-    best, partner, window = -np.inf, landmark, 0
-    turns[:] = False
-    for w in range(len(log_onset)):
-        onset[:] = w
+    n_windows = len(tables.log_onset)
+    best, partner, window, turning = -np.inf, landmark, 0, False
+    for attempt in range(n_windows + (1 if may_turn else 0)):
+        turns[group] = attempt == n_windows  # last, at the time that was best without
+        onset[group] = window if turns[group] else attempt
         for other in range(len(label)):
-            label[:] = 0
-            label[landmark] = 1
-            label[other] = 1
-            gain, _ = hypothesis_gain(label, onset, turns, quadratic, linear, position, spread, log_prior, log_onset)
+            if label[other] > 0 or (turns[group] and other == landmark):
+                continue
+            label[landmark] = group
+            label[other] = group
+            gain = _gain(label, onset, turns, tables)
+            label[landmark] = 0
+            label[other] = 0
             if gain > best:
-                best, partner, window = gain, other, w
-    label[:] = 0
-    label[landmark] = 1
-    label[partner] = 1
-    onset[:] = 0
-    onset[1] = window
+                best, partner, window, turning = gain, other, onset[group], turns[group]
+    label[landmark] = group
+    label[partner] = group
+    onset[group] = window
+    turns[group] = turning
 
 
 @kernel
 def climb_from_many_starts(
-    may_turn: bool,
-    quadratic: FloatArray,
-    linear: FloatArray,
-    position: FloatArray,
-    spread: FloatArray,
-    log_prior: FloatArray,
-    log_onset: FloatArray,
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
-    kept_label: IntArray,
-    kept_onset: IntArray,
-    kept_turns: Any,
-    kept_gain: FloatArray,
-) -> int:
-    """Climb from `label`, from the best pair of every landmark, and from the best so far with each landmark changed."""
+    may_turn: bool, tables: Tables, label: IntArray, onset: IntArray, turns: Any, weighed: Weighed
+) -> None:
+    """Climb from `label`, from the best pair of every landmark, and from the best so far with each landmark changed.
+
+    A static landmark changes by moving on its own, and by moving with the one that goes with it best.
+    """
     count, groups = len(label), len(onset) - 1
-    last = len(kept_gain) - 1
-    kept = 0
-    kept = _climb(
-        label, onset, turns, may_turn, quadratic, linear, position, spread, log_prior, log_onset,
-        kept_label, kept_onset, kept_turns, kept_gain, kept,
-    )  # fmt: skip
-    best, best_onset, best_turns, best_gain = label.copy(), onset.copy(), turns.copy(), kept_gain[last]
+    best_gain = _climb(label, onset, turns, may_turn, tables, weighed)
+    best, best_onset, best_turns = label.copy(), onset.copy(), turns.copy()
     for start in range(3 * count):
         landmark = start % count
         if start < count:
-            _best_pair(landmark, quadratic, linear, position, spread, log_prior, log_onset, label, onset, turns)
+            label[:] = 0
+            onset[:] = 0
+            turns[:] = False
         else:
             label[:] = best
             onset[:] = best_onset
             turns[:] = best_turns
-            _compact(label, onset, turns)
-            free = np.max(label) + 1
-            if start < 2 * count:
-                if free > groups:
-                    continue
-                label[landmark] = free
-            else:
-                if label[landmark] == 0:
-                    continue
-                label[landmark] = 0
-        kept = _climb(
-            label, onset, turns, may_turn, quadratic, linear, position, spread, log_prior, log_onset,
-            kept_label, kept_onset, kept_turns, kept_gain, kept,
-        )  # fmt: skip
-        gain, _ = hypothesis_gain(label, onset, turns, quadratic, linear, position, spread, log_prior, log_onset)
+        free = int(np.max(label)) + 1
+        if start >= 2 * count and label[landmark] > 0:
+            label[landmark] = 0
+        elif label[landmark] > 0 or free > groups:
+            continue
+        elif start >= 2 * count:
+            label[landmark] = free
+        else:
+            _add_best_pair(landmark, free, may_turn, tables, label, onset, turns)
+        gain = _climb(label, onset, turns, may_turn, tables, weighed)
         if gain > best_gain:
             best[:] = label
             best_onset[:] = onset
             best_turns[:] = turns
             best_gain = gain
-    return kept
+
+
+@kernel
+def weigh_neighbours(
+    label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed
+) -> None:
+    """All that one move makes of a hypothesis is weighed."""
+    n_windows = len(tables.log_onset)
+    trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
+    for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):
+        trial[:] = label
+        trial_onset[:] = onset
+        trial_turns[:] = turns
+        if _apply(trial, trial_onset, trial_turns, move, n_windows, may_turn):
+            _weigh(trial, trial_onset, trial_turns, tables, weighed)

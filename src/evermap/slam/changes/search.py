@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.slam.changes.climb import WORTH_KEEPING, climb_from_many_starts
+from evermap.slam.changes.climb import Tables, Weighed, climb_from_many_starts, weigh_neighbours
 from evermap.slam.changes.evidence import Comparison, Evidence
 from evermap.slam.changes.gain import hypothesis_gain
 from evermap.slam.changes.prior import ChangePrior
@@ -16,7 +16,11 @@ MOST_GROUPS = 4
 """Groups in one hypothesis, at most."""
 MOST_CANDIDATES = 40
 """Landmarks that may move in one search; in larger maps those that would gain most alone."""
-MOST_KEPT = 20_000
+NEAR = 5.0
+"""Hypotheses within this of the best [nats] have their neighbours weighed too, or their own weights would be too large;
+"""
+MOST_WIDENED = 30
+"""so many of them at most."""
 
 
 class Hypotheses(NamedTuple):
@@ -66,11 +70,7 @@ def find_changes(
     )
     if start is not None:
         label[:], onset[:], turns[:] = start.label[0, candidates], start.onset[0], start.turns[0]
-    kept_label = np.zeros((MOST_KEPT, count), np.int64)
-    kept_onset = np.zeros((MOST_KEPT, MOST_GROUPS + 1), np.int64)
-    kept_turns = np.zeros((MOST_KEPT, MOST_GROUPS + 1), bool)
-    kept_gain = np.full(MOST_KEPT + 1, -np.inf)
-    tables = (
+    tables = Tables(
         quadratic,
         linear,
         position[candidates],
@@ -78,17 +78,18 @@ def find_changes(
         prior.log_prior(len(np.unique(evidence.landmark)), count),
         prior.log_onset(n_windows),
     )
-    kept = climb_from_many_starts(
-        prior.p_rotated > 0.0, *tables, label, onset, turns, kept_label, kept_onset, kept_turns, kept_gain
+    may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, MOST_GROUPS)
+    climb_from_many_starts(may_turn, tables, label, onset, turns, weighed)
+    near = weighed.ranked
+    for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
+        weigh_neighbours(weighed.label[k], weighed.onset[k], weighed.turns[k], may_turn, tables, weighed)
+    ranked = weighed.ranked
+    labels = np.zeros((len(ranked), len(position)), np.int64)
+    labels[:, candidates] = weighed.label[ranked]
+    motion = np.array(
+        [hypothesis_gain(weighed.label[k], weighed.onset[k], weighed.turns[k], *tables)[1] for k in ranked]
     )
-    worth = np.flatnonzero(kept_gain[:kept] > kept_gain[-1] - WORTH_KEEPING)
-    rows = np.column_stack([kept_label[worth], kept_onset[worth], kept_turns[worth]])
-    first = worth[np.unique(rows, axis=0, return_index=True)[1]]
-    first = first[np.argsort(-kept_gain[first], kind="stable")]
-    labels = np.zeros((len(first), len(position)), np.int64)
-    labels[:, candidates] = kept_label[first]
-    motion = np.array([hypothesis_gain(kept_label[k], kept_onset[k], kept_turns[k], *tables)[1] for k in first])
-    return Hypotheses(labels, kept_onset[first], kept_turns[first], motion, kept_gain[first])
+    return Hypotheses(labels, weighed.onset[ranked], weighed.turns[ranked], motion, weighed.gain[ranked])
 
 
 def _candidates(
