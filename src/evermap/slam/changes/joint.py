@@ -22,7 +22,7 @@ from evermap.slam.changes.timing import parting_time
 from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Revision, Rival
 from evermap.slam.noise import START
-from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.problem import Estimate, Noise, Problem, independent
 from evermap.slam.triangulate import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
@@ -31,8 +31,8 @@ RIVAL_NATS = 5.0
 MOST_RIVALS = 2
 DISAGREEMENT = 4.0
 """Chi-square over its degrees of freedom above which a map without changes does not explain what was seen."""
-HELD_INFORMATION = 1e8
-"""Without a map the first pose is held where it was, to 0.1 mm: where all of it lies is not what is asked."""
+LOOSE_MAP_M = 1.0
+"""Standard deviation of a map that bends nothing, but keeps what little is known of near where the map has it."""
 SWAP_SOFTNESS_M = 0.02
 """Error that the sightings of a window share, while it is decided which identities are swapped."""
 ROUNDS = 6
@@ -82,22 +82,21 @@ class Joint:
         return current
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """Without the prior map: one that is wrong bends the solution, and what it cannot bend looks like noise."""
+        """With the map believed to a metre: one that is wrong bends the solution, or makes it look noisy."""
         self._held = problem
-        if not self._in_map(problem):
+        if self._given is None or not self._in_map(problem):
             return problem, estimate
         free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
-            start_pose=estimate.pose[0],
-            start_information=HELD_INFORMATION,
-            landmark_mean=np.zeros((self._count, 2)),
-            landmark_information=np.zeros((2 * self._count, 2 * self._count)),
+            landmark_mean=self._given.mean,
+            landmark_information=independent(self._given.given[:, None, None] * np.eye(2) / LOOSE_MAP_M**2),
         )
         start = in_sensor_metres(self._first_places(estimate), self._calibration)
-        # what the map puts in the wrong place is where most of its sightings say
-        smoother = Smoother(free, START, heavy=True, robust=self._robust)
-        return free, outvoted(free, start, smoother.inlier_probability(start))
+        # what the map puts in the wrong place is where most of its sightings say, whatever the map
+        weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
+        unmapped = replace(free, landmark_information=np.zeros_like(free.landmark_information))
+        return free, outvoted(unmapped, start, weights)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Search at the present estimate, and again at what it leads to where the session ends."""

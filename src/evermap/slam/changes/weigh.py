@@ -7,6 +7,7 @@ evidence together with the changes: an unexplained change makes both look bad.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from evermap.slam.changes.explain import GivenMap, Group
 from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.changes.robust import without_transients
 from evermap.slam.changes.search import Hypotheses, find_changes
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """By which the standard deviations of the map may be wrong."""
@@ -102,7 +103,7 @@ def weigh(
         improved = tried(*best) > tried(factor, softness)
         if improved:
             factor, softness = best
-    return _verdict(list(trials.values()), trials[factor, softness], _first_windows(evidence, len(given.mean)))
+    return _verdict(list(trials.values()), trials[factor, softness], _Seen.of(evidence, given))
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,21 +153,34 @@ def _try(
     return _Trial(factor, softness, comparison, hypotheses, base)
 
 
-def _first_windows(evidence: Evidence, count: int) -> IntArray:
-    """(L,) the window in which every landmark was seen first."""
-    first = np.full(count, np.iinfo(np.int64).max)
-    np.minimum.at(first, evidence.landmark, evidence.window)
-    return first
+class _Seen(NamedTuple):
+    """First and last window (L,) in which every landmark was seen, and whether the map holds it."""
+
+    first: IntArray
+    last: IntArray
+    given: BoolArray
+
+    @classmethod
+    def of(cls, evidence: Evidence, given: GivenMap) -> _Seen:
+        first = np.full(len(given.mean), np.iinfo(np.int64).max)
+        last = np.full(len(given.mean), -1)
+        np.minimum.at(first, evidence.landmark, evidence.window)
+        np.maximum.at(last, evidence.landmark, evidence.window)
+        return cls(first, last, given.given)
+
+    def shows(self, members: IntArray, window: int) -> BoolArray:
+        """Whether each would show that it has moved from a window on: known from before, and seen since."""
+        return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
-def _verdict(trials: list[_Trial], best: _Trial, first_window: IntArray) -> Verdict:
+def _verdict(trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
     leader: dict[_Key, tuple[float, tuple[Group, ...]]] = {}
     for trial in trials:
         for row, gain in enumerate(trial.hypotheses.gain):
-            key, groups = _groups(trial.hypotheses, row, first_window)
+            key, groups = _groups(trial.hypotheses, row, seen)
             log_weight = trial.base + float(gain) - top
             weight[key] = weight.get(key, 0.0) + float(np.exp(log_weight))
             if key not in leader or log_weight > leader[key][0]:
@@ -189,14 +203,16 @@ def _verdict(trials: list[_Trial], best: _Trial, first_window: IntArray) -> Verd
 _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
-def _groups(hypotheses: Hypotheses, row: int, first_window: IntArray) -> tuple[_Key, tuple[Group, ...]]:
+def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[Group, ...]]:
     """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
     label = hypotheses.label[row]
     groups = []
     for g in range(1, int(label.max()) + 1):
-        members = np.flatnonzero(label == g)
-        window = int(hypotheses.onset[row, g])
-        if np.all(first_window[members] >= window):  # nobody saw them before: as well before the session
+        members, window = np.flatnonzero(label == g), int(hypotheses.onset[row, g])
+        members = members[seen.shows(members, window)]  # of the others nothing can be said
+        if len(members) == 0:
+            continue
+        if np.all(seen.first[members] >= window):  # nobody saw them before: as well before the session
             window = 0
         groups.append(Group(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window))
     key = tuple((tuple(int(j) for j in group.members), group.window > 0) for group in groups)
