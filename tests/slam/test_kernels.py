@@ -26,6 +26,7 @@ from evermap.slam.kernels import (
     NOISE_NAMES,
     detection_residual,
     inlier_weight,
+    invert_3x3,
     odometry_residual,
     outlier_loss,
 )
@@ -341,3 +342,26 @@ def test_silence_makes_the_covariance_grow_with_its_length():
     assert across.increment[2] == pytest.approx(0.1 * (22.0 - silent))
     eigenvalues = np.linalg.eigvalsh(across.covariance(np.full(5, 1e-4)))
     assert eigenvalues.min() > 0
+
+
+@patiently
+@given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6), st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
+def test_inverse_of_three_by_three_is_numpys(below, log_scale):
+    root = np.zeros((3, 3))
+    root[np.tril_indices(3)] = below
+    root[np.diag_indices(3)] = 0.5 + np.abs(np.diag(root))
+    scale = np.diag(10.0 ** np.array(log_scale))
+    matrix = scale @ root @ root.T @ scale
+    expected = np.linalg.inv(scale) @ np.linalg.inv(root @ root.T) @ np.linalg.inv(scale)
+    found = np.full((3, 3), 7.0)
+    invert_3x3(matrix, found)
+    assert scale @ found @ scale == pytest.approx(scale @ expected @ scale, rel=1e-9, abs=1e-9)
+    invert_3x3(matrix, matrix)
+    assert np.array_equal(matrix, found)
+
+
+@pytest.mark.parametrize("turn", [-2.0, -0.05, 0.0499, 1e-3, 1e-7, 0.0, 0.0501, 3.0])
+def test_increment_of_a_turn_by_series_and_by_sines_is_the_exponential(turn):
+    drive = Drive(np.array([0.0, 1.0]), np.tile([0.7, -0.2, turn / 0.1], (2, 1)), np.zeros(2))
+    out = integrated(drive, 0.2, 0.3, default_prior().mean)
+    assert out.increment == pytest.approx(se2.exp(np.array([0.07, -0.02, turn])), abs=1e-14)

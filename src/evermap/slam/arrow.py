@@ -16,14 +16,16 @@ from evermap.errors import DataError, NumericalError
 from evermap.slam.kernels import (
     detection_residual,
     inlier_weight,
-    integrate_odometry,
     inverse_of,
+    invert_3x3,
     kernel,
+    odometry_covariance,
     odometry_residual,
     outlier_loss,
     residual_by_states,
     wrapped,
 )
+from evermap.slam.preintegration import Intervals
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import BoolArray, FloatArray
 
@@ -79,14 +81,17 @@ def _add(target: FloatArray, a: FloatArray, b: FloatArray, weight: FloatArray) -
 
 
 @kernel
+def _dot(a: Any, column: int, b: Any, other: int) -> Any:
+    """One entry of `a' b` for matrices of three rows."""
+    return a[0, column] * b[0, other] + a[1, column] * b[1, other] + a[2, column] * b[2, other]
+
+
+@kernel
 def assemble(
     pose: FloatArray,
     landmark: FloatArray,
     states: FloatArray,
-    stamp: FloatArray,
-    odometry_stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
+    driven: Intervals,
     pose_row: Any,
     landmark_row: Any,
     reading: FloatArray,
@@ -116,28 +121,39 @@ def assemble(
     weights = np.zeros(len(pose_row))
     cost = 0.0
 
-    increment, motion, noise, covariance = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
-    e, j1, j2 = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
+    covariance, information, e, pull = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    j1, j2, motion = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))
+    j, weighted = np.zeros((3, 10)), np.zeros((3, 10))
     for i in range(n - 1):
-        integrate_odometry(
-            odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, increment, motion, noise, covariance
-        )
-        for kind in range(len(variance)):
-            covariance += variance[kind] * noise[kind]
-        information = inverse_of(covariance)
-        odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
+        odometry_covariance(driven.noise[i], driven.floor[i], variance, covariance)
+        invert_3x3(covariance, information)
+        odometry_residual(pose[i], pose[i + 1], driven.increment[i], e, j1, j2)
+        motion[:] = driven.by_states[i]
         residual_by_states(motion, e, free)
-        _add(diagonal[i], j1, j1, information)
-        _add(diagonal[i + 1], j2, j2, information)
-        _add(off[i], j2, j1, information)
-        _add(border[i, :, at_motion:], j1, motion, information)
-        _add(border[i + 1, :, at_motion:], j2, motion, information)
-        _add(corner[at_motion:, at_motion:], motion, motion, information)
-        pull = information @ e
-        cost += 0.5 * np.dot(e, pull)
-        right_pose[i] -= j1.T @ pull
-        right_pose[i + 1] -= j2.T @ pull
-        right_shared[at_motion:] -= motion.T @ pull
+        for a in range(3):
+            for b in range(3):
+                j[a, b], j[a, 3 + b] = j1[a, b], j2[a, b]
+            for b in range(4):
+                j[a, 6 + b] = motion[a, b]
+            pull[a] = information[a, 0] * e[0] + information[a, 1] * e[1] + information[a, 2] * e[2]
+            cost += 0.5 * e[a] * pull[a]
+        for a in range(3):
+            for b in range(10):
+                weighted[a, b] = information[a, 0] * j[0, b] + information[a, 1] * j[1, b] + information[a, 2] * j[2, b]
+        for a in range(3):
+            for b in range(3):
+                diagonal[i, a, b] += _dot(j, a, weighted, b)
+                diagonal[i + 1, a, b] += _dot(j, 3 + a, weighted, 3 + b)
+                off[i, a, b] = _dot(j, 3 + a, weighted, b)
+            for b in range(4):
+                border[i, a, at_motion + b] += _dot(j, a, weighted, 6 + b)
+                border[i + 1, a, at_motion + b] += _dot(j, 3 + a, weighted, 6 + b)
+            right_pose[i, a] -= j[0, a] * pull[0] + j[1, a] * pull[1] + j[2, a] * pull[2]
+            right_pose[i + 1, a] -= j[0, 3 + a] * pull[0] + j[1, 3 + a] * pull[1] + j[2, 3 + a] * pull[2]
+        for a in range(4):
+            for b in range(4):
+                corner[at_motion + a, at_motion + b] += _dot(j, 6 + a, weighted, 6 + b)
+            right_shared[at_motion + a] -= j[0, 6 + a] * pull[0] + j[1, 6 + a] * pull[1] + j[2, 6 + a] * pull[2]
 
     z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     information2 = np.zeros((2, 2))
@@ -199,49 +215,88 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
     Eliminates pose after pose (block Cholesky of the chain), solves the border's Schur complement, and returns along
     the chain.
     """
-    diagonal, off, border = normal.diagonal.copy(), normal.off, normal.border.copy()
-    corner, right_pose, right_shared = normal.corner.copy(), normal.right_pose.copy(), normal.right_shared
-    n, shared = len(diagonal), len(corner)
-    inverse = np.zeros((n, 3, 3))
-    gain = np.zeros((n, 3, shared))
+    off = normal.off
+    n, shared = len(normal.diagonal), len(normal.corner)
+    inverse, factor, block = np.empty((n, 3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    border, gain = np.empty((n, 3, shared)), np.empty((n, 3, shared))
+    right = np.empty((n, 3))
+    corner = normal.corner.copy()
     for k in range(shared):
         corner[k, k] *= 1.0 + damping
     for i in range(n):
-        for k in range(3):
-            diagonal[i, k, k] *= 1.0 + damping
+        block[:] = normal.diagonal[i]
+        for a in range(3):
+            block[a, a] *= 1.0 + damping
+            right[i, a] = normal.right_pose[i, a]
+            for k in range(shared):
+                border[i, a, k] = normal.border[i, a, k]
         if i > 0:
-            factor = off[i - 1] @ inverse[i - 1]
-            diagonal[i] -= factor @ off[i - 1].T
-            border[i] -= factor @ border[i - 1]
-            right_pose[i] -= factor @ right_pose[i - 1]
-        inverse[i] = inverse_of(diagonal[i])
-        gain[i] = inverse[i] @ border[i]
+            _multiply(off[i - 1], inverse[i - 1], factor)
+            for a in range(3):
+                f0, f1, f2 = factor[a, 0], factor[a, 1], factor[a, 2]
+                for b in range(3):
+                    block[a, b] -= f0 * off[i - 1, b, 0] + f1 * off[i - 1, b, 1] + f2 * off[i - 1, b, 2]
+                right[i, a] -= f0 * right[i - 1, 0] + f1 * right[i - 1, 1] + f2 * right[i - 1, 2]
+                for k in range(shared):
+                    border[i, a, k] -= f0 * border[i - 1, 0, k] + f1 * border[i - 1, 1, k] + f2 * border[i - 1, 2, k]
+        invert_3x3(block, inverse[i])
+        _multiply(inverse[i], border[i], gain[i])
     flat_border, flat_gain = border.reshape(3 * n, shared), gain.reshape(3 * n, shared)
     schur: FloatArray = corner - flat_border.T @ flat_gain
-    rest = right_shared - flat_gain.T @ right_pose.reshape(3 * n)
+    rest = normal.right_shared - flat_gain.T @ right.reshape(3 * n)
     step_shared: Any = np.linalg.solve(schur, rest)
-    step_pose = np.zeros((n, 3))
+    step_pose = -(flat_gain @ step_shared).reshape(n, 3)
     for i in range(n - 1, -1, -1):
-        right = right_pose[i].copy()
+        r0, r1, r2 = right[i, 0], right[i, 1], right[i, 2]
         if i < n - 1:
-            right -= off[i].T @ step_pose[i + 1]
-        step_pose[i] = inverse[i] @ right - gain[i] @ step_shared
+            x, y, turn = step_pose[i + 1, 0], step_pose[i + 1, 1], step_pose[i + 1, 2]
+            r0 -= off[i, 0, 0] * x + off[i, 1, 0] * y + off[i, 2, 0] * turn
+            r1 -= off[i, 0, 1] * x + off[i, 1, 1] * y + off[i, 2, 1] * turn
+            r2 -= off[i, 0, 2] * x + off[i, 1, 2] * y + off[i, 2, 2] * turn
+        for a in range(3):
+            step_pose[i, a] += inverse[i, a, 0] * r0 + inverse[i, a, 1] * r1 + inverse[i, a, 2] * r2
     if not covariances:
         empty2, empty3 = np.zeros((0, 0)), np.zeros((0, 3, 3))
         return Solution(step_pose, step_shared, empty3, empty3, empty3, empty2)
     cov_shared = inverse_of(schur)
-    cov_pose = np.zeros((n, 3, 3))
+    cov_pose = np.empty((n, 3, 3))
     cov_next = np.zeros((n, 3, 3))
-    cross = (flat_gain @ cov_shared).reshape(n, 3, shared)
+    cross = -(flat_gain @ cov_shared).reshape(n, 3, shared)
+    back = factor
     for i in range(n - 1, -1, -1):
-        cross[i] = -cross[i]
-        cov_pose[i] = inverse[i] - cross[i] @ gain[i].T
+        cov_pose[i] = inverse[i]
         if i < n - 1:
-            back = inverse[i] @ off[i].T
-            cross[i] -= back @ cross[i + 1]
-            cov_next[i] = -back @ cov_pose[i + 1] - gain[i] @ cross[i + 1].T
-            cov_pose[i] = inverse[i] - cov_next[i] @ back.T - cross[i] @ gain[i].T
+            _multiply(inverse[i], off[i].T, back)
+            for a in range(3):
+                b0, b1, b2 = back[a, 0], back[a, 1], back[a, 2]
+                for k in range(shared):
+                    cross[i, a, k] -= b0 * cross[i + 1, 0, k] + b1 * cross[i + 1, 1, k] + b2 * cross[i + 1, 2, k]
+            for a in range(3):
+                for b in range(3):
+                    total = 0.0
+                    for m in range(3):
+                        total += back[a, m] * cov_pose[i + 1, m, b]
+                    for k in range(shared):
+                        total += gain[i, a, k] * cross[i + 1, b, k]
+                    cov_next[i, a, b] = -total
+            for a in range(3):
+                for b in range(3):
+                    for m in range(3):
+                        cov_pose[i, a, b] -= cov_next[i, a, m] * back[b, m]
+        for a in range(3):
+            for b in range(3):
+                for k in range(shared):
+                    cov_pose[i, a, b] -= cross[i, a, k] * gain[i, b, k]
     return Solution(step_pose, step_shared, cov_pose, cov_next, cross, cov_shared)
+
+
+@kernel
+def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """A (3, 3) times a (3, n), without a temporary."""
+    for i in range(3):
+        a0, a1, a2 = a[i, 0], a[i, 1], a[i, 2]
+        for k in range(b.shape[1]):
+            out[i, k] = a0 * b[0, k] + a1 * b[1, k] + a2 * b[2, k]
 
 
 @kernel
@@ -361,10 +416,7 @@ class Smoother:
             estimate.pose,
             estimate.landmark[known],
             estimate.states,
-            problem.stamp_s,
-            problem.drive.stamp_s,
-            problem.drive.velocity,
-            problem.drive.unknown,
+            problem.drive.between(problem.stamp_s, estimate.states),
             problem.pose_row,
             rank[problem.landmark_row],
             problem.reading,

@@ -33,9 +33,6 @@ FLOOR_VARIANCE = 1e-8
 """And once for every interval, however short: 0.1 mm and 0.1 mrad."""
 MAX_STEP_S = 0.1
 
-_AXIS = np.array([0, 0, 1, 2, 2])  # forward, lateral, turn
-_DRIVER = np.array([1, 2, 1, 0, 2])  # time, distance, angle
-
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -52,6 +49,22 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
     """Inverse of a small matrix, row after row in memory as all others."""
     inverted: Any = np.linalg.inv(matrix)
     return np.ascontiguousarray(inverted)
+
+
+@kernel
+def invert_3x3(matrix: FloatArray, out: FloatArray) -> None:
+    """Inverse of a symmetric positive definite (3, 3) by its factors `L D L'`, without a temporary; may be in place."""
+    a, b, c, f = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[2, 2]
+    l10, l20 = b / a, c / a
+    d1, rest = matrix[1, 1] - l10 * b, matrix[1, 2] - l20 * b
+    l21 = rest / d1
+    d2 = f - l20 * c - l21 * rest
+    m20 = l10 * l21 - l20
+    i02, i12 = m20 / d2, -l21 / d2
+    out[0, 0], out[1, 1], out[2, 2] = 1.0 / a + l10 * l10 / d1 + m20 * i02, 1.0 / d1 - l21 * i12, 1.0 / d2
+    out[0, 1] = out[1, 0] = -l10 / d1 - l21 * i02
+    out[0, 2] = out[2, 0] = i02
+    out[1, 2] = out[2, 1] = i12
 
 
 @kernel
@@ -92,42 +105,41 @@ def integrate_odometry(
     end = stop + delay
     count = len(stamp)
     row = max(np.searchsorted(stamp, begin, side="right") - 1, 0)
-    x = y = theta = 0.0
-    jacobian[:] = 0.0
-    noise[:] = 0.0
-    floor[:] = 0.0
     turn_abs = abs(velocity[row, 2])
     first_v = scale_v * velocity[row, 0] - slip * turn_abs
     first_l = scale_v * velocity[row, 1]
     first_w = scale_w * velocity[row, 2]
     v, left, w = first_v, first_l, first_w
-    now = begin
+    x = y = theta = 0.0
     ct, st = 1.0, 0.0
-    # all sums are over twists seen from the start: one transformation at the end instead of one a step
-    column, product = np.zeros((3, 3)), np.zeros((3, 3))
+    # All sums are over twists seen from the start, one transformation at the end instead of one a step, and in scalars:
+    # derivatives by forward scale, turn scale and slip,
+    scale_x = scale_y = turn_x = turn_y = slip_x = slip_y = angle = 0.0
+    # squares of the forward twist by distance and by angle (the lateral one is the same, turned by 90 degrees),
+    f_xx = f_xy = f_yy = g_xx = g_xy = g_yy = 0.0
+    # squares of the turning twist by time, by angle and by what is unknown, and of the other two for the floor
+    t_xx = t_xy = t_yy = t_x = t_y = 0.0
+    a_xx = a_xy = a_yy = a_x = a_y = a_t = 0.0
+    u_xx = u_xy = u_yy = u_x = u_y = u_t = 0.0
+    even = 0.0
+    now = begin
     while now < end:
         until = end if row + 1 >= count else min(end, stamp[row + 1])
         if until > now:
             reported_v, reported_l, reported_w = velocity[row, 0], velocity[row, 1], velocity[row, 2]
             turn_abs = abs(reported_w)
-            speed = math.sqrt(reported_v * reported_v + reported_l * reported_l)
             v = scale_v * reported_v - slip * turn_abs
             left = scale_v * reported_l
             w = scale_w * reported_w
-            pieces = max(1, math.ceil((until - now) / MAX_STEP_S))
-            h = (until - now) / pieces
+            extra = unknown[row]
+            pieces, h = 1, until - now
+            if h > MAX_STEP_S:
+                pieces = math.ceil(h / MAX_STEP_S)
+                h /= pieces
+            by_distance, by_angle = h * math.sqrt(reported_v * reported_v + reported_l * reported_l), h * turn_abs
             turn = w * h
-            c, s = math.cos(turn), math.sin(turn)
-            if abs(turn) < 1e-4:
-                sin_by = 1.0 - turn * turn / 6.0
-                cos_by = 0.5 * turn
-                sin_by2 = turn / 6.0
-                cos_by2 = 0.5 - turn * turn / 24.0
-            else:
-                sin_by = s / turn
-                cos_by = (1.0 - c) / turn
-                sin_by2 = (turn - s) / (turn * turn)
-                cos_by2 = (1.0 - c) / (turn * turn)
+            sin_by, cos_by, sin_by2, cos_by2 = _of_turn(turn)
+            c, s = 1.0 - cos_by * turn, sin_by * turn
             step_x = (sin_by * v - cos_by * left) * h
             step_y = (cos_by * v + sin_by * left) * h
             # right Jacobian of the exponential: from a change of the twist to a change of the step, seen at its end
@@ -137,67 +149,102 @@ def integrate_odometry(
                 y += st * step_x + ct * step_y
                 ct, st = ct * c - st * s, st * c + ct * s
                 theta += turn
-                column[0, 0], column[0, 1] = ct * sin_by + st * cos_by, st * sin_by - ct * cos_by
-                column[1, 0], column[1, 1] = ct * cos_by - st * sin_by, st * cos_by + ct * sin_by
-                column[2, 0] = ct * by_turn_x - st * by_turn_y + y
-                column[2, 1] = st * by_turn_x + ct * by_turn_y - x
-                column[2, 2] = 1.0
-                for k in range(2):
-                    jacobian[k, 1] += (column[0, k] * reported_v + column[1, k] * reported_l) * h
-                    jacobian[k, 2] += column[2, k] * reported_w * h
-                    jacobian[k, 3] -= column[0, k] * turn_abs * h
-                jacobian[2, 2] += reported_w * h
-                for axis in range(3):
-                    base = FLOOR_TURN_RAD if axis == 2 else FLOOR_FORWARD_M
-                    always = h * (base * base + unknown[row])
-                    for i in range(3):
-                        for j in range(i + 1):
-                            product[i, j] = column[axis, i] * column[axis, j]
-                            floor[i, j] += always * product[i, j]
-                    for kind in range(N_NOISE):
-                        if _AXIS[kind] != axis:
-                            continue
-                        driver = _DRIVER[kind]
-                        amount = h if driver == 0 else (h * speed if driver == 1 else h * turn_abs)
-                        for i in range(3):
-                            for j in range(i + 1):
-                                noise[kind, i, j] += amount * product[i, j]
+                fx, fy = ct * sin_by + st * cos_by, st * sin_by - ct * cos_by
+                tx, ty = ct * by_turn_x - st * by_turn_y + y, st * by_turn_x + ct * by_turn_y - x
+                scale_x += (fx * reported_v - fy * reported_l) * h
+                scale_y += (fy * reported_v + fx * reported_l) * h
+                turn_x += tx * reported_w * h
+                turn_y += ty * reported_w * h
+                angle += reported_w * h
+                slip_x -= fx * by_angle
+                slip_y -= fy * by_angle
+                xx, xy, yy = fx * fx, fx * fy, fy * fy
+                f_xx, f_xy, f_yy = f_xx + by_distance * xx, f_xy + by_distance * xy, f_yy + by_distance * yy
+                g_xx, g_xy, g_yy = g_xx + by_angle * xx, g_xy + by_angle * xy, g_yy + by_angle * yy
+                even += h * (FLOOR_FORWARD_M * FLOOR_FORWARD_M + extra) * (xx + yy)
+                xx, xy, yy = tx * tx, tx * ty, ty * ty
+                t_xx, t_xy, t_yy, t_x, t_y = t_xx + h * xx, t_xy + h * xy, t_yy + h * yy, t_x + h * tx, t_y + h * ty
+                a_xx, a_xy, a_yy = a_xx + by_angle * xx, a_xy + by_angle * xy, a_yy + by_angle * yy
+                a_x, a_y, a_t = a_x + by_angle * tx, a_y + by_angle * ty, a_t + by_angle
+                if extra > 0.0:
+                    more = h * extra
+                    u_xx, u_xy, u_yy = u_xx + more * xx, u_xy + more * xy, u_yy + more * yy
+                    u_x, u_y, u_t = u_x + more * tx, u_y + more * ty, u_t + more
         now = until
         if row + 1 < count and until >= stamp[row + 1]:
             row += 1
+    increment[0], increment[1], increment[2] = x, y, theta
     c, s = math.cos(theta), math.sin(theta)
     # adjoint of the inverse increment: what is seen from the start, seen from the end
     lever_x, lever_y = s * x - c * y, c * x + s * y
-    _carry(jacobian, c, s, lever_x, lever_y)
-    for kind in range(N_NOISE):
-        _carry_covariance(noise[kind], c, s, lever_x, lever_y)
-    _carry_covariance(floor, c, s, lever_x, lever_y)
-    for axis in range(3):
-        floor[axis, axis] += FLOOR_VARIANCE
-    increment[0], increment[1], increment[2] = x, y, theta
     # a later window gains the last velocity at its end and loses the first at its start
-    jacobian[0, 0] = v - (c * first_v + s * first_l + (s * x - c * y) * first_w)
-    jacobian[1, 0] = left - (-s * first_v + c * first_l + (c * x + s * y) * first_w)
+    jacobian[0, 0] = v - (c * first_v + s * first_l + lever_x * first_w)
+    jacobian[1, 0] = left - (-s * first_v + c * first_l + lever_y * first_w)
     jacobian[2, 0] = w - first_w
-
-
-@kernel
-def _carry(columns: FloatArray, c: float, s: float, lever_x: float, lever_y: float) -> None:
-    """Columns of perturbations before a step, as perturbations after it."""
-    for k in range(columns.shape[1]):
-        a, b, t = columns[0, k], columns[1, k], columns[2, k]
-        columns[0, k] = c * a + s * b + lever_x * t
-        columns[1, k] = -s * a + c * b + lever_y * t
-
-
-@kernel
-def _carry_covariance(p: FloatArray, c: float, s: float, lever_x: float, lever_y: float) -> None:
-    """The same for a covariance of which the lower half is given."""
+    jacobian[0, 1], jacobian[1, 1], jacobian[2, 1] = c * scale_x + s * scale_y, -s * scale_x + c * scale_y, 0.0
+    jacobian[0, 2] = c * turn_x + s * turn_y + lever_x * angle
+    jacobian[1, 2] = -s * turn_x + c * turn_y + lever_y * angle
+    jacobian[2, 2] = angle
+    jacobian[0, 3], jacobian[1, 3], jacobian[2, 3] = c * slip_x + s * slip_y, -s * slip_x + c * slip_y, 0.0
+    seconds = max(end - begin, 0.0)
+    _carried(noise[0], f_xx, f_xy, f_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carried(noise[1], g_xx, g_xy, g_yy, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carried(noise[2], f_yy, -f_xy, f_xx, 0.0, 0.0, 0.0, c, s, lever_x, lever_y)
+    _carried(noise[3], t_xx, t_xy, t_yy, t_x, t_y, seconds, c, s, lever_x, lever_y)
+    _carried(noise[4], a_xx, a_xy, a_yy, a_x, a_y, a_t, c, s, lever_x, lever_y)
+    _carried(floor, u_xx + even, u_xy, u_yy + even, u_x, u_y, u_t, c, s, lever_x, lever_y)
     for i in range(3):
-        for j in range(i):
-            p[j, i] = p[i, j]
-    _carry(p, c, s, lever_x, lever_y)
-    _carry(p.T, c, s, lever_x, lever_y)
+        for j in range(3):
+            floor[i, j] += FLOOR_TURN_RAD * FLOOR_TURN_RAD * noise[3, i, j]
+        floor[i, i] += FLOOR_VARIANCE
+
+
+@kernel
+def odometry_covariance(noise: FloatArray, floor: FloatArray, variance: FloatArray, out: FloatArray) -> None:
+    """Covariance (3, 3) of an interval: `floor` and what (5,) variances make of `noise` (5, 3, 3)."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = floor[i, j]
+            for kind in range(N_NOISE):
+                total += variance[kind] * noise[kind, i, j]
+            out[i, j] = out[j, i] = total
+
+
+@kernel
+def _of_turn(turn: float) -> tuple[float, float, float, float]:
+    """`sin(a) / a`, `(1 - cos(a)) / a`, `(a - sin(a)) / a^2`, `(1 - cos(a)) / a^2`; by series where `a` is small."""
+    if abs(turn) > 0.05:
+        c, s = math.cos(turn), math.sin(turn)
+        return s / turn, (1.0 - c) / turn, (turn - s) / (turn * turn), (1.0 - c) / (turn * turn)
+    q = turn * turn
+    to_sin = 1.0 / 6.0 - q * (1.0 / 120.0 - q / 5040.0)
+    cos_by2 = 0.5 - q * (1.0 / 24.0 - q * (1.0 / 720.0 - q / 40320.0))
+    return 1.0 - q * to_sin, turn * cos_by2, turn * to_sin, cos_by2
+
+
+@kernel
+def _carried(
+    out: FloatArray,
+    xx: float,
+    xy: float,
+    yy: float,
+    xt: float,
+    yt: float,
+    tt: float,
+    c: float,
+    s: float,
+    lever_x: float,
+    lever_y: float,
+) -> None:
+    """A covariance of perturbations before a step, as one of perturbations after it."""
+    x_x, x_y, x_t = c * xx + s * xy + lever_x * xt, c * xy + s * yy + lever_x * yt, c * xt + s * yt + lever_x * tt
+    y_x, y_y, y_t = c * xy - s * xx + lever_y * xt, c * yy - s * xy + lever_y * yt, c * yt - s * xt + lever_y * tt
+    out[0, 0] = x_x * c + x_y * s + x_t * lever_x
+    out[1, 1] = y_y * c - y_x * s + y_t * lever_y
+    out[0, 1] = out[1, 0] = x_y * c - x_x * s + x_t * lever_y
+    out[0, 2] = out[2, 0] = x_t
+    out[1, 2] = out[2, 1] = y_t
+    out[2, 2] = tt
 
 
 @kernel

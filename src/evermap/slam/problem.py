@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.preintegration import Intervals, Preintegration
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SILENCE_S = 1.0
@@ -28,6 +29,11 @@ class Drive:
     stamp_s: FloatArray
     velocity: FloatArray
     unknown: FloatArray
+    _preintegration: Preintegration = field(init=False, repr=False, compare=False, default_factory=Preintegration)
+
+    def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
+        """Motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""
+        return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:

@@ -1,0 +1,83 @@
+"""Odometry between poses, integrated once for all who ask at the same calibration states.
+
+Between two changes of the calibration, neither the steps of the smoother's poses and landmarks nor its noise levels
+change what the odometry says of an interval: increment, derivatives, and covariance for unit noise of every kind
+(compare Forster et al. 2017, whose biases are our calibration states).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.slam.kernels import N_NOISE, integrate_odometry, kernel
+from evermap.types import FloatArray
+
+
+class Intervals(NamedTuple):
+    """Odometry of n intervals; see `kernels.integrate_odometry`.
+
+    Attributes:
+        increment: (n, 3) pose at the end seen from the start.
+        by_states: (n, 3, 4) its derivatives by delay, scales and slip.
+        noise: (n, 5, 3, 3) covariance for unit noise of each kind.
+        floor: (n, 3, 3) covariance that is always there.
+    """
+
+    increment: FloatArray
+    by_states: FloatArray
+    noise: FloatArray
+    floor: FloatArray
+
+
+class Preintegration:
+    """The intervals that were asked for last, and what they were integrated with."""
+
+    def __init__(self) -> None:
+        self._stamp_s = np.zeros(0)
+        self._motion_states = np.zeros(0)
+        self._intervals: Intervals | None = None
+
+    def between(
+        self, stamp_s: FloatArray, states: FloatArray, odometry: tuple[FloatArray, FloatArray, FloatArray]
+    ) -> Intervals:
+        """Intervals between consecutive poses.
+
+        Args:
+            stamp_s: (N,) instants of the poses.
+            states: (9,) calibration states.
+            odometry: stamps (n,), velocities (n, 3) and unknown variance (n,), the same at every call.
+        """
+        kept = self._intervals
+        if kept is not None and np.array_equal(self._motion_states, states[5:]):
+            first = int(np.searchsorted(self._stamp_s, stamp_s[0]))
+            if np.array_equal(self._stamp_s[first : first + len(stamp_s)], stamp_s):
+                rows = slice(first, first + len(stamp_s) - 1)
+                return Intervals(*(part[rows] for part in kept))
+        self._stamp_s, self._motion_states = stamp_s.copy(), states[5:].copy()
+        self._intervals = Intervals(*_integrate(stamp_s, *odometry, states))
+        return self._intervals
+
+
+@kernel
+def _integrate(
+    stamp: FloatArray, odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    n = len(stamp) - 1
+    increment, by_states = np.empty((n, 3)), np.empty((n, 3, 4))
+    noise, floor = np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3))
+    for i in range(n):
+        integrate_odometry(
+            odometry_stamp,
+            velocity,
+            unknown,
+            stamp[i],
+            stamp[i + 1],
+            states,
+            increment[i],
+            by_states[i],
+            noise[i],
+            floor[i],
+        )
+    return increment, by_states, noise, floor
