@@ -57,8 +57,11 @@ class Session:
         return Smoother(self.problem, self.world.noise, heavy=True).optimum(start, tolerance=1e-4)
 
     def revised(self, prior: ChangePrior | None = None) -> tuple[Joint, Revision]:
+        """What the method makes of the whole session, as the estimator asks it at the end."""
         method = Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangePrior())
-        return method, method.revise(self.problem, self.static, self.world.noise, heavy=False, final=True)
+        problem, estimate = method.unprejudiced(self.problem, self.static)
+        estimate = Smoother(problem, self.world.noise, heavy=True).optimum(estimate, tolerance=1e-4)
+        return method, method.revise(problem, estimate, self.world.noise, heavy=False, final=True)
 
 
 def make_session(

@@ -1,0 +1,89 @@
+"""A copy that is displaced alone is left out; what moved and stayed there is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from references import static_evidence
+
+from evermap.slam.changes.evidence import Evidence, compare
+from evermap.slam.changes.explain import GivenMap
+from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.robust import without_transients
+from evermap.slam.changes.search import find_changes
+from evermap.slam.changes.weigh import weigh
+
+PRIOR = ChangePrior()
+COUNT, WINDOWS = 6, 4
+SIGMA_M = 0.02
+
+
+def evidence_with(shift: np.ndarray, seed: int) -> tuple[Evidence, GivenMap]:
+    """Copies of six landmarks in four windows, displaced by `shift` (WINDOWS, COUNT, 2) and by noise."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-5.0, 5.0, (COUNT, 2))
+    plain = static_evidence(position, WINDOWS)
+    # the whole is free to be shifted, as from an unknown start
+    size = len(plain.pull)
+    shared = np.tile(np.eye(2), (size // 2, 1))
+    information = np.linalg.inv(SIGMA_M**2 * np.eye(size) + 100.0 * shared @ shared.T)
+    e = shift.reshape(-1, 2) + SIGMA_M * rng.normal(size=(size // 2, 2))
+    evidence = replace(plain, position=plain.position + e, information=information)
+    return evidence, GivenMap(position, np.tile(0.02**2 * np.eye(2), (COUNT, 1, 1)), np.ones(COUNT, bool))
+
+
+def dropped(evidence: Evidence, given: GivenMap) -> set[tuple[int, int]]:
+    """(landmark, window) of the copies left out."""
+
+    def search(evidence, start):
+        soft = evidence.softened(0.02)
+        comparison = compare(soft, given.mean, given.covariance, given.given)
+        return comparison, find_changes(soft, comparison, given.mean, WINDOWS, PRIOR, start=start)
+
+    kept = without_transients(evidence, given.mean, PRIOR, search)
+    left = set(zip(kept.landmark.tolist(), kept.window.tolist(), strict=True))
+    return set(zip(evidence.landmark.tolist(), evidence.window.tolist(), strict=True)) - left
+
+
+def none() -> np.ndarray:
+    return np.zeros((WINDOWS, COUNT, 2))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_nothing_displaced_nothing_dropped(seed: int) -> None:
+    assert dropped(*evidence_with(none(), seed)) == set()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("window", [0, 1, 2])
+def test_displaced_in_one_window_only(seed: int, window: int) -> None:
+    shift = none()
+    shift[window, 2] = [0.5, 0.3]
+    evidence, given = evidence_with(shift, seed)
+    assert dropped(evidence, given) == {(2, window)}
+    assert weigh(evidence, given, PRIOR, WINDOWS).groups == ()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("since", [0, 1, 2, 3])
+def test_lasting_moves_stay(seed: int, since: int) -> None:
+    shift = none()
+    shift[since:, [2, 4]] = [0.5, 0.3]
+    evidence, given = evidence_with(shift, seed)
+    assert dropped(evidence, given) == set()
+    verdict = weigh(evidence, given, PRIOR, WINDOWS)
+    assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([2, 4], since)]
+    np.testing.assert_allclose(verdict.groups[0].motion[:2], [0.5, 0.3], atol=0.06)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_transient_beside_a_lasting_move(seed: int) -> None:
+    shift = none()
+    shift[1:, [0, 4]] = [-0.4, 0.3]
+    shift[2, 3] = [0.6, 0.0]
+    evidence, given = evidence_with(shift, seed)
+    assert dropped(evidence, given) == {(3, 2)}
+    verdict = weigh(evidence, given, PRIOR, WINDOWS)
+    assert [(group.members.tolist(), group.window) for group in verdict.groups] == [([0, 4], 1)]
