@@ -106,7 +106,9 @@ def _draw_displacements(rows: Rows) -> Figure:
         panels = figure.subplots(len(sensors), len(datasets), sharex=True, squeeze=False)
         for across, sensor in zip(panels, sensors, strict=True):
             for axes, dataset in zip(across, datasets, strict=True):
-                _draw_over_delta(axes, chosen(rows, dataset=dataset, sensor=sensor))
+                own = chosen(rows, dataset=dataset, sensor=sensor)
+                axes.set_visible(bool(own))
+                _draw_over_delta(axes, own)
                 model = "our sensor model" if sensor == "ours" else "the paper's"
                 axes.set_title(f"data set {dataset}, {model}")
         for axes in panels[-1]:
@@ -180,4 +182,8 @@ def _draw_reliability(said: list[float], right: list[bool]) -> Figure:
     from evermap.viz.reliability_figure import plot_reliability
 
     truth = [float(value) for value in right]
-    return plot_reliability(reliability(said, truth), belief_scores(said, truth), title="changes reported by 'joint'")
+    figure = plot_reliability(reliability(said, truth), belief_scores(said, truth), title="changes reported by 'joint'")
+    above, below = figure.axes
+    above.set_ylabel("the very group [1]")
+    below.set(xlabel="probability said [1]", ylabel="changes")
+    return figure
