@@ -124,7 +124,8 @@ class Joint:
             self.verdict, self._groups = verdict, groups
             if not in_map and not groups and len(self._landmark) == self._count:
                 return Revision(problem, estimate, self._current())
-            believed = replace(given, covariance=given.covariance * verdict.map_factor**2)
+            # the search may find the map better than it says; the solution does not build on that
+            believed = replace(given, covariance=given.covariance * max(verdict.map_factor, 1.0) ** 2)
             start = _with_copies(self._first_places(estimate), evidence, groups)
             problem, start, self._landmark = explained(base, start, believed, groups, self._prior.spread)
             # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
