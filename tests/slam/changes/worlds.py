@@ -68,6 +68,7 @@ def make_session(
     seed: int,
     *moves: Move,
     sigma_map_m: float = 0.02,
+    map_factor: float = 1.0,
     unmapped: tuple[int, ...] = (),
     with_map: bool = True,
     n_poses: int = 240,
@@ -75,7 +76,10 @@ def make_session(
     p_seen: float = 0.3,
     **options: object,
 ) -> Session:
-    """A robot that goes round in the middle of landmarks; the map has them where they were before all `moves`."""
+    """A robot that goes round in the middle of landmarks; the map has them where they were before all `moves`.
+
+    Its errors are `map_factor` times what it says.
+    """
     world = make_world(
         seed, n_poses=n_poses, n_landmarks=n_landmarks, p_seen=p_seen, turn_radps=0.4, reach=0.4, **options  # type: ignore[arg-type]
     )  # fmt: skip
@@ -102,7 +106,7 @@ def make_session(
     given = None
     if with_map:
         held = ~np.isin(np.arange(n_landmarks), unmapped)
-        mean = np.where(held[:, None], old + sigma_map_m * rng.normal(size=old.shape), 0.0)
+        mean = np.where(held[:, None], old + map_factor * sigma_map_m * rng.normal(size=old.shape), 0.0)
         given = GivenMap(mean, np.tile(sigma_map_m**2 * np.eye(2), (n_landmarks, 1, 1)), held)
         information = independent(np.where(held[:, None, None], np.eye(2) / sigma_map_m**2, 0.0))
         problem = replace(

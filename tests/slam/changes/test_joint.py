@@ -1,0 +1,173 @@
+"""The joint search on simulated sessions: what is found, when, and what the estimate is worth then.
+
+Every scene is run with many seeds, and how often it comes out right is asserted as measured, not as hoped for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
+
+from evermap.slam.arrow import Smoother
+from evermap.slam.changes.explain import GivenMap, Group, explained
+from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.method import Revision
+from evermap.types import ChangeKind, MapChange
+
+BEFORE = Move((1, 2, 5), (0.3, -0.2))
+WITHIN = Move((1, 2, 5), (0.3, -0.2), at_s=100.3)
+SECOND = Move((3, 7), (-0.3, -0.3))
+TURNED = Move((1, 2, 3), (0.3, -0.2), turn_rad=0.4)
+
+
+def is_found(change: MapChange, move: Move) -> bool:
+    """The very group, kind and time, to within 10 s."""
+    if change.landmark_ids != move.members:
+        return False
+    if change.kind != (ChangeKind.ROTATED if move.turn_rad else ChangeKind.MOVED):
+        return False
+    if move.at_s is None:
+        return bool(np.isnan(change.stamp_from_s))
+    return change.stamp_from_s - 10.0 <= move.at_s <= change.stamp_to_s + 10.0
+
+
+def all_found(changes: tuple[MapChange, ...], *moves: Move) -> bool:
+    """Every move, and nothing else."""
+    return len(changes) == len(moves) and all(any(is_found(change, move) for change in changes) for move in moves)
+
+
+def count_exact(seeds: range, *moves: Move, **options: object) -> int:
+    return sum(all_found(make_session(seed, *moves, **options).revised()[1].changes, *moves) for seed in seeds)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("moves", [(), (BEFORE,), (WITHIN,)])
+def test_one_session_of_each_kind(moves: tuple[Move, ...]) -> None:
+    assert count_exact(range(1), *moves) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("with_map", [True, False])
+def test_nothing_moved_nothing_found(with_map: bool) -> None:
+    assert count_exact(range(30), with_map=with_map) == 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("moves", "options"),
+    [
+        pytest.param((BEFORE,), {}, id="before"),
+        pytest.param((BEFORE,), {"n_landmarks": 14, "n_poses": 400}, id="larger"),
+        pytest.param((BEFORE, SECOND), {}, id="two groups"),
+        pytest.param((TURNED,), {}, id="turned"),
+        pytest.param((BEFORE,), {"unmapped": (6,)}, id="a landmark that the map does not hold"),
+        pytest.param((Move((4,), (0.2, 0.25)),), {}, id="one alone"),
+    ],
+)
+def test_group_that_moved_before_the_session(moves: tuple[Move, ...], options: dict[str, object]) -> None:
+    assert count_exact(range(20), *moves, **options) == 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("moves", "options", "least"),
+    [
+        pytest.param((WITHIN,), {}, 19, id="within"),
+        pytest.param((WITHIN,), {"with_map": False}, 19, id="without a map"),
+        pytest.param((WITHIN, SECOND), {}, 19, id="one before and one within"),
+    ],
+)
+def test_group_that_moved_within_the_session(moves: tuple[Move, ...], options: dict[str, object], least: int) -> None:
+    exact = count_exact(range(20), *moves, **options)
+    print("exact", exact)
+    assert exact >= least
+
+
+def told(session: Session, *moves: Move) -> Revision:
+    """What somebody estimates who was told what moved, and when."""
+    assert session.given is not None
+    groups = tuple(
+        Group(np.array(m.members), bool(m.turn_rad), np.array([*m.by, m.turn_rad]), 0 if m.at_s is None else 1, m.at_s)
+        for m in moves
+    )
+    start = replace(session.world.truth, landmark=session.before)
+    problem, start, landmark = explained(session.problem, start, session.given, groups, ChangePrior().spread)
+    estimate = Smoother(problem, session.world.noise).optimum(start)
+    current = np.arange(len(session.before))
+    current[landmark] = np.arange(len(landmark))
+    return Revision(problem, estimate, current)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moves", [(BEFORE,), (WITHIN,), (TURNED,)])
+def test_as_good_as_if_told(moves: tuple[Move, ...]) -> None:
+    """Where the exact set is found, poses and landmarks are nearly those of somebody who knew it."""
+    ours: list[tuple[float, float]] = []
+    best: list[tuple[float, float]] = []
+    for seed in range(10):
+        session = make_session(seed, *moves)
+        _, revision = session.revised()
+        if not all_found(revision.changes, *moves):
+            continue
+        estimate = Smoother(revision.problem, session.world.noise).optimum(revision.estimate)
+        ours.append((pose_rmse(session, estimate), landmark_rmse(session, replace(revision, estimate=estimate))))
+        known = told(session, *moves)
+        best.append((pose_rmse(session, known.estimate), landmark_rmse(session, known)))
+    print(np.mean(ours, axis=0), np.mean(best, axis=0))
+    assert len(ours) >= 9
+    assert np.all(np.mean(ours, axis=0) <= 1.1 * np.mean(best, axis=0) + 0.002)
+
+
+@pytest.mark.slow
+def test_displacements_are_right() -> None:
+    errors = []
+    for seed in range(10):
+        _, revision = make_session(seed, BEFORE, SECOND).revised()
+        assert all_found(revision.changes, BEFORE, SECOND)
+        for change in revision.changes:
+            move = BEFORE if change.landmark_ids == BEFORE.members else SECOND
+            errors.append(np.subtract(change.displacement_m, move.by))
+    assert np.sqrt(np.mean(np.square(errors))) < 0.04
+
+
+@pytest.mark.slow
+def test_an_instant_is_inside_its_interval_most_of_the_time() -> None:
+    """The interval takes poses for known, which were estimated with wrong places of the members near the instant."""
+    inside = trials = 0
+    for seed in range(30):
+        move = replace(WITHIN, at_s=60.0 + 2.7 * seed)
+        _, revision = make_session(seed, move).revised()
+        for change in revision.changes:
+            if change.landmark_ids == move.members:
+                trials += 1
+                inside += change.stamp_from_s <= move.at_s <= change.stamp_to_s
+    print("inside", inside, "of", trials)
+    assert trials >= 27
+    assert inside >= 0.7 * trials
+
+
+@pytest.mark.slow
+def test_complement_is_told_as_an_alternative() -> None:
+    """Half of the landmarks moved, or the other half did: no recording tells, and the search says so."""
+    half = Move((0, 2, 3, 6, 8), (0.35, 0.2))
+    others = tuple(sorted(set(range(10)) - set(half.members)))
+    for seed in range(8):
+        method, _ = make_session(seed, half).revised()
+        assert method.verdict is not None
+        ranked = [(method.verdict.groups, method.verdict.probability), *method.verdict.alternatives]
+        p = {tuple(tuple(int(j) for j in group.members) for group in groups): weight for groups, weight in ranked}
+        assert p[half.members,] == pytest.approx(p[others,], abs=0.05)
+        assert p[half.members,] + p[others,] > 0.9
+
+
+@pytest.mark.slow
+def test_same_session_same_answer() -> None:
+    first, second = (make_session(0, WITHIN).revised()[1] for _ in range(2))
+    assert first.changes == second.changes
+    np.testing.assert_array_equal(first.estimate.landmark, second.estimate.landmark)
+
+
+def test_empty_map_holds_nothing() -> None:
+    assert not GivenMap.empty(3).given.any()
