@@ -27,8 +27,10 @@ from evermap.slam.kernels import (
     detection_residual,
     inlier_weight,
     invert_3x3,
+    multiply,
     odometry_residual,
     outlier_loss,
+    sandwich,
 )
 from evermap.slam.problem import SILENCE_S, SILENT_VARIANCE, Drive
 
@@ -365,3 +367,14 @@ def test_increment_of_a_turn_by_series_and_by_sines_is_the_exponential(turn):
     drive = Drive(np.array([0.0, 1.0]), np.tile([0.7, -0.2, turn / 0.1], (2, 1)), np.zeros(2))
     out = integrated(drive, 0.2, 0.3, default_prior().mean)
     assert out.increment == pytest.approx(se2.exp(np.array([0.07, -0.02, turn])), abs=1e-14)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(3, 3), (2, 10), (3, 41)])
+def test_products_in_place_are_numpys(rows, columns):
+    rng = np.random.default_rng(0)
+    a, b, out = rng.normal(size=(rows, 3)), rng.normal(size=(3, columns)), np.full((rows, columns), 7.0)
+    multiply(a, b, out)
+    assert out == pytest.approx(a @ b)
+    root, j, squared = rng.normal(size=(columns, columns)), rng.normal(size=(rows, columns)), np.full((rows, rows), 7.0)
+    sandwich(j, root @ root.T, np.full((rows, columns), 7.0), squared)
+    assert squared == pytest.approx(j @ root @ root.T @ j.T)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -244,6 +245,27 @@ def test_weights_find_the_outliers():
     assert wrong.sum() > 5
     assert np.all(p[wrong] < 0.5)
     assert np.mean(p[~wrong] > 0.5) > 0.99
+
+
+def test_what_is_remembered_belongs_to_the_estimate_that_is_asked_about():
+    """Also when the last trial was rejected, and for two estimates in turns."""
+    world = make_world(4, n_poses=15)
+    rng = np.random.default_rng(0)
+    far = Estimate(
+        world.truth.pose + 5.0 * rng.normal(size=world.truth.pose.shape),
+        world.truth.landmark + 5.0 * rng.normal(size=world.truth.landmark.shape),
+        world.truth.states,
+    )
+    smoother = Smoother(world.problem, world.noise, robust=False)
+    found = [smoother.optimum(far, iterations=count) for count in range(1, 6)]
+    rejected = [np.array_equal(a.pose, b.pose) for a, b in pairwise(found)]
+    assert any(rejected)
+    again = [smoother.optimum(far, iterations=count) for count in (3, 4)]
+    for estimate in (again[1], found[0], again[0], found[0], far):
+        fresh = Smoother(world.problem, world.noise, robust=False)
+        assert smoother.cost(estimate) == fresh.cost(estimate)
+        assert np.array_equal(smoother.marginals(estimate).pose, fresh.marginals(estimate).pose)
+        assert np.array_equal(smoother.inlier_probability(estimate), fresh.inlier_probability(estimate))
 
 
 def test_problems_that_fit_into_no_memory_are_refused():

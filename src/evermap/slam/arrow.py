@@ -19,6 +19,7 @@ from evermap.slam.kernels import (
     inverse_of,
     invert_3x3,
     kernel,
+    multiply,
     odometry_covariance,
     odometry_residual,
     outlier_loss,
@@ -66,18 +67,6 @@ class Solution(NamedTuple):
     cov_next: FloatArray
     cov_cross: FloatArray
     cov_shared: FloatArray
-
-
-@kernel
-def _add(target: FloatArray, a: FloatArray, b: FloatArray, weight: FloatArray) -> None:
-    """Target += a' weight b, for small matrices without temporaries."""
-    for i in range(a.shape[1]):
-        for k in range(weight.shape[0]):
-            scaled = 0.0
-            for m in range(weight.shape[0]):
-                scaled += a[m, i] * weight[m, k]
-            for j in range(b.shape[1]):
-                target[i, j] += scaled * b[k, j]
 
 
 @kernel
@@ -156,32 +145,42 @@ def assemble(
             right_shared[at_motion + a] -= j[0, 6 + a] * pull[0] + j[1, 6 + a] * pull[1] + j[2, 6 + a] * pull[2]
 
     z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    information2 = np.zeros((2, 2))
     for m in range(len(pose_row)):
         i, j = pose_row[m], 2 * landmark_row[m]
         detection_residual(
             pose[i], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], z, jx, jl, jc
         )
-        for k in range(5):
-            if not free[k]:
-                jc[:, k] = 0.0
         squared = (z[0] / sigma[m, 0]) ** 2 + (z[1] / sigma[m, 1]) ** 2
         weight = inlier_weight(squared, log_odds, heavy)
         weights[m] = weight
         cost += outlier_loss(squared, log_odds, heavy)
-        information2[0, 0] = weight / sigma[m, 0] ** 2
-        information2[1, 1] = weight / sigma[m, 1] ** 2
-        _add(diagonal[i], jx, jx, information2)
-        _add(border[i, :, j : j + 2], jx, jl, information2)
-        _add(border[i, :, at_states:at_motion], jx, jc, information2)
-        _add(corner[j : j + 2, j : j + 2], jl, jl, information2)
-        _add(corner[j : j + 2, at_states:at_motion], jl, jc, information2)
-        _add(corner[at_states:at_motion, j : j + 2], jc, jl, information2)
-        _add(corner[at_states:at_motion, at_states:at_motion], jc, jc, information2)
-        pull2 = information2 @ z
-        right_pose[i] -= jx.T @ pull2
-        right_shared[j : j + 2] -= jl.T @ pull2
-        right_shared[at_states:at_motion] -= jc.T @ pull2
+        for row in range(2):
+            precision = weight / sigma[m, row] ** 2
+            for k in range(5):
+                if not free[k]:
+                    jc[row, k] = 0.0
+            for a in range(3):
+                scaled = precision * jx[row, a]
+                right_pose[i, a] -= scaled * z[row]
+                for b in range(3):
+                    diagonal[i, a, b] += scaled * jx[row, b]
+                for b in range(2):
+                    border[i, a, j + b] += scaled * jl[row, b]
+                for b in range(5):
+                    border[i, a, at_states + b] += scaled * jc[row, b]
+            for a in range(2):
+                scaled = precision * jl[row, a]
+                right_shared[j + a] -= scaled * z[row]
+                for b in range(2):
+                    corner[j + a, j + b] += scaled * jl[row, b]
+                for b in range(5):
+                    corner[j + a, at_states + b] += scaled * jc[row, b]
+                    corner[at_states + b, j + a] += scaled * jc[row, b]
+            for a in range(5):
+                scaled = precision * jc[row, a]
+                right_shared[at_states + a] -= scaled * z[row]
+                for b in range(5):
+                    corner[at_states + a, at_states + b] += scaled * jc[row, b]
 
     for k in range(9):
         precision = 1.0 / prior_sigma[k] ** 2
@@ -231,7 +230,7 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
             for k in range(shared):
                 border[i, a, k] = normal.border[i, a, k]
         if i > 0:
-            _multiply(off[i - 1], inverse[i - 1], factor)
+            multiply(off[i - 1], inverse[i - 1], factor)
             for a in range(3):
                 f0, f1, f2 = factor[a, 0], factor[a, 1], factor[a, 2]
                 for b in range(3):
@@ -240,7 +239,7 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
                 for k in range(shared):
                     border[i, a, k] -= f0 * border[i - 1, 0, k] + f1 * border[i - 1, 1, k] + f2 * border[i - 1, 2, k]
         invert_3x3(block, inverse[i])
-        _multiply(inverse[i], border[i], gain[i])
+        multiply(inverse[i], border[i], gain[i])
     flat_border, flat_gain = border.reshape(3 * n, shared), gain.reshape(3 * n, shared)
     schur: FloatArray = corner - flat_border.T @ flat_gain
     rest = normal.right_shared - flat_gain.T @ right.reshape(3 * n)
@@ -266,7 +265,7 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
     for i in range(n - 1, -1, -1):
         cov_pose[i] = inverse[i]
         if i < n - 1:
-            _multiply(inverse[i], off[i].T, back)
+            multiply(inverse[i], off[i].T, back)
             for a in range(3):
                 b0, b1, b2 = back[a, 0], back[a, 1], back[a, 2]
                 for k in range(shared):
@@ -288,15 +287,6 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
                 for k in range(shared):
                     cov_pose[i, a, b] -= cross[i, a, k] * gain[i, b, k]
     return Solution(step_pose, step_shared, cov_pose, cov_next, cross, cov_shared)
-
-
-@kernel
-def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """A (3, 3) times a (3, n), without a temporary."""
-    for i in range(3):
-        a0, a1, a2 = a[i, 0], a[i, 1], a[i, 2]
-        for k in range(b.shape[1]):
-            out[i, k] = a0 * b[0, k] + a1 * b[1, k] + a2 * b[2, k]
 
 
 @kernel
@@ -338,6 +328,7 @@ class Smoother:
         self._robust = robust
         self._known = np.zeros(len(problem.landmark_mean), dtype=bool)
         self._information = np.zeros((0, 0))
+        self._last: tuple[Estimate, Normal] | None = None
         size_gb = 5e-8 * len(problem.stamp_s) * (len(problem.landmark_mean) * 2 + 9)
         if size_gb > MEMORY_LIMIT_GB:
             raise DataError(
@@ -365,6 +356,7 @@ class Smoother:
                     break
         if not np.isfinite(normal.cost):
             raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
+        self._last = (estimate, normal)  # the last trial need not be the best
         return estimate
 
     def cost(self, estimate: Estimate) -> float:
@@ -409,6 +401,8 @@ class Smoother:
 
     def normal(self, estimate: Estimate) -> Normal:
         """The problem linearised at `estimate`; landmarks without position are left out."""
+        if self._last is not None and self._last[0] is estimate:
+            return self._last[1]
         problem, noise = self.problem, self.noise
         known = estimate.known
         rank = np.cumsum(known) - 1
@@ -433,6 +427,7 @@ class Smoother:
             self._log_odds,
             self._heavy and self._robust,
         )
+        self._last = (estimate, parts)
         return parts
 
 

@@ -12,7 +12,15 @@ import math
 
 import numpy as np
 
-from evermap.slam.kernels import integrate_odometry, inverse_of, kernel, wrapped
+from evermap.slam.kernels import (
+    integrate_odometry,
+    invert_3x3,
+    kernel,
+    multiply,
+    odometry_covariance,
+    sandwich,
+    wrapped,
+)
 from evermap.slam.problem import Drive, Noise
 from evermap.types import FloatArray
 
@@ -91,9 +99,8 @@ def _reckon(
         c, s = np.cos(increment[2]), np.sin(increment[2])
         carry[0, 0], carry[0, 1], carry[0, 2] = c, s, s * increment[0] - c * increment[1]
         carry[1, 0], carry[1, 1], carry[1, 2] = -s, c, c * increment[0] + s * increment[1]
-        spread[i] = carry @ spread[i - 1] @ carry.T + floor
-        for kind in range(len(variance)):
-            spread[i] += variance[kind] * noise[kind]
+        odometry_covariance(noise, floor, variance, spread[i])
+        spread[i] += carry @ spread[i - 1] @ carry.T
 
 
 @kernel
@@ -115,7 +122,8 @@ def _bridge(
     motion, noise, floor = np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
     increment, collected = np.zeros((2, 3)), np.zeros((2, 3, 3))
     joint = np.zeros((6, 6))
-    ends = np.zeros((3, 6))
+    ends, ends_part = np.zeros((3, 6)), np.zeros((3, 6))
+    share, gain, part = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     for k in range(len(stamp)):
         i = min(np.searchsorted(pose_stamp, stamp[k], side="right") - 1, n - 1)
         for side in range(2):  # from the pose before, and to the pose after
@@ -126,32 +134,46 @@ def _bridge(
             integrate_odometry(
                 odometry_stamp, velocity, unknown, begin, end, states, increment[side], motion, noise, floor
             )
-            collected[side] = floor
-            for kind in range(len(variance)):
-                collected[side] += variance[kind] * noise[kind]
+            odometry_covariance(noise, floor, variance, collected[side])
         if i < 0:  # dead reckoning backwards from the first pose
             out[k] = _composed(pose[0], _inverted(increment[1]))
-            carry = _adjoint(increment[1])
-            spread[k] = carry @ (covariance[0] + collected[1]) @ carry.T
+            joint[:3, :3] = covariance[0] + collected[1]
+            sandwich(_adjoint(increment[1]), joint[:3, :3], part, spread[k])
             continue
         forward = _composed(pose[i], increment[0])
         from_start = _adjoint(_inverted(increment[0]))
         if i >= n - 1:
             out[k] = forward
-            spread[k] = from_start @ covariance[i] @ from_start.T + collected[0]
+            sandwich(from_start, covariance[i], part, spread[k])
+            spread[k] += collected[0]
             continue
         closing = _composed(_inverted(_composed(forward, increment[1])), pose[i + 1])
         closing[2] = wrapped(closing[2])
         to_end = _adjoint(_inverted(increment[1]))
-        share = collected[0] @ to_end.T
-        gain = share @ inverse_of(to_end @ share + collected[1])
-        out[k] = _composed(forward, gain @ closing)
+        multiply(collected[0], to_end.T, share)
+        multiply(to_end, share, gain)
+        for a in range(3):
+            for b in range(3):
+                part[a, b] = gain[a, b] + collected[1, a, b]
+        invert_3x3(part, part)
+        multiply(share, part, gain)
         # perturbations of the two ends, carried to this instant
-        ends[:, :3] = from_start - gain @ to_end @ from_start
-        ends[:, 3:] = gain
-        joint[:3, :3], joint[3:, 3:] = covariance[i], covariance[i + 1]
-        joint[:3, 3:], joint[3:, :3] = consecutive[i], consecutive[i].T
-        spread[k] = ends @ joint @ ends.T + collected[0] - gain @ share.T
+        multiply(to_end, from_start, share)
+        multiply(gain, share, part)
+        step = np.zeros(3)
+        for a in range(3):
+            for b in range(3):
+                step[a] += gain[a, b] * closing[b]
+                ends[a, b], ends[a, 3 + b] = from_start[a, b] - part[a, b], gain[a, b]
+                joint[a, b], joint[3 + a, 3 + b] = covariance[i, a, b], covariance[i + 1, a, b]
+                joint[a, 3 + b] = joint[3 + b, a] = consecutive[i, a, b]
+        out[k] = _composed(forward, step)
+        sandwich(ends, joint, ends_part, spread[k])
+        multiply(collected[0], to_end.T, share)
+        multiply(gain, share.T, part)
+        for a in range(3):
+            for b in range(3):
+                spread[k, a, b] += collected[0, a, b] - part[a, b]
 
 
 @kernel

@@ -52,6 +52,32 @@ def inverse_of(matrix: FloatArray) -> FloatArray:
 
 
 @kernel
+def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """A (r, 3) times a (3, n), without a temporary."""
+    for i in range(a.shape[0]):
+        a0, a1, a2 = a[i, 0], a[i, 1], a[i, 2]
+        for k in range(b.shape[1]):
+            out[i, k] = a0 * b[0, k] + a1 * b[1, k] + a2 * b[2, k]
+
+
+@kernel
+def sandwich(j: FloatArray, cov: FloatArray, part: FloatArray, out: FloatArray) -> None:
+    """`j cov j'` for j (r, n) and a symmetric cov, with room for `j cov` in `part` (r, n)."""
+    size = j.shape[1]
+    for a in range(j.shape[0]):
+        for b in range(size):
+            part[a, b] = 0.0
+        for k in range(size):
+            for b in range(size):
+                part[a, b] += j[a, k] * cov[k, b]
+        for c in range(a + 1):
+            total = 0.0
+            for b in range(size):
+                total += part[a, b] * j[c, b]
+            out[a, c] = out[c, a] = total
+
+
+@kernel
 def invert_3x3(matrix: FloatArray, out: FloatArray) -> None:
     """Inverse of a symmetric positive definite (3, 3) by its factors `L D L'`, without a temporary; may be in place."""
     a, b, c, f = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[2, 2]

@@ -19,12 +19,14 @@ import numpy as np
 
 from evermap.slam.kernels import (
     detection_residual,
-    integrate_odometry,
-    inverse_of,
+    invert_3x3,
     kernel,
+    odometry_covariance,
     odometry_residual,
     residual_by_states,
+    sandwich,
 )
+from evermap.slam.preintegration import Intervals
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
@@ -86,11 +88,7 @@ def refine_noise(
     detection = np.sqrt((squares + PSEUDO_COUNT * start.detection**2) / (counts + PSEUDO_COUNT))
     pulls, chances, fisher = _odometry_sums(
         estimate.pose,
-        estimate.states,
-        problem.stamp_s,
-        problem.drive.stamp_s,
-        problem.drive.velocity,
-        problem.drive.unknown,
+        problem.drive.between(problem.stamp_s, estimate.states),
         noise.odometry**2,
         free,
         marginals.pose,
@@ -140,7 +138,7 @@ def _detection_sums(
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     rows = np.zeros(7, dtype=np.int64)
     j = np.zeros((2, 10))
-    cov = np.zeros((10, 10))
+    cov, part, explained = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2))
     for m in range(len(pose_row)):
         i = pose_row[m]
         detection_residual(
@@ -158,7 +156,7 @@ def _detection_sums(
                 cov[3 + a, b] = cov[b, 3 + a] = cov_cross[i, b, rows[a]]
             for b in range(7):
                 cov[3 + a, 3 + b] = cov_shared[rows[a], rows[b]]
-        explained = j @ cov @ j.T
+        sandwich(j, cov, part, explained)
         w = weights[m]
         for k in range(2):
             if not given[m, k]:
@@ -170,11 +168,7 @@ def _detection_sums(
 @kernel
 def _odometry_sums(
     pose: FloatArray,
-    states: FloatArray,
-    stamp: FloatArray,
-    odometry_stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
+    driven: Intervals,
     variance: FloatArray,
     free: Any,
     cov_pose: FloatArray,
@@ -190,38 +184,46 @@ def _odometry_sums(
     shared = len(cov_shared)
     pulls, chances, fisher = np.zeros(kinds), np.zeros(kinds), np.zeros((kinds, kinds))
     weighted = np.zeros((kinds, 3, 3))
-    increment, motion, noise, floor = np.zeros(3), np.zeros((3, 4)), np.zeros((kinds, 3, 3)), np.zeros((3, 3))
-    e, j1, j2 = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
-    j, cov = np.zeros((3, 10)), np.zeros((10, 10))
+    information, left = np.zeros((3, 3)), np.zeros((3, 3))
+    e, pull = np.zeros(3), np.zeros(3)
+    j1, j2, motion, j = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4)), np.zeros((3, 10))
+    cov, part, explained = np.zeros((10, 10)), np.zeros((3, 10)), np.zeros((3, 3))
     cov[6:, 6:] = cov_shared[shared - 4 :, shared - 4 :]
     for i in range(len(pose) - 1):
-        integrate_odometry(
-            odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, increment, motion, noise, floor
-        )
-        covariance = floor.copy()
-        for k in range(kinds):
-            covariance += variance[k] * noise[k]
-        information = inverse_of(covariance)
-        odometry_residual(pose[i], pose[i + 1], increment, e, j1, j2)
-        j[:, :3], j[:, 3:6] = j1, j2
+        noise = driven.noise[i]
+        odometry_covariance(noise, driven.floor[i], variance, information)
+        invert_3x3(information, information)
+        odometry_residual(pose[i], pose[i + 1], driven.increment[i], e, j1, j2)
+        motion[:] = driven.by_states[i]
         residual_by_states(motion, e, free)
-        j[:, 6:] = motion
-        cov[:3, :3], cov[3:6, 3:6] = cov_pose[i], cov_pose[i + 1]
-        cov[:3, 3:6], cov[3:6, :3] = cov_next[i], cov_next[i].T
         for a in range(3):
+            for b in range(3):
+                j[a, b], j[a, 3 + b] = j1[a, b], j2[a, b]
+                cov[a, b], cov[3 + a, 3 + b] = cov_pose[i, a, b], cov_pose[i + 1, a, b]
+                cov[a, 3 + b] = cov[3 + b, a] = cov_next[i, a, b]
             for b in range(4):
+                j[a, 6 + b] = motion[a, b]
                 cov[a, 6 + b] = cov[6 + b, a] = cov_cross[i, a, shared - 4 + b]
                 cov[3 + a, 6 + b] = cov[6 + b, 3 + a] = cov_cross[i + 1, a, shared - 4 + b]
-        explained = j @ cov @ j.T
-        pull = information @ e
+            pull[a] = information[a, 0] * e[0] + information[a, 1] * e[1] + information[a, 2] * e[2]
+        sandwich(j, cov, part, explained)
         # W - W V W: what the residual still is allowed to be
-        left = information - information @ explained @ information
+        sandwich(information, explained, part, left)
+        for a in range(3):
+            for b in range(3):
+                left[a, b] = information[a, b] - left[a, b]
         for k in range(kinds):
-            pulls[k] += pull @ noise[k] @ pull
-            weighted[k] = noise[k] @ left
-            chances[k] += np.trace(weighted[k])
+            for a in range(3):
+                for b in range(3):
+                    pulls[k] += pull[a] * noise[k, a, b] * pull[b]
+                    weighted[k, a, b] = (
+                        noise[k, a, 0] * left[0, b] + noise[k, a, 1] * left[1, b] + noise[k, a, 2] * left[2, b]
+                    )
+                chances[k] += weighted[k, a, a]
             for m in range(k + 1):
-                fisher[k, m] += 0.5 * np.sum(weighted[k] * weighted[m].T)
+                for a in range(3):
+                    for b in range(3):
+                        fisher[k, m] += 0.5 * weighted[k, a, b] * weighted[m, b, a]
     for k in range(kinds):
         for m in range(k):
             fisher[m, k] = fisher[k, m]

@@ -8,7 +8,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from evermap import se2
-from evermap.slam.kernels import N_NOISE, detection_residual, integrate_odometry, inverse_of, kernel
+from evermap.slam.kernels import (
+    N_NOISE,
+    detection_residual,
+    integrate_odometry,
+    inverse_of,
+    kernel,
+    odometry_covariance,
+)
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
@@ -45,7 +52,7 @@ class Motion:
             kinds,
             covariance,
         )
-        covariance += np.tensordot(noise.odometry**2, kinds, 1)
+        odometry_covariance(kinds, covariance, noise.odometry**2, covariance)
         return cls(increment, by_states * problem.prior.free[5:], covariance)
 
 
