@@ -51,6 +51,10 @@ class ModesConfig(Section):
     switch_probability: Probability = Field(
         default=1e-4, description="of a landmark to be in another mode at the next look; ignored with a lifetime"
     )
+    births: Literal["evidence", "gate"] = Field(
+        default="evidence",
+        description="'evidence' keeps a new mode that explains more than it costs, 'gate' every one, as the paper does",
+    )
     lifetime: str | None = Field(
         default=None, description="prior of how long a mode lasts, e.g. 'exponential:half-life=30d'; unset: constant"
     )

@@ -27,7 +27,9 @@ def explain(moving: MovingWorld, method: str, *, seed: int = 0, **settings: obje
     modes = Modes.one_each(len(moving.problem.landmark_mean))
     start = moving.static_optimum()
     near = explain_with_modes(moving.problem, start, moving.world.noise, modes, model, rng, heavy=True)
-    return explain_with_modes(near.problem, near.estimate, moving.world.noise, near.modes, model, rng)
+    estimate = Smoother(near.problem, moving.world.noise).optimum(near.estimate)
+    found = explain_with_modes(near.problem, estimate, moving.world.noise, near.modes, model, rng)
+    return replace(found, estimate=Smoother(found.problem, moving.world.noise).optimum(found.estimate))
 
 
 def pose_rmse_m(estimate: Estimate, moving: MovingWorld) -> float:
@@ -172,7 +174,8 @@ class Flipping:
 def test_a_cycle_ends(rounds: int):
     moving = make_moving_world(SEED)
     modes = Modes(np.array([0, 1, 2, 3, 4, 5, 2]), 6)
-    model = replace(model_of("viterbi", gate_probability=1.0), selector=Flipping(), rounds=rounds)
+    model = model_of("viterbi", gate_probability=1.0, births="gate")
+    model = replace(model, selector=Flipping(), rounds=rounds)
     start = replace(moving.told_optimum(), pose=moving.static_optimum().pose)
     found = explain_with_modes(moving.told, start, moving.world.noise, modes, model, np.random.default_rng(0))
     assert not found.settled

@@ -11,7 +11,6 @@ from problems import default_prior
 
 from evermap.slam.method import Static
 from evermap.slam.modes.multi_hypothesis import MultiHypothesis
-from evermap.slam.problem import Estimate
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.types import FloatArray, IntArray
 
@@ -56,7 +55,7 @@ def test_a_stream_finds_what_moved_as_if_told(method: str, seed: int):
 
 def test_a_detection_goes_to_the_mode_it_gates_with_and_starts_one_where_it_gates_with_none():
     moving = make_moving_world(5)
-    method = MultiHypothesis(6, model_of("viterbi"))
+    method = MultiHypothesis(6, model_of("viterbi", births="gate"))
     detection = np.flatnonzero(moving.problem.landmark_row == 2)[:1]
     far = {2: 100.0, 6: 100.0}
 
@@ -72,17 +71,3 @@ def test_a_detection_goes_to_the_mode_it_gates_with_and_starts_one_where_it_gate
     assert method.assign(moving.problem, row, detection, compare).tolist() == [6]
     far.update({6: 100.0, 7: 0.0})
     assert method.assign(moving.problem, row, detection, compare).tolist() == [7]
-
-
-def test_every_revision_begins_without_the_modes_so_far():
-    moving = make_moving_world(5)
-    problem, truth = moving.problem, moving.world.truth
-    method = MultiHypothesis(6, model_of("viterbi", gate_probability=1.0))
-    method._modes = method._modes.with_owner(np.array([6]), 2)
-    torn = replace(problem.with_places(7), landmark_row=np.where(problem.landmark_row == 2, 6, problem.landmark_row))
-    landmark = np.vstack([truth.landmark, truth.landmark[2]])
-    landmark[2] = np.nan
-    standing, estimate, modes = method._static(torn, Estimate(truth.pose, landmark, truth.states))
-    np.testing.assert_array_equal(standing.landmark_row, problem.landmark_row)
-    np.testing.assert_array_equal(estimate.landmark, truth.landmark)
-    assert len(modes.landmark) == len(standing.landmark_mean) == 6

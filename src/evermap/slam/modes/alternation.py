@@ -8,16 +8,17 @@ why `joint` exists.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evermap.config import ModesConfig
 from evermap.slam.arrow import Smoother
+from evermap.slam.modes.evidence import united
 from evermap.slam.modes.gating import gate_threshold, with_births, with_map_restored
 from evermap.slam.modes.looks import Looks, look_at_modes, news_in_a_miss
 from evermap.slam.modes.places import FREE, Modes, at_places, compacted
-from evermap.slam.modes.tidying import merged, pruned, without_empty
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.selectors.chain import ModeChain
 from evermap.slam.selectors.protocol import Selection, Selector, selector_by_name
@@ -29,6 +30,8 @@ SOLVER_TOLERANCE = 1e-4
 """Of every round: the next one starts where it ended [m, rad]."""
 PASSES = 3
 """Births and alternations, at most; two are enough where the trajectory is not far off."""
+LEAST_SWITCH = 1e-300
+"""A switch that is ruled out still leaves a filter that can recover."""
 SETTLED_M = 0.01
 """A pass that moves no pose farther than this changes no gate."""
 
@@ -42,7 +45,8 @@ class ModeModel:
         chain: how modes change from look to look.
         sensor: field of view and detection probability.
         gate: squared Mahalanobis distance from which a detection is none of a mode.
-        significance: of the difference between two modes, below which they are two.
+        switch_cost: nats of one switch, for weighing whether a mode pays for itself.
+        weighs: modes must pay for themselves; False takes every mode that is born and selected, as the paper does.
         rounds: of selecting and solving, at most.
         chained: whether the selector knows the chain, or takes every look by itself.
         negative_information: whether misses count in the selection.
@@ -53,7 +57,8 @@ class ModeModel:
     chain: ModeChain
     sensor: Sensor
     gate: float
-    significance: float
+    switch_cost: float
+    weighs: bool
     rounds: int
     chained: bool
     negative_information: bool
@@ -73,7 +78,8 @@ class ModeModel:
             chain=ModeChain(switch_probability=settings.switch_probability, lifetime=lifetime),
             sensor=sensor,
             gate=gate_threshold(settings.gate_probability),
-            significance=settings.switch_probability,
+            switch_cost=-math.log(max(settings.switch_probability, LEAST_SWITCH)),
+            weighs=settings.births == "evidence",
             rounds=1 if plain else settings.rounds,
             chained=method not in {"max-mixture", "nn"},
             negative_information=not plain,
@@ -112,7 +118,7 @@ def explain_with_modes(
     *,
     heavy: bool = False,
 ) -> Explanation:
-    """Births, the alternation and the tidying, again and again until a pass changes nothing.
+    """Births, the alternation and the uniting, again and again until a pass changes nothing.
 
     A pass that ends where it began may still have straightened the trajectory, and then other gates fail: what moved
     together shows when the others have let go of it.
@@ -127,45 +133,44 @@ def explain_with_modes(
         heavy: outliers have the Cauchy's tails in the least squares.
     """
     estimate = _with_map(problem, estimate, modes)
+    miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
+    most_gain = noise.outlier_log_odds if model.robust else math.inf
+    fewest = 1 + int(model.switch_cost / most_gain) if model.weighs else 1
     for _ in range(PASSES):
         before, given = estimate, problem.landmark_row
         marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
-        problem, estimate, modes, lost = with_births(problem, estimate, marginals, noise, modes, model.gate)
-        problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.significance)
+        problem, estimate, modes, lost = with_births(
+            problem, estimate, marginals, noise, modes, model.gate, fewest=fewest
+        )
+        problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.switch_cost)
         # what a selector with a window may keep: detections that gate with the mode that they were given
         kept = np.where(lost, FREE, given)
-        found = _tidied(problem, estimate, noise, modes, model, rng, kept, heavy=heavy)
+        found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, given, heavy=heavy)
+        while model.weighs:
+            problem, estimate, modes = _weighed(found, noise, model.switch_cost, most_gain, heavy=heavy)
+            if modes is found.modes:
+                break
+            kept = problem.landmark_row
+            found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, None, heavy=heavy)
         problem, estimate, modes = found.problem, found.estimate, found.modes
         moved = np.abs(estimate.pose[:, :2] - before.pose[:, :2]).max()
-        if moved < SETTLED_M and np.array_equal(problem.landmark_row, given):
+        if not found.settled or (moved < SETTLED_M and np.array_equal(problem.landmark_row, given)):
             break
     problem, estimate, modes, to = compacted(problem, estimate, modes)
     table = np.where(found.looks.table != FREE, to[found.looks.table], FREE)
     return replace(found, problem=problem, estimate=estimate, modes=modes, looks=replace(found.looks, table=table))
 
 
-def _tidied(
-    problem: Problem,
-    estimate: Estimate,
-    noise: Noise,
-    modes: Modes,
-    model: ModeModel,
-    rng: np.random.Generator,
-    kept: IntArray,
-    *,
-    heavy: bool,
-) -> Explanation:
-    """The alternation, again and again until no mode has to be pruned or merged: every time there are fewer."""
-    miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
-    while True:
-        found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, heavy=heavy)
-        modes = found.modes
-        problem, estimate, tidy = pruned(found.problem, found.estimate, modes)
-        marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
-        problem, estimate, tidy = merged(problem, estimate, marginals, tidy, model.significance)
-        if tidy is modes:
-            return found
-        modes, kept = tidy, problem.landmark_row
+def _weighed(
+    found: Explanation, noise: Noise, switch_cost: float, outlier_cost: float, *, heavy: bool
+) -> tuple[Problem, Estimate, Modes]:
+    """Without the modes that do not pay for themselves."""
+    problem, estimate, modes = found.problem, found.estimate, found.modes
+    if not len(found.looks.several):
+        return problem, estimate, modes
+    smoother = Smoother(problem, noise, heavy=heavy, robust=math.isfinite(outlier_cost))
+    marginals, weights = smoother.marginals(estimate), smoother.inlier_probability(estimate)
+    return united(problem, estimate, marginals, weights, modes, switch_cost=switch_cost, outlier_cost=outlier_cost)
 
 
 def _with_map(problem: Problem, estimate: Estimate, modes: Modes) -> Estimate:
@@ -185,10 +190,14 @@ def _alternate(
     rng: np.random.Generator,
     miss_weight: float,
     kept: IntArray,
+    solved: IntArray | None,
     *,
     heavy: bool,
 ) -> Explanation:
-    """Select, solve, and so on with the same modes; the best of all if it does not settle."""
+    """Select, solve, and so on with the same modes; the best of all if it does not settle.
+
+    Nothing is solved where the selection is that of which the estimate is the optimum, `solved`.
+    """
     best, best_score = None, -np.inf
     seen: set[bytes] = set()
     for round_ in range(1, model.rounds + 1):
@@ -197,10 +206,11 @@ def _alternate(
         )
         previous = looks.columns_of(kept) if round_ == 1 else None
         selection = model.selector.select(looks.evidence, model.chain, rng, previous=previous)
-        before, problem = problem, looks.assigned(problem, selection.indicator)
-        if round_ > 1 and np.array_equal(problem.landmark_row, before.landmark_row):
-            return Explanation(before, estimate, modes, looks, selection, settled=True)
-        estimate, modes = without_empty(problem, estimate, modes)  # never selected, never again
+        problem = looks.assigned(problem, selection.indicator)
+        estimate, modes = _without_empty(problem, estimate, modes)
+        if solved is not None and np.array_equal(problem.landmark_row, solved):
+            return Explanation(problem, estimate, modes, looks, selection, settled=True)
+        solved = problem.landmark_row
         smoother = Smoother(problem, noise, heavy=heavy, robust=model.robust)
         estimate = smoother.optimum(estimate, iterations=SOLVER_ITERATIONS, tolerance=SOLVER_TOLERANCE)
         score = looks.prior_score(selection.indicator, selection.log_joint) - smoother.cost(estimate)
@@ -212,3 +222,12 @@ def _alternate(
         seen.add(problem.landmark_row.tobytes())
     assert best is not None
     return best
+
+
+def _without_empty(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Estimate, Modes]:
+    """Without the modes that no detection holds: never selected, never again. The prior map's stay, seen or not."""
+    count = np.bincount(problem.landmark_row, minlength=len(modes.landmark))
+    empty = np.flatnonzero((modes.landmark != FREE) & estimate.known & ~problem.mapped & (count == 0))
+    if len(empty) == 0:
+        return estimate, modes
+    return at_places(estimate, empty, np.nan), modes.without(empty)

@@ -17,6 +17,11 @@ from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.triangulate import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
+MOST_MODES = 4
+"""Of a landmark; the paper needs no more than three, and the cost of a solution grows with the square of all."""
+MOST_GROUPS = 16
+"""Groups of detections that are looked at before the largest are chosen."""
+
 
 def gate_threshold(gate_probability: float) -> float:
     """Squared Mahalanobis distance that range and bearing of a true detection stay below with this probability."""
@@ -61,7 +66,7 @@ def explained(
 
 
 def with_map_restored(
-    problem: Problem, estimate: Estimate, marginals: Marginals, modes: Modes, significance: float
+    problem: Problem, estimate: Estimate, marginals: Marginals, modes: Modes, switch_cost: float
 ) -> tuple[Problem, Estimate, Modes]:
     """The prior map's modes back where the map has them, where detections have dragged them away.
 
@@ -78,7 +83,7 @@ def with_map_restored(
         block = slice(2 * row, 2 * row + 2)
         scatter = np.linalg.inv(problem.landmark_information[block, block]) - marginals.shared[block, block]
         away = estimate.landmark[row] - problem.landmark_mean[row]
-        if away @ np.linalg.solve(scatter, away) > -2.0 * math.log(significance):
+        if away @ np.linalg.solve(scatter, away) > 2.0 * switch_cost:
             dragged.append(row)
     if not dragged:
         return problem, estimate, modes
@@ -94,36 +99,67 @@ def with_map_restored(
 
 
 def with_births(
-    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, modes: Modes, threshold: float
+    problem: Problem,
+    estimate: Estimate,
+    marginals: Marginals,
+    noise: Noise,
+    modes: Modes,
+    threshold: float,
+    *,
+    fewest: int = 1,
 ) -> tuple[Problem, Estimate, Modes, BoolArray]:
     """New modes for detections that gate with none of their landmark's, in order of time.
 
-    The first of them starts a mode where it points to, and those that gate with it need no other. All detections stay
-    where they are, for a selector to decide.
+    The first of them starts a mode, and those that gate with it need no other; it begins in their midst. All detections
+    stay where they are, for a selector to decide. A landmark has at most `MOST_MODES`: those count that most detections
+    speak for.
+
+    Args:
+        problem: the measurements.
+        estimate: poses and positions.
+        marginals: of it.
+        noise: of the sensor.
+        modes: whose mode each place is.
+        threshold: of the squared distance, from `gate_threshold`.
+        fewest: detections that a new mode needs.
 
     Returns:
         Problem, estimate and modes, with the new ones; and (M,) which detections gated with none before.
     """
-    gated = explained(problem, estimate, marginals, noise, modes, threshold)
-    lost: BoolArray = np.logical_not(gated.any(axis=1))
-    born: dict[int, list[tuple[FloatArray, FloatArray]]] = {}
-    starts: list[int] = []
-    for m in np.flatnonzero(lost).tolist():
-        of_landmark = born.setdefault(int(modes.landmark[problem.landmark_row[m]]), [])
-        own = _at_sighting(problem, estimate, noise, m)
-        cov_pose = marginals.pose[problem.pose_row[m]]
-        if any(_distance_to(problem, estimate, noise, m, cov_pose, *mode) < threshold for mode in of_landmark):
-            continue
-        of_landmark.append((own[0], own[1] @ cov_pose @ own[1].T + own[2]))
-        starts.append(m)
-    if not starts:
+    lost: BoolArray = np.logical_not(explained(problem, estimate, marginals, noise, modes, threshold).any(axis=1))
+    owner = modes.landmark[problem.landmark_row]
+    room = MOST_MODES - (modes.table(estimate) != FREE).sum(axis=1)
+    at: list[FloatArray] = []
+    whose: list[int] = []
+    for landmark in np.unique(owner[lost]):
+        groups = _groups(problem, estimate, marginals, noise, np.flatnonzero(lost & (owner == landmark)), threshold)
+        groups = sorted((group for group in groups if len(group) >= fewest), key=len, reverse=True)
+        for group in groups[: max(0, room[landmark])]:
+            pose, reading = estimate.pose[problem.pose_row[group]], problem.reading[group]
+            at.append(np.median(sighted_at(pose, reading, estimate.states, problem.mount), axis=0))
+            whose.append(int(landmark))
+    if not at:
         return problem, estimate, modes, lost
-    started = np.array(starts)
-    place = modes.rows_for(len(started))
-    owner = modes.landmark[problem.landmark_row[started]]
+    place = modes.rows_for(len(at))
     problem, estimate = grown(problem, estimate, int(place.max()) + 1)
-    at = sighted_at(estimate.pose[problem.pose_row[started]], problem.reading[started], estimate.states, problem.mount)
-    return problem, at_places(estimate, place, at), modes.with_owner(place, owner), lost
+    return problem, at_places(estimate, place, np.array(at)), modes.with_owner(place, np.array(whose)), lost
+
+
+def _groups(
+    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, lost: IntArray, threshold: float
+) -> list[IntArray]:
+    """Lost detections of one landmark, each with the first before it whose mode it gates with."""
+    groups: list[IntArray] = []
+    while len(lost) and len(groups) < MOST_GROUPS:
+        at, by_pose, of_sensor = _at_sighting(problem, estimate, noise, int(lost[0]))
+        cov = by_pose @ marginals.pose[problem.pose_row[lost[0]]] @ by_pose.T + of_sensor
+        cov_pose = marginals.pose[problem.pose_row[lost]]
+        squared = [_distance_to(problem, estimate, noise, m, cov_pose[k], at, cov) for k, m in enumerate(lost.tolist())]
+        near = np.array(squared) < threshold
+        near[0] = True
+        groups.append(lost[near])
+        lost = lost[~near]
+    return groups
 
 
 def _at_sighting(

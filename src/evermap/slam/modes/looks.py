@@ -138,22 +138,20 @@ def news_in_a_miss(problem: Problem, estimate: Estimate, modes: Modes, sensor: S
     A landmark counts as looked at while it is in view of the place that it was last seen at.
     """
     owner = modes.landmark[problem.landmark_row]
-    detected: list[FloatArray] = []
+    rows = np.arange(len(problem.stamp_s))
+    places = np.flatnonzero(estimate.known)
+    in_view = _in_view(estimate, places[:, None], sensor)
+    detected, starts = [np.zeros(0)], [np.ones(0, dtype=np.bool_)]
     for landmark in np.unique(owner):
         mine = np.flatnonzero(owner == landmark)
-        seen_at = problem.pose_row[mine]
-        rows = np.arange(len(problem.stamp_s))
-        place = problem.landmark_row[mine[np.maximum(np.searchsorted(seen_at, rows, side="right") - 1, 0)]]
-        look = np.isin(rows, seen_at)
-        for one in np.unique(place):
-            if estimate.known[one]:
-                look |= (place == one) & _in_view(estimate, np.array([[one]]), sensor)[:, 0]
-        pause = np.diff(problem.stamp_s, append=np.inf) > LONGEST_SEQUENCE_GAP_S
-        breaks = np.flatnonzero(~look | pause) + 1
-        hits = np.isin(rows, seen_at).astype(np.float64)
-        parts = zip(np.split(hits, breaks), np.split(look, breaks), strict=True)
-        detected += [part[kept] for part, kept in parts if kept.any()]
-    first = np.concatenate([[0], np.cumsum([len(part) for part in detected])])
+        hit = np.isin(rows, problem.pose_row[mine])
+        last = np.maximum(np.searchsorted(problem.pose_row[mine], rows, side="right") - 1, 0)
+        place = np.searchsorted(places, problem.landmark_row[mine[last]])
+        look = np.flatnonzero(hit | in_view[rows, place])
+        pause = (np.diff(look) > 1) | (np.diff(problem.stamp_s[look]) > LONGEST_SEQUENCE_GAP_S)
+        detected.append(hit[look].astype(np.float64))
+        starts.append(np.append(True, pause))
+    first = np.append(np.flatnonzero(np.concatenate(starts)), sum(map(len, starts)))
     return miss_weight_from(np.concatenate(detected), first.astype(np.int64), sensor.p_detect)
 
 

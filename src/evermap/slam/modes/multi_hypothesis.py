@@ -7,19 +7,18 @@ whole session.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from evermap.slam.method import Compare, Revision
 from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
-from evermap.slam.modes.places import FREE, Modes, at_places, compacted, moved_to
+from evermap.slam.modes.gating import MOST_MODES
+from evermap.slam.modes.places import Modes
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
-LEAST_SWITCH = 1e-300
-"""A switch that is ruled out still leaves a filter that can recover."""
+MOST_SURPRISE = 7.0
+"""Nats that a single detection can say against all modes: it may be an outlier."""
 
 
 class MultiHypothesis:
@@ -37,6 +36,8 @@ class MultiHypothesis:
         self._modes = Modes.one_each(n_landmarks)
         self._log_belief = np.zeros(n_landmarks)
         """(P,) log probability of each place to be where its landmark is, by all looks so far."""
+        self._surprise = np.zeros(n_landmarks)
+        """(L,) how much the latest detections of each landmark speak against all its modes (Page 1954)."""
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
         """The most probable mode that each detection gates with, else a new one."""
@@ -56,35 +57,15 @@ class MultiHypothesis:
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Births and the alternation over everything so far."""
         del final
-        static, at, modes = self._static(problem, estimate)
-        found = explain_with_modes(static, at, noise, modes, self._model, self._rng, heavy=heavy)
+        found = explain_with_modes(problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy)
         self._modes = found.modes
         current = self._current(found.problem)
-        self._log_belief = np.full(len(found.modes.landmark), self._log_switch)
+        self._log_belief = np.full(len(found.modes.landmark), -self._model.switch_cost)
         self._log_belief[current] = 0.0
         changes = switches(found, self._model.chain)
         if np.array_equal(found.problem.landmark_row, problem.landmark_row):
             return Revision(problem, estimate, current, changes)
         return Revision(found.problem, found.estimate, current, changes)
-
-    def _static(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate, Modes]:
-        """Every detection at its landmark's own place again, at the estimate that the modes so far have led to.
-
-        One detection in twenty falls outside its gate. The estimate bends to fit the mode that it starts, and then
-        needs it; so every revision has births of its own, which a selector must want with all looks in view.
-        """
-        owner = self._modes.landmark
-        others = np.flatnonzero(np.arange(len(owner)) >= self._modes.n_landmarks)
-        problem = moved_to(problem, others, owner[others])
-        lost = others[~estimate.known[owner[others]]]  # its own place was given up: it begins at another
-        estimate = at_places(estimate, owner[lost], estimate.landmark[lost])
-        estimate = at_places(estimate, others, np.nan)
-        return compacted(problem, estimate, self._modes.with_owner(others, FREE))[:3]
-
-    @property
-    def _log_switch(self) -> float:
-        """Of a landmark to be elsewhere at the next look; between frames it is the constant, lifetime or not."""
-        return math.log(max(self._model.significance, LEAST_SWITCH))
 
     def _best_of(self, places: IntArray, distance: FloatArray, log_volume: FloatArray) -> int:
         """One step of the forward filter over the modes of one landmark, and where its detection belongs."""
@@ -95,18 +76,34 @@ class MultiHypothesis:
             return first
         places, distance, log_volume = places[there], distance[there], log_volume[there]
         before = self._log_belief[places] - np.logaddexp.reduce(self._log_belief[places])
-        before = np.logaddexp(before, self._log_switch)
+        before = np.logaddexp(before, -self._model.switch_cost)
         said = -0.5 * (distance + log_volume)
         self._log_belief[places] = before + said if self._model.chained else said
         gates = distance < self._model.gate
-        if gates.any():
-            return int(places[np.argmax(np.where(gates, self._log_belief[places], -np.inf))])
         landmark = int(self._modes.landmark[first])
+        if not self._is_elsewhere(landmark, len(places), float(distance.min())):
+            allowed = gates if gates.any() else distance == distance.min()
+            return int(places[np.argmax(np.where(allowed, self._log_belief[places], -np.inf))])
         new = len(self._modes.landmark)
         self._modes = self._modes.with_owner(np.array([new]), landmark)
         self._log_belief = np.append(self._log_belief, np.zeros(len(self._modes.landmark) - len(self._log_belief)))
-        self._log_belief[new] = self._log_belief[places].max() + self._log_switch
+        self._log_belief[new] = self._log_belief[places].max() - self._model.switch_cost
+        self._surprise[landmark] = 0.0
         return new
+
+    def _is_elsewhere(self, landmark: int, n_modes: int, nearest: float) -> bool:
+        """Whether detections that gate with no mode have gone on for long enough to start one.
+
+        Page's test: the sum of what each says, never below zero, so that what lies within the gate counts against a
+        move, and a move is as much worth as a switch costs.
+        """
+        if n_modes >= MOST_MODES:
+            return False
+        if not self._model.weighs:
+            return nearest >= self._model.gate
+        said = 0.5 * min(nearest - self._model.gate, 2.0 * MOST_SURPRISE)
+        self._surprise[landmark] = max(0.0, self._surprise[landmark] + said)
+        return bool(self._surprise[landmark] > self._model.switch_cost)
 
     def _current(self, problem: Problem) -> IntArray:
         """(L,) the mode of every landmark's last detection; its first one where it has none yet."""

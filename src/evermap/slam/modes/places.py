@@ -57,6 +57,10 @@ class Modes:
         owner[place] = landmark
         return replace(self, landmark=owner)
 
+    def without(self, places: IntArray) -> Modes:
+        """Rows behind the landmarks' own belong to nobody; the landmarks' own stay theirs, without position."""
+        return self.with_owner(places[places >= self.n_landmarks], FREE)
+
 
 def grown(problem: Problem, estimate: Estimate, count: int) -> tuple[Problem, Estimate]:
     """Room for `count` places; those that are new have neither prior nor position."""
