@@ -69,6 +69,8 @@ class Joint:
         self._prior = prior
         self._robust = robust
         self._held: Problem | None = None
+        self._free: Problem | None = None
+        self._start: Estimate | None = None
         self._concluded: Revision | None = None
         self._landmark = np.arange(n_landmarks)
         self._groups: tuple[Group, ...] = ()
@@ -83,20 +85,22 @@ class Joint:
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """With the map believed to a metre: one that is wrong bends the solution, or makes it look noisy."""
-        self._held = problem
+        self._held = self._free = problem
+        self._start = self._first_places(estimate)
         if self._given is None or not self._in_map(problem):
             return problem, estimate
-        free = replace(
+        self._free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
             landmark_mean=self._given.mean,
             landmark_information=independent(self._given.given[:, None, None] * np.eye(2) / LOOSE_MAP_M**2),
         )
-        start = in_sensor_metres(self._first_places(estimate), self._calibration)
+        start = in_sensor_metres(self._start, self._calibration)
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
-        weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
-        unmapped = replace(free, landmark_information=np.zeros_like(free.landmark_information))
-        return free, outvoted(unmapped, start, weights)
+        weights = Smoother(self._free, START, heavy=True, robust=self._robust).inlier_probability(start)
+        unmapped = replace(self._free, landmark_information=np.zeros_like(self._free.landmark_information))
+        self._start = outvoted(unmapped, start, weights)
+        return self._free, self._start
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Search at the present estimate, and again at what it leads to where the session ends."""
@@ -104,7 +108,11 @@ class Joint:
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
             self.verdict = None  # nothing of what was thought on the way is taken for granted
-            problem = problem if self._held is None else self._held
+            if self._free is not None and self._start is not None and self._held is not None:
+                # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
+                smoother = Smoother(self._free, noise, heavy=True, robust=self._robust)
+                estimate = smoother.optimum(self._start, iterations=10, tolerance=1e-4)
+                problem = self._held
         in_map = self._in_map(problem)
         given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
         base = self._base(problem)
@@ -119,7 +127,7 @@ class Joint:
                 return Revision(problem, estimate, self._current())
             before = self.verdict
             verdict, given = self._weighed(evidence, given, len(bounds) - 1, thorough=final)
-            groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in verdict.groups)
+            groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in verdict.groups)
             settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
             self.verdict, self._groups = verdict, groups
             if not in_map and not groups and len(self._landmark) == self._count:
@@ -173,7 +181,7 @@ class Joint:
         for found, probability in self.verdict.alternatives[:MOST_RIVALS]:
             if probability < self.verdict.probability * math.exp(-RIVAL_NATS):
                 break
-            groups = tuple(self._timed(group, base, estimate, noise, bounds) for group in found)
+            groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in found)
             start = _with_copies(self._first_places(estimate), evidence, groups)
             problem, start, landmark = explained(base, start, believed, groups, self._prior.spread)
             smoother = Smoother(problem, noise, robust=self._robust)
@@ -227,19 +235,28 @@ class Joint:
         """(L,) the last place of every landmark."""
         return _current(self._landmark, self._count)
 
-    def _timed(self, group: Group, base: Problem, estimate: Estimate, noise: Noise, bounds: IntArray) -> Group:
+    def _timed(
+        self, group: Group, base: Problem, estimate: Estimate, noise: Noise, evidence: Evidence, bounds: IntArray
+    ) -> Group:
         """The group with the time of its change, where that was within the session.
 
-        At first only the window is known; once the group has places of its own, every detection tells.
+        The search, for which no pose is certain, says between which windows. Within those every detection tells, once
+        the group has places of its own.
         """
         if group.window == 0:
             return group
-        known = [g for g in self._groups if g.since_s is not None and np.array_equal(g.members, group.members)]
+        seen = evidence.window[np.isin(evidence.landmark, group.members)]
+        first = seen[seen < group.window].max()
+        last = seen[seen >= group.window].min(initial=len(bounds) - 2)
+        stamps = base.stamp_s[np.minimum(bounds[[first, group.window, last + 1]], len(base.stamp_s) - 1)]
+        within_s = (float(stamps[0]), float(stamps[2]))
+        known = any(g.since_s is not None and np.array_equal(g.members, group.members) for g in self._groups)
         if not known:
-            stamps = base.stamp_s[[bounds[group.window - 1], bounds[group.window]]]
-            return replace(group, since_s=float(stamps[1]), between_s=(float(stamps[0]), float(stamps[1])))
+            return replace(group, since_s=float(stamps[1]), between_s=within_s)
         old = estimate.landmark[: self._count]
-        since_s, between_s = parting_time(base, estimate, noise, group.members, old[group.members], group.moved(old))
+        since_s, between_s = parting_time(
+            base, estimate, noise, group.members, old[group.members], group.moved(old), within_s
+        )
         return replace(group, since_s=since_s, between_s=between_s)
 
     def _changes(self, groups: tuple[Group, ...], probability: float, base: Problem) -> tuple[MapChange, ...]:

@@ -15,7 +15,13 @@ SHARE = 0.95
 
 
 def parting_time(
-    problem: Problem, estimate: Estimate, noise: Noise, members: IntArray, old: FloatArray, new: FloatArray
+    problem: Problem,
+    estimate: Estimate,
+    noise: Noise,
+    members: IntArray,
+    old: FloatArray,
+    new: FloatArray,
+    within_s: tuple[float, float],
 ) -> tuple[float, tuple[float, float]]:
     """First stamp [s] at the new places, and two stamps between which the change happened.
 
@@ -26,8 +32,13 @@ def parting_time(
         members: (k,) landmarks of the group.
         old: (k, 2) their places before.
         new: (k, 2) and after.
+        within_s: the change is known to lie between these two stamps.
     """
-    mine = np.flatnonzero(np.isin(problem.landmark_row, members))
+    stamp_s = problem.stamp_s[problem.pose_row]
+    inside = (stamp_s >= within_s[0]) & (stamp_s <= within_s[1])
+    mine = np.flatnonzero(np.isin(problem.landmark_row, members) & inside)
+    if len(mine) < 2:
+        return within_s[1], within_s
     column = np.searchsorted(members, problem.landmark_row[mine])
     sigma = noise.of_detections(problem.sigma_given[mine])
     loss = np.empty((2, len(mine)))
@@ -42,7 +53,7 @@ def parting_time(
             noise.outlier_log_odds,
             loss[k],
         )
-    stamp_s = problem.stamp_s[problem.pose_row[mine]]
+    stamp_s = stamp_s[mine]
     # log likelihood of the change just before detection k, for k = 1 .. n - 1: both places were seen
     log_likelihood = -np.cumsum(loss[0] - loss[1])[:-1]
     weight = np.exp(log_likelihood - log_likelihood.max())
