@@ -35,6 +35,11 @@ LOOSE_MAP_M = 1.0
 """Standard deviation of a map that bends nothing, but keeps what little is known of near where the map has it."""
 SWAP_SOFTNESS_M = 0.02
 """Error that the sightings of a window share, while it is decided which identities are swapped."""
+VISIT_GAP_S = 10.0
+"""A landmark that was not seen for longer than this is visited anew."""
+VISIT_MARGIN = 0.5
+MOST_VISITS = 8
+"""Visits that get windows of their own: this share of the interval around it, and this many."""
 ROUNDS = 6
 """Searches at the end of a session, at most."""
 POSES_A_WINDOW = 60
@@ -223,13 +228,13 @@ class Joint:
         return verdict, given
 
     def _bounds(self, problem: Problem) -> IntArray:
-        """First pose of every window; where something is thought to have moved a new window begins."""
+        """First pose of every window; a group that moved has windows of its own, visit by visit."""
         n_poses = len(problem.stamp_s)
         n_seen = len(np.unique(self._landmark[problem.landmark_row]))
         windows = max(min(n_poses // POSES_A_WINDOW, MOST_WINDOWS, MOST_ITEMS // max(n_seen, 1)), 1)
         bounds = np.linspace(0, n_poses, windows + 1).astype(np.int64)
-        since = [group.since_s for group in self._groups if group.since_s is not None]
-        return np.unique(np.append(bounds, np.searchsorted(problem.stamp_s, since)))
+        cuts = [cut for group in self._groups for cut in _visits(problem, group)]
+        return np.unique(np.append(bounds, np.searchsorted(problem.stamp_s, cuts)))
 
     def _current(self) -> IntArray:
         """(L,) the last place of every landmark."""
@@ -241,7 +246,7 @@ class Joint:
         """The group with the time of its change, where that was within the session.
 
         The search, for which no pose is certain, says between which windows. Within those every detection tells, once
-        the group has places of its own.
+        the poses are those of a world where it happened then.
         """
         if group.window == 0:
             return group
@@ -250,8 +255,8 @@ class Joint:
         last = seen[seen >= group.window].min(initial=len(bounds) - 2)
         stamps = base.stamp_s[np.minimum(bounds[[first, group.window, last + 1]], len(base.stamp_s) - 1)]
         within_s = (float(stamps[0]), float(stamps[2]))
-        known = any(g.since_s is not None and np.array_equal(g.members, group.members) for g in self._groups)
-        if not known:
+        solved = any(g.since_s == stamps[1] and np.array_equal(g.members, group.members) for g in self._groups)
+        if not solved:  # the poses are those of another time, and would vote for it
             return replace(group, since_s=float(stamps[1]), between_s=within_s)
         old = estimate.landmark[: self._count]
         since_s, between_s = parting_time(
@@ -278,6 +283,17 @@ class Joint:
             rotation_rad=0.0,
             probability=probability,
         )
+
+
+def _visits(problem: Problem, group: Group) -> FloatArray:
+    """When a group was met again [s], around the time when it is thought to have moved."""
+    if group.between_s is None or group.since_s is None:
+        return np.zeros(0)
+    stamps = problem.stamp_s[problem.pose_row[np.isin(problem.landmark_row, group.members)]]
+    starts = stamps[1:][np.diff(stamps) > VISIT_GAP_S]
+    margin = VISIT_MARGIN * (group.between_s[1] - group.between_s[0])
+    near = (starts >= group.between_s[0] - margin) & (starts <= group.between_s[1] + margin)
+    return np.append(starts[near][:MOST_VISITS], group.since_s)
 
 
 def _change(group: Group, probability: float, first_s: float) -> MapChange:
