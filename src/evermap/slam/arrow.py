@@ -293,23 +293,30 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
 def eliminate_chain(normal: Normal) -> tuple[FloatArray, FloatArray]:
     """Information (3 + G, 3 + G) and right side (3 + G,) that are left for the last pose and the shared numbers."""
     n, shared = len(normal.diagonal), len(normal.corner)
-    corner, right_shared = normal.corner.copy(), normal.right_shared.copy()
-    block, border, right = normal.diagonal[0].copy(), normal.border[0].copy(), normal.right_pose[0].copy()
+    off = normal.off
+    border, gain = normal.border.copy(), np.empty((n - 1, 3, shared))
+    block, inverse, factor = normal.diagonal[0].copy(), np.zeros((3, 3)), np.zeros((3, 3))
+    right = normal.right_pose.copy()
     for i in range(n - 1):
-        inverse = inverse_of(block)
-        gain = inverse @ border
-        corner -= border.T @ gain
-        right_shared -= gain.T @ right
-        factor = normal.off[i] @ inverse
-        block = normal.diagonal[i + 1] - factor @ normal.off[i].T
-        right = normal.right_pose[i + 1] - factor @ right
-        border = normal.border[i + 1] - factor @ border
+        invert_3x3(block, inverse)
+        multiply(inverse, border[i], gain[i])
+        multiply(off[i], inverse, factor)
+        for a in range(3):
+            f0, f1, f2 = factor[a, 0], factor[a, 1], factor[a, 2]
+            for b in range(3):
+                block[a, b] = normal.diagonal[i + 1, a, b] - (f0 * off[i, b, 0] + f1 * off[i, b, 1] + f2 * off[i, b, 2])
+            right[i + 1, a] -= f0 * right[i, 0] + f1 * right[i, 1] + f2 * right[i, 2]
+            for k in range(shared):
+                border[i + 1, a, k] -= f0 * border[i, 0, k] + f1 * border[i, 1, k] + f2 * border[i, 2, k]
+    flat_gain = gain.reshape(3 * (n - 1), shared)
+    corner = normal.corner - border[: n - 1].reshape(3 * (n - 1), shared).T @ flat_gain
+    right_shared = normal.right_shared - flat_gain.T @ right[: n - 1].reshape(3 * (n - 1))
     information = np.zeros((3 + shared, 3 + shared))
     information[:3, :3] = block
-    information[:3, 3:] = border
-    information[3:, :3] = border.T
+    information[:3, 3:] = border[n - 1]
+    information[3:, :3] = border[n - 1].T
     information[3:, 3:] = corner
-    return information, np.concatenate((right, right_shared))
+    return information, np.concatenate((right[n - 1], right_shared))
 
 
 class Smoother:

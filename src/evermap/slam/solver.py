@@ -7,14 +7,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from evermap import se2
 from evermap.slam.kernels import (
     N_NOISE,
     detection_residual,
     integrate_odometry,
-    inverse_of,
     kernel,
+    multiply,
     odometry_covariance,
+    sandwich,
 )
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
@@ -127,11 +127,11 @@ def compare(
     nis, log_det = np.empty(len(detections)), np.empty(len(detections))
     _innovations(
         solver.joint_covariance(different),
-        se2.compose(solver.last_pose(), motion.increment),
+        solver.last_pose(),
+        motion.increment,
         solver.states(),
         np.array([solver.landmark(int(place)) for place in different]).reshape(-1, 2),
         column,
-        se2.adjoint(se2.inverse(motion.increment)),
         motion.by_states,
         motion.covariance,
         problem.reading[detections],
@@ -147,11 +147,11 @@ def compare(
 @kernel
 def _innovations(
     joint: FloatArray,
-    pose: FloatArray,
+    pose_before: FloatArray,
+    increment: FloatArray,
     states: FloatArray,
     places: FloatArray,
     column: Any,
-    carry: FloatArray,
     by_states: FloatArray,
     odometry_covariance: FloatArray,
     reading: FloatArray,
@@ -163,22 +163,34 @@ def _innovations(
 ) -> None:
     """Distance and log determinant of every detection by itself; `joint` belongs to the pose before."""
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    h, part, rows = np.zeros((2, 14)), np.zeros((14, 14)), np.arange(14)
+    h, h_part, part, rows = np.zeros((2, 14)), np.zeros((2, 14)), np.zeros((14, 14)), np.arange(14)
+    s, by_noise, jx_part = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 3))
+    cosine, sine = np.cos(pose_before[2]), np.sin(pose_before[2])
+    dx, dy, turn = increment[0], increment[1], increment[2]
+    pose = pose_before + np.array([cosine * dx - sine * dy, sine * dx + cosine * dy, turn])
+    # what happened before, seen from the end of the increment
+    cosine, sine = np.cos(turn), np.sin(turn)
+    carry = np.array(
+        [[cosine, sine, sine * dx - cosine * dy], [-sine, cosine, cosine * dx + sine * dy], [0.0, 0.0, 1.0]]
+    )
     for m in range(len(reading)):
         at = places[column[m]]
         detection_residual(pose, at, states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         # the new pose in terms of the old one and the states
-        h[:, :3] = jx @ carry
+        multiply(jx, carry, h[:, :3])
         for k in range(5):
             h[0, 3 + k], h[1, 3 + k] = (jc[0, k], jc[1, k]) if free[k] else (0.0, 0.0)
-        h[:, 8:12] = jx @ by_states
+        multiply(jx, by_states, h[:, 8:12])
         h[:, 12:] = jl
         rows[12], rows[13] = 12 + 2 * column[m], 13 + 2 * column[m]
-        for a in range(14):
-            for b in range(14):
-                part[a, b] = joint[rows[a], rows[b]]
-        s = h @ part @ h.T + jx @ odometry_covariance @ jx.T
-        s[0, 0] += sigma[m, 0] ** 2
-        s[1, 1] += sigma[m, 1] ** 2
-        nis[m] = e @ (inverse_of(s) @ e)
-        log_det[m] = np.log(s[0, 0] * s[1, 1] - s[0, 1] * s[1, 0])
+        for row in range(14):
+            for other in range(14):
+                part[row, other] = joint[rows[row], rows[other]]
+        sandwich(h, part, h_part, s)
+        sandwich(jx, odometry_covariance, jx_part, by_noise)
+        a = s[0, 0] + by_noise[0, 0] + sigma[m, 0] ** 2
+        b = s[0, 1] + by_noise[0, 1]
+        d = s[1, 1] + by_noise[1, 1] + sigma[m, 1] ** 2
+        det = a * d - b * b
+        nis[m] = (d * e[0] * e[0] - 2.0 * b * e[0] * e[1] + a * e[1] * e[1]) / det
+        log_det[m] = np.log(det)

@@ -242,10 +242,12 @@ class StreamingSlam:
 
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
-        seen = np.unique(self._problem.landmark_row[detections])
-        seen = seen[~self._problem.mapped[seen]]  # the map is believed: no vote moves its landmarks
-        young = np.isin(self._n_compared[seen], DISPUTED_AT)
-        return bool(np.any(young & (2 * self._n_surprising[seen] > self._n_compared[seen])))
+        seen = self._problem.landmark_row[detections]
+        doubted = seen[2 * self._n_surprising[seen] > self._n_compared[seen]]
+        if not len(doubted):
+            return False
+        mapped = self._problem.mapped  # the map is believed: no vote moves its landmarks
+        return any(not mapped[j] and self._n_compared[j] in DISPUTED_AT for j in doubted)
 
     def _meet_new_landmarks(self, motion: Motion | None, states: FloatArray, detections: IntArray) -> None:
         """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
