@@ -10,7 +10,7 @@ from problems import make_world
 from scipy import stats
 
 from evermap.slam.arrow import Smoother
-from evermap.slam.modes.gating import distances, explained, gate_threshold, with_births
+from evermap.slam.modes.gating import distances, distances_to_modes, gate_threshold, with_births
 from evermap.slam.modes.places import FREE, Modes
 
 
@@ -94,7 +94,7 @@ def test_gates_of_several_modes_are_those_of_each_alone():
     estimate = moving.told_optimum()
     marginals = Smoother(moving.told, moving.world.noise).marginals(estimate)
     modes = Modes(np.array([0, 1, 2, 3, 4, 5, moving.moved]), 6)
-    gates = explained(moving.told, estimate, marginals, moving.world.noise, modes, gate_threshold(0.95))
+    gates = distances_to_modes(moving.told, estimate, marginals, moving.world.noise, modes) < gate_threshold(0.95)
     own = np.arange(len(moving.told.reading))
     for column, places in enumerate(modes.table(estimate).T):
         place = places[modes.landmark[moving.told.landmark_row]]

@@ -64,6 +64,11 @@ class ModeModel:
     negative_information: bool
     robust: bool
 
+    @property
+    def surprise(self) -> float:
+        """Nats by which detections must speak against all modes before they start one: as many as a switch costs."""
+        return self.switch_cost if self.weighs else 0.0
+
     @classmethod
     def from_settings(cls, method: str, settings: ModesConfig, sensor: Sensor, *, robust: bool = True) -> ModeModel:
         """By the name of a method, as in `slam.method`; `max-mixture` neither iterates nor looks at misses.
@@ -135,12 +140,11 @@ def explain_with_modes(
     estimate = _with_map(problem, estimate, modes)
     miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
     most_gain = noise.outlier_log_odds if model.robust else math.inf
-    fewest = 1 + int(model.switch_cost / most_gain) if model.weighs else 1
     for _ in range(PASSES):
         before, given = estimate, problem.landmark_row
         marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
         problem, estimate, modes, lost = with_births(
-            problem, estimate, marginals, noise, modes, model.gate, fewest=fewest
+            problem, estimate, marginals, noise, modes, model.gate, surprise=model.surprise
         )
         problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.switch_cost)
         # what a selector with a window may keep: detections that gate with the mode that they were given
@@ -200,17 +204,17 @@ def _alternate(
     """
     best, best_score = None, -np.inf
     seen: set[bytes] = set()
-    for round_ in range(1, model.rounds + 1):
+    for _ in range(model.rounds):
         looks = look_at_modes(
             problem, estimate, noise, modes, model.sensor, miss_weight=miss_weight, robust=model.robust
         )
-        previous = looks.columns_of(kept) if round_ == 1 else None
+        previous = looks.columns_of(kept)
         selection = model.selector.select(looks.evidence, model.chain, rng, previous=previous)
         problem = looks.assigned(problem, selection.indicator)
         estimate, modes = _without_empty(problem, estimate, modes)
         if solved is not None and np.array_equal(problem.landmark_row, solved):
             return Explanation(problem, estimate, modes, looks, selection, settled=True)
-        solved = problem.landmark_row
+        solved = kept = problem.landmark_row
         smoother = Smoother(problem, noise, heavy=heavy, robust=model.robust)
         estimate = smoother.optimum(estimate, iterations=SOLVER_ITERATIONS, tolerance=SOLVER_TOLERANCE)
         score = looks.prior_score(selection.indicator, selection.log_joint) - smoother.cost(estimate)

@@ -19,6 +19,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_MODES = 4
 """Of a landmark; the paper needs no more than three, and the cost of a solution grows with the square of all."""
+MOST_SURPRISE = 7.0
+"""Nats that a single detection can say against all modes: it may be an outlier."""
 MOST_GROUPS = 16
 """Groups of detections that are looked at before the largest are chosen."""
 
@@ -52,17 +54,25 @@ def distances(
     return found
 
 
-def explained(
-    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, modes: Modes, threshold: float
-) -> BoolArray:
-    """(M, K) which detections gate with which columns of their landmark's modes (`Modes.table`)."""
-    table = modes.table(estimate)
-    places = table[modes.landmark[problem.landmark_row]]
+def distances_to_modes(
+    problem: Problem, estimate: Estimate, marginals: Marginals, noise: Noise, modes: Modes
+) -> FloatArray:
+    """(M, K) squared distance of every detection to each of its landmark's modes (`Modes.table`); inf for no mode."""
+    places = modes.table(estimate)[modes.landmark[problem.landmark_row]]
     detections, columns = np.nonzero(places != FREE)
-    gates = np.zeros(places.shape, dtype=np.bool_)
-    distance = distances(problem, estimate, marginals, noise, detections, places[detections, columns])
-    gates[detections, columns] = distance < threshold
-    return gates
+    squared = np.full(places.shape, np.inf)
+    squared[detections, columns] = distances(
+        problem, estimate, marginals, noise, detections, places[detections, columns]
+    )
+    return squared
+
+
+def surprised(before: float, squared_distance: float, threshold: float) -> float:
+    """Nats by which the detections of a landmark up to this one speak against all its modes (Page 1954).
+
+    The sum of what each says, never below zero: what lies within the gate counts against a move.
+    """
+    return max(0.0, before + 0.5 * min(squared_distance - threshold, 2.0 * MOST_SURPRISE))
 
 
 def with_map_restored(
@@ -106,7 +116,7 @@ def with_births(
     modes: Modes,
     threshold: float,
     *,
-    fewest: int = 1,
+    surprise: float = 0.0,
 ) -> tuple[Problem, Estimate, Modes, BoolArray]:
     """New modes for detections that gate with none of their landmark's, in order of time.
 
@@ -121,20 +131,23 @@ def with_births(
         noise: of the sensor.
         modes: whose mode each place is.
         threshold: of the squared distance, from `gate_threshold`.
-        fewest: detections that a new mode needs.
+        surprise: nats of Page's sum (`surprised`) that it takes; at 0 every single detection starts a mode.
 
     Returns:
-        Problem, estimate and modes, with the new ones; and (M,) which detections gated with none before.
+        Problem, estimate and modes, with the new ones; and (M,) which detections were looked at for them.
     """
-    lost: BoolArray = np.logical_not(explained(problem, estimate, marginals, noise, modes, threshold).any(axis=1))
+    nearest = distances_to_modes(problem, estimate, marginals, noise, modes).min(axis=1)
+    lost = np.zeros(len(nearest), dtype=np.bool_)
     owner = modes.landmark[problem.landmark_row]
     room = MOST_MODES - (modes.table(estimate) != FREE).sum(axis=1)
     at: list[FloatArray] = []
     whose: list[int] = []
-    for landmark in np.unique(owner[lost]):
-        groups = _groups(problem, estimate, marginals, noise, np.flatnonzero(lost & (owner == landmark)), threshold)
-        groups = sorted((group for group in groups if len(group) >= fewest), key=len, reverse=True)
-        for group in groups[: max(0, room[landmark])]:
+    for landmark in np.unique(owner[nearest >= threshold]):
+        mine = np.flatnonzero(owner == landmark)
+        mine = mine[_in_excursion(nearest[mine], threshold, surprise) & (nearest[mine] >= threshold)]
+        lost[mine] = True
+        groups = _groups(problem, estimate, marginals, noise, mine, threshold)
+        for group in sorted(groups, key=len, reverse=True)[: max(0, room[landmark])]:
             pose, reading = estimate.pose[problem.pose_row[group]], problem.reading[group]
             at.append(np.median(sighted_at(pose, reading, estimate.states, problem.mount), axis=0))
             whose.append(int(landmark))
@@ -143,6 +156,19 @@ def with_births(
     place = modes.rows_for(len(at))
     problem, estimate = grown(problem, estimate, int(place.max()) + 1)
     return problem, at_places(estimate, place, np.array(at)), modes.with_owner(place, np.array(whose)), lost
+
+
+def _in_excursion(squared: FloatArray, threshold: float, surprise: float) -> BoolArray:
+    """(n,) detections of one landmark during which Page's sum, once above zero, comes to exceed `surprise`."""
+    level = np.zeros(len(squared))
+    before = 0.0
+    for k, value in enumerate(squared.tolist()):
+        level[k] = before = surprised(before, value, threshold)
+    excursion = np.cumsum(level == 0.0)
+    highest = np.zeros(int(excursion[-1]) + 1)
+    np.maximum.at(highest, excursion, level)
+    above: BoolArray = highest[excursion] > surprise
+    return above
 
 
 def _groups(

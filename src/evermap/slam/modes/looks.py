@@ -60,16 +60,16 @@ class Looks:
         return replace(problem, landmark_row=row)
 
     def columns_of(self, landmark_row: IntArray) -> IntArray:
-        """(R,) columns that hold by the places of detections; a miss takes that of the detection before it.
+        """(R,) columns that hold by the places of detections; -1 where a detection's place has no position.
 
-        -1 where nothing is known: where a detection's place has no position, and before the first detection.
+        A miss takes that of the detection before it, or of the first one.
         """
-        place = np.where(self.hit, landmark_row[np.where(self.hit, self.detection, 0)], FREE)
-        at = self.table[self.landmark] == place[:, None]
-        column = np.where(self.hit & at.any(axis=1), at.argmax(axis=1), -1)
-        last = np.maximum.accumulate(np.where(self.hit, np.arange(len(self)), -1))
-        last = np.where((last >= 0) & (self.landmark[last] == self.landmark), last, np.arange(len(self)))
-        return column[last]
+        hits = np.flatnonzero(self.hit)
+        at = self.table[self.landmark[hits]] == landmark_row[self.detection[hits], None]
+        column = np.where(at.any(axis=1), at.argmax(axis=1), -1)
+        last = np.searchsorted(hits, np.arange(len(self)), side="right") - 1
+        before = (last >= 0) & (self.landmark[hits[last]] == self.landmark)
+        return column[np.where(before, last, last + 1)]
 
     def prior_score(self, indicator: IntArray, log_joint: FloatArray) -> float:
         """What the chain and the misses say about a selection: all of its log probability but the detections'."""

@@ -1,8 +1,8 @@
 """Nielsen's methods behind the estimator's seam: causal at every frame, thought over when stock is taken.
 
 At its frame a detection goes to the mode that is most probable by all looks so far, of those that it gates with; where
-it gates with none, it starts a mode. Whenever stock is taken, births, selection and least squares alternate over the
-whole session.
+it gates with none, and those before it hardly did, it starts one. Whenever stock is taken, births, selection and least
+squares alternate over the whole session, beginning with the modes so far.
 """
 
 from __future__ import annotations
@@ -12,13 +12,10 @@ import numpy as np
 from evermap.slam.method import Compare, Revision
 from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
-from evermap.slam.modes.gating import MOST_MODES
+from evermap.slam.modes.gating import MOST_MODES, surprised
 from evermap.slam.modes.places import Modes
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
-
-MOST_SURPRISE = 7.0
-"""Nats that a single detection can say against all modes: it may be an outlier."""
 
 
 class MultiHypothesis:
@@ -37,7 +34,7 @@ class MultiHypothesis:
         self._log_belief = np.zeros(n_landmarks)
         """(P,) log probability of each place to be where its landmark is, by all looks so far."""
         self._surprise = np.zeros(n_landmarks)
-        """(L,) how much the latest detections of each landmark speak against all its modes (Page 1954)."""
+        """(L,) how much the latest detections of each landmark speak against all its modes (`surprised`)."""
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
         """The most probable mode that each detection gates with, else a new one."""
@@ -81,7 +78,8 @@ class MultiHypothesis:
         self._log_belief[places] = before + said if self._model.chained else said
         gates = distance < self._model.gate
         landmark = int(self._modes.landmark[first])
-        if not self._is_elsewhere(landmark, len(places), float(distance.min())):
+        self._surprise[landmark] = surprised(self._surprise[landmark], float(distance.min()), self._model.gate)
+        if self._surprise[landmark] <= self._model.surprise or len(places) >= MOST_MODES:
             allowed = gates if gates.any() else distance == distance.min()
             return int(places[np.argmax(np.where(allowed, self._log_belief[places], -np.inf))])
         new = len(self._modes.landmark)
@@ -90,20 +88,6 @@ class MultiHypothesis:
         self._log_belief[new] = self._log_belief[places].max() - self._model.switch_cost
         self._surprise[landmark] = 0.0
         return new
-
-    def _is_elsewhere(self, landmark: int, n_modes: int, nearest: float) -> bool:
-        """Whether detections that gate with no mode have gone on for long enough to start one.
-
-        Page's test: the sum of what each says, never below zero, so that what lies within the gate counts against a
-        move, and a move is as much worth as a switch costs.
-        """
-        if n_modes >= MOST_MODES:
-            return False
-        if not self._model.weighs:
-            return nearest >= self._model.gate
-        said = 0.5 * min(nearest - self._model.gate, 2.0 * MOST_SURPRISE)
-        self._surprise[landmark] = max(0.0, self._surprise[landmark] + said)
-        return bool(self._surprise[landmark] > self._model.switch_cost)
 
     def _current(self, problem: Problem) -> IntArray:
         """(L,) the mode of every landmark's last detection; its first one where it has none yet."""
