@@ -122,6 +122,7 @@ def explain_with_modes(
     rng: np.random.Generator,
     *,
     heavy: bool = False,
+    anew: bool = False,
 ) -> Explanation:
     """Births, the alternation and the uniting, again and again until a pass changes nothing.
 
@@ -136,6 +137,7 @@ def explain_with_modes(
         model: how modes change and are selected.
         rng: for selectors that draw.
         heavy: outliers have the Cauchy's tails in the least squares.
+        anew: selectors with a window decide about everything again.
     """
     estimate = _with_map(problem, estimate, modes)
     miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
@@ -148,7 +150,7 @@ def explain_with_modes(
         )
         problem, estimate, modes = with_map_restored(problem, estimate, marginals, modes, model.switch_cost)
         # what a selector with a window may keep: detections that gate with the mode that they were given
-        kept = np.where(lost, FREE, given)
+        kept = np.where(lost | anew, FREE, given)
         found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, given, heavy=heavy)
         while model.weighs:
             problem, estimate, modes = _weighed(found, noise, model.switch_cost, most_gain, heavy=heavy)

@@ -53,8 +53,9 @@ class MultiHypothesis:
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Births and the alternation over everything so far."""
-        del final
-        found = explain_with_modes(problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy)
+        found = explain_with_modes(
+            problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy, anew=final
+        )
         self._modes = found.modes
         current = self._current(found.problem)
         self._log_belief = np.full(len(found.modes.landmark), -self._model.switch_cost)
