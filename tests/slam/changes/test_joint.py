@@ -134,7 +134,7 @@ def test_displacements_are_right() -> None:
 
 @pytest.mark.slow
 def test_an_instant_is_inside_its_interval_most_of_the_time() -> None:
-    """The interval takes poses for known, which were estimated with wrong places of the members near the instant."""
+    """Of 95 % intervals, which take poses for known."""
     inside = trials = 0
     for seed in range(30):
         move = replace(WITHIN, at_s=60.0 + 2.7 * seed)
@@ -145,7 +145,7 @@ def test_an_instant_is_inside_its_interval_most_of_the_time() -> None:
                 inside += change.stamp_from_s <= move.at_s <= change.stamp_to_s
     print("inside", inside, "of", trials)
     assert trials >= 27
-    assert inside >= 0.7 * trials
+    assert inside >= 0.9 * trials
 
 
 @pytest.mark.slow

@@ -14,7 +14,8 @@ from evermap.slam.changes.timing import parting_time
 from evermap.slam.problem import Problem
 
 MEMBERS = np.array([1, 3])
-DURATION_S = 48.0
+WHOLE = (0.0, 100.0)
+"""Nothing is known beforehand."""
 
 
 def sightings(world: World, at_s: float, by: np.ndarray, rng: np.random.Generator | None) -> Problem:
@@ -32,7 +33,7 @@ def sightings(world: World, at_s: float, by: np.ndarray, rng: np.random.Generato
 
 def timed(world: World, problem: Problem, by: np.ndarray) -> tuple[float, tuple[float, float]]:
     old = world.truth.landmark[MEMBERS]
-    return parting_time(problem, world.truth, QUIET, MEMBERS, old, old + by)
+    return parting_time(problem, world.truth, QUIET, MEMBERS, old, old + by, WHOLE)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -18,7 +18,7 @@ from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, l
 from evermap.slam.changes.explain import GivenMap, Group, explained
 from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.changes.swaps import likeliest_swap, with_swap
-from evermap.slam.changes.timing import parting_time
+from evermap.slam.changes.timing import parting_time, unswayed
 from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Revision, Rival
 from evermap.slam.noise import START
@@ -260,7 +260,13 @@ class Joint:
             return replace(group, since_s=float(stamps[1]), between_s=within_s)
         old = estimate.landmark[: self._count]
         since_s, between_s = parting_time(
-            base, estimate, noise, group.members, old[group.members], group.moved(old), within_s
+            base,
+            unswayed(base, estimate, noise, group.members),
+            noise,
+            group.members,
+            old[group.members],
+            group.moved(old),
+            within_s,
         )
         return replace(group, since_s=since_s, between_s=between_s)
 

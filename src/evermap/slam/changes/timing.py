@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from evermap.slam.arrow import Smoother
 from evermap.slam.kernels import detection_residual, kernel, outlier_loss
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
 SHARE = 0.95
 """Of the posterior of the instant that lies between the two stamps reported."""
+
+
+def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Estimate:
+    """The estimate with poses that no sighting of the members has bent.
+
+    Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
+    """
+    others = ~np.isin(problem.landmark_row, members)
+    rest = replace(
+        problem,
+        pose_row=problem.pose_row[others],
+        landmark_row=problem.landmark_row[others],
+        reading=problem.reading[others],
+        sigma_given=problem.sigma_given[others],
+    )
+    start = Estimate(estimate.pose, estimate.landmark[: len(problem.landmark_mean)], estimate.states)
+    free = Smoother(rest, noise, heavy=True).optimum(start, iterations=5, tolerance=1e-4)
+    return Estimate(free.pose, estimate.landmark, free.states)
 
 
 def parting_time(
