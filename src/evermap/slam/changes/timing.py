@@ -14,6 +14,8 @@ from evermap.types import FloatArray, IntArray
 
 SHARE = 0.95
 """Of the posterior of the instant that lies between the two stamps reported."""
+HELD_M = 0.005
+"""To this the other landmarks are held meanwhile."""
 
 
 def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Estimate:
@@ -28,6 +30,9 @@ def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArr
         landmark_row=problem.landmark_row[others],
         reading=problem.reading[others],
         sigma_given=problem.sigma_given[others],
+        # the other landmarks stay where they are, or the whole might turn away from the members' places
+        landmark_mean=np.nan_to_num(estimate.landmark[: len(problem.landmark_mean)]),
+        landmark_information=np.eye(problem.landmark_mean.size) / HELD_M**2,
     )
     start = Estimate(estimate.pose, estimate.landmark[: len(problem.landmark_mean)], estimate.states)
     free = Smoother(rest, noise, heavy=True).optimum(start, iterations=5, tolerance=1e-4)
