@@ -32,8 +32,6 @@ PASSES = 3
 """Births and alternations, at most; two are enough where the trajectory is not far off."""
 LEAST_SWITCH = 1e-300
 """A switch that is ruled out still leaves a filter that can recover."""
-SETTLED_M = 0.01
-"""A pass that moves no pose farther than this changes no gate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +64,8 @@ class ModeModel:
 
     @property
     def surprise(self) -> float:
-        """Nats by which detections must speak against all modes before they start one: as many as a switch costs."""
-        return self.switch_cost if self.weighs else 0.0
+        """Nats by which detections must speak against all modes before they start one: a switch each way."""
+        return 2.0 * self.switch_cost if self.weighs else 0.0
 
     @classmethod
     def from_settings(cls, method: str, settings: ModesConfig, sensor: Sensor, *, robust: bool = True) -> ModeModel:
@@ -143,7 +141,7 @@ def explain_with_modes(
     miss_weight = news_in_a_miss(problem, estimate, modes, model.sensor) if model.negative_information else 0.0
     most_gain = noise.outlier_log_odds if model.robust else math.inf
     for _ in range(PASSES):
-        before, given = estimate, problem.landmark_row
+        given = problem.landmark_row
         marginals = Smoother(problem, noise, heavy=heavy, robust=model.robust).marginals(estimate)
         problem, estimate, modes, lost = with_births(
             problem, estimate, marginals, noise, modes, model.gate, surprise=model.surprise
@@ -159,9 +157,9 @@ def explain_with_modes(
             kept = problem.landmark_row
             found = _alternate(problem, estimate, noise, modes, model, rng, miss_weight, kept, None, heavy=heavy)
         problem, estimate, modes = found.problem, found.estimate, found.modes
-        moved = np.abs(estimate.pose[:, :2] - before.pose[:, :2]).max()
-        if not found.settled or (moved < SETTLED_M and np.array_equal(problem.landmark_row, given)):
+        if not found.settled or np.array_equal(problem.landmark_row, given):
             break
+        anew = False
     problem, estimate, modes, to = compacted(problem, estimate, modes)
     table = np.where(found.looks.table != FREE, to[found.looks.table], FREE)
     return replace(found, problem=problem, estimate=estimate, modes=modes, looks=replace(found.looks, table=table))
