@@ -12,6 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap import se2
+from evermap.slam.align import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence
@@ -94,6 +96,7 @@ class Joint:
         self._start = self._first_places(estimate)
         if self._given is None or not self._in_map(problem):
             return problem, estimate
+        self._start = self._where_most_agree(self._start)
         self._free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
@@ -106,6 +109,15 @@ class Joint:
         unmapped = replace(self._free, landmark_information=np.zeros_like(self._free.landmark_information))
         self._start = outvoted(unmapped, start, weights)
         return self._free, self._start
+
+    def _where_most_agree(self, estimate: Estimate) -> Estimate:
+        """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
+        assert self._given is not None
+        both = self._given.given & estimate.known
+        motion, agree = consensus(estimate.landmark[both], self._given.mean[both])
+        if np.count_nonzero(agree) < 2:
+            return estimate
+        return Estimate(se2.compose(motion, estimate.pose), se2.transform(motion, estimate.landmark), estimate.states)
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Search at the present estimate, and again at what it leads to where the session ends."""
@@ -219,7 +231,10 @@ class Joint:
             if swap is None:
                 break
             other = with_swap(given, swap.first, swap.second)
-            rival = weigh(evidence, other, self._prior, n_windows, before=verdict, thorough=thorough)
+            # the same copies for both: what is left out costs nothing, and must not be what decides
+            rival = weigh(
+                verdict.evidence, other, self._prior, n_windows, before=verdict, thorough=thorough, spared=True
+            )
             log_odds = rival.score + swap.log_prior - verdict.score
             if log_odds <= 0.0:  # moves explain it better
                 break

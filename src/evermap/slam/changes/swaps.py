@@ -12,7 +12,7 @@ from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.search import item_columns
 from evermap.types import FloatArray
 
-P_SWAPPED = 0.001
+P_SWAPPED = 1e-5
 """Prior probability that any two landmarks of a map were mixed up."""
 
 

@@ -20,8 +20,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 MAP_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """By which the standard deviations of the map may be wrong."""
-MAP_FACTOR_SPREAD = 0.7
-"""Standard deviation of the logarithm of that factor: a map's own word is right within a factor of two."""
+MAP_FACTOR_SPREAD = 0.35
+"""Standard deviation of the logarithm of that factor: a map's own word is nearly always right within one of two."""
 SOFTNESS_M = (0.005, 0.01, 0.02, 0.04)
 """Errors that the sightings of one landmark in one window may share."""
 TRANSIENT_SOFTNESS_M = 0.02
@@ -40,6 +40,7 @@ class Verdict:
         softness_m: error shared by the sightings of a window.
         score: log posterior of the best hypothesis under the best degree of belief, for comparing maps [nats].
         misfit: chi-square of what the best hypothesis leaves, over its degrees of freedom.
+        evidence: what was weighed: without the copies that are displaced alone.
     """
 
     groups: tuple[Group, ...]
@@ -49,6 +50,7 @@ class Verdict:
     softness_m: float
     score: float
     misfit: float
+    evidence: Evidence
 
 
 def weigh(
@@ -59,6 +61,7 @@ def weigh(
     *,
     before: Verdict | None = None,
     thorough: bool = True,
+    spared: bool = False,
 ) -> Verdict:
     """Search for changes, and weigh what was found.
 
@@ -68,12 +71,13 @@ def weigh(
         prior: how changes are distributed.
         n_windows: windows of the evidence.
         before: what was found last time; one start of the search.
+        spared: no copy of this evidence is displaced alone.
         thorough: try all degrees of belief, else those of `before`.
     """
     factor = 1.0 if before is None else before.map_factor
     softness = 0.0 if n_windows == 1 else (0.01 if before is None else before.softness_m)
     position = _positions(evidence, given)
-    if n_windows > 1:
+    if n_windows > 1 and not spared:
 
         def search(evidence: Evidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
             soft = evidence.softened(TRANSIENT_SOFTNESS_M)
@@ -103,7 +107,7 @@ def weigh(
         improved = tried(*best) > tried(factor, softness)
         if improved:
             factor, softness = best
-    return _verdict(list(trials.values()), trials[factor, softness], _Seen.of(evidence, given))
+    return _verdict(evidence, list(trials.values()), trials[factor, softness], _Seen.of(evidence, given))
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +177,7 @@ class _Seen(NamedTuple):
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
-def _verdict(trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
+def _verdict(evidence: Evidence, trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
@@ -196,6 +200,7 @@ def _verdict(trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
         map_factor=best.factor,
         softness_m=best.softness,
         score=best.score,
+        evidence=evidence,
         misfit=gained / max(best.comparison.freedom, 1.0),
     )
 
