@@ -42,11 +42,13 @@ class MovingWorld:
         return Smoother(self.told, self.world.noise).optimum(near, iterations=60, tolerance=1e-9)
 
 
-def make_moving_world(seed: int, *, by: tuple[float, float] = FAR, **options: object) -> MovingWorld:
-    """Landmark 2 is elsewhere from the middle of the poses on; noise as in the static world."""
+def make_moving_world(
+    seed: int, *, by: tuple[float, float] = FAR, since: int | None = None, **options: object
+) -> MovingWorld:
+    """Landmark 2 is elsewhere from a pose on, by default the middle one; noise as in the static world."""
     world = make_world(seed, **{"n_poses": 60, "n_landmarks": 6, "n_mapped": 6, **options})  # type: ignore[arg-type]
     problem, truth = world.problem, world.truth
-    moved, since = 2, len(problem.stamp_s) // 2
+    moved, since = 2, len(problem.stamp_s) // 2 if since is None else since
     at = truth.landmark[moved] + by
     late = (problem.landmark_row == moved) & (problem.pose_row >= since)
     reading = problem.reading.copy()

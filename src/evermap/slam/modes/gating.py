@@ -167,7 +167,7 @@ def _in_excursion(squared: FloatArray, threshold: float, surprise: float) -> Boo
     excursion = np.cumsum(level == 0.0)
     highest = np.zeros(int(excursion[-1]) + 1)
     np.maximum.at(highest, excursion, level)
-    above: BoolArray = highest[excursion] > surprise
+    above: BoolArray = (level > 0.0) & (highest[excursion] > surprise)
     return above
 
 
