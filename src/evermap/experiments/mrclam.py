@@ -36,8 +36,6 @@ SCHEMA_VERSION = "1"
 PRIOR_SIGMA_M = 0.02
 MAIN, OTHERS = 6, (3, 1, 2)
 """Dataset 6 has the whole truth. Of 3 the last part is known, of 1 and 2 the landmarks only."""
-SWAPPED = {1: (11, 17)}
-"""Landmarks whose barcodes were exchanged while recording (of some robots); they are mapped, and not scored."""
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables that must be 1 before numpy is loaded for timings on one core; the command sets them."""
 SCORING = (
@@ -147,7 +145,7 @@ def _jobs(data: Path, datasets: tuple[int, ...]) -> Iterator[Job]:
         path = find_dataset(data, dataset)
         for robot in list_robots(path):
             recording = read_recording(path, robot=robot)
-            yield Job(dataset, robot, _without(recording, SWAPPED.get(dataset, ())))
+            yield Job(dataset, robot, recording)
 
 
 def find_dataset(data: Path, dataset: int) -> Path:
@@ -162,16 +160,6 @@ def find_dataset(data: Path, dataset: int) -> Path:
             return path
     problem = f"no {name}.zip and no folder {name} here"
     raise InputError(problem, path=data, hint="--data FOLDER with the recordings as their authors distribute them")
-
-
-def _without(recording: Recording, landmark_ids: tuple[int, ...]) -> Recording:
-    """The recording with some landmarks left out of the survey, so that they are not scored."""
-    survey = recording.true_landmarks
-    if survey is None or not landmark_ids:
-        return recording
-    keep = ~np.isin(survey.landmark_id, landmark_ids)
-    known = Landmarks.at(survey.landmark_id[keep], survey.position_m[keep], frame=survey.frame)
-    return replace(recording, true_landmarks=replace(known, clock=survey.clock))
 
 
 @dataclass

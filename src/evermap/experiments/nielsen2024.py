@@ -38,7 +38,7 @@ EXPERIMENT = "nielsen2024"
 SCORING = (
     "no alignment: the map gives the frame; poses at 2 Hz against the truth (data set 6) or against a trajectory "
     "smoothed with the true landmarks (1, 2, 3; of 3 the last 466 s also against the truth); landmarks seen ten times "
-    "or more; of data set 1 without landmarks 11 and 17, whose barcodes were exchanged while recording"
+    "or more"
 )
 PATHS = "paths.json"
 _DRAWN_DELTA_M = {6: 1.0, 1: 1.0, 2: 2.1, 3: 1.0}

@@ -137,7 +137,7 @@ def _during(key: str, datasets: tuple[int, ...]) -> Callable[[Rows, Rows], float
     def measure(_: Rows, runs: Rows) -> float | None:
         rows = chosen(runs, part="during", method="joint", dataset=datasets)
         if key == "found":
-            in_time = [row["time_off_window_s"] is not None and row["time_off_window_s"] <= 10.0 for row in rows]
+            in_time = [row["time_off_interval_s"] is not None and row["time_off_interval_s"] <= 10.0 for row in rows]
             return sum(in_time) / len(rows) if rows else None
         return _worst_mean(rows, key)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.experiments.mrclam import SWAPPED, find_dataset
+from evermap.experiments.mrclam import find_dataset
 from evermap.experiments.nielsen2024_runs import BUILDING, SENSORS, Job, recording_of
 from evermap.io.shifts import Shift
 from evermap.metrics.landmarks import MIN_SIGHTINGS
@@ -170,16 +170,14 @@ def _searched(dataset: int, job: Callable[..., Job]) -> Iterator[Job]:
         yield job("search", scenario, sensor="ours", method="joint", shifts=shifts, delta_m=delta)
 
 
-def _random(
-    draws: Sequence[np.random.SeedSequence], recording: Recording, dataset: int, job: Callable[..., Job]
-) -> Iterator[Job]:
+def _random(draws: Sequence[np.random.SeedSequence], recording: Recording, job: Callable[..., Job]) -> Iterator[Job]:
     """Random groups and displacements; the scenario's name holds the number of the draw."""
     for number, draw in enumerate(draws):
-        shifts = random_shifts(recording, np.random.default_rng(draw), SWAPPED.get(dataset, ()))
+        shifts = random_shifts(recording, np.random.default_rng(draw))
         yield job("search", f"random {number}", sensor="ours", method="joint", shifts=shifts)
 
 
-def random_shifts(recording: Recording, rng: np.random.Generator, excluded: tuple[int, ...] = ()) -> tuple[Shift, ...]:
+def random_shifts(recording: Recording, rng: np.random.Generator) -> tuple[Shift, ...]:
     """No, one or two groups (20, 50, 30 %) of one to four neighbours each, moved by 0.05 to 1 m in any direction.
 
     One group in ten turns as well, by up to 30 degrees. Only landmarks that were seen often enough to be scored.
@@ -187,7 +185,7 @@ def random_shifts(recording: Recording, rng: np.random.Generator, excluded: tupl
     survey = recording.true_landmarks
     assert survey is not None
     ids, hits = np.unique(recording.detections.landmark_id, return_counts=True)
-    free = np.isin(survey.landmark_id, ids[hits >= MIN_SIGHTINGS]) & ~np.isin(survey.landmark_id, excluded)
+    free = np.isin(survey.landmark_id, ids[hits >= MIN_SIGHTINGS])
     shifts = []
     for _ in range(int(rng.choice(3, p=[0.2, 0.5, 0.3]))):
         rows = np.flatnonzero(free)

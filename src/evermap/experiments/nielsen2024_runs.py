@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import DataError, NumericalError
-from evermap.experiments.mrclam import PRIOR_SIGMA_M, SWAPPED, find_dataset
+from evermap.experiments.mrclam import PRIOR_SIGMA_M, find_dataset
 from evermap.experiments.nielsen2024_scores import change_scores, run_scores
 from evermap.io.shifts import Shift, shifted
 from evermap.metrics.alignment import interpolate
@@ -63,7 +63,7 @@ NOTHING: Row = {
         (
             "pose_rmse_m", "pose_seen_rmse_m", "pose_max_m", "heading_rmse_deg", "pose_true_rmse_m",
             "landmark_rmse_m", "landmark_max_m", "truth_rank", "precision", "recall", "displacement_error_m",
-            "time_error_s", "time_off_window_s", "recording_s", "frames", "wall_s", "cpu_s", "step_p99_ms",
+            "time_off_interval_s", "time_off_window_s", "recording_s", "frames", "wall_s", "cpu_s", "step_p99_ms",
         )
     ),
 }  # fmt: skip
@@ -136,17 +136,12 @@ def recording_of(data: Path, dataset: int, robot: int) -> Recording:
     return read_recording(find_dataset(data, dataset), robot=robot)
 
 
-def survey_of(recording: Recording, dataset: int, *, scored: bool) -> Landmarks:
-    """True landmarks: all of them, or (`scored`) without those whose barcodes were exchanged while recording.
-
-    The survey has no true place for such an identity, so it is not scored, and not in the map of the reference. The
-    estimator is not told: its map has them where the survey says.
-    """
+def survey_of(recording: Recording) -> Landmarks:
+    """True landmarks, as a map to localise in."""
     survey = recording.true_landmarks
     if survey is None:
         raise DataError(f"{recording.name}: no surveyed landmarks")
-    keep = ~np.isin(survey.landmark_id, SWAPPED.get(dataset, ()) if scored else ())
-    return Landmarks.at(survey.landmark_id[keep], survey.position_m[keep], sigma_m=PRIOR_SIGMA_M, frame="prior_map")
+    return Landmarks.at(survey.landmark_id, survey.position_m, sigma_m=PRIOR_SIGMA_M, frame="prior_map")
 
 
 def reference_of(data: Path, dataset: int, robot: int) -> Reference:
@@ -158,7 +153,7 @@ def reference_of(data: Path, dataset: int, robot: int) -> Reference:
     result = run_slam(
         recording,
         load_config(None, ["slam.method=nohyp"]),
-        prior_map=survey_of(recording, dataset, scored=True),
+        prior_map=survey_of(recording),
     )
     value = {parameter.name: parameter.value for parameter in result.parameters}
     law = (value["range_slope"], value["range_skew_per_rad"], value["range_curvature_per_rad2"])
@@ -180,7 +175,7 @@ def half_time_s(recording: Recording) -> float:
 
 def inputs_of(job: Job, recording: Recording, reference: Reference) -> tuple[Recording, Landmarks, Landmarks]:
     """What the estimator is given (recording and map), and where the landmarks truly are at the end."""
-    truth = survey_of(recording, job.dataset, scored=False)
+    truth = survey_of(recording)
     if job.sensor != "ours":
         recording = limited(recording, PAPER_RANGE_M, PAPER_BEARING_RAD)
     if not job.during:
@@ -227,14 +222,12 @@ def run_job(job: Job, data: Path, reference: Reference) -> tuple[Row, SlamResult
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     if result.interrupted:
         raise KeyboardInterrupt
-    swapped = SWAPPED.get(job.dataset, ())
-    scored = ~np.isin(landmarks.landmark_id, swapped)
-    at = Landmarks.at(landmarks.landmark_id[scored], landmarks.position_m[scored])
+    at = Landmarks.at(landmarks.landmark_id, landmarks.position_m)
     row = {
         **job.key,
         **NOTHING,
         **run_scores(recording, result, reference.trajectory, original.truth, at),
-        **change_scores(true_changes(job, original), result, original, swapped, job.during),
+        **change_scores(true_changes(job, original), result, original, job.during),
         "recording_s": float(np.ptp(recording.frames.stamp_s)),
         "frames": len(result.online),
         "wall_s": wall,
@@ -251,7 +244,7 @@ def warm_up(jobs: Sequence[Job], data: Path) -> None:
 
     for job in {(job.sensor, job.method): job for job in jobs}.values():
         recording = recording_of(data, job.dataset, job.robot)
-        run_slam(first_frames(recording, 60), job.config(), prior_map=survey_of(recording, job.dataset, scored=False))
+        run_slam(first_frames(recording, 60), job.config(), prior_map=survey_of(recording))
 
 
 def _poses_at(trajectory: Trajectory, stamp_s: FloatArray) -> FloatArray:

@@ -5,7 +5,8 @@ Nothing is aligned: the map gives the frame, and an estimate that slides away wi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -49,20 +50,16 @@ def run_scores(
     }
 
 
-def change_scores(
-    true: Sequence[MapChange], result: SlamResult, recording: Recording, ignored: Collection[int], during: bool
-) -> Row:
+def change_scores(true: Sequence[MapChange], result: SlamResult, recording: Recording, during: bool) -> Row:
     """How the changes that were found agree with those that were made; plain JSON values.
 
     Args:
         true: what was made.
         result: of the run.
         recording: before the edit.
-        ignored: landmarks that do not count, because their identities are wrong in the recording.
         during: whether the change happened during the recording.
     """
-    true, found = _counted(true, ignored), _counted(result.changes, ignored)
-    others = tuple(replace(other, changes=_counted(other.changes, ignored)) for other in result.alternatives)
+    found, others = result.changes, result.alternatives
     errors = compare_changes(found, true)
     groups = {change.landmark_ids for change in true}
     right = [change.landmark_ids in groups for change in found]
@@ -89,13 +86,13 @@ def change_scores(
 
 
 def _time_scores(right: Sequence[MapChange], true: Sequence[MapChange], recording: Recording) -> Row:
-    """Distance of the change's time to the true time, and to the window that the recording leaves open [s].
+    """How far the true time lies outside of the interval that was reported, and its middle outside of the window [s].
 
     The window reaches from the last sighting of the group before the change to the first after it: within it all
     times explain the recording equally well.
     """
     if not right:
-        return {"time_error_s": None, "time_off_window_s": None}
+        return {"time_off_interval_s": None, "time_off_window_s": None}
     at_s, found_s = time_of_change(true[0]), time_of_change(right[0])
     detections = recording.detections
     stamps = recording.frames.stamp_s[detections.frame]
@@ -103,15 +100,11 @@ def _time_scores(right: Sequence[MapChange], true: Sequence[MapChange], recordin
     opens = float(seen_s[seen_s < at_s].max(initial=stamps[0]))
     closes = float(seen_s[seen_s >= at_s].min(initial=stamps[-1]))
     return {
-        "time_error_s": abs(found_s - at_s),
+        "time_off_interval_s": max(right[0].stamp_from_s - at_s, at_s - right[0].stamp_to_s, 0.0)
+        if math.isfinite(right[0].stamp_from_s)
+        else abs(found_s - at_s),
         "time_off_window_s": max(opens - found_s, found_s - closes, 0.0),
     }
-
-
-def _counted(changes: Sequence[MapChange], ignored: Collection[int]) -> tuple[MapChange, ...]:
-    """The changes without landmarks that do not count; ids sorted."""
-    kept = [replace(change, landmark_ids=tuple(sorted(set(change.landmark_ids) - set(ignored)))) for change in changes]
-    return tuple(change for change in kept if change.landmark_ids)
 
 
 def _rms(values: FloatArray) -> float | None:
