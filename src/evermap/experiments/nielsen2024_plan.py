@@ -114,7 +114,7 @@ def jobs(settings: Settings, data: Path) -> list[Job]:
         if "search" in settings.parts:
             planned += _searched(dataset, job) if dataset != BUILDING else []
             draws = np.random.SeedSequence([settings.seed, dataset, robot]).spawn(settings.random_changes)
-            planned += _random(draws, recording_of(data, dataset, robot), dataset, job)
+            planned += _random(draws, recording_of(data, dataset, robot), job)
     return planned
 
 
