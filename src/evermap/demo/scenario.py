@@ -39,7 +39,7 @@ class Scenario:
         """Default settings, but for the length standard that the simulated range sensor is."""
         from evermap.config import CalibrationConfig, Config, SlamConfig
 
-        return Config(slam=SlamConfig(calibration=CalibrationConfig(fix={"range_slope": 0.0})))
+        return Config(slam=SlamConfig(method="nohyp", calibration=CalibrationConfig(fix={"range_slope": 0.0})))
 
     def _world(self, change_rate: float, seed: int) -> BuildingSimulation:
         # without a length standard no estimator can tell the size of a building: 1 % of slope would put 0.1 m of
