@@ -36,7 +36,7 @@ class Scenario:
         return self._world(self.change_rate, seed), self._world(0.0, seed)
 
     def estimator(self) -> Config:
-        """Default settings, but for the length standard that the simulated range sensor is."""
+        """Default settings, but for a map that is believed for ever and the simulated sensor's true metre."""
         from evermap.config import CalibrationConfig, Config, SlamConfig
 
         return Config(slam=SlamConfig(method="nohyp", calibration=CalibrationConfig(fix={"range_slope": 0.0})))
