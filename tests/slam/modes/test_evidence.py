@@ -33,6 +33,14 @@ def test_the_second_place_is_worth_the_ratio_of_two_gaussians(seed: int):
     assert _log_ratio(mean, covariance, 1, 3) == pytest.approx(moved - same, rel=1e-9)
 
 
+def test_a_place_that_is_hardly_known_is_no_second_one():
+    """All its sightings are outliers: its variance is so large that rounding leaves no definite covariance."""
+    covariance = 1e-4 * np.eye(4) + 1e9 * np.kron(np.array([[1.0, 0.0], [0.0, 0.0]]), np.ones((2, 2)))
+    covariance[:2, :2] -= 1e-3 * np.eye(2)
+    assert np.linalg.eigvalsh(covariance)[0] < 0.0
+    assert _log_ratio(np.array([[0.02, 0.01], [0.0, 0.0]]), covariance, 0, 1) < 5.0
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_places_that_coincide_are_those_of_the_tied_least_squares_problem(seed: int):
     mean, covariance = random_places(seed)

@@ -7,7 +7,6 @@ two of them coincide, and what everything else then does.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -133,11 +132,12 @@ def _histories(problem: Problem, estimate: Estimate, weights: FloatArray, modes:
 
 def _log_ratio(mean: FloatArray, covariance: FloatArray, a: int, b: int) -> float:
     """Log of how much better a displacement explains the difference of two places than chance does."""
-    chance = _of_difference(covariance, a, b)
-    moved = chance + MOVE_SIGMA_M**2 * np.eye(2)
-    apart = mean[a] - mean[b]
-    squared = apart @ (np.linalg.solve(chance, apart) - np.linalg.solve(moved, apart))
-    return 0.5 * float(squared + math.log(np.linalg.det(chance) / np.linalg.det(moved)))
+    # along the axes of chance; where a place is hardly known, rounding may leave less than what all sightings share
+    variance, axes = np.linalg.eigh(_of_difference(covariance, a, b))
+    variance = np.maximum(variance, SHARED_ERROR_M**2)
+    moved = variance + MOVE_SIGMA_M**2
+    apart = axes.T @ (mean[a] - mean[b])
+    return 0.5 * float(np.sum(apart**2 * (1.0 / variance - 1.0 / moved) + np.log(variance / moved)))
 
 
 def _of_difference(covariance: FloatArray, a: int, b: int) -> FloatArray:
