@@ -29,6 +29,7 @@ BUILDING = 0
 PAPER_RANGE_M, PAPER_BEARING_RAD = 5.0, 0.4
 """Detections beyond these were disregarded by the paper."""
 _PAPER = (
+    "slam.modes.births=gate",
     "slam.sensor_model=plain",
     "slam.robust=false",
     "slam.estimate_noise=false",
