@@ -92,11 +92,10 @@ class Joint:
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """With the map believed to a metre: one that is wrong bends the solution, or makes it look noisy."""
-        self._held = self._free = problem
-        self._start = self._first_places(estimate)
         if self._given is None or not self._in_map(problem):
             return problem, estimate
-        self._start = self._where_most_agree(self._start)
+        self._held = problem
+        self._start = self._where_most_agree(self._first_places(estimate))
         self._free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
