@@ -48,6 +48,21 @@ def test_one_session_of_each_kind(moves: tuple[Move, ...]) -> None:
     assert count_exact(range(1), *moves) == 1
 
 
+@pytest.mark.parametrize("with_map", [True, False])
+def test_what_was_thought_on_the_way_can_be_thought_again(with_map: bool) -> None:
+    session = make_session(0, WITHIN, with_map=with_map)
+    method, estimate = session.method(), session.static
+    noise = session.world.noise
+    before = method.revise(session.problem, estimate, noise, heavy=True, final=False)
+    assert len(before.estimate.landmark) > len(session.before)  # places were added
+    problem, estimate = method.unprejudiced(before.problem, before.estimate)
+    estimate = Smoother(problem, noise).optimum(estimate, tolerance=1e-4)
+    last = method.revise(problem, estimate, noise, heavy=False, final=True)
+    assert all_found(last.changes, WITHIN)
+    again = method.revise(last.problem, last.estimate, noise, heavy=False, final=True)
+    assert again.problem is last.problem
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("with_map", [True, False])
 def test_nothing_moved_nothing_found(with_map: bool) -> None:

@@ -56,9 +56,13 @@ class Session:
         start = replace(start, landmark=self.before.copy())
         return Smoother(self.problem, self.world.noise, heavy=True).optimum(start, tolerance=1e-4)
 
+    def method(self, prior: ChangePrior | None = None) -> Joint:
+        """The joint search, before it has seen anything."""
+        return Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangePrior())
+
     def revised(self, prior: ChangePrior | None = None) -> tuple[Joint, Revision]:
         """What the method makes of the whole session, as the estimator asks it at the end."""
-        method = Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangePrior())
+        method = self.method(prior)
         problem, estimate = method.unprejudiced(self.problem, self.static)
         estimate = Smoother(problem, self.world.noise, heavy=True).optimum(estimate, tolerance=1e-4)
         return method, method.revise(problem, estimate, self.world.noise, heavy=False, final=True)
