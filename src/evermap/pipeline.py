@@ -45,6 +45,8 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
+    from threadpoolctl import threadpool_limits
+
     from evermap.config import Config
     from evermap.slam.association.identify import identified
     from evermap.slam.session import prepare
@@ -56,9 +58,11 @@ def run_slam(
         recording = identified(recording, prior, noise, prior_map=prior_map)
     prepared = prepare(recording, prior_map)
     warm_up()
-    slam = _estimator(prepared, prior, noise, recording, config)
-    step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
-    return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
+    # small matrices: several threads would only wait for each other, and sum in another order on another machine
+    with threadpool_limits(limits=1, user_api="blas"):
+        slam = _estimator(prepared, prior, noise, recording, config)
+        step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
+        return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
 
 
 def warm_up() -> None:
