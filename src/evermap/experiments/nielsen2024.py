@@ -24,7 +24,7 @@ from evermap.errors import EvermapError
 from evermap.experiments.mrclam import machine
 from evermap.experiments.nielsen2024_figures import draw_all
 from evermap.experiments.nielsen2024_plan import METHODS, PARTS, QUICK, Settings, jobs
-from evermap.experiments.nielsen2024_runs import Job, Reference, reference_of, run_job, warm_up
+from evermap.experiments.nielsen2024_runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
 from evermap.experiments.nielsen2024_simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap.experiments.nielsen2024_table import as_markdown, verdicts
 from evermap.types import SlamResult
@@ -191,7 +191,8 @@ def _earlier(out: Path) -> tuple[dict[str, list[Row]], dict[str, Row]]:
         return nothing, {}
     if table.get("experiment") != EXPERIMENT or table.get("schema_version") != SCHEMA_VERSION:
         return nothing, {}
-    return {name: table[name] for name in nothing}, paths
+    known = [row for row in table["runs"] if NOTHING.keys() <= row.keys()]  # others are of an older evermap
+    return {"simulation": table["simulation"], "runs": known}, paths
 
 
 def _merged(earlier: Iterable[Row], done: Iterable[Row]) -> list[Row]:
