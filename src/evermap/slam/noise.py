@@ -116,6 +116,21 @@ def _inflation(fisher: FloatArray) -> FloatArray:
 
 
 @kernel
+def joint_covariance(
+    pose: int, place: int, cov_pose: FloatArray, cov_cross: FloatArray, cov_shared: FloatArray, out: FloatArray
+) -> None:
+    """Covariance (10, 10) of one pose, one place and the five sensor states, from the parts of `Marginals`."""
+    at_states = len(cov_shared) - 9
+    out[:3, :3] = cov_pose[pose]
+    for a in range(7):
+        row = 2 * place + a if a < 2 else at_states + a - 2
+        for b in range(3):
+            out[3 + a, b] = out[b, 3 + a] = cov_cross[pose, b, row]
+        for b in range(7):
+            out[3 + a, 3 + b] = cov_shared[row, 2 * place + b if b < 2 else at_states + b - 2]
+
+
+@kernel
 def _detection_sums(
     pose: FloatArray,
     landmark: FloatArray,
@@ -133,10 +148,8 @@ def _detection_sums(
     cov_shared: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted squares of residuals and their effective number, range and bearing apart."""
-    at_states = len(cov_shared) - 9
     squares, counts = np.zeros(2), np.zeros(2)
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    rows = np.zeros(7, dtype=np.int64)
     j = np.zeros((2, 10))
     cov, part, explained = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2))
     for m in range(len(pose_row)):
@@ -144,18 +157,11 @@ def _detection_sums(
         detection_residual(
             pose[i], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc
         )
-        rows[0], rows[1] = 2 * landmark_row[m], 2 * landmark_row[m] + 1
         for k in range(5):
-            rows[2 + k] = at_states + k
             if not free[k]:
                 jc[:, k] = 0.0
         j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
-        cov[:3, :3] = cov_pose[i]
-        for a in range(7):
-            for b in range(3):
-                cov[3 + a, b] = cov[b, 3 + a] = cov_cross[i, b, rows[a]]
-            for b in range(7):
-                cov[3 + a, 3 + b] = cov_shared[rows[a], rows[b]]
+        joint_covariance(i, landmark_row[m], cov_pose, cov_cross, cov_shared, cov)
         sandwich(j, cov, part, explained)
         w = weights[m]
         for k in range(2):

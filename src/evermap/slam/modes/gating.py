@@ -13,6 +13,7 @@ import numpy as np
 
 from evermap.slam.kernels import detection_residual, kernel
 from evermap.slam.modes.places import FREE, Modes, at_places, grown, moved_to
+from evermap.slam.noise import joint_covariance
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.triangulate import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -238,26 +239,17 @@ def _distances(
     cov_cross: FloatArray,
     cov_shared: FloatArray,
 ) -> FloatArray:
-    at_states = len(cov_shared) - 9
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    rows = np.zeros(7, dtype=np.int64)
     j, cov = np.zeros((2, 10)), np.zeros((10, 10))
     out = np.zeros(len(place))
     for m in range(len(place)):
         i = pose_row[m]
         detection_residual(pose[i], landmark[place[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
-        rows[0], rows[1] = 2 * place[m], 2 * place[m] + 1
         for k in range(5):
-            rows[2 + k] = at_states + k
             if not free[k]:
                 jc[:, k] = 0.0
         j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
-        cov[:3, :3] = cov_pose[i]
-        for a in range(7):
-            for b in range(3):
-                cov[3 + a, b] = cov[b, 3 + a] = cov_cross[i, b, rows[a]]
-            for b in range(7):
-                cov[3 + a, 3 + b] = cov_shared[rows[a], rows[b]]
+        joint_covariance(i, place[m], cov_pose, cov_cross, cov_shared, cov)
         s = j @ cov @ j.T
         s00, s01, s11 = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
         out[m] = (s11 * e[0] ** 2 - 2.0 * s01 * e[0] * e[1] + s00 * e[1] ** 2) / (s00 * s11 - s01 * s01)
