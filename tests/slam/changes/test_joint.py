@@ -64,12 +64,14 @@ def test_what_was_thought_on_the_way_can_be_thought_again(with_map: bool) -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize("with_map", [True, False])
 def test_nothing_moved_nothing_found(with_map: bool) -> None:
     assert count_exact(range(30), with_map=with_map) == 30
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize(
     ("moves", "options"),
     [
@@ -86,6 +88,7 @@ def test_group_that_moved_before_the_session(moves: tuple[Move, ...], options: d
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize(
     ("moves", "options", "least"),
     [
@@ -116,6 +119,7 @@ def told(session: Session, *moves: Move) -> Revision:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize("moves", [(BEFORE,), (WITHIN,), (TURNED,)])
 def test_as_good_as_if_told(moves: tuple[Move, ...]) -> None:
     """Where the exact set is found, poses and landmarks are nearly those of somebody who knew it."""
@@ -136,6 +140,7 @@ def test_as_good_as_if_told(moves: tuple[Move, ...]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 def test_displacements_are_right() -> None:
     errors = []
     for seed in range(10):
@@ -148,6 +153,7 @@ def test_displacements_are_right() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 def test_an_instant_is_inside_its_interval_most_of_the_time() -> None:
     """Of 95 % intervals, which take poses for known."""
     inside = trials = 0
@@ -164,6 +170,7 @@ def test_an_instant_is_inside_its_interval_most_of_the_time() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 def test_complement_is_told_as_an_alternative() -> None:
     """Half of the landmarks moved, or the other half did: no recording tells, and the search says so."""
     half = Move((0, 2, 3, 6, 8), (0.35, 0.2))
@@ -178,6 +185,7 @@ def test_complement_is_told_as_an_alternative() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 def test_same_session_same_answer() -> None:
     first, second = (make_session(0, WITHIN).revised()[1] for _ in range(2))
     assert first.changes == second.changes

@@ -93,12 +93,14 @@ def verdict_on_drawn_evidence(seed: int, n_windows: int) -> tuple[float, bool]:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize("n_windows", [1, 3])
 def test_probabilities_are_reliable_where_the_model_holds(n_windows: int) -> None:
     assert_reliable([verdict_on_drawn_evidence(seed, n_windows) for seed in range(300)])
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.xfail(
     reason="of what a session's verdict reports with 0.88 on average, 0.76 is right: changes too small to show weigh "
     "too little against 'nothing moved'",
@@ -117,6 +119,7 @@ def test_probabilities_are_reliable_in_sessions() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 @pytest.mark.parametrize("n_windows", [1, 3])
 def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
     """Poses, calibration and size eliminated: what is left of 40 sessions has the spread it says."""
