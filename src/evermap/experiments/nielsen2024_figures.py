@@ -152,7 +152,7 @@ def _legend(figure: Figure, panels: list[Axes]) -> None:
             known.setdefault(label, handle)
     (dashed,) = panels[0].plot([], [], "--", color=INK)
     known["landmarks"] = dashed
-    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=8)
+    figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=5)
 
 
 def _draw_paths(paths: Mapping[str, Row]) -> Figure:
@@ -173,7 +173,7 @@ def _draw_paths(paths: Mapping[str, Row]) -> Figure:
             axes.set(aspect="equal", xlabel="x [m]", title=f"data set {name}")
         panels[0].set_ylabel("y [m]")
         handles, labels = panels[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
         settle(figure)
     return figure
 
