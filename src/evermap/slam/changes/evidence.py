@@ -48,6 +48,13 @@ class Evidence:
     log_scale_sigma: float
     log_constant: float = 0.0
 
+    def first_seen(self, otherwise: FloatArray) -> FloatArray:
+        """(L, 2) the first copy of every landmark; `otherwise` (L, 2) for those that have none."""
+        position = otherwise.copy()
+        landmark, first = np.unique(self.landmark, return_index=True)
+        position[landmark] = self.position[first]
+        return position
+
     def without(self, copies: BoolArray) -> Evidence:
         """With some copies (R,) left out, as if their sightings had not been made."""
         kept = ~copies
@@ -177,7 +184,7 @@ def compare(evidence: Evidence, mean: FloatArray, covariance: FloatArray, mapped
     seen = np.unique(evidence.landmark)
     column = np.searchsorted(seen, evidence.landmark)
     count, n_seen = len(evidence.landmark), len(seen)
-    anchor = np.where(mapped[seen, None], mean[seen], _first_positions(evidence))
+    anchor = np.where(mapped[:, None], mean, evidence.first_seen(mean))[seen]
     spread = np.zeros((2 * count, 2 * n_seen + 1))  # unknowns behind all copies: places and size
     rows = np.arange(count)
     spread[2 * rows, 2 * column] = spread[2 * rows + 1, 2 * column + 1] = 1.0
@@ -211,13 +218,6 @@ def compare(evidence: Evidence, mean: FloatArray, covariance: FloatArray, mapped
         misfit=float(estimated @ left),
         freedom=float(2 * count - 2 * np.count_nonzero(~mapped[seen]) - 3),
     )
-
-
-def _first_positions(evidence: Evidence) -> FloatArray:
-    """(S, 2) position of the first copy of every landmark."""
-    _, first = np.unique(evidence.landmark, return_index=True)
-    positions: FloatArray = evidence.position[first]
-    return positions
 
 
 class _Piece(NamedTuple):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,9 +76,7 @@ class Joint:
         self._given = given
         self._prior = prior
         self._robust = robust
-        self._held: Problem | None = None
-        self._free: Problem | None = None
-        self._start: Estimate | None = None
+        self._loosened: _Loosened | None = None
         self._concluded: Revision | None = None
         self._landmark = np.arange(n_landmarks)
         self._groups: tuple[Group, ...] = ()
@@ -94,20 +93,18 @@ class Joint:
         """With the map believed to a metre: one that is wrong bends the solution, or makes it look noisy."""
         if self._given is None or not self._in_map(problem):
             return problem, estimate
-        self._held = problem
-        self._start = self._where_most_agree(self._first_places(estimate))
-        self._free = replace(
+        free = replace(
             self._base(problem),
             prior=self._calibration.without_scale(),
             landmark_mean=self._given.mean,
             landmark_information=independent(self._given.given[:, None, None] * np.eye(2) / LOOSE_MAP_M**2),
         )
-        start = in_sensor_metres(self._start, self._calibration)
+        start = in_sensor_metres(self._where_most_agree(self._first_places(estimate)), self._calibration)
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
-        weights = Smoother(self._free, START, heavy=True, robust=self._robust).inlier_probability(start)
-        unmapped = replace(self._free, landmark_information=np.zeros_like(self._free.landmark_information))
-        self._start = outvoted(unmapped, start, weights)
-        return self._free, self._start
+        weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
+        unmapped = replace(free, landmark_information=np.zeros_like(free.landmark_information))
+        self._loosened = _Loosened(problem, free, outvoted(unmapped, start, weights))
+        return free, self._loosened.start
 
     def _where_most_agree(self, estimate: Estimate) -> Estimate:
         """The whole moved to where most landmarks are at their places: those seen first may have been the others."""
@@ -124,11 +121,11 @@ class Joint:
             return replace(self._concluded, problem=problem, estimate=estimate)
         if final:
             self.verdict = None  # nothing of what was thought on the way is taken for granted
-            if self._free is not None and self._start is not None and self._held is not None:
+            if self._loosened is not None:
                 # what has not been explained yet may look like outliers on the wrong side: none is ruled out here
-                smoother = Smoother(self._free, noise, heavy=True, robust=self._robust)
-                estimate = smoother.optimum(self._start, iterations=10, tolerance=1e-4)
-                problem = self._held
+                problem, free, start = self._loosened
+                smoother = Smoother(free, noise, heavy=True, robust=self._robust)
+                estimate = smoother.optimum(start, iterations=10, tolerance=1e-4)
         in_map = self._in_map(problem)
         given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
         base = self._base(problem)
@@ -150,8 +147,7 @@ class Joint:
                 return Revision(problem, estimate, self._current())
             # the search may find the map better than it says; the solution does not build on that
             believed = replace(given, covariance=given.covariance * max(verdict.map_factor, 1.0) ** 2)
-            start = _with_copies(self._first_places(estimate), evidence, groups)
-            problem, start, self._landmark = explained(base, start, believed, groups, self._prior.spread)
+            problem, start, self._landmark = self._explained(base, estimate, evidence, believed, groups)
             # with the kernel that never lets go: as long as places are wrong, right detections look like outliers
             smoother = Smoother(problem, noise, heavy=True, robust=self._robust)
             estimate = smoother.optimum(start, iterations=5, tolerance=1e-4)
@@ -182,6 +178,13 @@ class Joint:
         """One place a landmark: the first."""
         return Estimate(estimate.pose, estimate.landmark[: self._count], estimate.states)
 
+    def _explained(
+        self, base: Problem, estimate: Estimate, evidence: Evidence, believed: GivenMap, groups: tuple[Group, ...]
+    ) -> tuple[Problem, Estimate, IntArray]:
+        """The problem in a world where these groups moved, a start, and the landmark of every place."""
+        start = _with_copies(self._first_places(estimate), evidence, groups)
+        return explained(base, start, believed, groups, self._prior.spread)
+
     def _rivals(
         self,
         base: Problem,
@@ -198,8 +201,7 @@ class Joint:
             if probability < self.verdict.probability * math.exp(-RIVAL_NATS):
                 break
             groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in found)
-            start = _with_copies(self._first_places(estimate), evidence, groups)
-            problem, start, landmark = explained(base, start, believed, groups, self._prior.spread)
+            problem, start, landmark = self._explained(base, estimate, evidence, believed, groups)
             smoother = Smoother(problem, noise, robust=self._robust)
             solved = smoother.optimum(start, iterations=5, tolerance=1e-4)
             current = _current(landmark, self._count)
@@ -305,6 +307,14 @@ class Joint:
         )
 
 
+class _Loosened(NamedTuple):
+    """The problem as it was held, the same with the map believed to a metre, and where to start that from."""
+
+    held: Problem
+    free: Problem
+    start: Estimate
+
+
 def _visits(problem: Problem, group: Group) -> FloatArray:
     """When a group was met again [s], around the time when it is thought to have moved."""
     if group.between_s is None or group.since_s is None:
@@ -340,18 +350,10 @@ def _current(landmark: IntArray, count: int) -> IntArray:
     return current
 
 
-def _first_seen(evidence: Evidence, fallback: FloatArray) -> FloatArray:
-    """(L, 2) every landmark's first copy."""
-    position = fallback.copy()
-    landmark, first = np.unique(evidence.landmark, return_index=True)
-    position[landmark] = evidence.position[first]
-    return position
-
-
 def _with_copies(estimate: Estimate, evidence: Evidence, groups: tuple[Group, ...]) -> Estimate:
     """Where members of groups that moved within the session were seen first."""
     landmark = estimate.landmark.copy()
-    first = _first_seen(evidence, landmark)
+    first = evidence.first_seen(landmark)
     for group in groups:
         if group.window > 0:
             landmark[group.members] = first[group.members]

@@ -76,7 +76,7 @@ def weigh(
     """
     factor = 1.0 if before is None else before.map_factor
     softness = 0.0 if n_windows == 1 else (0.01 if before is None else before.softness_m)
-    position = _positions(evidence, given)
+    position = np.where(given.given[:, None], given.mean, evidence.first_seen(given.mean))
     if n_windows > 1 and not spared:
 
         def search(evidence: Evidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
@@ -130,14 +130,6 @@ def _beside(values: tuple[float, ...], value: float) -> tuple[float, ...]:
     """The neighbours of a value."""
     at = values.index(value)
     return values[max(at - 1, 0) : at] + values[at + 1 : at + 2]
-
-
-def _positions(evidence: Evidence, given: GivenMap) -> FloatArray:
-    """(L, 2) the map, and for landmarks that it does not hold where they were seen first."""
-    position = np.zeros_like(given.mean)
-    landmark, first = np.unique(evidence.landmark, return_index=True)
-    position[landmark] = evidence.position[first]
-    return np.where(given.given[:, None], given.mean, position)
 
 
 def _try(
