@@ -56,8 +56,8 @@ class CliqueWorld:
     steps: int = 1000
     period: int = 200
     mean_survival_steps: float = 300.0
-    extent_m: float = 10.0
-    distance_m: tuple[float, float] = (1.0, 5.0)
+    extent_m: float = 4.0
+    distance_m: tuple[float, float] = (3.0, 5.0)
     share_in_field: float = 0.1
     occluded_share: float = 0.0
     occluded_steps: float = 5.0
