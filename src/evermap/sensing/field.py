@@ -56,7 +56,8 @@ class Field:
         """Whether points (..., 3) in the sensor's frame lie in the field; shape (...)."""
         azimuth, elevation = self.angles(point_sensor_m)
         near = np.linalg.norm(point_sensor_m, axis=-1) <= self.range_max_m
-        return near & (np.abs(azimuth) <= self.half_azimuth_rad) & (np.abs(elevation) <= self.half_elevation_rad)
+        inside = (np.abs(azimuth) <= self.half_azimuth_rad) & (np.abs(elevation) <= self.half_elevation_rad)
+        return np.asarray(near & inside)
 
 
 LIDAR = Field(16.0, math.pi, math.radians(30.0), Projection.SPHERICAL)

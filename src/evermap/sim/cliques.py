@@ -9,7 +9,7 @@ that the filters are given is not the true one.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from evermap.sensing.field import LIDAR, Field
 from evermap.types import BoolArray, FloatArray, IntArray
 
 HARMONICS = 3
-"""Of the trajectory: enough to come by from several sides, few enough to be a path that something could drive or fly."""
+"""Of the trajectory: enough to come by from several sides, few enough to be a path that something could drive."""
 TRIES = 1000
 """Before a world is given up for which no place for an object can be found."""
 
@@ -269,14 +269,15 @@ def named_world(name: str, field: Field) -> CliqueWorld:
     Raises:
         ConfigError: no such world.
     """
+    nominal = CliqueWorld(field=field)
     known = {
-        "nominal": {},
-        "angle60": {"viewing_angle_rad": math.radians(60.0)},
-        "range04": {"fading_m": 0.4 * field.range_max_m},
-        "occlusion": {"occluded_share": 0.15, "occluded_steps": 5.0},
-        "false-alarms": {"p_false": 0.03},
-        "pose-noise": {"pose_noise_m": 0.1, "pose_noise_rad": math.radians(2.0)},
+        "nominal": nominal,
+        "angle60": replace(nominal, viewing_angle_rad=math.radians(60.0)),
+        "range04": replace(nominal, fading_m=0.4 * field.range_max_m),
+        "occlusion": replace(nominal, occluded_share=0.15, occluded_steps=5.0),
+        "false-alarms": replace(nominal, p_false=0.03),
+        "pose-noise": replace(nominal, pose_noise_m=0.1, pose_noise_rad=math.radians(2.0)),
     }
     if name not in known:
         raise ConfigError(f"there is no world {name!r}", field="world", hint=", ".join(known))
-    return CliqueWorld(field=field, **known[name])
+    return known[name]
