@@ -39,7 +39,8 @@ class CliqueWorld:
         period: steps after which the trajectory repeats.
         mean_survival_steps: of the exponential survival time, from the first step in which the object is in the field.
         extent_m: root mean square distance of the trajectory from its middle, in the plane.
-        distance_m: least and most distance of an object's surface from the nearest point of the trajectory.
+        distance_m: least and most distance of an object, as the sphere around it, from the trajectory; raising or
+            lowering it by some 0.5 m comes on top.
         share_in_field: least share of a period in which an object's centre is in the field.
         occluded_share: share of the time that an object in the world is hidden.
         occluded_steps: mean number of steps for which it then stays hidden.
@@ -71,13 +72,20 @@ class CliqueWorld:
         for name in ("pose_noise_m", "pose_noise_rad"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"must be finite and not negative, not {getattr(self, name)!r}", field=name)
+        if self.viewing_angle_rad > math.pi:
+            raise ConfigError(f"must be at most pi, not {self.viewing_angle_rad!r}", field="viewing_angle_rad")
         for name in ("p_false", "share_in_field"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ConfigError(f"must lie in [0, 1], not {getattr(self, name)!r}", field=name)
         if not 0.0 <= self.occluded_share < 1.0:
             raise ConfigError(f"must lie in [0, 1), not {self.occluded_share!r}", field="occluded_share")
-        if not self.occluded_steps >= max(1.0, self.occluded_share / (1.0 - self.occluded_share)):
-            raise ConfigError(f"too short for that share: {self.occluded_steps!r}", field="occluded_steps", hint="5")
+        shortest = max(1.0, self.occluded_share / (1.0 - self.occluded_share))
+        if not self.occluded_steps >= shortest:
+            raise ConfigError(
+                f"too short for that share: {self.occluded_steps!r}",
+                field="occluded_steps",
+                hint=f"at least {shortest:.3g}",
+            )
         for name in ("objects", "steps", "period"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"must be positive, not {getattr(self, name)!r}", field=name)
@@ -140,7 +148,7 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
     """Draw one run; the same seed gives the same run.
 
     Raises:
-        ConfigError: no place for the objects can be found that the sensor passes by.
+        ConfigError: no place for the objects can be found that the sensor passes by, or one never comes into the field.
     """
     rng = np.random.default_rng(seed)
     position, rotation = _trajectory(world, rng)
@@ -155,6 +163,10 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
 
     in_field = world.field.contains(in_sensor_frame(landmark, position, rotation))
     seen_at_all = np.stack([in_field[:, clique == c].any(axis=1) for c in range(world.objects)], axis=1)
+    if not seen_at_all.any(axis=0).all():
+        raise ConfigError(
+            "an object never comes into the field", field="share_in_field", hint="a larger share, or more steps"
+        )
     first = np.argmax(seen_at_all, axis=0)
     survival = rng.exponential(world.mean_survival_steps, world.objects)
     hidden = _occlusions(world, rng)
