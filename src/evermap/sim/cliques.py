@@ -138,6 +138,10 @@ class CliqueRun:
         seen = in_sensor_frame(self.landmark_m, self.pose_position_m, self.pose_rotation)
         return self.world.field.contains(seen)
 
+    def p_detect(self) -> FloatArray:
+        """(F, K) true probability that each landmark is detected while its object is there and nobody hides it."""
+        return _chance_there(self.world, self.position_m, self.rotation, self.landmark_m, self.normal)
+
 
 def in_sensor_frame(point_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> FloatArray:
     """(F, K, 3) points (K, 3) of the world in the frames of F sensor poses."""
@@ -171,12 +175,9 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
     survival = rng.exponential(world.mean_survival_steps, world.objects)
     hidden = _occlusions(world, rng)
 
-    to_sensor = position[:, None, :] - landmark[None, :, :]
-    distance = np.linalg.norm(to_sensor, axis=2)
-    facing = np.einsum("fki,ki->fk", to_sensor, normal) >= math.cos(world.viewing_angle_rad) * distance
     there = np.arange(world.steps)[:, None] <= first + survival
-    visible = facing & (there & ~hidden)[:, clique]
-    chance = np.where(visible, np.exp(-distance / world.fading_m), world.p_false) * in_field
+    chance_there = _chance_there(world, position, rotation, landmark, normal)
+    chance = np.where((there & ~hidden)[:, clique], chance_there, world.p_false * in_field)
     detected = rng.random(chance.shape) < chance
 
     given_position = position + world.pose_noise_m * rng.normal(size=position.shape)
@@ -196,6 +197,17 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
         hidden=hidden,
         detected=detected,
     )
+
+
+def _chance_there(
+    world: CliqueWorld, position: FloatArray, rotation: FloatArray, landmark: FloatArray, normal: FloatArray
+) -> FloatArray:
+    """(F, K) probability of a detection: fading with range where the landmark faces the sensor, 0 outside the field."""
+    to_sensor = position[:, None, :] - landmark[None, :, :]
+    distance = np.linalg.norm(to_sensor, axis=2)
+    facing = np.einsum("fki,ki->fk", to_sensor, normal) >= math.cos(world.viewing_angle_rad) * distance
+    in_field = world.field.contains(in_sensor_frame(landmark, position, rotation))
+    return np.where(facing, np.exp(-distance / world.fading_m), world.p_false) * in_field
 
 
 def _trajectory(world: CliqueWorld, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
