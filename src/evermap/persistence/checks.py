@@ -45,6 +45,12 @@ def check_probability(values: FloatArray, field: str, rows: IntArray | None = No
         )
 
 
+def check_log_likelihood(values: FloatArray, field: str, rows: IntArray | None = None) -> None:
+    """Raise `InputError` unless all of `values` are numbers; an infinity is a certainty."""
+    if first := _first(np.isnan(values), rows):
+        raise InputError(f"row {first[1]}: nan is no log-likelihood", field=field, hint="a number, or an infinity")
+
+
 def check_detected(values: FloatArray, rows: IntArray | None = None, noun: str = "row") -> None:
     """Raise `InputError` unless all of `values` are 0 or 1."""
     if first := _first(~((values == 0.0) | (values == 1.0)), rows):
@@ -119,7 +125,7 @@ def impossible(who: str) -> str:
     return f"{who}: this observation is impossible, whether the feature is there or gone"
 
 
-def check_rows(rows: Any, n: int, *, twice: bool = False) -> IntArray:
+def check_rows(rows: Any, n: int, *, twice: bool = False, field: str = "rows") -> IntArray:
     """Row numbers as int64, each in range and, unless `twice` is allowed, at most once.
 
     Raises:
@@ -128,10 +134,10 @@ def check_rows(rows: Any, n: int, *, twice: bool = False) -> IntArray:
     """
     index = np.asarray(rows)
     if index.ndim != 1 or (index.size and index.dtype.kind not in "iu"):
-        raise InputError("rows are a list of whole numbers", field="rows")
+        raise InputError("row numbers are a list of whole numbers", field=field)
     index = index.astype(np.int64)
     if first := _first((index < 0) | (index >= n), None):
-        raise InputError(f"entry {first[0]}: row {index[first[0]]} of {n} does not exist", field="rows")
+        raise InputError(f"entry {first[0]}: row {index[first[0]]} of {n} does not exist", field=field)
     if not twice and np.bincount(index, minlength=1).max() > 1:
         row = int(np.argmax(np.bincount(index)))
         raise DataError(f"row {row} is observed twice in one update", field="rows", hint="run(), which takes streams")

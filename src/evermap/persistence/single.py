@@ -1,13 +1,15 @@
-"""The persistence filter (Rosen 2016, Algorithm 1) in inverse odds: `init`, `predict`, `update`, and `run` for streams.
+"""The persistence filter (Rosen 2016, Algorithm 1) in inverse odds: `init`, `predict`, `update`, `observe`, and `run`.
 
 All functions are pure. Rows are independent; every row has its own clock (seconds since its birth), its own prior and,
 at every observation, its own `P_M` (miss although there) and `P_F` (detection although gone). A feature exists at
 `t <= T`. With `r = (1 - p) / p` a gap of conditional survival `q` gives `r <- r + (1 + r) (1 - q) / q`, and an
 observation multiplies `r` by its likelihood when gone over its likelihood when there (MATH.md section 2).
+`update` takes a detector's yes or no, `observe` the likelihoods of any model of detection, `run` a stream.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -17,9 +19,9 @@ from evermap.errors import InputError, NumericalError
 from evermap.persistence import checks
 from evermap.persistence.death import log_death_odds
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST, Belief, init
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
-__all__ = ["Belief", "init", "predict", "run", "update"]
+__all__ = ["Belief", "init", "observe", "predict", "run", "update"]
 
 
 def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
@@ -58,30 +60,49 @@ def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any
         DataError: a row twice (use `run`).
         NumericalError: an observation that is impossible under both states.
     """
-    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
-    values = [checks.as_rows(stamp_s, len(index), "stamp_s")]
-    for column, field in ((detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false")):
-        values.append(checks.as_rows(column, len(index), field))
-    looked = ~np.isnan(values[0])
-    if not looked.all():
-        index = index[looked]
-        values = [column[looked] for column in values]
-    time, hit, miss, false = values
+    columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
+    index, (time, hit, miss, false) = _looked_at(state, rows, columns)
     checks.check_looks(time, hit, miss, false, state.stamp_s[index], index)
-
     there, gone = checks.likelihoods(hit, miss, false)
     predicted = _gap(state, index, time)
-    observed = _observe(predicted, there, gone)
-    checks.check_possible(observed, index)
+    with np.errstate(all="ignore"):
+        after = predicted * gone / there
+    after = _clamp(after, predicted, there > 0.0, gone > 0.0)
+    return _settle(state, index, time, after, lambda: _log_evidence(predicted, there, gone))
 
-    inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
-    inverse_odds[index] = observed
-    stamps[index] = time
-    evidence = state.log_evidence
-    if evidence is not None:
-        evidence = evidence.copy()
-        evidence[index] += _log_evidence(predicted, there, gone)
-    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=evidence)
+
+def observe(state: Belief, stamp_s: Any, log_there: Any, log_gone: Any = 0.0, *, rows: Any = None) -> Belief:
+    """Beliefs after one look at each feature, whatever model of detection says how likely its outcome was.
+
+    With `log p(y | there) - log p(y | gone)` in the place of `log_there` the beliefs are the same; the evidence is then
+    relative to that of a world without the features.
+
+    Args:
+        state: beliefs of N features.
+        stamp_s: scalar, (N,) or (len(rows),) times of the looks since birth; a row whose time is NaN was not looked at.
+        log_there: `log p(y | there)`, of the same shape; -inf where the outcome proves that the feature is gone.
+        log_gone: `log p(y | gone)`, of the same shape.
+        rows: the rows looked at, each once; all where None.
+
+    Raises:
+        InputError: a likelihood that is no number, time running back, or a row that does not exist.
+        DataError: a row twice.
+        NumericalError: an observation that is impossible under both states.
+    """
+    columns = {"stamp_s": stamp_s, "log_there": log_there, "log_gone": log_gone}
+    index, (time, there, gone) = _looked_at(state, rows, columns)
+    checks.check_times(time, state.stamp_s[index], index)
+    checks.check_log_likelihood(there, "log_there", index)
+    checks.check_log_likelihood(gone, "log_gone", index)
+    predicted = _gap(state, index, time)
+    with np.errstate(all="ignore"):
+        ratio = there - gone
+        # Many landmarks may weigh more than exp can hold: in two halves, each cut where the clamp would cut anyway.
+        half = np.where(np.isfinite(ratio), np.clip(0.5 * ratio, -LOG_LARGEST, LOG_LARGEST), ratio)
+        factor = np.exp(-half)
+        after = predicted * factor * factor
+    after = _clamp(after, predicted, ratio > -np.inf, ratio < np.inf)
+    return _settle(state, index, time, after, lambda: _log_evidence_of_logs(predicted, there, gone))
 
 
 def run(
@@ -155,12 +176,37 @@ def _gap(state: Belief, index: IntArray, time: FloatArray) -> FloatArray:
     return np.where(certain, np.inf, np.minimum(after, LARGEST))
 
 
-def _observe(predicted: FloatArray, there: FloatArray, gone: FloatArray) -> FloatArray:
-    """Inverse odds after an observation; NaN where it is impossible under both states."""
-    with np.errstate(all="ignore"):
-        after = predicted * gone / there
-    after = np.where((predicted > 0.0) & (gone > 0.0), np.maximum(after, SMALLEST), after)
-    return np.where(np.isfinite(predicted) & (there > 0.0), np.minimum(after, LARGEST), after)
+def _looked_at(state: Belief, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
+    """The rows looked at, and their part of each column; the first column is the times."""
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
+    values = [checks.as_rows(column, len(index), field) for field, column in columns.items()]
+    looked = ~np.isnan(values[0])
+    if looked.all():
+        return index, values
+    return index[looked], [column[looked] for column in values]
+
+
+def _clamp(after: FloatArray, predicted: FloatArray, there: BoolArray, gone: BoolArray) -> FloatArray:
+    """Inverse odds after an observation that is possible if `there` and if `gone`; NaN where under neither state.
+
+    Only what excludes a state makes a certainty; a finite doubt stays one.
+    """
+    after = np.where((predicted > 0.0) & gone, np.maximum(after, SMALLEST), after)
+    return np.where(np.isfinite(predicted) & there, np.minimum(after, LARGEST), after)
+
+
+def _settle(
+    state: Belief, index: IntArray, time: FloatArray, after: FloatArray, log_evidence: Callable[[], FloatArray]
+) -> Belief:
+    """The state with these rows renewed, and the evidence of their looks if anybody keeps it."""
+    checks.check_possible(after, index)
+    inverse_odds, stamps, evidence = state.inverse_odds.copy(), state.stamp_s.copy(), state.log_evidence
+    inverse_odds[index] = after
+    stamps[index] = time
+    if evidence is not None:
+        evidence = evidence.copy()
+        evidence[index] += log_evidence()
+    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=evidence)
 
 
 def _log_evidence(predicted: FloatArray, there: FloatArray, gone: FloatArray) -> FloatArray:
@@ -169,3 +215,11 @@ def _log_evidence(predicted: FloatArray, there: FloatArray, gone: FloatArray) ->
     complement = np.where(np.isinf(predicted), 1.0, np.minimum(predicted, LARGEST) * probability)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(probability * there + complement * gone), dtype=np.float64)
+
+
+def _log_evidence_of_logs(predicted: FloatArray, log_there: FloatArray, log_gone: FloatArray) -> FloatArray:
+    """As `_log_evidence`, of likelihoods that only their logarithms can hold."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        log_alive = -np.log1p(predicted)
+        log_dead = np.where(np.isinf(predicted), 0.0, np.log(predicted) + log_alive)
+        return np.asarray(np.logaddexp(log_alive + log_there, log_dead + log_gone), dtype=np.float64)
