@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.arrow import Smoother
-from evermap.slam.kernels import detection_residual, inlier_weight, kernel, wrapped
+from evermap.slam.kernels import AT_PLACES, detection_residual, inlier_weight, kernel, wrapped
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
 
-AT_PLACES = 12
-"""Where places begin in the joint covariance: behind the pose (3) and the calibration states (9)."""
 UNKNOWN_VARIANCE = 1e4
 """Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
 ITERATIONS = 10
@@ -75,7 +73,7 @@ class BorderFilter:
             if j not in self._slot:
                 self._meet(j, landmark)
         if motion is not None:
-            _predict(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
+            drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
         _update(
             self._pose,
             self._states,
@@ -148,10 +146,10 @@ class BorderFilter:
 
 
 @kernel
-def _predict(
+def drive_on(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
 ) -> None:
-    """Drive on: the newest pose becomes the next one, in place."""
+    """The newest pose becomes the next one, in place: its pose and the joint covariance."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     pose[0] += c * increment[0] - s * increment[1]
     pose[1] += s * increment[0] + c * increment[1]

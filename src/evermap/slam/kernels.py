@@ -32,6 +32,8 @@ FLOOR_TURN_RAD = 0.001
 FLOOR_VARIANCE = 1e-8
 """And once for every interval, however short: 0.1 mm and 0.1 mrad."""
 MAX_STEP_S = 0.1
+AT_PLACES = 12
+"""Where places begin in a joint covariance: behind the newest pose (3) and the calibration states (9)."""
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 

@@ -79,8 +79,11 @@ class Method(Protocol):
         ...
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """The problem, and values to start from, on which noise levels are learned before the last revisions."""
-        ...
+        """The problem, and values to start from, on which noise levels are learned before the last revisions.
+
+        As they are, for a method that has no prejudice: nothing that it believes bends the solution.
+        """
+        return problem, estimate
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """The best explanation of everything so far.
@@ -95,7 +98,7 @@ class Method(Protocol):
         ...
 
 
-class Static:
+class Static(Method):
     """`nohyp`: the world is as it is, every detection belongs to the one place of its landmark."""
 
     def __init__(self, n_landmarks: int) -> None:
@@ -105,10 +108,6 @@ class Static:
         """The place of each detection's landmark."""
         del row, compare
         return problem.landmark_row[detections]
-
-    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """As they are."""
-        return problem, estimate
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Nothing to think about."""

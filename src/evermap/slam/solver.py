@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from evermap.slam.kernels import (
+    AT_PLACES,
     N_NOISE,
     detection_residual,
     integrate_odometry,
@@ -182,7 +183,7 @@ def _innovations(
             h[0, 3 + k], h[1, 3 + k] = (jc[0, k], jc[1, k]) if free[k] else (0.0, 0.0)
         multiply(jx, by_states, h[:, 8:12])
         h[:, 12:] = jl
-        rows[12], rows[13] = 12 + 2 * column[m], 13 + 2 * column[m]
+        rows[12], rows[13] = AT_PLACES + 2 * column[m], AT_PLACES + 2 * column[m] + 1
         for row in range(14):
             for other in range(14):
                 part[row, other] = joint[rows[row], rows[other]]

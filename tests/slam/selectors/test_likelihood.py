@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from evermap.errors import InputError
-from evermap.slam.selectors.likelihood import hit_probabilities, log_psi, miss_weight_from, predict
+from evermap.slam.selectors.likelihood import Readings, hit_probabilities, log_psi, miss_weight_from, predict
 from evermap.types import Sensor
 
 CAMERA = Sensor(
@@ -84,11 +85,8 @@ def test_likelihood_is_that_of_the_definition(weight, density, uncertain):
     states = np.array([0.05, 0.02, -0.01, -0.1, 0.03, 0, 0, 0, 0])
     pose_covariance = random_covariance(rng, (len(pose),), 3, 0.1 * uncertain)
     mode_covariance = random_covariance(rng, (3, 2), 2, 0.2 * uncertain)
-    given = {"pose_covariance": pose_covariance, "mode_covariance_m2": mode_covariance}
-    found = log_psi(
-        pose, landmark, mode, reading, sigma, CAMERA, states=states, miss_weight=weight, outlier_density=density,
-        gone=True, **given,
-    )  # fmt: skip
+    readings = Readings(pose, landmark, mode, reading, sigma, states, pose_covariance, mode_covariance)
+    found = log_psi(readings, CAMERA, miss_weight=weight, outlier_density=density, gone=True)
     assert found.shape == (len(pose), 3)
     floors = 0
     for row, (p, i) in enumerate(zip(pose, landmark, strict=True)):
@@ -122,18 +120,16 @@ def test_likelihood_is_that_of_the_definition(weight, density, uncertain):
 
 
 def test_exact_poses_and_modes_are_the_limit_of_certain_ones():
-    pose, landmark, mode, reading, sigma = scene(2)
-    exact = log_psi(pose, landmark, mode, reading, sigma, CAMERA, outlier_density=1e-3)
-    certain = log_psi(
-        pose, landmark, mode, reading, sigma, CAMERA, outlier_density=1e-3,
-        pose_covariance=np.zeros((len(pose), 3, 3)), mode_covariance_m2=np.zeros((3, 2, 2, 2)),
-    )  # fmt: skip
+    exact = Readings(*scene(2))
+    certain = replace(
+        exact, pose_covariance=np.zeros((len(exact.landmark), 3, 3)), mode_covariance_m2=np.zeros((3, 2, 2, 2))
+    )
+    exact, certain = (log_psi(readings, CAMERA, outlier_density=1e-3) for readings in (exact, certain))
     np.testing.assert_array_equal(exact, certain)
 
 
 def test_mahalanobis_distance_is_that_of_the_density():
-    pose, landmark, mode, reading, sigma = scene(3)
-    found = predict(pose, landmark, mode, reading, sigma, CAMERA)
+    found = predict(Readings(*scene(3)), CAMERA)
     scale = np.log(2 * math.pi * found.range_sigma_m * found.bearing_sigma_rad)  # exact: errors are independent
     np.testing.assert_allclose(found.log_density, -0.5 * found.squared_distance - scale, rtol=1e-9)
     assert np.isnan(found.squared_distance[::3]).all()
@@ -146,16 +142,18 @@ def test_a_wrong_identity_cannot_force_a_switch_where_outliers_are_possible():
     reading = expected(pose[0], mode[0, 1], CAMERA)[None]
     sigma = np.array([[0.05, 0.02]])
     price = 2 * math.log(1e-4)
-    by_paper = log_psi(pose, np.array([0]), mode, reading, sigma, CAMERA)[0]
-    with_floor = log_psi(pose, np.array([0]), mode, reading, sigma, CAMERA, outlier_density=0.1)[0]
+    readings = Readings(pose, np.array([0]), mode, reading, sigma)
+    by_paper = log_psi(readings, CAMERA)[0]
+    with_floor = log_psi(readings, CAMERA, outlier_density=0.1)[0]
     assert by_paper[1] - by_paper[0] > -price > with_floor[1] - with_floor[0] > 0.0
 
 
 def test_a_sensor_that_never_misses_leaves_a_miss_possible():
     never = Sensor(p_detect=1.0)
-    found = log_psi(
-        np.zeros((1, 3)), np.array([0]), np.array([[[2.0, 0.0]]]), np.full((1, 2), np.nan), np.full((1, 2), 0.1), never
+    miss = Readings(
+        np.zeros((1, 3)), np.array([0]), np.array([[[2.0, 0.0]]]), np.full((1, 2), np.nan), np.full((1, 2), 0.1)
     )
+    found = log_psi(miss, never)
     assert found[0, 0] == pytest.approx(math.log(1e-6))
 
 

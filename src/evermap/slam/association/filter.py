@@ -13,14 +13,12 @@ import numpy as np
 
 from evermap import se2
 from evermap.slam.association.jcbb import Pairings, gates, kernel
-from evermap.slam.kernels import detection_residual
+from evermap.slam.border import drive_on
+from evermap.slam.kernels import AT_PLACES, detection_residual
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import Motion
 from evermap.slam.triangulate import sighted_at
 from evermap.types import FloatArray, IntArray
-
-AT_LANDMARKS = 12
-"""First column of the landmarks: pose (3) and calibration states (9) come before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +57,7 @@ class Belief:
 
     def may_be_one(self, a: int, b: int, confidence: float) -> bool:
         """Whether the difference of two landmarks is insignificant."""
-        rows, others = AT_LANDMARKS + 2 * a + np.arange(2), AT_LANDMARKS + 2 * b + np.arange(2)
+        rows, others = AT_PLACES + 2 * a + np.arange(2), AT_PLACES + 2 * b + np.arange(2)
         p = self.covariance
         cross = p[np.ix_(rows, others)]
         spread = p[np.ix_(rows, rows)] + p[np.ix_(others, others)] - cross - cross.T + 1e-12 * np.eye(2)
@@ -72,14 +70,9 @@ def predicted(belief: Belief, problem: Problem, noise: Noise, row: int) -> Belie
     if row == 0:
         return belief
     motion = Motion.between(problem, noise, row, belief.states)
-    carry = np.zeros((3, len(belief.covariance)))
-    carry[:, :3] = se2.adjoint(se2.inverse(motion.increment))
-    carry[:, 8:12] = motion.by_states
-    joint = belief.covariance.copy()
-    joint[:3, :] = carry @ belief.covariance
-    joint[:, :3] = joint[:3, :].T
-    joint[:3, :3] = carry @ belief.covariance @ carry.T + motion.covariance
-    return Belief(se2.compose(belief.pose, motion.increment), belief.states, belief.landmark, joint)
+    pose, covariance = belief.pose.copy(), belief.covariance.copy()
+    drive_on(pose, covariance, motion.increment, motion.by_states, motion.covariance)
+    return Belief(pose, belief.states, belief.landmark, covariance)
 
 
 def pairings_of_frame(
@@ -106,7 +99,7 @@ def pairings_of_frame(
     rows = np.zeros((count, 2, len(belief.covariance)))
     rows[:, :, :8] = block[:, :, :8]
     for k in range(count):
-        at = AT_LANDMARKS + 2 * target[k]
+        at = AT_PLACES + 2 * target[k]
         rows[k, :, at : at + 2] = block[k, :, 8:]
     h = rows.reshape(2 * count, len(belief.covariance))
     joint = h @ belief.covariance @ h.T + np.diag((sigma[detections[source]] ** 2).ravel())
@@ -142,7 +135,7 @@ def _in_gate(
             for k in range(5):
                 for a in range(2):
                     by[a, 3 + k] = jc[a, k] if free[k] else 0.0
-            columns[8], columns[9] = AT_LANDMARKS + 2 * j, AT_LANDMARKS + 2 * j + 1
+            columns[8], columns[9] = AT_PLACES + 2 * j, AT_PLACES + 2 * j + 1
             for a in range(10):
                 for b in range(10):
                     part[a, b] = covariance[columns[a], columns[b]]

@@ -23,7 +23,7 @@ from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.changes.swaps import likeliest_swap, with_swap
 from evermap.slam.changes.timing import parting_time, unswayed
 from evermap.slam.changes.weigh import Verdict, weigh
-from evermap.slam.method import Compare, Revision, Rival
+from evermap.slam.method import Compare, Method, Revision, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
 from evermap.slam.triangulate import outvoted
@@ -51,7 +51,7 @@ MOST_ITEMS = 400
 """Landmarks times windows, so that a search stays a matter of milliseconds."""
 
 
-class Joint:
+class Joint(Method):
     """Which landmarks moved together, before the session or within it.
 
     Args:

@@ -14,7 +14,7 @@ from evermap.sensing.visibility import WORTH_A_MISS, detection_probability
 from evermap.slam.modes.places import FREE, Modes
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.selectors.chain import ModeLooks
-from evermap.slam.selectors.likelihood import log_psi, miss_weight_from
+from evermap.slam.selectors.likelihood import Readings, log_psi, miss_weight_from
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 LONGEST_SEQUENCE_GAP_S = 5.0
@@ -117,13 +117,15 @@ def look_at_modes(
     sigma[hit] = noise.of_detections(problem.sigma_given[detection[hit]])
     position = np.where((table[several] != FREE)[:, :, None], estimate.landmark[table[several]], np.nan)
     log_likelihood = log_psi(
-        estimate.pose[pose_row],
-        np.searchsorted(several, landmark),
-        position,
-        reading,
-        sigma,
+        Readings(
+            estimate.pose[pose_row],
+            np.searchsorted(several, landmark),
+            position,
+            reading,
+            sigma,
+            states=estimate.states,
+        ),
         sensor,
-        states=estimate.states,
         miss_weight=miss_weight,
         outlier_density=_outlier_density(noise) if robust else 0.0,
     )

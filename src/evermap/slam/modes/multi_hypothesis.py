@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.slam.method import Compare, Revision
+from evermap.slam.method import Compare, Method, Revision
 from evermap.slam.modes.alternation import ModeModel, explain_with_modes
 from evermap.slam.modes.changes import switches
 from evermap.slam.modes.gating import MOST_MODES, surprised
@@ -18,8 +18,8 @@ from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray
 
 
-class MultiHypothesis:
-    """A `Method` with the multi-hypothesis map and one of the selectors.
+class MultiHypothesis(Method):
+    """The method with the multi-hypothesis map and one of the selectors.
 
     Args:
         n_landmarks: landmarks of the session, with or without a prior map.
@@ -46,10 +46,6 @@ class MultiHypothesis:
         for k, mine in enumerate(candidates):
             place[k] = self._best_of(mine, distance[which == k], log_volume[which == k])
         return place
-
-    def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """As they are."""
-        return problem, estimate
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
         """Births and the alternation over everything so far."""

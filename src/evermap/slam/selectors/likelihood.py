@@ -2,32 +2,58 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.errors import InputError
 from evermap.sensing.visibility import log_in_view
-from evermap.types import FloatArray, IntArray, Sensor
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 MOST_CERTAIN = 1.0 - 1e-6
 """No sensor detects more reliably than this: a miss is always possible."""
 
 
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """What R looks at landmarks read, and the modes that these landmarks may be at.
+
+    Attributes:
+        pose_world_robot: (R, 3) pose at every look.
+        landmark: (R,) row of `mode_position_m` that each look is at.
+        mode_position_m: (L, K, 2) modes of every landmark, nan for one that it does not have.
+        reading: (R, 2) range [m] and bearing [rad] as reported; nan for an expected detection that did not come.
+        sigma: (R, 2) their standard deviations.
+        states: (9,) calibration states of `slam.calibration`; None for a sensor that reads true.
+        pose_covariance: (R, 3, 3) in the robot's frame; None where poses count as exact.
+        mode_covariance_m2: (L, K, 2, 2); None where positions count as exact.
+    """
+
+    pose_world_robot: FloatArray
+    landmark: IntArray
+    mode_position_m: FloatArray
+    reading: FloatArray
+    sigma: FloatArray
+    states: FloatArray | None = None
+    pose_covariance: FloatArray | None = None
+    mode_covariance_m2: FloatArray | None = None
+
+    @property
+    def missed(self) -> BoolArray:
+        """(R,) which looks are expected detections that did not come."""
+        missed: BoolArray = np.isnan(self.reading[:, 0])
+        return missed
+
+    @property
+    def has_mode(self) -> BoolArray:
+        """(R, K) which modes the landmark of each look has."""
+        has_mode: BoolArray = np.isfinite(self.mode_position_m[self.landmark, :, 0])
+        return has_mode
+
+
 def log_psi(
-    pose_world_robot: FloatArray,
-    landmark: IntArray,
-    mode_position_m: FloatArray,
-    reading: FloatArray,
-    sigma: FloatArray,
-    sensor: Sensor,
-    *,
-    states: FloatArray | None = None,
-    pose_covariance: FloatArray | None = None,
-    mode_covariance_m2: FloatArray | None = None,
-    miss_weight: float = 1.0,
-    outlier_density: float = 0.0,
-    gone: bool = False,
+    readings: Readings, sensor: Sensor, *, miss_weight: float = 1.0, outlier_density: float = 0.0, gone: bool = False
 ) -> FloatArray:
     """Log likelihood of every look under every mode of the landmark that it looks at.
 
@@ -36,15 +62,8 @@ def log_psi(
     `S = H P H' + R`. Poses and modes count as independent in `P`.
 
     Args:
-        pose_world_robot: (R, 3) pose at every look.
-        landmark: (R,) row of `mode_position_m` that each look is at.
-        mode_position_m: (L, K, 2) modes of every landmark, nan for one that it does not have.
-        reading: (R, 2) range [m] and bearing [rad] as reported; nan for an expected detection that did not come.
-        sigma: (R, 2) their standard deviations.
+        readings: the looks, and the modes.
         sensor: limits, mounting and `P_D0`.
-        states: (9,) calibration states of `slam.calibration`; None for a sensor that reads true.
-        pose_covariance: (R, 3, 3) in the robot's frame; None where poses count as exact.
-        mode_covariance_m2: (L, K, 2, 2); None where positions count as exact.
         miss_weight: share of a miss that is news, from `miss_weight_from`.
         outlier_density: of detections that come from elsewhere (wrong identities), per metre and radian: a floor, so
             that no single detection can force a switch. 0 is the paper's.
@@ -54,18 +73,7 @@ def log_psi(
         (R, K) or (R, K + 1) log likelihoods; -inf for modes that the landmark does not have, and for a detection of
         what is gone where there are no outliers.
     """
-    predicted = predict(
-        pose_world_robot,
-        landmark,
-        mode_position_m,
-        reading,
-        sigma,
-        sensor,
-        states=states,
-        pose_covariance=pose_covariance,
-        mode_covariance_m2=mode_covariance_m2,
-    )
-    has_mode = np.isfinite(mode_position_m[landmark, :, 0])
+    predicted, has_mode, missed = predict(readings, sensor), readings.has_mode, readings.missed
     in_view = log_in_view(
         np.where(has_mode, predicted.range_m, 0.0),
         np.where(has_mode, predicted.bearing_rad, 0.0),
@@ -73,7 +81,6 @@ def log_psi(
         range_margin_m=np.where(has_mode, predicted.range_sigma_m, 1.0),
         bearing_margin_rad=np.where(has_mode, predicted.bearing_sigma_rad, 1.0),
     )
-    missed = np.isnan(reading[:, 0])
     with np.errstate(divide="ignore"):
         log_outlier = np.log(outlier_density)
         log_p_detect = np.log(sensor.p_detect) + in_view
@@ -103,38 +110,30 @@ class Predicted(NamedTuple):
     log_density: FloatArray
 
 
-def predict(
-    pose_world_robot: FloatArray,
-    landmark: IntArray,
-    mode_position_m: FloatArray,
-    reading: FloatArray,
-    sigma: FloatArray,
-    sensor: Sensor,
-    *,
-    states: FloatArray | None = None,
-    pose_covariance: FloatArray | None = None,
-    mode_covariance_m2: FloatArray | None = None,
-) -> Predicted:
-    """Expected readings and how the actual ones compare; arguments as in `log_psi`."""
+def predict(readings: Readings, sensor: Sensor) -> Predicted:
+    """Expected readings and how the actual ones compare."""
     from evermap.slam.selectors.likelihood_kernels import predict_rows
 
-    rows, modes = len(landmark), mode_position_m.shape[1]
+    rows, modes = len(readings.landmark), readings.mode_position_m.shape[1]
     out = Predicted(*(np.full((rows, modes), np.nan) for _ in Predicted._fields))
     predict_rows(
-        np.ascontiguousarray(pose_world_robot, dtype=np.float64),
-        np.asarray(landmark, dtype=np.int64),
-        np.ascontiguousarray(mode_position_m, dtype=np.float64),
-        np.ascontiguousarray(reading, dtype=np.float64),
-        np.ascontiguousarray(sigma, dtype=np.float64),
+        _contiguous(readings.pose_world_robot),
+        np.asarray(readings.landmark, dtype=np.int64),
+        _contiguous(readings.mode_position_m),
+        _contiguous(readings.reading),
+        _contiguous(readings.sigma),
         np.asarray(sensor.mount_robot_sensor, dtype=np.float64),
-        np.zeros(9) if states is None else np.ascontiguousarray(states, dtype=np.float64),
-        np.zeros((rows, 3, 3)) if pose_covariance is None else np.ascontiguousarray(pose_covariance),
-        np.zeros((*mode_position_m.shape, 2))
-        if mode_covariance_m2 is None
-        else np.ascontiguousarray(mode_covariance_m2),
+        _contiguous(readings.states, 9),
+        _contiguous(readings.pose_covariance, rows, 3, 3),
+        _contiguous(readings.mode_covariance_m2, *readings.mode_position_m.shape, 2),
         *out,
     )
     return out
+
+
+def _contiguous(values: FloatArray | None, *shape: int) -> FloatArray:
+    """As the kernel wants it; zeros of this shape where nothing is given."""
+    return np.zeros(shape) if values is None else np.ascontiguousarray(values, dtype=np.float64)
 
 
 def miss_weight_from(detected: FloatArray, first: IntArray, p_detect: float) -> float:

@@ -28,7 +28,7 @@ def predict_rows(
     squared_distance: FloatArray,
     log_density: FloatArray,
 ) -> None:
-    """Fill the fields of `likelihood.Predicted` where there is a mode; arguments as in `likelihood.predict`."""
+    """Fill the fields of `likelihood.Predicted` where there is a mode; arguments as in `likelihood.Readings`."""
     h = np.zeros(2)
     by_pose, by_landmark, by_states = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     for row in range(len(landmark)):
