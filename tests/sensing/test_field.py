@@ -125,3 +125,20 @@ def test_a_field_that_cannot_be_is_said_in_one_line(arguments, said):
     with pytest.raises(ConfigError, match=said) as error:
         Field(*arguments)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_outline_lies_on_the_border_of_the_field(name):
+    sensor, _ = FIELDS[name]
+    lower, upper, *slices = sensor.outline(3.0)
+    for edge, sign in ((lower, -1.0), (upper, 1.0)):
+        azimuth, elevation = sensor.angles(edge)
+        np.testing.assert_allclose(np.linalg.norm(edge, axis=1), 3.0)
+        np.testing.assert_allclose(elevation, sign * sensor.half_elevation_rad)
+        np.testing.assert_allclose(azimuth[[0, -1]], [-sensor.half_azimuth_rad, sensor.half_azimuth_rad])
+    for line, share in zip(slices, np.linspace(-1.0, 1.0, 5), strict=True):
+        np.testing.assert_array_equal(line[[0, -1]], 0.0)
+        azimuth, elevation = sensor.angles(line[1:-1])
+        np.testing.assert_allclose(azimuth, share * sensor.half_azimuth_rad, atol=1e-12)
+        assert np.all(np.diff(elevation) > 0.0)
+        assert np.all(np.abs(elevation) < sensor.half_elevation_rad)

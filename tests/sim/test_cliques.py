@@ -317,3 +317,11 @@ def test_an_object_that_is_never_passed_is_refused():
     blinkered = Field(1.0, 0.1, 0.1, Projection.PINHOLE)
     with pytest.raises(ConfigError, match="share_in_field"):
         simulate_cliques(CliqueWorld(field=blinkered, share_in_field=0.0, steps=200), 0)
+
+
+def test_true_detection_probability_is_the_thesis_model_of_what_is_there(run):
+    distance, angle = sight(run)
+    inside = in_field(run, run.position_m, run.rotation)
+    faces = angle <= run.world.viewing_angle_rad
+    expected = inside * np.where(faces, np.exp(-distance / run.world.fading_m), run.world.p_false)
+    np.testing.assert_allclose(run.p_detect(), expected, atol=1e-12)

@@ -59,6 +59,30 @@ class Field:
         inside = (np.abs(azimuth) <= self.half_azimuth_rad) & (np.abs(elevation) <= self.half_elevation_rad)
         return np.asarray(near & inside)
 
+    def outline(self, range_m: float) -> FloatArray:
+        """(7, 65, 3) lines in the sensor's frame that a picture shows the field by, cut off at `range_m`.
+
+        The first two are the lower and the upper edge; each of the others comes from the sensor, goes up between the
+        two, and returns to it.
+        """
+        share = np.linspace(-1.0, 1.0, 65)
+        edges = [self._rays(share, np.full(65, level)) for level in (-1.0, 1.0)]
+        slices = []
+        for at in np.linspace(-1.0, 1.0, 5):
+            ray = self._rays(np.full(65, at), share)
+            ray[[0, -1]] = 0.0
+            slices.append(ray)
+        return range_m * np.stack([*edges, *slices])
+
+    def _rays(self, azimuth_share: FloatArray, elevation_share: FloatArray) -> FloatArray:
+        """(N, 3) unit vectors at shares of the half angles."""
+        azimuth, elevation = azimuth_share * self.half_azimuth_rad, elevation_share * self.half_elevation_rad
+        if self.projection is Projection.PINHOLE:
+            ray = np.stack([np.ones_like(azimuth), np.tan(azimuth), np.tan(elevation)], axis=-1)
+        else:
+            ray = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
 
 LIDAR = Field(16.0, math.pi, math.radians(30.0), Projection.SPHERICAL)
 CAMERA = Field(16.0, math.radians(45.0), math.radians(45.0), Projection.PINHOLE)

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap import se2
-from evermap.errors import MissingExtraError
 from evermap.metrics.consistency import chi2_interval
 from evermap.metrics.summary import Evaluation, compare_with_truth
 from evermap.types import FloatArray, IntArray, Recording, SlamResult, Trajectory
 from evermap.viz.change_layer import moves
+from evermap.viz.rerun_stream import require_rerun, rgb
 from evermap.viz.style import ALERT, ESTIMATE, LANDMARK, MUTED, ODOMETRY
 
 TIMELINE = "stamp_s"
@@ -39,11 +39,8 @@ def write_scene(
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        hint = "pip install 'evermap[rerun]'"
-        raise MissingExtraError("a rerun scene needs rerun-sdk, which is not installed", hint=hint) from error
+    require_rerun()
+    import rerun as rr
 
     path = Path(path)
     evaluation = evaluation or compare_with_truth(recording, result)
@@ -100,11 +97,6 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
     )
 
 
-def _rgb(colour: str) -> tuple[int, int, int]:
-    red, green, blue = bytes.fromhex(colour[1:])
-    return red, green, blue
-
-
 def _time(stamp_s: FloatArray) -> Any:
     import rerun as rr
 
@@ -129,11 +121,11 @@ def _send_truth(stream: Any, recording: Recording, evaluation: Evaluation) -> No
     if recording.truth is not None and evaluation.poses is not None:
         rows = _thin(len(recording.truth))
         line = _flat(recording.truth.pose_world_robot[rows, :2], -0.01)
-        stream.log("world/truth/path", rr.LineStrips3D([line], colors=_rgb(MUTED), radii=0.012), static=True)
+        stream.log("world/truth/path", rr.LineStrips3D([line], colors=rgb(MUTED), radii=0.012), static=True)
     if recording.true_landmarks is not None and evaluation.poses is not None:
         points = _flat(recording.true_landmarks.position_m)
         size = np.full((len(points), 3), [0.07, 0.07, 0.002])
-        boxes = rr.Boxes3D(centers=points, half_sizes=size, colors=_rgb(MUTED))
+        boxes = rr.Boxes3D(centers=points, half_sizes=size, colors=rgb(MUTED))
         stream.log("world/truth/landmarks", boxes, static=True)
 
 
@@ -146,7 +138,7 @@ def _send_odometry(stream: Any, result: SlamResult, evaluation: Evaluation) -> N
     pose = np.zeros(3) if aligned is None else aligned.pose_truth_estimate
     rows = _thin(len(result.dead_reckoning))
     line = se2.compose(pose, result.dead_reckoning.pose_world_robot[rows])[:, :2]
-    strip = rr.LineStrips3D([_flat(line, -0.02)], colors=_rgb(ODOMETRY), radii=0.006)
+    strip = rr.LineStrips3D([_flat(line, -0.02)], colors=rgb(ODOMETRY), radii=0.006)
     stream.log("world/odometry_alone", strip, static=True)
 
 
@@ -162,8 +154,8 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray)
     quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
     places = rr.Transform3D.columns(translation=_flat(poses[:, :2]), quaternion=quaternion)
     stream.send_columns("world/robot", [_time(stamps)], places)
-    body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=_rgb(ESTIMATE), fill_mode="solid")
-    heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=_rgb(ESTIMATE), radii=0.02)
+    body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=rgb(ESTIMATE), fill_mode="solid")
+    heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=rgb(ESTIMATE), radii=0.02)
     stream.log("world/robot/body", body, static=True)
     stream.log("world/robot/heading", heading, static=True)
     if len(rows) > 1:
@@ -171,7 +163,7 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
         columns = rr.LineStrips3D.columns(strips=pieces)
         stream.send_columns("world/path", [_time(stamps[1:])], columns)
-        stream.log("world/path", rr.LineStrips3D.from_fields(colors=_rgb(ESTIMATE), radii=0.012), static=True)
+        stream.log("world/path", rr.LineStrips3D.from_fields(colors=rgb(ESTIMATE), radii=0.012), static=True)
 
 
 def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -> None:
@@ -190,11 +182,9 @@ def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray)
         names = landmarks.landmark_id[group].astype(str).tolist()
         entity = f"world/landmarks/{names[0]}" + (f"_and_{len(names) - 1}_more" if len(names) > 1 else "")
         stream.set_time(TIMELINE, duration=float(first_s[group].max()))
-        marks = rr.Points3D(
-            points[group], colors=_rgb(LANDMARK), radii=0.05, labels=names, show_labels=len(order) <= 60
-        )
+        marks = rr.Points3D(points[group], colors=rgb(LANDMARK), radii=0.05, labels=names, show_labels=len(order) <= 60)
         stream.log(entity, marks)
-        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=_rgb(LANDMARK), radii=0.008))
+        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=rgb(LANDMARK), radii=0.008))
     stream.reset_time()
 
 
@@ -206,7 +196,7 @@ def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -
         arrows = rr.Arrows3D(
             origins=_flat(move.before_m, 0.02),
             vectors=_flat(move.after_m - move.before_m),
-            colors=_rgb(move.colour),
+            colors=rgb(move.colour),
             radii=0.01 if move.alternative else 0.02,
             labels=[move.label] * len(move.before_m),
             show_labels=False,
@@ -254,7 +244,7 @@ def _send_rays(stream: Any, recording: Recording, result: SlamResult, pose_truth
     counts = np.bincount(row, minlength=len(kept))
     columns = rr.LineStrips3D.columns(strips=rays).partition(lengths=counts)
     stream.send_columns("world/detections", [_time(frames.stamp_s[kept])], columns)
-    stream.log("world/detections", rr.LineStrips3D.from_fields(colors=_rgb(ALERT), radii=0.006), static=True)
+    stream.log("world/detections", rr.LineStrips3D.from_fields(colors=rgb(ALERT), radii=0.006), static=True)
 
 
 def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluation: Evaluation) -> None:
@@ -289,9 +279,9 @@ def _plot(
     import rerun as rr
 
     look = (
-        rr.SeriesPoints(colors=_rgb(colour), marker_sizes=1.5)
+        rr.SeriesPoints(colors=rgb(colour), marker_sizes=1.5)
         if points
-        else rr.SeriesLines(colors=_rgb(colour), widths=1.5)
+        else rr.SeriesLines(colors=rgb(colour), widths=1.5)
     )
     stream.log(entity, look, static=True)
     stream.send_columns(entity, [_time(stamp_s)], rr.Scalars.columns(scalars=values))
