@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import InputError
-from evermap.metrics.removal import RemovalTally, bootstrap_errors, removal_scores, removal_tally
+from evermap.metrics.removal import RemovalTally, bootstrap, removal_scores, removal_tally, standard_errors
 
 
 def one(belief: list[float], in_view: str, first: int, survival: float) -> RemovalTally:
@@ -135,21 +135,31 @@ def test_bootstrap_of_independent_runs_is_their_standard_error_of_the_mean() -> 
     """MES/S of one column a run is a plain mean: the bootstrap's limit is known. Runs of equal columns are one draw."""
     belief, in_view, first, survival = drawn(3, columns=60)
     tally = removal_tally(belief, in_view, first, survival)
-    errors = bootstrap_errors(tally, np.arange(60), draws=4000)
+    errors = standard_errors(bootstrap(tally, np.arange(60), draws=4000))
     expected = np.std(tally.survival_ratio) / math.sqrt(60)
     assert errors.survival_ratio == pytest.approx(expected, rel=0.05)
 
     copies = [np.repeat(values, 5, axis=-1) for values in (belief, in_view, first, survival)]
-    correlated = bootstrap_errors(removal_tally(*copies), np.repeat(np.arange(60), 5), draws=4000)
+    correlated = standard_errors(bootstrap(removal_tally(*copies), np.repeat(np.arange(60), 5), draws=4000))
     assert correlated.survival_ratio == pytest.approx(expected, rel=0.05)
 
 
-def test_bootstrap_has_a_seed() -> None:
+def test_bootstrap_has_a_seed_that_draws_the_same_runs_for_every_filter() -> None:
     belief, in_view, first, survival = drawn(4)
     tally, run = removal_tally(belief, in_view, first, survival), np.arange(40) // 4
-    one_, two, other = (bootstrap_errors(tally, run, draws=20, seed=seed) for seed in (1, 1, 2))
+    one_, two, other = (bootstrap(tally, run, draws=20, seed=seed) for seed in (1, 1, 2))
     assert one_ == two
     assert one_ != other
+    landmarks = removal_tally(*(np.repeat(values, 2, axis=-1) for values in (belief, in_view, first, survival)))
+    split = bootstrap(landmarks, np.repeat(run, 2), weight=np.full(80, 0.5), draws=20, seed=1)
+    assert [scores.accuracy for scores in split] == pytest.approx([scores.accuracy for scores in one_])
+
+
+def test_an_unknown_score_has_no_standard_error() -> None:
+    tally = one([1.0, 1.0, 0.9, 0.5], "vvvv", first=0, survival=1.0)
+    errors = standard_errors(bootstrap(tally, np.array([0]), draws=5))
+    assert math.isnan(errors.delay_mean)
+    assert errors.accuracy == 0.0
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ all others. In such a step a belief of at least `rho_high` is a positive, and it
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -178,10 +179,12 @@ def _percentile(values: FloatArray, weight: FloatArray, share: float) -> float:
     return float(np.quantile(values, share, weights=weight, method="inverted_cdf"))
 
 
-def bootstrap_errors(
+def bootstrap(
     tally: RemovalTally, run: IntArray, *, weight: FloatArray | None = None, draws: int = 200, seed: int = 0
-) -> RemovalScores:
-    """Standard errors of `removal_scores`: whole runs are drawn again, since what is in one run is not independent.
+) -> list[RemovalScores]:
+    """Scores of resampled runs: whole runs are drawn again, since what is in one run is not independent.
+
+    The same seed draws the same runs, whatever the tally: differences of two filters can be taken draw by draw.
 
     Args:
         tally: of N columns.
@@ -189,18 +192,15 @@ def bootstrap_errors(
         weight: as in `removal_scores`.
         draws: samples of as many runs as there are, with replacement.
         seed: of the draws.
-
-    Returns:
-        Standard deviations over the draws in which a score is known; nan where there are fewer than two.
     """
-    rng = np.random.default_rng(seed)
     runs = int(run.max()) + 1
     w = np.ones(len(run)) if weight is None else weight
-    drawn = rng.multinomial(runs, np.full(runs, 1.0 / runs), size=draws)
-    scores = [asdict(removal_scores(tally, w * times[run])) for times in drawn]
-    errors = {}
-    for name in scores[0]:
-        values = np.array([score[name] for score in scores])
-        known = values[np.isfinite(values)]
-        errors[name] = float(np.std(known, ddof=1)) if len(known) > 1 else float("nan")
-    return RemovalScores(**errors)
+    drawn = np.random.default_rng(seed).multinomial(runs, np.full(runs, 1.0 / runs), size=draws)
+    return [removal_scores(tally, w * times[run]) for times in drawn]
+
+
+def standard_errors(draws: Sequence[RemovalScores]) -> RemovalScores:
+    """Standard deviation of every score over the draws in which it is known; nan where those are fewer than two."""
+    table = np.array([astuple(scores) for scores in draws])
+    known = [column[np.isfinite(column)] for column in table.T]
+    return RemovalScores(*(float(np.std(column, ddof=1)) if len(column) > 1 else float("nan") for column in known))
