@@ -21,7 +21,7 @@ RULES = {
     "se2": "types",
     "config": "errors types",
     "survival": "errors types se2",
-    "sensing": "errors types se2",
+    "sensing": "errors types se2 compiled",
     "persistence": "errors types se2 compiled survival sensing",
     "recurrence": "errors types compiled survival persistence io",
     "tracking": "errors types se2 config survival sensing persistence recurrence",

@@ -1,0 +1,271 @@
+"""One look at all cliques, compiled: what is expected, what it says of each clique, and what it teaches.
+
+The cost of a landmark is the rotation into the sensor's frame, two table look-ups and two divisions; logarithms are
+taken of products of many ratios at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numba import njit
+
+from evermap.compiled import drop_stale_code
+from evermap.types import BoolArray, FloatArray, IntArray
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+drop_stale_code(__file__)
+
+HIGHEST = 0.98
+"""No landmark is detected with more than this: a model that is certain cannot learn that it is wrong."""
+OUT_OF_FIELD = 0.01
+"""Probability of being in the field below which a look says nothing."""
+FAR_OUT = 5.0
+"""Standard deviations from an edge beyond which it is not looked at."""
+EXPONENT = 600.0
+"""Cut of log likelihood ratios: far from what a double holds, and certain either way."""
+
+
+def kernel(function: _Function) -> _Function:
+    """Compile at the first call and keep the machine code."""
+    return cast("_Function", njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function))
+
+
+@kernel
+def normal_cdf(z: float) -> float:
+    """`P(x < z)` of a standard normal."""
+    if z > FAR_OUT:
+        return 1.0
+    if z < -FAR_OUT:
+        return 0.0
+    return 0.5 * math.erfc(-z * 0.7071067811865476)
+
+
+@kernel
+def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -> float:
+    """Probability that a point of the sensor's frame is in the field; `limits` as `learned` packs them."""
+    range_max, sin_az, cos_az, sin_el, cos_el, spherical, all_around, sigma_m, sigma_rad = limits
+    inside = normal_cdf((range_max - range_m) / sigma_m)
+    if inside < OUT_OF_FIELD:
+        return 0.0
+    level_squared = x * x + y * y
+    ahead = math.sqrt(level_squared) if spherical > 0.0 else x
+    squared_m, squared_rad = sigma_m * sigma_m, sigma_rad * sigma_rad
+    spread = math.sqrt(squared_m + (ahead * ahead + z * z) * squared_rad)
+    inside *= normal_cdf((ahead * sin_el - abs(z) * cos_el) / spread)
+    if all_around == 0.0:
+        spread = math.sqrt(squared_m + level_squared * squared_rad)
+        inside *= normal_cdf((x * sin_az - abs(y) * cos_az) / spread)
+    return inside
+
+
+@kernel
+def face_of(x: float, y: float, z: float) -> int:
+    """Which of the six faces of a cube a direction goes through."""
+    a, b, c = abs(x), abs(y), abs(z)
+    if a >= b and a >= c:
+        return 0 if x > 0.0 else 1
+    if b >= c:
+        return 2 if y > 0.0 else 3
+    return 4 if z > 0.0 else 5
+
+
+@kernel
+def between(value: float, count: int) -> tuple[int, float]:
+    """The middle below `value`, in units of bins from the first one's lower edge, and how far it is to the next."""
+    shifted = value - 0.5
+    if shifted <= 0.0:
+        return 0, 0.0
+    low = int(shifted)
+    if low >= count - 1:
+        return count - 2, 1.0
+    return low, shifted - low
+
+
+@kernel
+def look(
+    position_m: FloatArray,
+    rotation: FloatArray,
+    limits: FloatArray,
+    detected: BoolArray,
+    active: BoolArray,
+    elapsed_s: FloatArray,
+    first: IntArray,
+    landmark_m: FloatArray,
+    outward: FloatArray,
+    hits: Any,
+    expected: Any,
+    occluded: FloatArray,
+    log_chain: FloatArray,
+    pending: FloatArray,
+    range_rate: FloatArray,
+    facing_rate: FloatArray,
+    p_false: float,
+    come_hz: FloatArray,
+    go_hz: FloatArray,
+    log_weight: FloatArray,
+    log_there: FloatArray,
+    log_gone: FloatArray,
+    p_occluded: FloatArray,
+    looked: IntArray,
+) -> None:
+    """Fill the last four arrays (C,), and update `hits` to `pending` in place; names as in `learned.Learned`."""
+    chains, ranges, facings = len(come_hz), len(range_rate), len(facing_rate)
+    largest = 0
+    for c in range(len(first) - 1):
+        largest = max(largest, first[c + 1] - first[c])
+    row = np.empty(largest, np.int64)
+    inside = np.empty(largest)
+    base = np.empty(largest)  # detection by range and incidence
+    own = np.empty(largest)  # the landmark's own factor, by direction
+    face = np.empty(largest, np.int64)
+    low_r, part_r = np.empty(largest, np.int64), np.empty(largest)
+    low_f, part_f = np.empty(largest, np.int64), np.empty(largest)
+    weight = np.empty(chains)
+    at_facing, at_false = 2 * ranges, 2 * ranges + 2 * facings
+    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
+    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
+    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
+    reach = limits[0] + FAR_OUT * limits[7]
+
+    for c in range(len(first) - 1):
+        looked[c] = 0
+        log_there[c] = log_gone[c] = p_occluded[c] = np.nan
+        if not active[c]:
+            continue
+
+        # what is expected, landmark by landmark
+        n = 0
+        log_ratio, log_absent, ratio, absent = 0.0, 0.0, 1.0, 1.0
+        for k in range(first[c], first[c + 1]):
+            dx, dy, dz = (
+                position_m[0] - landmark_m[k, 0],
+                position_m[1] - landmark_m[k, 1],
+                position_m[2] - landmark_m[k, 2],
+            )
+            squared = dx * dx + dy * dy + dz * dz
+            if squared > reach * reach:
+                continue
+            range_m = max(math.sqrt(squared), 1e-9)
+            x = -(r00 * dx + r10 * dy + r20 * dz)
+            y = -(r01 * dx + r11 * dy + r21 * dz)
+            z = -(r02 * dx + r12 * dy + r22 * dz)
+            seen = in_field(x, y, z, range_m, limits)
+            if seen < OUT_OF_FIELD:
+                continue
+            low, part = between(range_m / limits[0] * ranges, ranges)
+            by_range = range_rate[low] + part * (range_rate[low + 1] - range_rate[low])
+            low_r[n], part_r[n] = low, part
+            cosine = (dx * outward[k, 0] + dy * outward[k, 1] + dz * outward[k, 2]) / range_m
+            low, part = between(0.5 * (cosine + 1.0) * facings, facings)
+            by_facing = facing_rate[low] + part * (facing_rate[low + 1] - facing_rate[low])
+            low_f[n], part_f[n] = low, part
+            side = face_of(dx, dy, dz)
+            row[n], inside[n], face[n] = k, seen, side
+            base[n], own[n] = by_range * by_facing, hits[k, side] / expected[k, side]
+            p_detect = seen * min(base[n] * own[n], HIGHEST)
+            p_alarm = seen * p_false
+            p_either = p_alarm + (1.0 - p_alarm) * p_detect
+            if detected[k]:
+                ratio *= p_either / p_alarm
+                absent *= p_alarm
+            else:
+                ratio *= (1.0 - p_either) / (1.0 - p_alarm)
+                absent *= 1.0 - p_alarm
+            if ratio > 1e100 or ratio < 1e-100 or absent < 1e-100:
+                log_ratio += math.log(ratio)
+                log_absent += math.log(absent)
+                ratio = absent = 1.0
+            n += 1
+        if n == 0:
+            continue
+        log_ratio += math.log(ratio)
+        log_absent += math.log(absent)
+
+        # who stands before it, under every chain, and what the look says of the clique
+        free = math.exp(min(max(log_ratio, -EXPONENT), EXPONENT))
+        top = -np.inf
+        for j in range(chains):
+            rate = come_hz[j] + go_hz[j]
+            share = come_hz[j] / rate
+            occluded[c, j] = share + (occluded[c, j] - share) * math.exp(-rate * elapsed_s[c])
+            weight[j] = log_weight[j] + log_chain[c, j]
+            top = max(top, weight[j])
+        total = 0.0
+        for j in range(chains):
+            weight[j] = math.exp(weight[j] - top)
+            total += weight[j]
+        mixed = 0.0
+        for j in range(chains):
+            weight[j] /= total
+            mixed += weight[j] * ((1.0 - occluded[c, j]) * free + occluded[c, j])
+        hidden = 0.0
+        for j in range(chains):
+            under = (1.0 - occluded[c, j]) * free + occluded[c, j]
+            occluded[c, j] /= under
+            hidden += weight[j] * under / mixed * occluded[c, j]
+            log_chain[c, j] += math.log(under / mixed)
+        log_gone[c] = log_absent
+        log_there[c] = log_absent + math.log(mixed)
+        p_occluded[c] = hidden
+        looked[c] = n
+
+        # what it teaches, if the clique is there: hits and expected hits, each factor with the others given
+        clear = 1.0 - hidden
+        for i in range(n):
+            k, seen = row[i], inside[i]
+            low_range, low_facing = low_r[i], low_f[i]
+            by_range = range_rate[low_range] + part_r[i] * (range_rate[low_range + 1] - range_rate[low_range])
+            by_facing = facing_rate[low_facing] + part_f[i] * (facing_rate[low_facing + 1] - facing_rate[low_facing])
+            p_detect = min(base[i] * own[i], HIGHEST)
+            hit = 0.0
+            if detected[k]:
+                true = clear * p_detect / (p_detect + p_false)
+                hit = true
+                pending[c, at_false] += 1.0 - true
+                pending[c, at_false + 2] += 1.0
+                hits[k, face[i]] += true
+            view = clear * seen
+            pending[c, at_false + 1] += seen * (1.0 - clear * p_detect)
+            pending[c, at_false + 3] += seen
+            expected[k, face[i]] += view * base[i]
+            for_range, for_facing = view * by_facing * own[i], view * by_range * own[i]
+            part = part_r[i]
+            pending[c, low_range] += hit * (1.0 - part)
+            pending[c, low_range + 1] += hit * part
+            pending[c, ranges + low_range] += for_range * (1.0 - part)
+            pending[c, ranges + low_range + 1] += for_range * part
+            part = part_f[i]
+            pending[c, at_facing + low_facing] += hit * (1.0 - part)
+            pending[c, at_facing + low_facing + 1] += hit * part
+            pending[c, at_facing + facings + low_facing] += for_facing * (1.0 - part)
+            pending[c, at_facing + facings + low_facing + 1] += for_facing * part
+
+
+@kernel
+def collect(
+    surely_there: BoolArray,
+    surely_gone: BoolArray,
+    pending: FloatArray,
+    log_chain: FloatArray,
+    learned: FloatArray,
+    log_weight: FloatArray,
+) -> None:
+    """Move what pends of cliques that are sure into the sums `learned` (P,) and `log_weight` (J,), in place."""
+    last = pending.shape[1]
+    for c in range(len(surely_there)):
+        if surely_there[c]:
+            for i in range(last - 2):
+                learned[i] += pending[c, i]
+            for j in range(len(log_weight)):
+                log_weight[j] += log_chain[c, j]
+                log_chain[c, j] = 0.0
+            pending[c, :] = 0.0
+        elif surely_gone[c]:
+            learned[last - 4] += pending[c, last - 2]
+            learned[last - 3] += pending[c, last - 1]
+            pending[c, :] = 0.0

@@ -1,0 +1,289 @@
+"""Detection that is learned while the map is watched, and misses that are explained instead of suppressed.
+
+A landmark that is there is detected with `P_D = P(in the field) R(range) V(incidence) G(landmark, direction)`, or by
+mistake with `P_F`; somebody may stand before its whole clique, and then only false alarms remain (MATH.md section 3, the lines
+beyond the thesis). `R`, `V`, `P_F` and how often and how long somebody stands there are the sensor's `Profile`, shared
+by all it sees. `G` is each landmark's own, for each of six directions: hits over expected hits, which start equal.
+
+What a look teaches of a clique's own landmarks is exact in one respect that matters: the hypothesis 'still there' says
+that it has been there all the time, so its numbers count every look, whatever is believed of it now. What is shared
+must not learn from things that have gone, so a clique's share pends until the clique is seen again.
+
+Use, a frame:
+
+    model, seen = learned.look(model, stamp_s, position_m, rotation, detected)
+    belief = single.observe(belief, seen.stamp_s, seen.log_there, seen.log_gone)
+    model = learned.confirm(model, seen, belief.probability)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evermap.errors import DataError, InputError
+from evermap.sensing.field import Projection
+from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile
+from evermap.types import BoolArray, FloatArray, IntArray
+
+FACES = 6
+"""Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
+SURELY_THERE = 0.99
+SURELY_GONE = 0.001
+"""Beliefs at which what pends of a clique is taken for what it is."""
+MOSTLY_FREE = 0.1
+"""Probability of being occluded above which a clique has not been seen again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """What is known of the sensor, and of K landmarks on C cliques.
+
+    Attributes:
+        profile: of the sensor.
+        first: (C + 1,) landmarks `first[c]` to `first[c + 1]` are those of clique c.
+        landmark_m: (K, 3) in the world.
+        outward: (K, 3) unit vectors away from the middle of each clique; the prior of its landmarks' normals.
+        hits, expected: (K, 6) float32 sums by direction; their ratio is a landmark's own factor.
+        stamp_s: (C,) when each clique was last in the field; nan before.
+        occluded: (C, J) probability of being occluded then, under each chain.
+        log_chain: (C, J) log evidence for each chain that pends.
+        pending: (C, P) sums for the profile that pend, in its order, and then for false alarms if the clique is gone.
+    """
+
+    profile: Profile
+    first: IntArray
+    landmark_m: FloatArray
+    outward: FloatArray
+    hits: NDArray[np.float32]
+    expected: NDArray[np.float32]
+    stamp_s: FloatArray
+    occluded: FloatArray
+    log_chain: FloatArray
+    pending: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class CliqueLook:
+    """What one frame says of C cliques; nan for those that were not in the field.
+
+    Attributes:
+        stamp_s: (C,) time of the look.
+        log_there, log_gone: (C,) log likelihood of the detections and misses if the clique is there, and if not.
+        p_occluded: (C,) probability that it was occluded, if there.
+        expected: (C,) number of landmarks in the field.
+    """
+
+    stamp_s: FloatArray
+    log_there: FloatArray
+    log_gone: FloatArray
+    p_occluded: FloatArray
+    expected: IntArray
+
+
+def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -> Learned:
+    """A model of landmarks that nothing is known of but their places.
+
+    Args:
+        landmark_m: (K, 3) in the world, sorted by clique.
+        clique: (K,) which clique each is of; all of 0 to C - 1 occur.
+        profile: of the sensor, from earlier sessions or robots, or what is assumed of one that has seen nothing.
+
+    Raises:
+        InputError: shapes that differ, places that are not finite, or cliques that are not sorted or lack landmarks.
+    """
+    point = np.ascontiguousarray(landmark_m, dtype=np.float64)
+    member = np.asarray(clique)
+    if point.ndim != 2 or point.shape[1] != 3 or member.shape != (len(point),):
+        raise InputError(f"shapes {point.shape} and {member.shape} instead of (K, 3) and (K,)", field="landmark_m")
+    wrong = np.flatnonzero(~np.isfinite(point).all(axis=1))
+    if wrong.size:
+        raise InputError(f"row {wrong[0]}: {point[wrong[0]]} is no place", field="landmark_m", hint="finite metres")
+    step = np.diff(member, prepend=-1)
+    wrong = np.flatnonzero((step < 0) | (step > 1))
+    if len(member) == 0 or wrong.size or member[0] != 0:
+        where = f"row {wrong[0]}: clique {member[wrong[0]]}" if wrong.size else "the first clique is not 0"
+        raise InputError(f"{where}", field="clique", hint="landmarks sorted by clique, cliques numbered from 0")
+    first = np.append(np.flatnonzero(step), len(member)).astype(np.int64)
+    count = np.diff(first)
+    middle = np.add.reduceat(point, first[:-1], axis=0) / count[:, None]
+    away = point - np.repeat(middle, count, axis=0)
+    length = np.linalg.norm(away, axis=1, keepdims=True)
+    start = profile if isinstance(profile, Profile) else Profile.of(profile)
+    chain = start.occlusion
+    c, prior = len(count), start.assumed.hits
+    return Learned(
+        profile=start,
+        first=first,
+        landmark_m=point,
+        outward=np.where(length > 1e-9, away / np.maximum(length, 1e-9), 0.0),
+        hits=np.full((len(point), FACES), prior, dtype=np.float32),
+        expected=np.full((len(point), FACES), prior, dtype=np.float32),
+        stamp_s=np.full(c, np.nan),
+        occluded=np.tile(chain.come_hz / (chain.come_hz + chain.go_hz), (c, 1)),
+        log_chain=np.zeros((c, len(chain.weight))),
+        pending=np.zeros((c, 2 * RANGE_BINS + 2 * FACING_BINS + 4)),
+    )
+
+
+def look(
+    model: Learned,
+    stamp_s: float,
+    position_m: FloatArray,
+    rotation: FloatArray,
+    detected: BoolArray,
+    *,
+    active: BoolArray | None = None,
+) -> tuple[Learned, CliqueLook]:
+    """Take in one frame.
+
+    Args:
+        model: so far.
+        stamp_s: time of the frame, on one clock for all.
+        position_m: (3,) of the sensor in the world.
+        rotation: (3, 3) from the sensor's frame to the world's.
+        detected: (K,) which landmarks were detected; those that are not in the field don't count.
+        active: (C,) which cliques are looked at; all where None.
+
+    Returns:
+        The model after the frame, and what the frame says of each clique.
+
+    Raises:
+        InputError: shapes, a pose that is none, or time running back.
+    """
+    from evermap.sensing import kernels
+
+    place, turn = np.asarray(position_m, dtype=np.float64), np.ascontiguousarray(rotation, dtype=np.float64)
+    hit, k, c = np.asarray(detected), len(model.landmark_m), len(model)
+    if hit.shape != (k,) or hit.dtype != np.bool_:
+        raise InputError(f"{hit.dtype} of shape {hit.shape} instead of bool of ({k},)", field="detected")
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f"{position_m} is no place", field="position_m", hint="three finite numbers")
+    if turn.shape != (3, 3) or not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6:
+        raise InputError("is no rotation", field="rotation", hint="an orthonormal matrix (3, 3)")
+    if not math.isfinite(stamp_s):
+        raise InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
+    late = np.flatnonzero(model.stamp_s > stamp_s)
+    if late.size:
+        problem = f"time {stamp_s} s lies before the last look at clique {late[0]} at {model.stamp_s[late[0]]} s"
+        raise InputError(problem, field="stamp_s", hint="sort by time")
+    chosen = np.ones(c, dtype=np.bool_) if active is None else np.asarray(active)
+    if chosen.shape != (c,) or chosen.dtype != np.bool_:
+        raise InputError(f"{chosen.dtype} of shape {chosen.shape} instead of bool of ({c},)", field="active")
+
+    after = replace(
+        model,
+        hits=model.hits.copy(),
+        expected=model.expected.copy(),
+        occluded=model.occluded.copy(),
+        log_chain=model.log_chain.copy(),
+        pending=model.pending.copy(),
+    )
+    profile, chain = model.profile, model.profile.occlusion
+    seen = CliqueLook(np.empty(c), np.empty(c), np.empty(c), np.empty(c), np.empty(c, dtype=np.int64))
+    kernels.look(
+        place,
+        turn,
+        _limits(profile.assumed),
+        hit,
+        chosen,
+        np.nan_to_num(stamp_s - model.stamp_s),
+        model.first,
+        model.landmark_m,
+        model.outward,
+        after.hits,
+        after.expected,
+        after.occluded,
+        after.log_chain,
+        after.pending,
+        profile.range_rate,
+        profile.facing_rate,
+        profile.p_false,
+        chain.come_hz,
+        chain.go_hz,
+        profile.log_weight,
+        seen.log_there,
+        seen.log_gone,
+        seen.p_occluded,
+        seen.expected,
+    )
+    in_view = seen.expected > 0
+    return (
+        replace(after, stamp_s=np.where(in_view, stamp_s, model.stamp_s)),
+        replace(seen, stamp_s=np.where(in_view, stamp_s, np.nan)),
+    )
+
+
+def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learned:
+    """Let the profile learn from the cliques that the last look has made sure of.
+
+    Args:
+        model: after `look`.
+        seen: what `look` returned with it.
+        probability: (C,) that each clique exists, after that look.
+
+    Raises:
+        InputError: probabilities of another shape.
+        DataError: a probability that is none, of a clique that was looked at.
+    """
+    from evermap.sensing import kernels
+
+    belief = np.asarray(probability, dtype=np.float64)
+    if belief.shape != (len(model),):
+        raise InputError(f"shape {belief.shape} instead of ({len(model)},)", field="probability")
+    in_view = seen.expected > 0
+    wrong = np.flatnonzero(in_view & ~((belief >= 0.0) & (belief <= 1.0)))
+    if wrong.size:
+        raise DataError(f"row {wrong[0]}: {belief[wrong[0]]} is no probability", field="probability", hint="0 to 1")
+    there = in_view & (belief > SURELY_THERE) & (seen.p_occluded < MOSTLY_FREE)
+    gone = in_view & (belief < SURELY_GONE)
+    profile = model.profile
+    sums = np.concatenate(
+        [
+            profile.range_hits,
+            profile.range_expected,
+            profile.facing_hits,
+            profile.facing_expected,
+            [profile.false_hits, profile.false_looks, 0.0, 0.0],
+        ]
+    )
+    pending, log_chain, log_weight = model.pending.copy(), model.log_chain.copy(), profile.log_weight.copy()
+    kernels.collect(there, gone, pending, log_chain, sums, log_weight)
+    range_hits, range_expected, facing_hits, facing_expected, rest = np.split(
+        sums, np.cumsum([RANGE_BINS, RANGE_BINS, FACING_BINS, FACING_BINS])
+    )
+    learned = replace(
+        profile,
+        range_hits=range_hits,
+        range_expected=range_expected,
+        facing_hits=facing_hits,
+        facing_expected=facing_expected,
+        false_hits=float(rest[0]),
+        false_looks=float(rest[1]),
+        log_weight=log_weight - log_weight.max(),
+    )
+    return replace(model, profile=learned, pending=pending, log_chain=log_chain)
+
+
+def _limits(assumed: Assumed) -> FloatArray:
+    """The field and its softness as the kernels take them."""
+    field = assumed.field
+    return np.array(
+        [
+            field.range_max_m,
+            math.sin(field.half_azimuth_rad),
+            math.cos(field.half_azimuth_rad),
+            math.sin(field.half_elevation_rad),
+            math.cos(field.half_elevation_rad),
+            float(field.projection is Projection.SPHERICAL),
+            float(field.half_azimuth_rad >= math.pi),
+            assumed.sigma_position_m,
+            assumed.sigma_attitude_rad,
+        ]
+    )
