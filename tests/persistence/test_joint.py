@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from evermap.errors import InputError, NumericalError
 from evermap.persistence import joint, single
 from evermap.sensing.clique_range import nearest_per_clique, range_degraded_miss
-from evermap.survival import Exponential, LifetimePrior
+from evermap.survival import Exponential, LifetimePrior, Uniform
 
 from .cliques import PRIORS, Looks, looks, summed
 
@@ -114,14 +114,14 @@ def test_what_was_not_expected_is_neither_used_nor_checked() -> None:
     clique = np.array([2, 0, 0, 1])
     expected = np.array([False, True, False, True])
     detected = np.array([np.nan, 0.0, 7.0, 1.0])
-    p_miss = np.array([np.nan, 0.4, -1.0, 0.4])
+    p_miss = np.array([np.nan, 0.4, -1.0, 2.0])
     after = joint.jcf(before, [5.0, np.nan, 5.0], detected, p_miss, 0.1, expected, clique)
     np.testing.assert_array_equal(after.inverse_odds[1:], before.inverse_odds[1:])  # no look; none expected
     np.testing.assert_array_equal(after.stamp_s, [5.0, 2.0, 2.0])
     one = single.update(before, 5.0, 0, 0.4, 0.1, rows=[0])
     assert after.inverse_odds[0] == pytest.approx(one.inverse_odds[0], rel=1e-13)
-    alone = joint.iff(single.init(4, Exponential(0.1)), [np.nan, 5.0, 5.0, 5.0], detected, p_miss, 0.1, expected)
-    np.testing.assert_array_equal(alone.stamp_s, [0.0, 5.0, 0.0, 5.0])
+    alone = joint.iff(single.init(4, Exponential(0.1)), [5.0, 5.0, 5.0, np.nan], detected, p_miss, 0.1, expected)
+    np.testing.assert_array_equal(alone.stamp_s, [0.0, 5.0, 0.0, 0.0])
 
 
 @few
@@ -184,6 +184,25 @@ def test_a_thousand_members_leave_a_doubt() -> None:
     assert state.log_evidence[0] == pytest.approx(expected, rel=1e-12)
     state = joint.jcf(state, 2.0, 1, 0.1, 0.01, True, members[:200])
     assert state.probability[0] > 0.99
+
+
+def test_a_thousand_members_do_not_shake_a_certainty() -> None:
+    """Who was just born is there, and who outlived nothing is gone, however many members say otherwise."""
+    members = np.zeros(5_000, dtype=np.int64)
+    born = joint.jcf(single.init(1, Exponential(0.1)), 0.0, 0, 0.1, 0.01, True, members)
+    assert born.inverse_odds[0] == 0.0
+    gone = joint.jcf(single.init(1, Uniform(10.0)), 11.0, 1, 0.1, 0.01, True, members)
+    assert np.isposinf(gone.inverse_odds[0])
+
+
+@pytest.mark.parametrize(
+    ("detected", "p_miss", "p_false", "doubt"), [(1, 0.1, 1e-200, 1e-300), (0, 1e-200, 0.1, 1e300)]
+)
+def test_a_doubt_stays_finite_by_every_road(detected: int, p_miss: float, p_false: float, doubt: float) -> None:
+    state = single.update(single.init(1, Exponential(0.1)), 1.0, 1, 0.1, 0.1)
+    look = (2.0, detected, p_miss, p_false)
+    assert single.update(single.update(state, *look), *look).inverse_odds[0] == doubt
+    assert joint.jcf(state, *look, True, np.array([0, 0])).inverse_odds[0] == doubt
 
 
 def test_the_range_degraded_filter_by_hand() -> None:

@@ -62,7 +62,7 @@ def test_the_nearest_landmark(ranges: list[tuple[float, int]]) -> None:
 
 def test_the_miss_rate_grows_with_range_within_its_bounds() -> None:
     assert range_degraded_miss(9.0, 9.0) == pytest.approx(1.0 - math.exp(-1.0), rel=1e-15)
-    assert range_degraded_miss(1e-12, 10.0) == pytest.approx(1e-13, rel=1e-12)
+    assert range_degraded_miss(1e-12, 10.0) == pytest.approx(1e-13, rel=1e-12, abs=0.0)
     bounded = range_degraded_miss([0.0, 5.0, np.inf], 9.0, least=0.4, most=0.98)
     np.testing.assert_allclose(bounded, [0.4, 1.0 - math.exp(-5.0 / 9.0), 0.98], rtol=1e-15)
 
