@@ -175,4 +175,5 @@ def _pairwise_block(point_m: FloatArray, own: float, neighbours: int, reach_m: f
     total = closeness.sum(axis=1)
     own_weight = np.where(total > 0.0, own, 1.0)
     others = closeness * np.divide(1.0 - own_weight, total, where=total > 0.0, out=np.zeros_like(total))[:, None]
-    return np.linalg.solve(np.eye(len(point_m)) - others, np.diag(own_weight))
+    solved = np.linalg.solve(np.eye(len(point_m)) - others, np.diag(own_weight))
+    return np.maximum(solved, 0.0)  # elimination with pivots leaves -1e-17 where the answer is 0
