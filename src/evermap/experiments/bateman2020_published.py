@@ -10,8 +10,6 @@ import numpy as np
 from evermap.experiments.bateman2020_scores import Row, Scored
 from evermap.experiments.bateman2020_settings import IN_THE_TABLE, NOMINAL, OF_THE_THESIS, SUPPRESSION
 
-METRICS = ("accuracy", "survival_ratio")
-NAMES = {"accuracy": "accuracy", "survival_ratio": "MES/S"}
 LIMIT = 2.0
 """Standard errors of the difference within which ours says nothing about an ordering."""
 

@@ -14,7 +14,6 @@ from evermap.experiments.bateman2020_runs import TUNING, Stack, miss_rate, simul
 from evermap.experiments.bateman2020_settings import (
     IN_THE_TABLE,
     NOMINAL,
-    SENSORS,
     SUPPRESSION,
     FilterSettings,
     Settings,
@@ -32,6 +31,8 @@ from evermap.types import FloatArray, IntArray
 Row = dict[str, Any]
 
 METRICS = tuple(f.name for f in fields(RemovalScores))
+COMPARED = ("accuracy", "survival_ratio")
+"""The two that the thesis tells."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class Scored:
 
     Attributes:
         row: world, sensor, filter, and every score with its standard error.
-        draws: (B,) accuracy and MES/S of resampled runs, the same runs for all filters of a stack.
+        draws: (B,) those of `COMPARED`, of resampled runs: the same runs for all filters of a stack.
         reliability: of the beliefs in possible detections.
     """
 
@@ -55,7 +56,7 @@ def score(
     """Scores of beliefs (F, N) with their standard errors; landmarks of a clique share its weight.
 
     Returns:
-        Every score and `<score>_se`, None where unknown; and (B,) draws of accuracy and MES/S.
+        Every score and `<score>_se`, None where unknown; and (B,) draws of those of `COMPARED`.
     """
     weight = 1.0 / np.bincount(clique, minlength=stack.cliques)[clique]
     tally = removal_tally(
@@ -69,8 +70,7 @@ def score(
     drawn = bootstrap(tally, stack.run[clique], weight=weight, draws=draws, seed=seed)
     values, errors = asdict(removal_scores(tally, weight)), asdict(standard_errors(drawn))
     row = {name: _known(values[name]) for name in METRICS} | {f"{name}_se": _known(errors[name]) for name in METRICS}
-    compared = ("accuracy", "survival_ratio")
-    return row, {name: np.array([getattr(scores, name) for scores in drawn]) for name in compared}
+    return row, {name: np.array([getattr(scores, name) for scores in drawn]) for name in COMPARED}
 
 
 def _known(value: float) -> float | None:
@@ -94,7 +94,8 @@ def score_world(
         in_view = stack.in_view[:, clique]
         bins = reliability(belief[in_view], there[:, clique][in_view])
         done()
-        yield Scored({"world": world, "sensor": sensor, "filter": name} | row, drawn, bins)
+        at = {"world": world, "sensor": sensor, "filter": name}
+        yield Scored(at | row | {"calibration_error": _known(bins.error)}, drawn, bins)
 
 
 def sweep(settings: Settings, sensor: str, done: Callable[[], None]) -> Iterator[Row]:
@@ -135,6 +136,3 @@ def _depends(name: str, parameter: str) -> bool:
         "observed_m": suppresses or degrades,
         "p_miss": not degrades,
     }.get(parameter, True)
-
-
-__all__ = ["METRICS", "SENSORS", "Row", "Scored", "score", "score_world", "sweep", "sweep_points", "tuned_p_miss"]

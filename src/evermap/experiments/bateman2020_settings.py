@@ -123,6 +123,10 @@ class Settings:
         changes: dict[str, Any] = {name: value}
         return replace(self, filters=replace(self.filters, **changes))
 
+    def value_of(self, section: str, name: str) -> float:
+        """A parameter of the sweep, at its place in the file."""
+        return float(self.world[name] if section == "world" else getattr(self.filters, name))
+
 
 def _world_arguments(table: dict[str, Any]) -> dict[str, Any]:
     """Keys and values of the file as `CliqueWorld` has them."""

@@ -1,0 +1,115 @@
+"""Scores over the parameters that the thesis hides, and whether beliefs mean what they say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.experiments.bateman2020_scores import COMPARED, Row, Scored
+from evermap.experiments.bateman2020_settings import LEARNED, ORACLE, SUPPRESSION, TUNED
+from evermap.experiments.bateman2020_table import NAMES, title
+from evermap.viz.style import ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, house_style, new_figure, settle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from evermap.experiments.bateman2020_settings import Settings
+
+_COLUMNS = 4
+_COLOURS = {"iff": ODOMETRY, "jff": MUTED, "jcf": LANDMARK, "jcfr": ESTIMATE}
+_CALIBRATED = {"jcf" + SUPPRESSION: MUTED, TUNED: ODOMETRY, ORACLE: INK, LEARNED: ESTIMATE}
+_FEWEST = 30
+"""Beliefs in a bin below which its share says nothing."""
+_LOGARITHMIC = {"prior_mean_steps", "p_false", "rho_low"}
+
+
+def draw_sweeps(rows: Sequence[Row], settings: Settings) -> dict[str, Figure]:
+    """A figure for each sensor: accuracy above MES/S, a column a parameter."""
+    sensors = dict.fromkeys(row["sensor"] for row in rows)
+    return {
+        f"sensitivity-{sensor}": _sweep([row for row in rows if row["sensor"] == sensor], settings)
+        for sensor in sensors
+    }
+
+
+def _sweep(rows: Sequence[Row], settings: Settings) -> Figure:
+    parameters = list(dict.fromkeys((row["section"], row["parameter"]) for row in rows))
+    bands = -(-len(parameters) // _COLUMNS)
+    with house_style():
+        figure = new_figure(7.4, 2.75 * bands + 0.5)
+        panels = figure.subplots(2 * bands, _COLUMNS, sharey="row", squeeze=False)
+        for axes in panels.flat:
+            axes.set_visible(False)
+        for k, (section, parameter) in enumerate(parameters):
+            own = [row for row in rows if (row["section"], row["parameter"]) == (section, parameter)]
+            band, column = divmod(k, _COLUMNS)
+            for line, metric in enumerate(COMPARED):
+                axes = panels[2 * band + line, column]
+                axes.set_visible(True)
+                _draw_over_values(axes, own, metric)
+                axes.axvline(settings.value_of(section, parameter), color=MUTED, lw=0.7, ls=":", zorder=1)
+                if parameter in _LOGARITHMIC:
+                    axes.set_xscale("log")
+                if column == 0:
+                    axes.set_ylabel(NAMES[metric])
+            panels[2 * band, column].tick_params(labelbottom=False)
+            panels[2 * band + 1, column].set_xlabel(title(section, parameter))
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        settle(figure)
+    return figure
+
+
+def _draw_over_values(axes: Axes, rows: Sequence[Row], metric: str) -> None:
+    for name in dict.fromkeys(row["filter"] for row in rows):
+        own = [row for row in rows if row["filter"] == name]
+        known = [np.nan if row[metric] is None else row[metric] for row in own]
+        style: dict[str, Any] = {"color": _COLOURS[name.removesuffix(SUPPRESSION)], "marker": "o", "ms": 2.5, "lw": 1.1}
+        dashes = "-" if name.endswith(SUPPRESSION) else "--"
+        axes.plot([row["value"] for row in own], known, dashes, label=name, **style)
+    axes.set_ylim(0.45 if metric == "accuracy" else 0.0, 1.02)
+
+
+def draw_calibration(scored: Sequence[Scored]) -> Figure | None:
+    """A panel for each sensor and world; None where no such filter was run."""
+    shown = [one for one in scored if one.row["filter"] in _CALIBRATED]
+    if not shown:
+        return None
+    sensors = list(dict.fromkeys(one.row["sensor"] for one in shown))
+    worlds = list(dict.fromkeys(one.row["world"] for one in shown))
+    across = min(3, len(worlds))
+    down = -(-len(worlds) // across)
+    with house_style():
+        figure = new_figure(2.4 * across + 0.3, 2.3 * down * len(sensors) + 0.5)
+        panels = figure.subplots(down * len(sensors), across, sharex=True, sharey=True, squeeze=False)
+        for axes in panels.flat:
+            axes.set_visible(False)
+        for i, sensor in enumerate(sensors):
+            for j, world in enumerate(worlds):
+                axes = panels[i * down + j // across, j % across]
+                axes.set_visible(True)
+                axes.plot([0.0, 1.0], [0.0, 1.0], color=MUTED, lw=0.8, ls="--", label="calibrated")
+                for one in shown:
+                    if (one.row["sensor"], one.row["world"]) == (sensor, world):
+                        _draw_bins(axes, one)
+                axes.set(xlim=(-0.03, 1.03), ylim=(-0.04, 1.04), title=f"{sensor}, {world}")
+        for axes in panels[:, 0]:
+            axes.set_ylabel("truly there [1]")
+        for axes in panels[-1]:
+            axes.set_xlabel("P(there) [1]")
+        known: dict[str, Any] = {}
+        for axes in panels.flat:
+            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                known.setdefault(label, handle)
+        figure.legend(known.values(), known.keys(), loc="outside lower center", ncols=len(known))
+        settle(figure)
+    return figure
+
+
+def _draw_bins(axes: Axes, one: Scored) -> None:
+    name, bins = one.row["filter"], one.reliability
+    filled = bins.count >= _FEWEST
+    axes.plot(bins.belief[filled], bins.present[filled], color=_CALIBRATED[name], marker="o", ms=3, lw=1.1, label=name)
