@@ -12,14 +12,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evermap.errors import ConfigError
+from evermap.experiments.bateman2020_learned import learned_beliefs
 from evermap.experiments.bateman2020_runs import Stack
 from evermap.experiments.bateman2020_settings import LEARNED, ORACLE, SUPPRESSION, TUNED, FilterSettings
 from evermap.persistence import jff, joint, single
 from evermap.persistence.state import Belief
 from evermap.sensing.clique_range import nearest_per_clique, range_degraded_miss
 from evermap.sensing.suppression import suppressed
-from evermap.sim.cliques import CliqueRun
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -42,9 +41,9 @@ def beliefs(
     """
     base = name.removesuffix(SUPPRESSION)
     every_clique = np.arange(stack.cliques)
-    if base == LEARNED:
-        return np.concatenate([learned_beliefs(run) for run in stack.runs], axis=1), every_clique
     prior = Exponential.from_mean(assumed.prior_mean_steps)
+    if base == LEARNED:
+        return np.concatenate([learned_beliefs(run, prior)[0] for run in stack.runs], axis=1), every_clique
     expected = stack.expected if base in {TUNED, ORACLE} else stack.in_view[:, stack.clique]
     looks = stack.looks()
     if name.endswith(SUPPRESSION):
@@ -59,12 +58,6 @@ def beliefs(
     if base == "jff-mixture":
         return _mixture(stack, looks, assumed, prior), stack.clique
     return _joint(base, stack, expected, looks, assumed, prior, tuned_p_miss), every_clique
-
-
-def learned_beliefs(run: CliqueRun) -> FloatArray:
-    """(F, C) beliefs of the clique filter whose detection model learns as it goes."""
-    del run
-    raise ConfigError(f"there is no filter {LEARNED!r} yet", field="filters", hint=ORACLE)
 
 
 def _follow(

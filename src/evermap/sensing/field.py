@@ -1,4 +1,4 @@
-"""The field of a sensor in space: how far, how wide and how high it looks, softly where the pose is uncertain."""
+"""The field of a sensor in space: how far, how wide and how high it looks."""
 
 from __future__ import annotations
 

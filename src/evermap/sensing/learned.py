@@ -1,9 +1,10 @@
 """Detection that is learned while the map is watched, and misses that are explained instead of suppressed.
 
 A landmark that is there is detected with `P_D = P(in the field) R(range) V(incidence) G(landmark, direction)`, or by
-mistake with `P_F`; somebody may stand before its whole clique, and then only false alarms remain (MATH.md section 3, the lines
-beyond the thesis). `R`, `V`, `P_F` and how often and how long somebody stands there are the sensor's `Profile`, shared
-by all it sees. `G` is each landmark's own, for each of six directions: hits over expected hits, which start equal.
+mistake with `P_F`; somebody may stand before its whole clique, and then only false alarms remain (MATH.md section 3,
+the lines beyond the thesis). `R`, `V`, `P_F` and how often and how long somebody stands there are the sensor's
+`Profile`, shared by all it sees. `G` is each landmark's own, for each of six directions: hits over expected hits,
+which start equal.
 
 What a look teaches of a clique's own landmarks is exact in one respect that matters: the hypothesis 'still there' says
 that it has been there all the time, so its numbers count every look, whatever is believed of it now. What is shared
