@@ -1,9 +1,61 @@
-"""Kept machine code, and when to throw it away."""
+"""Machine code of kernels: how it is kept, and when to throw it away."""
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import functools
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any, TypeVar, cast
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def kept(**options: Any) -> Callable[[_Function], _Function]:
+    """A decorator: compile a function at its first call, and keep the machine code beside the source.
+
+    Args:
+        options: as for numba's `njit`.
+    """
+
+    def decorate(function: _Function) -> _Function:
+        from numba import njit
+
+        dispatcher = njit(**options)(function)
+        dispatcher._cache = _keeper()(function)
+        return cast("_Function", dispatcher)
+
+    return decorate
+
+
+@functools.cache
+def _keeper() -> Callable[[Any], Any]:
+    """Numba's keeper of machine code, for several processes.
+
+    Its own reads the index of what is kept, chooses a file and writes both, without a lock. Of processes that compile
+    a function for different arguments at the same moment, one could be given the machine code of the other's.
+    """
+    from numba.core.caching import FunctionCache
+
+    class OneProcessAtATime(FunctionCache):
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            with _locked(Path(self.cache_path)):
+                return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            with _locked(Path(self.cache_path)):
+                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    return OneProcessAtATime
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "machine-code.lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
+        yield
 
 
 def drop_stale_code(module_file: str, *called: str) -> None:

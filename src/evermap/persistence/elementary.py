@@ -6,38 +6,23 @@ and correct to a few units in the last place over the stated ranges (their tests
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 
-from evermap.compiled import drop_stale_code
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
+from evermap.compiled import drop_stale_code, kept
 
 drop_stale_code(__file__)
 
-
-def kernel(function: _Function) -> _Function:
-    """Compile at the first call and keep the machine code; products and sums may fuse, nothing else is relaxed.
-
-    A call lets go of the interpreter's lock: kernels run side by side in threads.
-    """
-    return cast("_Function", njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function))
-
-
-def inlined(function: _Function) -> _Function:
-    """Compile into the kernels that call it, which is what lets their loops be vectorised."""
-    compiled = njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function)
-    return cast("_Function", compiled)
-
-
-def parallel_kernel(function: _Function) -> _Function:
-    """Compile with its `prange` loops spread over the threads."""
-    return cast("_Function", njit(cache=True, error_model="numpy", parallel=True)(function))
+kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
+"""Products and sums may fuse, nothing else is relaxed. A call lets go of the interpreter's lock: kernels run side by
+side in threads."""
+inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
+"""Into the kernels that call it, which is what lets their loops be vectorised."""
+parallel_kernel = kept(error_model="numpy", parallel=True)
+"""With its `prange` loops spread over the threads."""
 
 
 def _aligned_stack(_typing: Any) -> Any:

@@ -7,16 +7,12 @@ taken of products of many ratios at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
 
-from evermap.compiled import drop_stale_code
+from evermap.compiled import drop_stale_code, kept
 from evermap.types import BoolArray, FloatArray, IntArray
-
-_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 drop_stale_code(__file__)
 
@@ -29,10 +25,7 @@ FAR_OUT = 5.0
 EXPONENT = 600.0
 """Cut of log likelihood ratios: far from what a double holds, and certain either way."""
 
-
-def kernel(function: _Function) -> _Function:
-    """Compile at the first call and keep the machine code."""
-    return cast("_Function", njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function))
+kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 
 
 @kernel

@@ -8,13 +8,11 @@ detections and `increment^-1 * between(pose, next)` for odometry. Calibration st
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
 
-from evermap.compiled import drop_stale_code
+from evermap.compiled import drop_stale_code, kept
 from evermap.types import FloatArray
 
 NOISE_NAMES = (
@@ -35,15 +33,9 @@ MAX_STEP_S = 0.1
 AT_PLACES = 12
 """Where places begin in a joint covariance: behind the newest pose (3) and the calibration states (9)."""
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
-
 drop_stale_code(__file__)
 
-
-def kernel(function: _Function) -> _Function:
-    """Compile a function at its first call, and keep the machine code beside the source."""
-    return cast("_Function", njit(cache=True, error_model="numpy")(function))
+kernel = kept(error_model="numpy")
 
 
 @kernel

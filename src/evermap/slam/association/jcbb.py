@@ -13,29 +13,22 @@ all compatible sets by Bayes' rule against what is as good an explanation, landm
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.stats import chi2
 
-from evermap.compiled import drop_stale_code
+from evermap.compiled import drop_stale_code, kept
 from evermap.slam import kernels
 from evermap.types import FloatArray, IntArray
 
 MAX_NODES = 200_000
 """Nodes of the tree that are visited at most; a tenth of a second."""
 
-_Function = TypeVar("_Function", bound=Callable[..., Any])
-
 drop_stale_code(__file__, kernels.__file__)
 
-
-def kernel(function: _Function) -> _Function:
-    """Compile a function at its first call, and keep the machine code beside the source."""
-    return cast("_Function", njit(cache=True, error_model="numpy")(function))
+kernel = kept(error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)
