@@ -21,6 +21,7 @@ class Experiment(StrEnum):
     ROSEN2016 = "rosen2016"
     PRESENCE = "presence"
     NIELSEN2024 = "nielsen2024"
+    BATEMAN2020 = "bateman2020"
 
 
 DATA = {
@@ -29,7 +30,7 @@ DATA = {
     Experiment.PRESENCE: Path("../shared/data/presence"),
     Experiment.NIELSEN2024: Path("../shared/data/mrclam"),
 }
-"""Where the data of each experiment are looked for."""
+"""Where the data of each experiment are looked for; bateman2020 has none."""
 
 
 def reproduce(
@@ -71,6 +72,24 @@ def reproduce(
     jobs: Annotated[
         int | None, typer.Option(help="nielsen2024: runs at a time; 1 for timings that mean something.", min=1)
     ] = None,
+    runs: Annotated[
+        int | None, typer.Option(help="bateman2020: simulated for every world and sensor.", show_default="100")
+    ] = None,
+    world: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="bateman2020: only this world (nominal, angle60, range04, occlusion, false-alarms, pose-noise); "
+            "repeatable.",
+            show_default=False,
+        ),
+    ] = None,
+    filters: Annotated[
+        str | None,
+        typer.Option(
+            help="bateman2020: only these filters, by commas, in all worlds; e.g. jcf,jcfr+suppression.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace --out even if it holds other things than results.")
@@ -81,6 +100,7 @@ def reproduce(
     mrclam: all robots of the UTIAS recordings against the truth. rosen2016: figures 1 to 4 of the persistence filter's
     paper against reference numbers. presence: models of things that come and go against simple and published ones, in
     a room and at a door. nielsen2024: landmarks that moved, by all methods, in simulation and in the UTIAS recordings.
+    bateman2020: landmarks on rigid bodies seen in space, by filters of single landmarks and of whole bodies.
     Runs follow one another on one core, so that the timings mean something.
 
     \b
@@ -89,11 +109,13 @@ def reproduce(
       evermap reproduce rosen2016 --seed 1
       evermap reproduce presence --out out/presence
       evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
+      evermap reproduce bateman2020 --runs 20 --world nominal --world occlusion --filters jcf+suppression,oracle
     """
     _one_core()
     from evermap.runfolder import check_replaceable
 
     given = {
+        "--data": data is not None,
         "--all": everything,
         "--seed": seed is not None,
         "--sequences": sequences is not None,
@@ -102,6 +124,9 @@ def reproduce(
         "--method": method is not None,
         "--quick": quick,
         "--jobs": jobs is not None,
+        "--runs": runs is not None,
+        "--world": world is not None,
+        "--filters": filters is not None,
     }
     _refuse_options(experiment, given)
     target = out or Path("evermap-out") / experiment.value
@@ -128,6 +153,18 @@ def reproduce(
             folder = data or DATA[experiment]
             table = nielsen2024.reproduce(folder, target, wanted, progress=progress, force=force)
             as_text = nielsen2024.as_markdown
+        elif experiment is Experiment.BATEMAN2020:
+            from evermap.experiments import bateman2020
+
+            asked: dict[str, Any] = {
+                "runs": runs,
+                "seed": seed,
+                "worlds": world and tuple(world),
+                "chosen": filters and tuple(name.strip() for name in filters.split(",")),
+            }
+            plan = bateman2020.default_settings(**{name: value for name, value in asked.items() if value is not None})
+            table = bateman2020.reproduce(target, plan, progress=progress, force=force)
+            as_text = bateman2020.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -150,10 +187,11 @@ def reproduce(
 def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
     """An option that would be ignored is a mistake."""
     known = {
-        Experiment.MRCLAM: {"--all"},
-        Experiment.ROSEN2016: {"--seed", "--sequences"},
-        Experiment.PRESENCE: {"--seed"},
-        Experiment.NIELSEN2024: {"--seed", "--part", "--dataset", "--method", "--quick", "--jobs"},
+        Experiment.MRCLAM: {"--data", "--all"},
+        Experiment.ROSEN2016: {"--data", "--seed", "--sequences"},
+        Experiment.PRESENCE: {"--data", "--seed"},
+        Experiment.NIELSEN2024: {"--data", "--seed", "--part", "--dataset", "--method", "--quick", "--jobs"},
+        Experiment.BATEMAN2020: {"--seed", "--runs", "--world", "--filters"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))

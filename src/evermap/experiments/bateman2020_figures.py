@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,8 @@ def draw_sweeps(rows: Sequence[Row], settings: Settings) -> dict[str, Figure]:
 
 
 def _sweep(rows: Sequence[Row], settings: Settings) -> Figure:
+    least = min(row["accuracy"] for row in rows if row["accuracy"] is not None)
+    floors = {"accuracy": math.floor(20.0 * least) / 20.0, "survival_ratio": 0.0}
     parameters = list(dict.fromkeys((row["section"], row["parameter"]) for row in rows))
     bands = -(-len(parameters) // _COLUMNS)
     with house_style():
@@ -50,6 +53,7 @@ def _sweep(rows: Sequence[Row], settings: Settings) -> Figure:
                 axes = panels[2 * band + line, column]
                 axes.set_visible(True)
                 _draw_over_values(axes, own, metric)
+                axes.set_ylim(floors[metric] - 0.01, 1.02)
                 axes.axvline(settings.value_of(section, parameter), color=MUTED, lw=0.7, ls=":", zorder=1)
                 if parameter in _LOGARITHMIC:
                     axes.set_xscale("log")
@@ -70,7 +74,6 @@ def _draw_over_values(axes: Axes, rows: Sequence[Row], metric: str) -> None:
         style: dict[str, Any] = {"color": _COLOURS[name.removesuffix(SUPPRESSION)], "marker": "o", "ms": 2.5, "lw": 1.1}
         dashes = "-" if name.endswith(SUPPRESSION) else "--"
         axes.plot([row["value"] for row in own], known, dashes, label=name, **style)
-    axes.set_ylim(0.45 if metric == "accuracy" else 0.0, 1.02)
 
 
 def draw_calibration(scored: Sequence[Scored]) -> Figure | None:
