@@ -7,12 +7,15 @@
 PYTHON ?= python3
 VENV ?= .venv
 OUT ?= out/demo
+# Tests run in this many processes, a file of tests in one of them.
+PROCESSES ?= 2
+PYTEST = $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist loadfile
 PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test test-all experiments lint format docs-check bench lock clean
+.PHONY: help setup setup-dev demo test test-slow test-all experiments lint format docs-check bench lock clean
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 6
@@ -24,10 +27,14 @@ demo: $(RUNTIME)
 	$(VENV)/bin/evermap demo --out $(OUT) --force
 
 test: $(DEVELOPMENT)
-	$(VENV)/bin/python -m pytest
+	$(PYTEST)
+
+# What is slow, but for whole experiments.
+test-slow: $(DEVELOPMENT)
+	$(PYTEST) -m "slow and not experiment" --durations=8
 
 test-all: $(DEVELOPMENT)
-	$(VENV)/bin/python -m pytest -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow"
 
 experiments: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest -m experiment
