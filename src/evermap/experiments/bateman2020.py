@@ -77,7 +77,7 @@ def reproduce(
         figures = draw_examples(settings, p_miss["lidar"]) | draw_sweeps(varied, settings)
         calibration = draw_calibration(scored)
         save_all(figures if calibration is None else figures | {"calibration": calibration}, folder.path)
-        record_example(settings, p_miss["lidar"], folder.path)
+        record_example(settings, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
         table["outputs"] = sorted([*folder.files(), "summary.json"])
         text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -12,7 +12,7 @@ import numpy as np
 from evermap.errors import MissingExtraError
 from evermap.experiments.bateman2020_filters import beliefs
 from evermap.experiments.bateman2020_runs import Stack, simulate, stack
-from evermap.experiments.bateman2020_settings import NOMINAL, SUPPRESSION, TUNED, Settings
+from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL, SUPPRESSION, TUNED, Settings
 from evermap.viz.clique_belief_figure import draw_clique_beliefs
 from evermap.viz.clique_recording import log_clique_run
 from evermap.viz.clique_scene_figure import draw_clique_scene
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 SENSOR = "lidar"
 GONE_STEP = 350
 """Stated under figure 5.2: when the survival time is over. The clique that vanishes nearest to it is shown."""
-SHOWN = ("iff", "jcf", "jcfr" + SUPPRESSION, TUNED)
+SHOWN = ("iff", "jcf", "jcfr" + SUPPRESSION, TUNED, LEARNED)
 FIELD_M = 6.0
 """Length to which the sensor's field is drawn."""
 
@@ -37,11 +37,11 @@ def draw_examples(settings: Settings, p_miss: float) -> dict[str, Figure]:
     return {"fig5.1-scene": _draw_scene(runs.runs[0]), "fig5.2-beliefs": _draw_beliefs(runs, settings, p_miss)}
 
 
-def record_example(settings: Settings, p_miss: float, path: Callable[[str], Path]) -> None:
-    """The first run as `scene.rrd`, with the beliefs of `jcf-tuned`; nothing where rerun is not installed."""
+def record_example(settings: Settings, path: Callable[[str], Path]) -> None:
+    """The first run as `scene.rrd`, with the beliefs of `learned`; nothing where rerun is not installed."""
     one = simulate(settings.world_of(NOMINAL, SENSOR), 1, settings.seed)
     run = one.runs[0]
-    belief, _ = beliefs(TUNED, one, settings.filters, p_miss)
+    belief, _ = beliefs(LEARNED, one, settings.filters, None)
     with suppress(MissingExtraError):
         log_clique_run(
             path("scene.rrd"),
@@ -68,7 +68,7 @@ def _draw_scene(run: CliqueRun) -> Figure:
     )
     step = int(np.argmax(seen.sum(axis=1)))
     with house_style():
-        figure = new_figure(6.4, 5.2)
+        figure = new_figure(6.4, 4.8)
         draw_clique_scene(
             figure,
             run.position_m[lap],
@@ -94,7 +94,7 @@ def _draw_beliefs(runs: Stack, settings: Settings, p_miss: float) -> Figure:
         belief, _ = beliefs(name, one, settings.filters, p_miss)
         curves[name] = _from_birth(belief, one.runs[0])[:, clique]
     with house_style():
-        figure = new_figure(7.2, 6.2)
+        figure = new_figure(7.2, 7.0)
         draw_clique_beliefs(
             figure,
             np.arange(len(one.in_view)),

@@ -23,9 +23,9 @@ IN_THE_TABLE = (*OF_THE_THESIS, *(name + SUPPRESSION for name in OF_THE_THESIS))
 OTHER_READINGS = tuple(name + tail for name in ("iff-observable", "jff-mixture") for tail in ("", SUPPRESSION))
 """Of what the thesis leaves open about its baselines."""
 TUNED, ORACLE, LEARNED = "jcf-tuned", "oracle", "learned"
-BEYOND = (TUNED, TUNED + SUPPRESSION, ORACLE)
+BEYOND = (TUNED, TUNED + SUPPRESSION, ORACLE, LEARNED)
 IN_ALL_WORLDS = ("jcf" + SUPPRESSION, "jcfr" + SUPPRESSION, *BEYOND)
-FILTERS = (*IN_THE_TABLE, *OTHER_READINGS, *BEYOND, LEARNED)
+FILTERS = (*IN_THE_TABLE, *OTHER_READINGS, *BEYOND)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,7 @@ class Settings:
 
     def filters_in(self, world: str) -> tuple[str, ...]:
         """What is run in a world, in the order of the tables."""
-        everything = (*IN_THE_TABLE, *OTHER_READINGS, *BEYOND) if world == NOMINAL else IN_ALL_WORLDS
-        wanted = everything if self.chosen is None else self.chosen
+        wanted = self.chosen or (FILTERS if world == NOMINAL else IN_ALL_WORLDS)
         return tuple(name for name in FILTERS if name in wanted)
 
     def world_of(self, name: str, sensor: str) -> CliqueWorld:
