@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -24,19 +26,37 @@ def first_seconds(recording: Recording, seconds: float) -> Recording:
     """The beginning of a recording, counted from its first frame with detections."""
     stop = recording.frames.stamp_s[recording.detections.frame[0]] + seconds
     frames = int(np.searchsorted(recording.frames.stamp_s, stop))
-    rows = int(np.searchsorted(recording.odometry.stamp_s, stop))
-    odometry, detections = recording.odometry, recording.detections
-    keep = detections.frame < frames
-    columns = {name: getattr(detections, name)[keep] for name in detections.__slots__}
+    cut = with_detections(recording, recording.detections.frame < frames)
+    cut = with_odometry(cut, cut.odometry.stamp_s < stop)
     return replace(
-        recording,
-        odometry=replace(
-            odometry,
-            stamp_s=odometry.stamp_s[:rows],
-            forward_mps=odometry.forward_mps[:rows],
-            lateral_mps=odometry.lateral_mps[:rows],
-            angular_radps=odometry.angular_radps[:rows],
-        ),
-        frames=Frames(recording.frames.stamp_s[:frames], recording.frames.complete, recording.frames.clock),
-        detections=type(detections)(**columns),
+        cut, frames=Frames(recording.frames.stamp_s[:frames], recording.frames.complete, recording.frames.clock)
     )
+
+
+def with_detections(recording: Recording, keep: np.ndarray) -> Recording:
+    """Some of the detections only, by mask or rows."""
+    return replace(recording, detections=some_rows(recording.detections, keep))
+
+
+def with_odometry(recording: Recording, keep: np.ndarray) -> Recording:
+    """Some of the odometry only, by mask or rows."""
+    return replace(recording, odometry=some_rows(recording.odometry, keep))
+
+
+def some_rows(table: Any, keep: np.ndarray | slice) -> Any:
+    """A dataclass of columns with some of its rows; what is no column stays."""
+    columns = {field.name: getattr(table, field.name) for field in fields(table)}
+    return replace(table, **{name: column[keep] for name, column in columns.items() if isinstance(column, np.ndarray)})
+
+
+def with_ids(recording: Recording, rename: Callable[[np.ndarray], np.ndarray]) -> Recording:
+    """The same with other names of landmarks."""
+    return replace(
+        recording, detections=replace(recording.detections, landmark_id=rename(recording.detections.landmark_id))
+    )
+
+
+def without_odometry_between(recording: Recording, start_s: float, stop_s: float) -> Recording:
+    """Silent odometry between two times since its start."""
+    passed = recording.odometry.stamp_s - recording.odometry.stamp_s[0]
+    return with_odometry(recording, (passed < start_s) | (passed > stop_s))
