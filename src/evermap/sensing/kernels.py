@@ -39,20 +39,26 @@ def normal_cdf(z: float) -> float:
 
 
 @kernel
+def edge_distance(along: float, across: float, sine: float, cosine: float) -> float:
+    """How far inside the edge of half an angle a point lies; behind the apex it is the apex that is nearest."""
+    distance = along * sine - across * cosine
+    if along * cosine + across * sine < 0.0:
+        return math.copysign(math.sqrt(along * along + across * across), distance)
+    return distance
+
+
+@kernel
 def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -> float:
     """Probability that a point of the sensor's frame is in the field; `limits` as `learned` packs them."""
     range_max, sin_az, cos_az, sin_el, cos_el, spherical, all_around, sigma_m, sigma_rad = limits
     inside = normal_cdf((range_max - range_m) / sigma_m)
     if inside < OUT_OF_FIELD:
         return 0.0
-    level_squared = x * x + y * y
-    ahead = math.sqrt(level_squared) if spherical > 0.0 else x
-    squared_m, squared_rad = sigma_m * sigma_m, sigma_rad * sigma_rad
-    spread = math.sqrt(squared_m + (ahead * ahead + z * z) * squared_rad)
-    inside *= normal_cdf((ahead * sin_el - abs(z) * cos_el) / spread)
+    ahead = math.sqrt(x * x + y * y) if spherical > 0.0 else x
+    spread = math.sqrt(sigma_m * sigma_m + range_m * range_m * sigma_rad * sigma_rad)
+    inside *= normal_cdf(edge_distance(ahead, abs(z), sin_el, cos_el) / spread)
     if all_around == 0.0:
-        spread = math.sqrt(squared_m + level_squared * squared_rad)
-        inside *= normal_cdf((x * sin_az - abs(y) * cos_az) / spread)
+        inside *= normal_cdf(edge_distance(x, abs(y), sin_az, cos_az) / spread)
     return inside
 
 
@@ -217,7 +223,7 @@ def look(
             p_detect = min(base[i] * own[i], HIGHEST)
             hit = 0.0
             if detected[k]:
-                true = clear * p_detect / (p_detect + p_false)
+                true = clear * p_detect / (p_detect + (1.0 - p_detect) * p_false)
                 hit = true
                 pending[c, at_false] += 1.0 - true
                 pending[c, at_false + 2] += 1.0

@@ -106,7 +106,9 @@ def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -
     wrong = np.flatnonzero(~np.isfinite(point).all(axis=1))
     if wrong.size:
         raise InputError(f"row {wrong[0]}: {point[wrong[0]]} is no place", field="landmark_m", hint="finite metres")
-    step = np.diff(member, prepend=-1)
+    if member.dtype.kind not in "iu":
+        raise InputError(f"{member.dtype} instead of whole numbers", field="clique", hint="cliques numbered from 0")
+    step = np.diff(member.astype(np.int64), prepend=-1)
     wrong = np.flatnonzero((step < 0) | (step > 1))
     if len(member) == 0 or wrong.size or member[0] != 0:
         where = f"row {wrong[0]}: clique {member[wrong[0]]}" if wrong.size else "the first clique is not 0"

@@ -93,7 +93,9 @@ class InField:
     """Being in the field of a sensor whose pose is known to some precision.
 
     Every limit of the field is a surface; the distance of a landmark from it, over its standard deviation, goes through
-    the normal distribution function. Distances are exact to first order.
+    the normal distribution function. This is exact to first order at one edge. Edges are taken as independent, which in
+    the corners of a camera's image is too low by `asin(rho) / 2 pi` at most, `rho` the cosine between the two planes;
+    and of two opposite edges only the nearer one counts: a field is wide compared with its softness.
 
     Attributes:
         field: limits.
@@ -121,16 +123,11 @@ class InField:
         level = np.hypot(x, y)
         ahead = level if self.field.projection is Projection.SPHERICAL else x
         inside = ndtr((self.field.range_max_m - sight.range_m) / self.sigma_position_m)
-        inside *= ndtr(self._margin(ahead, np.abs(z), self.field.half_elevation_rad))
+        spread = np.hypot(self.sigma_position_m, sight.range_m * self.sigma_attitude_rad)
+        inside *= ndtr(_edge_distance(ahead, np.abs(z), self.field.half_elevation_rad) / spread)
         if self.field.half_azimuth_rad < math.pi:
-            inside *= ndtr(self._margin(x, np.abs(y), self.field.half_azimuth_rad))
+            inside *= ndtr(_edge_distance(x, np.abs(y), self.field.half_azimuth_rad) / spread)
         return np.asarray(inside)
-
-    def _margin(self, along: FloatArray, across: FloatArray, half_rad: float) -> FloatArray:
-        """Signed distance inside the limit at `half_rad`, over its standard deviation."""
-        distance = along * math.sin(half_rad) - across * math.cos(half_rad)
-        spread = np.sqrt(self.sigma_position_m**2 + (along**2 + across**2) * self.sigma_attitude_rad**2)
-        return np.asarray(distance / spread)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,3 +152,10 @@ class Product:
         for model in self.models:
             product *= model.probability(sight)
         return product
+
+
+def _edge_distance(along: FloatArray, across: FloatArray, half_rad: float) -> FloatArray:
+    """How far inside the edge at `half_rad` points lie; behind the apex it is the apex that is nearest."""
+    distance = along * math.sin(half_rad) - across * math.cos(half_rad)
+    behind = along * math.cos(half_rad) + across * math.sin(half_rad) < 0.0
+    return np.where(behind, np.copysign(np.hypot(along, across), distance), distance)
