@@ -26,8 +26,10 @@ from evermap.experiments.bateman2020_settings import (
     IN_THE_TABLE,
     LEARNED,
     NOMINAL,
+    READINGS,
     SENSORS,
     SUPPRESSION,
+    UNIFORM,
     WORLDS,
     Settings,
     default_settings,
@@ -49,7 +51,7 @@ def small(**changes: Any) -> Settings:
         tuning_runs=1,
         sweep_runs=2,
         bootstrap_draws=10,
-        worlds=(NOMINAL, "occlusion"),
+        worlds=(*READINGS, "occlusion"),
     )
     world = settings.world | {"steps": 80, "period": 40, "mean_survival_steps": 40.0}
     return replace(settings, world=world, **changes)
@@ -89,7 +91,7 @@ def test_every_value_of_the_sweep_can_be_set_and_the_files_own_is_among_them() -
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"worlds": ("mars",)}, "field 'world': there is no 'mars' .*nominal, angle60"),
+        ({"worlds": ("mars",)}, "field 'world': there is no 'mars' .*nominal, uniform"),
         ({"chosen": ("jcf", "kalman")}, "field 'filters': there is no 'kalman' .*iff, jff"),
         ({"runs": 1}, "field 'runs': must be 2 at least"),
         ({"seed": -1}, "field 'seed'"),
@@ -177,6 +179,17 @@ def test_the_miss_rate_counts_expected_landmarks_of_what_is_there(runs: Stack) -
                     looks += 1
                     misses += not run.detected[f, k]
     assert miss_rate(runs) == pytest.approx(misses / looks)
+
+
+def test_the_other_reading_differs_in_its_lifetimes_alone() -> None:
+    from scipy.stats import kstest
+
+    settings = small()
+    plain, uniform = (simulate(settings.world_of(name, "lidar"), 40, seed=3) for name in READINGS)
+    np.testing.assert_array_equal(plain.range_m, uniform.range_m)
+    assert kstest(uniform.survival_steps / 80.0, "uniform").pvalue > 0.01
+    assert kstest(plain.survival_steps / 40.0, "expon").pvalue > 0.01
+    assert settings.world_of(UNIFORM, "lidar") == replace(settings.world_of(NOMINAL, "lidar"), uniform_survival=True)
 
 
 # the filters
@@ -370,22 +383,23 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_the_whole_has_every_filter_in_every_world(table: dict[str, Any]) -> None:
     found = [(row["sensor"], row["world"], row["filter"]) for row in table["rows"]]
     settings = small()
-    expected = [(s, w, f) for s in SENSORS for w in (NOMINAL, "occlusion") for f in settings.filters_in(w)]
+    expected = [(s, w, f) for s in SENSORS for w in settings.worlds for f in settings.filters_in(w)]
     assert found == expected
-    assert len(table["orderings"]) == 64
+    assert len(table["orderings"]) == 2 * 64
     assert len(table["sweep"]) == 2 * 3 * len(IN_THE_TABLE)
-    names = ("fig5.1-scene", "fig5.2-beliefs", "sensitivity-lidar", "sensitivity-camera", "calibration")
+    names = ("scene", "beliefs", "sensitivity-lidar", "sensitivity-camera", "calibration")
     assert {f"{name}.{kind}" for name in names for kind in ("png", "svg")} <= set(table["outputs"])
 
 
 def test_the_text_tells_what_is_in_the_table(table: dict[str, Any]) -> None:
     text = bateman2020.as_markdown(table)
-    row = next(row for row in table["rows"] if (row["sensor"], row["filter"]) == ("camera", "jcfr"))
-    assert f"| `jcfr` | {row['accuracy']:.3f} ± {row['accuracy_se']:.3f} | 0.844 | 0.887 |" in text
-    for sensor in SENSORS:
-        own = [r for r in table["orderings"] if (r["sensor"], r["metric"]) == (sensor, "accuracy")]
-        holds = sum(r["verdict"] == "holds" for r in own)
-        assert f"| {sensor} | accuracy | {holds} of 16 |" in text
+    rows = {row["world"]: row for row in table["rows"] if (row["sensor"], row["filter"]) == ("camera", "jcfr")}
+    cells = [f"{rows[world]['accuracy']:.3f} ± {rows[world]['accuracy_se']:.3f}" for world in READINGS]
+    assert f"| `jcfr` | {cells[0]} | {cells[1]} | 0.844 | 0.887 |" in text
+    for world, sensor in ((world, sensor) for world in READINGS for sensor in SENSORS):
+        where = world, sensor, "accuracy"
+        own = [r["verdict"] for r in table["orderings"] if (r["world"], r["sensor"], r["metric"]) == where]
+        assert f"| {world} | {sensor} | accuracy | {own.count('holds')} of 16 |" in text
     occluded = [line for line in text.splitlines() if line.startswith("| occlusion | `oracle` |")]
     assert len(occluded) == 2
     angles = [
@@ -439,7 +453,7 @@ def test_command_runs_what_it_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--world", "mars"], "field 'world': there is no 'mars' (try: nominal, angle60,"),
+        (["--world", "mars"], "field 'world': there is no 'mars' (try: nominal, uniform-lifetimes, angle60,"),
         (["--filters", "jcf,kalman"], "field 'filters': there is no 'kalman' (try: iff, jff,"),
         (["--runs", "1"], "field 'runs': must be 2 at least"),
         (["--seed", "-1"], "field 'seed'"),

@@ -78,8 +78,8 @@ def reproduce(
     world: Annotated[
         list[str] | None,
         typer.Option(
-            help="bateman2020: only this world (nominal, angle60, range04, occlusion, false-alarms, pose-noise); "
-            "repeatable.",
+            help="bateman2020: only this world (nominal, uniform-lifetimes, angle60, range04, occlusion, "
+            "false-alarms, pose-noise); repeatable.",
             show_default=False,
         ),
     ] = None,

@@ -34,7 +34,7 @@ FIELD_M = 6.0
 def draw_examples(settings: Settings, p_miss: float) -> dict[str, Figure]:
     """Figures 5.1, of the first run, and 5.2."""
     runs = simulate(settings.world_of(NOMINAL, SENSOR), settings.runs, settings.seed)
-    return {"fig5.1-scene": _draw_scene(runs.runs[0]), "fig5.2-beliefs": _draw_beliefs(runs, settings, p_miss)}
+    return {"scene": _draw_scene(runs.runs[0]), "beliefs": _draw_beliefs(runs, settings, p_miss)}
 
 
 def record_example(settings: Settings, path: Callable[[str], Path]) -> None:

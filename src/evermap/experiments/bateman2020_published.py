@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 
 from evermap.experiments.bateman2020_scores import Row, Scored
-from evermap.experiments.bateman2020_settings import IN_THE_TABLE, NOMINAL, OF_THE_THESIS, SUPPRESSION
+from evermap.experiments.bateman2020_settings import IN_THE_TABLE, OF_THE_THESIS, READINGS, SUPPRESSION
 
 LIMIT = 2.0
 """Standard errors of the difference within which ours says nothing about an ordering."""
@@ -54,27 +54,32 @@ def orderings(scored: Sequence[Scored]) -> list[Row]:
     The standard error is that of the difference, over the same resampled runs. The thesis tells none of its own: its
     orderings are taken at their word.
     """
-    nominal = {(one.row["sensor"], one.row["filter"]): one for one in scored if one.row["world"] == NOMINAL}
-    out = []
-    for sensor, metric in _THESIS:
-        for a, b in pairs():
-            if (sensor, a) not in nominal or (sensor, b) not in nominal:
-                continue
-            worse, better = sorted((a, b), key=lambda name: THESIS[sensor, name, metric])
-            low, high = nominal[sensor, worse], nominal[sensor, better]
-            difference = high.row[metric] - low.row[metric]
-            error = float(np.std(high.draws[metric] - low.draws[metric], ddof=1))
-            known = abs(difference) > LIMIT * error
-            out.append(
-                {
-                    "sensor": sensor,
-                    "metric": metric,
-                    "worse": worse,
-                    "better": better,
-                    "thesis": THESIS[sensor, better, metric] - THESIS[sensor, worse, metric],
-                    "ours": difference,
-                    "ours_se": error,
-                    "verdict": "open" if not known else "holds" if difference > 0.0 else "reversed",
-                }
-            )
-    return out
+    known = {(one.row["world"], one.row["sensor"], one.row["filter"]): one for one in scored}
+    return [
+        _ordering(world, sensor, metric, a, b, known)
+        for world in READINGS
+        for sensor, metric in _THESIS
+        for a, b in pairs()
+        if (world, sensor, a) in known and (world, sensor, b) in known
+    ]
+
+
+def _ordering(
+    world: str, sensor: str, metric: str, a: str, b: str, known: Mapping[tuple[str, str, str], Scored]
+) -> Row:
+    worse, better = sorted((a, b), key=lambda name: THESIS[sensor, name, metric])
+    low, high = known[world, sensor, worse], known[world, sensor, better]
+    difference = high.row[metric] - low.row[metric]
+    error = float(np.std(high.draws[metric] - low.draws[metric], ddof=1))
+    clear = abs(difference) > LIMIT * error
+    return {
+        "world": world,
+        "sensor": sensor,
+        "metric": metric,
+        "worse": worse,
+        "better": better,
+        "thesis": THESIS[sensor, better, metric] - THESIS[sensor, worse, metric],
+        "ours": difference,
+        "ours_se": error,
+        "verdict": "open" if not clear else "holds" if difference > 0.0 else "reversed",
+    }

@@ -14,7 +14,11 @@ from evermap.sim.cliques import CliqueWorld, named_world
 
 SENSORS: dict[str, Field] = {"lidar": LIDAR, "camera": CAMERA}
 NOMINAL = "nominal"
-WORLDS = (NOMINAL, "angle60", "range04", "occlusion", "false-alarms", "pose-noise")
+UNIFORM = "uniform-lifetimes"
+"""The thesis' objects vanish "similar to" Rosen 2016, whose lifetimes are uniform; how similar, it does not say."""
+READINGS = (NOMINAL, UNIFORM)
+"""Worlds that may be the thesis'."""
+WORLDS = (*READINGS, "angle60", "range04", "occlusion", "false-alarms", "pose-noise")
 
 SUPPRESSION = "+suppression"
 """Appended to the name of a filter that leaves out looks by the thesis' rule."""
@@ -76,8 +80,8 @@ class Settings:
         bootstrap_draws: for every standard error.
         seed: of everything random.
         worlds: of `WORLDS`.
-        chosen: of `FILTERS`, in all these worlds. None: everything, that is the filters of the thesis in its own world,
-            `IN_ALL_WORLDS` in the others, and the sweep.
+        chosen: of `FILTERS`, in all these worlds. None: all of them in `READINGS`, `IN_ALL_WORLDS` in the others, and
+            the sweep.
     """
 
     world: dict[str, Any]
@@ -102,7 +106,7 @@ class Settings:
 
     def filters_in(self, world: str) -> tuple[str, ...]:
         """What is run in a world, in the order of the tables."""
-        wanted = self.chosen or (FILTERS if world == NOMINAL else IN_ALL_WORLDS)
+        wanted = self.chosen or (FILTERS if world in READINGS else IN_ALL_WORLDS)
         return tuple(name for name in FILTERS if name in wanted)
 
     def world_of(self, name: str, sensor: str) -> CliqueWorld:

@@ -7,7 +7,7 @@ from typing import Any
 
 from evermap.experiments.bateman2020_published import LIMIT, THESIS, TRIAL
 from evermap.experiments.bateman2020_scores import COMPARED, Row
-from evermap.experiments.bateman2020_settings import IN_THE_TABLE, LEARNED, NOMINAL, OTHER_READINGS, SUPPRESSION
+from evermap.experiments.bateman2020_settings import IN_THE_TABLE, LEARNED, OTHER_READINGS, READINGS, SUPPRESSION
 from evermap.experiments.markdown import markdown_table, number
 
 Rows = Sequence[Row]
@@ -23,13 +23,14 @@ _FORMS = {"brier": "{:.4f}", "delay_mean": "{:.1f}"}
 
 def as_markdown(table: Mapping[str, Any]) -> str:
     """The whole table as Markdown; no trailing line end."""
-    rows, nominal = table["rows"], [row for row in table["rows"] if row["world"] == NOMINAL]
+    rows = table["rows"]
+    read = [row for row in rows if row["world"] in READINGS]
     parts = []
     if any(row["filter"] == LEARNED for row in rows):
         parts += [_expected(table["expected"])]
     parts += [_made(table)]
-    if nominal:
-        parts += ["### Table 5.1", *(_published(nominal, sensor) for sensor in _distinct(nominal, "sensor"))]
+    if read:
+        parts += ["### Table 5.1", *(_published(read, sensor) for sensor in _distinct(read, "sensor"))]
     if table["orderings"]:
         parts += ["### Orderings of the thesis", _orderings(table["orderings"])]
     for sensor in _distinct(rows, "sensor"):
@@ -65,18 +66,17 @@ def _made(table: Mapping[str, Any]) -> str:
 
 
 def _published(rows: Rows, sensor: str) -> str:
-    """The thesis' columns, with both others of theirs: the paper's and the trial's."""
+    """Both readings of the thesis' world, the paper's numbers and the trial's, filter by filter."""
+    own = {(row["world"], row["filter"]): row for row in rows if row["sensor"] == sensor}
+    worlds = _distinct(rows, "world")
     lines = []
-    for row in rows:
-        name = row["filter"]
-        if row["sensor"] != sensor or name not in (*IN_THE_TABLE, *OTHER_READINGS):
-            continue
+    for name in (name for name in (*IN_THE_TABLE, *OTHER_READINGS) if (worlds[0], name) in own):
         cells = []
         for metric in COMPARED:
-            key = sensor, name, metric
-            cells += [_value(row, metric), number("{:.3f}", THESIS.get(key)), number("{:.3f}", TRIAL.get(key))]
+            cells += [_value(own[world, name], metric) for world in worlds]
+            cells += [number("{:.3f}", table.get((sensor, name, metric))) for table in (THESIS, TRIAL)]
         lines.append((f"`{name}`", *cells))
-    header = [cell for metric in COMPARED for cell in (f"{NAMES[metric]}, ours", "thesis", "trial")]
+    header = [cell for metric in COMPARED for cell in (*(f"{NAMES[metric]}, {w}" for w in worlds), "thesis", "trial")]
     return markdown_table((sensor, *header), lines)
 
 
@@ -86,18 +86,17 @@ def _value(row: Row, metric: str, form: str = "{:.3f}") -> str:
 
 
 def _orderings(rows: Rows) -> str:
-    """Counts a sensor and metric, and by name the pairs that don't hold."""
+    """Counts a world, sensor and metric, and by name the pairs that don't hold."""
     lines = []
-    for sensor in _distinct(rows, "sensor"):
-        for metric in COMPARED:
-            own = [row for row in rows if (row["sensor"], row["metric"]) == (sensor, metric)]
-            kinds = {kind: [row for row in own if row["verdict"] == kind] for kind in ("holds", "open", "reversed")}
-            count = f"{len(kinds['holds'])} of {len(own)}"
-            lines.append((sensor, NAMES[metric], count, *(_pairs(kinds[kind]) for kind in ("open", "reversed"))))
-    header = ("sensor", "score", "hold", f"within {LIMIT:g} standard errors of no difference", "reversed")
+    for world, sensor, metric in dict.fromkeys((row["world"], row["sensor"], row["metric"]) for row in rows):
+        own = [row for row in rows if (row["world"], row["sensor"], row["metric"]) == (world, sensor, metric)]
+        kinds = {kind: [row for row in own if row["verdict"] == kind] for kind in ("holds", "open", "reversed")}
+        count = f"{len(kinds['holds'])} of {len(own)}"
+        lines.append((world, sensor, NAMES[metric], count, *(_pairs(kinds[kind]) for kind in ("open", "reversed"))))
+    header = ("world", "sensor", "score", "hold", f"within {LIMIT:g} standard errors of no difference", "reversed")
     return (
         "Pairs of filters with and of filters without suppression, and each filter with and without it; *a < b* says "
-        "that the thesis has a below b.\n\n" + markdown_table(header, lines, words=(0, 1, 3, 4))
+        "that the thesis has a below b.\n\n" + markdown_table(header, lines, words=(0, 1, 2, 4, 5))
     )
 
 

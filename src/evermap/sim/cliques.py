@@ -38,6 +38,7 @@ class CliqueWorld:
         steps: length of a run.
         period: steps after which the trajectory repeats.
         mean_survival_steps: of the exponential survival time, from the first step in which the object is in the field.
+        uniform_survival: draw it evenly from 0 to `steps` instead, as Rosen 2016 does (whom the thesis names).
         extent_m: root mean square distance of the trajectory from its middle, in the plane.
         distance_m: least and most distance of an object, as the sphere around it, from the trajectory; raising or
             lowering it by some 0.5 m comes on top.
@@ -57,6 +58,7 @@ class CliqueWorld:
     steps: int = 1000
     period: int = 200
     mean_survival_steps: float = 300.0
+    uniform_survival: bool = False
     extent_m: float = 4.0
     distance_m: tuple[float, float] = (3.0, 5.0)
     share_in_field: float = 0.1
@@ -172,7 +174,10 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
             "an object never comes into the field", field="share_in_field", hint="a larger share, or more steps"
         )
     first = np.argmax(seen_at_all, axis=0)
-    survival = rng.exponential(world.mean_survival_steps, world.objects)
+    if world.uniform_survival:
+        survival = rng.uniform(0.0, world.steps, world.objects)
+    else:
+        survival = rng.exponential(world.mean_survival_steps, world.objects)
     hidden = _occlusions(world, rng)
 
     there = np.arange(world.steps)[:, None] <= first + survival
@@ -288,7 +293,7 @@ def _occlusions(world: CliqueWorld, rng: np.random.Generator) -> BoolArray:
 
 
 def named_world(name: str, field: Field) -> CliqueWorld:
-    """The thesis' world (`nominal`), or one that is harsher than the filters assume.
+    """The thesis' world (`nominal`), the same with other lifetimes, or one that is harsher than the filters assume.
 
     Raises:
         ConfigError: no such world.
@@ -296,6 +301,7 @@ def named_world(name: str, field: Field) -> CliqueWorld:
     nominal = CliqueWorld(field=field)
     known = {
         "nominal": nominal,
+        "uniform-lifetimes": replace(nominal, uniform_survival=True),
         "angle60": replace(nominal, viewing_angle_rad=math.radians(60.0)),
         "range04": replace(nominal, fading_m=0.4 * field.range_max_m),
         "occlusion": replace(nominal, occluded_share=0.15, occluded_steps=5.0),
