@@ -168,8 +168,8 @@ def look(
         raise InputError(f"{hit.dtype} of shape {hit.shape} instead of bool of ({k},)", field="detected")
     if place.shape != (3,) or not np.isfinite(place).all():
         raise InputError(f"{position_m} is no place", field="position_m", hint="three finite numbers")
-    if turn.shape != (3, 3) or not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6:
-        raise InputError("is no rotation", field="rotation", hint="an orthonormal matrix (3, 3)")
+    if turn.shape != (3, 3) or not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 or np.linalg.det(turn) < 0.0:
+        raise InputError("is no rotation", field="rotation", hint="an orthonormal matrix (3, 3), not mirrored")
     if not math.isfinite(stamp_s):
         raise InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
     late = np.flatnonzero(model.stamp_s > stamp_s)
