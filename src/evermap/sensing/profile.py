@@ -64,7 +64,12 @@ class Assumed:
             values = getattr(self, name)
             if not values or not all(0.0 < value < math.inf for value in values):
                 raise ConfigError(f"must be positive numbers, not {values!r}", field=name)
-        _ = self.fades, self.faces, self.in_field
+        if self.fading_m is not None and not 0.0 < self.fading_m <= math.inf:
+            raise ConfigError(f"must be positive, not {self.fading_m!r}", field="fading_m", hint="0.7 of the range")
+        if not 0.0 < self.viewing_angle_rad <= math.pi:
+            problem = f"must be above 0 and at most pi, not {self.viewing_angle_rad!r}"
+            raise ConfigError(problem, field="viewing_angle_rad")
+        _ = self.in_field  # says what is wrong with the poses
 
     @property
     def fades(self) -> Fading:
