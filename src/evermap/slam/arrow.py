@@ -20,13 +20,10 @@ from evermap.slam.kernels import (
     invert_3x3,
     kernel,
     multiply,
-    odometry_covariance,
-    odometry_residual,
     outlier_loss,
-    residual_by_states,
     wrapped,
 )
-from evermap.slam.preintegration import Intervals
+from evermap.slam.preintegration import Intervals, linearise_interval
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import BoolArray, FloatArray
 
@@ -110,20 +107,11 @@ def assemble(
     weights = np.zeros(len(pose_row))
     cost = 0.0
 
-    covariance, information, e, pull = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    j1, j2, motion = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4))
+    information, e, pull = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     j, weighted = np.zeros((3, 10)), np.zeros((3, 10))
     for i in range(n - 1):
-        odometry_covariance(driven.noise[i], driven.floor[i], variance, covariance)
-        invert_3x3(covariance, information)
-        odometry_residual(pose[i], pose[i + 1], driven.increment[i], e, j1, j2)
-        motion[:] = driven.by_states[i]
-        residual_by_states(motion, e, free)
+        linearise_interval(driven, i, pose, variance, free, e, j, information)
         for a in range(3):
-            for b in range(3):
-                j[a, b], j[a, 3 + b] = j1[a, b], j2[a, b]
-            for b in range(4):
-                j[a, 6 + b] = motion[a, b]
             pull[a] = information[a, 0] * e[0] + information[a, 1] * e[1] + information[a, 2] * e[2]
             cost += 0.5 * e[a] * pull[a]
         for a in range(3):

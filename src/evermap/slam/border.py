@@ -14,7 +14,16 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.arrow import Smoother
-from evermap.slam.kernels import AT_PLACES, detection_residual, inlier_weight, kernel, wrapped
+from evermap.slam.kernels import (
+    AT_PLACES,
+    adjoint,
+    composed,
+    detection_residual,
+    inlier_weight,
+    inverted,
+    kernel,
+    wrapped,
+)
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
@@ -150,20 +159,15 @@ def drive_on(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
 ) -> None:
     """The newest pose becomes the next one, in place: its pose and the joint covariance."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    pose[0] += c * increment[0] - s * increment[1]
-    pose[1] += s * increment[0] + c * increment[1]
-    pose[2] = wrapped(pose[2] + increment[2])
+    pose[:] = composed(pose, increment)
+    pose[2] = wrapped(pose[2])
     size = len(covariance)
-    # what happened before, seen from the end of the increment
-    c, s = np.cos(increment[2]), np.sin(increment[2])
-    lever_x, lever_y = s * increment[0] - c * increment[1], c * increment[0] + s * increment[1]
+    carry = adjoint(inverted(increment))
     for k in range(3, size):
         x, y, turn = covariance[0, k], covariance[1, k], covariance[2, k]
-        covariance[0, k] = c * x + s * y + lever_x * turn
-        covariance[1, k] = -s * x + c * y + lever_y * turn
+        covariance[0, k] = carry[0, 0] * x + carry[0, 1] * y + carry[0, 2] * turn
+        covariance[1, k] = carry[1, 0] * x + carry[1, 1] * y + carry[1, 2] * turn
     block = covariance[:3, :3].copy()
-    carry = np.array([[c, s, lever_x], [-s, c, lever_y], [0.0, 0.0, 1.0]])
     cross = covariance[:3, 8:12].copy() @ by_states.T
     covariance[:3, :3] = carry @ block @ carry.T + cross + cross.T + noise
     covariance[:3, :3] += by_states @ covariance[8:12, 8:12].copy() @ by_states.T

@@ -8,13 +8,14 @@ that swells in the middle.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from evermap.slam.kernels import (
+    adjoint,
+    composed,
     integrate_odometry,
     invert_3x3,
+    inverted,
     kernel,
     multiply,
     odometry_covariance,
@@ -87,18 +88,13 @@ def _reckon(
     spread: FloatArray,
 ) -> None:
     increment, motion, noise, floor = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
-    carry = np.eye(3)
     for i in range(1, len(stamp)):
         integrate_odometry(
             odometry_stamp, velocity, unknown, stamp[i - 1], stamp[i], states, increment, motion, noise, floor
         )
-        c, s = np.cos(out[i - 1, 2]), np.sin(out[i - 1, 2])
-        out[i, 0] = out[i - 1, 0] + c * increment[0] - s * increment[1]
-        out[i, 1] = out[i - 1, 1] + s * increment[0] + c * increment[1]
-        out[i, 2] = wrapped(out[i - 1, 2] + increment[2])
-        c, s = np.cos(increment[2]), np.sin(increment[2])
-        carry[0, 0], carry[0, 1], carry[0, 2] = c, s, s * increment[0] - c * increment[1]
-        carry[1, 0], carry[1, 1], carry[1, 2] = -s, c, c * increment[0] + s * increment[1]
+        out[i] = composed(out[i - 1], increment)
+        out[i, 2] = wrapped(out[i, 2])
+        carry = adjoint(inverted(increment))
         odometry_covariance(noise, floor, variance, spread[i])
         spread[i] += carry @ spread[i - 1] @ carry.T
 
@@ -136,20 +132,20 @@ def _bridge(
             )
             odometry_covariance(noise, floor, variance, collected[side])
         if i < 0:  # dead reckoning backwards from the first pose
-            out[k] = _composed(pose[0], _inverted(increment[1]))
+            out[k] = composed(pose[0], inverted(increment[1]))
             joint[:3, :3] = covariance[0] + collected[1]
-            sandwich(_adjoint(increment[1]), joint[:3, :3], part, spread[k])
+            sandwich(adjoint(increment[1]), joint[:3, :3], part, spread[k])
             continue
-        forward = _composed(pose[i], increment[0])
-        from_start = _adjoint(_inverted(increment[0]))
+        forward = composed(pose[i], increment[0])
+        from_start = adjoint(inverted(increment[0]))
         if i >= n - 1:
             out[k] = forward
             sandwich(from_start, covariance[i], part, spread[k])
             spread[k] += collected[0]
             continue
-        closing = _composed(_inverted(_composed(forward, increment[1])), pose[i + 1])
+        closing = composed(inverted(composed(forward, increment[1])), pose[i + 1])
         closing[2] = wrapped(closing[2])
-        to_end = _adjoint(_inverted(increment[1]))
+        to_end = adjoint(inverted(increment[1]))
         multiply(collected[0], to_end.T, share)
         multiply(to_end, share, gain)
         for a in range(3):
@@ -167,28 +163,10 @@ def _bridge(
                 ends[a, b], ends[a, 3 + b] = from_start[a, b] - part[a, b], gain[a, b]
                 joint[a, b], joint[3 + a, 3 + b] = covariance[i, a, b], covariance[i + 1, a, b]
                 joint[a, 3 + b] = joint[3 + b, a] = consecutive[i, a, b]
-        out[k] = _composed(forward, step)
+        out[k] = composed(forward, step)
         sandwich(ends, joint, ends_part, spread[k])
         multiply(collected[0], to_end.T, share)
         multiply(gain, share.T, part)
         for a in range(3):
             for b in range(3):
                 spread[k, a, b] += collected[0, a, b] - part[a, b]
-
-
-@kernel
-def _composed(a: FloatArray, b: FloatArray) -> FloatArray:
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
-
-
-@kernel
-def _inverted(a: FloatArray) -> FloatArray:
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
-
-
-@kernel
-def _adjoint(a: FloatArray) -> FloatArray:
-    c, s = math.cos(a[2]), math.sin(a[2])
-    return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])

@@ -94,6 +94,27 @@ def wrapped(angle: float) -> float:
 
 
 @kernel
+def composed(a: FloatArray, b: FloatArray) -> FloatArray:
+    """`a * b`, as `se2.compose`, but the heading is not wrapped."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
+
+
+@kernel
+def inverted(a: FloatArray) -> FloatArray:
+    """As `se2.inverse`, but the heading is not wrapped."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
+
+
+@kernel
+def adjoint(a: FloatArray) -> FloatArray:
+    """As `se2.adjoint`. That of an inverted motion carries perturbations at its start to its end."""
+    c, s = math.cos(a[2]), math.sin(a[2])
+    return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])
+
+
+@kernel
 def integrate_odometry(
     stamp: FloatArray,
     velocity: FloatArray,

@@ -19,14 +19,10 @@ import numpy as np
 
 from evermap.slam.kernels import (
     detection_residual,
-    invert_3x3,
     kernel,
-    odometry_covariance,
-    odometry_residual,
-    residual_by_states,
     sandwich,
 )
-from evermap.slam.preintegration import Intervals
+from evermap.slam.preintegration import Intervals, linearise_interval
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
@@ -191,24 +187,17 @@ def _odometry_sums(
     pulls, chances, fisher = np.zeros(kinds), np.zeros(kinds), np.zeros((kinds, kinds))
     weighted = np.zeros((kinds, 3, 3))
     information, left = np.zeros((3, 3)), np.zeros((3, 3))
-    e, pull = np.zeros(3), np.zeros(3)
-    j1, j2, motion, j = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 4)), np.zeros((3, 10))
+    e, pull, j = np.zeros(3), np.zeros(3), np.zeros((3, 10))
     cov, part, explained = np.zeros((10, 10)), np.zeros((3, 10)), np.zeros((3, 3))
     cov[6:, 6:] = cov_shared[shared - 4 :, shared - 4 :]
     for i in range(len(pose) - 1):
         noise = driven.noise[i]
-        odometry_covariance(noise, driven.floor[i], variance, information)
-        invert_3x3(information, information)
-        odometry_residual(pose[i], pose[i + 1], driven.increment[i], e, j1, j2)
-        motion[:] = driven.by_states[i]
-        residual_by_states(motion, e, free)
+        linearise_interval(driven, i, pose, variance, free, e, j, information)
         for a in range(3):
             for b in range(3):
-                j[a, b], j[a, 3 + b] = j1[a, b], j2[a, b]
                 cov[a, b], cov[3 + a, 3 + b] = cov_pose[i, a, b], cov_pose[i + 1, a, b]
                 cov[a, 3 + b] = cov[3 + b, a] = cov_next[i, a, b]
             for b in range(4):
-                j[a, 6 + b] = motion[a, b]
                 cov[a, 6 + b] = cov[6 + b, a] = cov_cross[i, a, shared - 4 + b]
                 cov[3 + a, 6 + b] = cov[6 + b, 3 + a] = cov_cross[i + 1, a, shared - 4 + b]
             pull[a] = information[a, 0] * e[0] + information[a, 1] * e[1] + information[a, 2] * e[2]

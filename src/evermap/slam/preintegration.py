@@ -7,11 +7,19 @@ change what the odometry says of an interval: increment, derivatives, and covari
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.slam.kernels import N_NOISE, integrate_odometry, kernel
+from evermap.slam.kernels import (
+    N_NOISE,
+    integrate_odometry,
+    invert_3x3,
+    kernel,
+    odometry_covariance,
+    odometry_residual,
+    residual_by_states,
+)
 from evermap.types import FloatArray
 
 
@@ -81,3 +89,33 @@ def _integrate(
             floor[i],
         )
     return increment, by_states, noise, floor
+
+
+@kernel
+def linearise_interval(
+    intervals: Intervals,
+    i: int,
+    pose: FloatArray,
+    variance: FloatArray,
+    free: Any,
+    residual: FloatArray,
+    jacobian: FloatArray,
+    information: FloatArray,
+) -> None:
+    """What the odometry of interval `i` says against poses `i` and `i + 1`.
+
+    Args:
+        intervals: the odometry.
+        i: which interval.
+        pose: (N, 3) all poses.
+        variance: (5,) of each kind of noise.
+        free: (9,) which calibration states are.
+        residual: (3,) out, that of `kernels.odometry_residual`.
+        jacobian: (3, 10) out, its derivatives by both poses and by delay, scales and slip.
+        information: (3, 3) out, inverse covariance.
+    """
+    odometry_covariance(intervals.noise[i], intervals.floor[i], variance, information)
+    invert_3x3(information, information)
+    odometry_residual(pose[i], pose[i + 1], intervals.increment[i], residual, jacobian[:, :3], jacobian[:, 3:6])
+    jacobian[:, 6:] = intervals.by_states[i]
+    residual_by_states(jacobian[:, 6:], residual, free)

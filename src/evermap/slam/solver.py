@@ -10,8 +10,11 @@ import numpy as np
 from evermap.slam.kernels import (
     AT_PLACES,
     N_NOISE,
+    adjoint,
+    composed,
     detection_residual,
     integrate_odometry,
+    inverted,
     kernel,
     multiply,
     odometry_covariance,
@@ -166,14 +169,7 @@ def _innovations(
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     h, h_part, part, rows = np.zeros((2, 14)), np.zeros((2, 14)), np.zeros((14, 14)), np.arange(14)
     s, by_noise, jx_part = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 3))
-    cosine, sine = np.cos(pose_before[2]), np.sin(pose_before[2])
-    dx, dy, turn = increment[0], increment[1], increment[2]
-    pose = pose_before + np.array([cosine * dx - sine * dy, sine * dx + cosine * dy, turn])
-    # what happened before, seen from the end of the increment
-    cosine, sine = np.cos(turn), np.sin(turn)
-    carry = np.array(
-        [[cosine, sine, sine * dx - cosine * dy], [-sine, cosine, cosine * dx + sine * dy], [0.0, 0.0, 1.0]]
-    )
+    pose, carry = composed(pose_before, increment), adjoint(inverted(increment))
     for m in range(len(reading)):
         at = places[column[m]]
         detection_residual(pose, at, states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
