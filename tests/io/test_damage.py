@@ -17,7 +17,7 @@ from evermap.types import Landmarks
 
 Files = dict[str, bytes]
 damage_settings = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+    max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 )
 INTERESTING = [
     b"\n",

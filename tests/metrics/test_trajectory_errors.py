@@ -25,7 +25,7 @@ def as_evo(stamp_s, poses):
 
 
 @given(st.floats(-20, 20), st.floats(-20, 20), st.floats(-3.1, 3.1))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_an_estimate_in_another_frame_has_no_error(x, y, theta):
     truth = figure_eight(STAMPS)
     estimate = se2.compose(np.array([x, y, theta]), truth)

@@ -14,7 +14,7 @@ from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Uniform
 from .priors import PRIORS, Stream, streams
 
 every_prior = pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
-few = settings(max_examples=40, deadline=None)
+few = settings(max_examples=40)
 
 
 def filtered(prior: LifetimePrior, stream: Stream) -> tuple[single.Belief, np.ndarray]:

@@ -37,7 +37,7 @@ from evermap.slam.problem import SILENCE_S, SILENT_VARIANCE, Drive
 ONCE = FLOOR_VARIANCE * np.eye(3)
 """What every window has, however short."""
 
-patiently = settings(deadline=None, max_examples=60)
+few = settings(max_examples=60)
 """The first example waits for the compiler."""
 
 lengths = st.floats(-20.0, 20.0)
@@ -94,7 +94,7 @@ def away_from_corners(pose, landmark, mount, reading):
     assume(abs(abs(se2.wrap(reading - bearing)) - np.pi) > 0.3)
 
 
-@patiently
+@few
 @given(poses, points, states, mounts, st.floats(0.1, 20.0), angles)
 def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -104,7 +104,7 @@ def test_detection_is_the_range_law(pose, landmark, states, mount, range_m, bear
     assert e[1] == pytest.approx(se2.wrap(expected[1]), abs=1e-10)
 
 
-@patiently
+@few
 @given(poses, points, states, mounts, angles)
 def test_detection_derivatives(pose, landmark, states, mount, bearing_rad):
     away_from_corners(pose, landmark, mount, bearing_rad)
@@ -133,7 +133,7 @@ def odometry(pose, following, increment):
     return e, j1, j2
 
 
-@patiently
+@few
 @given(poses, poses, poses)
 def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, increment):
     e, j1, j2 = odometry(pose, following, increment)
@@ -148,7 +148,7 @@ def test_odometry_residual_is_gtsams_and_its_derivatives_too(pose, following, in
     assert j2 == pytest.approx(by_following, rel=1e-5, abs=1e-6)
 
 
-@patiently
+@few
 @given(poses, poses)
 def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(pose, increment):
     following = se2.compose(pose, increment)
@@ -156,7 +156,7 @@ def test_odometry_residual_by_the_increment_is_minus_identity_where_it_is_small(
     assert by_increment == pytest.approx(-np.eye(3), abs=1e-6)
 
 
-@patiently
+@few
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-3, 2.5))
 def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, passed):
     out = integrated(drive, start, start + passed, states)
@@ -164,7 +164,7 @@ def test_increment_is_a_product_of_matrix_exponentials(drive, states, start, pas
     assert out.increment == pytest.approx(expected, abs=1e-9)
 
 
-@patiently
+@few
 @given(drives(), states, st.floats(-0.5, 2.0), st.floats(1e-2, 2.5))
 def test_increment_derivatives(drive, states, start, passed):
     """By delay, forward scale, turn scale and slip, as right perturbations of the increment."""
@@ -180,7 +180,7 @@ def test_increment_derivatives(drive, states, start, passed):
     assert out.jacobian == pytest.approx(central(perturbation, states[5:]), rel=1e-4, abs=1e-6)
 
 
-@patiently
+@few
 @given(drives(), states, st.floats(-0.5, 1.0), st.floats(1e-2, 1.5), st.floats(0.05, 0.95))
 def test_two_adjacent_windows_make_the_whole(drive, states, start, passed, share):
     middle, stop = start + share * passed, start + passed
@@ -290,7 +290,7 @@ def test_noise_counts_reported_distance_angle_and_time():
     assert out.noise[4] == pytest.approx(np.diag([0.0, 0.0, 3.0]), abs=1e-12)
 
 
-@patiently
+@few
 @given(
     st.floats(0.0, 300.0),
     st.one_of(st.floats(0.5, 50.0), st.just(7.0)),
@@ -346,7 +346,7 @@ def test_silence_makes_the_covariance_grow_with_its_length():
     assert eigenvalues.min() > 0
 
 
-@patiently
+@few
 @given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6), st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3))
 def test_inverse_of_three_by_three_is_numpys(below, log_scale):
     root = np.zeros((3, 3))

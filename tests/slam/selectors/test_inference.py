@@ -19,7 +19,7 @@ chains = st.sampled_from(sorted(CHAINS))
 
 
 @given(looks(), chains)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_decoding_finds_the_largest_joint_probability_of_all_sequences(looks, name):
     chain = CHAINS[name]
     found = most_probable(looks, chain)
@@ -33,7 +33,7 @@ def test_decoding_finds_the_largest_joint_probability_of_all_sequences(looks, na
 
 
 @given(looks(longest=5), chains)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, name):
     chain = CHAINS[name]
     _, stamp_s, likelihood = of_landmark(looks, 0)
@@ -44,7 +44,7 @@ def test_joint_probability_is_that_of_the_definition_for_every_sequence(looks, n
 
 
 @given(looks(), chains)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_posteriors_and_evidence_are_sums_over_all_sequences(looks, name):
     chain = CHAINS[name]
     beliefs = smoothed(looks, chain)
