@@ -298,9 +298,9 @@ def _one_case(name: str, n: int, prior: Exponential | GeneralPurpose, log_surviv
 
 def _row(case: Case, seconds: float, bandwidth: dict[str, float]) -> dict[str, Any]:
     """Nanoseconds an update of everyone in a case, and what the memory needs."""
-    best = _best_ns({"one": case.work}, seconds)
-    best |= _best_ns({"all": case.spread}, seconds) if case.spread else {}  # apart: sleeping cores wake up slowly
-    best |= _best_ns({f"peer {name}": work for name, work in case.peers.items()}, seconds / 2)
+    best = best_ns({"one": case.work}, seconds)
+    best |= best_ns({"all": case.spread}, seconds) if case.spread else {}  # apart: sleeping cores wake up slowly
+    best |= best_ns({f"peer {name}": work for name, work in case.peers.items()}, seconds / 2)
     best = {name: ns / case.n for name, ns in best.items()}
     floors = [case.moved_bytes / rate if case.moved_bytes else None for rate in bandwidth.values()]
     spread = best.get("all")
@@ -317,7 +317,7 @@ def _row(case: Case, seconds: float, bandwidth: dict[str, float]) -> dict[str, A
     }
 
 
-def _best_ns(contenders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
+def best_ns(contenders: dict[str, Callable[[], Any]], seconds: float) -> dict[str, float]:
     """Shortest time of each [ns], taking turns; the first call of all compiles and does not count."""
     best = dict.fromkeys(contenders, np.inf)
     for work in contenders.values():
@@ -338,7 +338,7 @@ def _copy_bandwidth(n: int, seconds: float, threads: int) -> float:
     parts = [slice(5 * n * k // threads, 5 * n * (k + 1) // threads) for k in range(threads)]
     with ThreadPoolExecutor(threads) as pool:
         copy = lambda: list(pool.map(lambda part: np.copyto(target[part], source[part]), parts))  # noqa: E731
-        ns = _best_ns({"copy": copy}, seconds)["copy"]
+        ns = best_ns({"copy": copy}, seconds)["copy"]
     return 2 * source.nbytes / ns
 
 
@@ -365,5 +365,5 @@ def _torch(n: int, seconds: float) -> dict[str, dict[str, float]]:
                 torch.cuda.synchronize()
 
             name = f"{look.__name__.removeprefix('look_')}_{str(kind).removeprefix('torch.')}"
-            times[name] = _best_ns({"": work}, seconds)[""] / n
+            times[name] = best_ns({"": work}, seconds)[""] / n
     return {torch.cuda.get_device_name(): times}

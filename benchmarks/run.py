@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import persistence, selectors
+from benchmarks import cliques, persistence, selectors
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -32,10 +32,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     "batch_memory_ratio": ("lower", 0.25, "memory that it adds, over gtsam LM and Marginals"),
     **persistence.METRICS,
     **selectors.METRICS,
+    **cliques.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors")
+PARTS = ("slam", "persistence", "selectors", "cliques")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -47,6 +48,7 @@ def run(
     turns: int = TURNS,
     n_features: int = persistence.N_FEATURES,
     seconds: float = persistence.SECONDS,
+    n_cliques: int = cliques.N_CLIQUES,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -54,7 +56,7 @@ def run(
         update_baseline: make these measurements the baseline; what is not measured stays.
         only: one of `PARTS`; all where None.
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
-        n_features, seconds: the same for the persistence filter.
+        n_features, seconds, n_cliques: the same for the persistence filter, and for the filters of cliques.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -78,6 +80,9 @@ def run(
         measured |= ratios
     if only in (None, "selectors"):
         ratios, shown["selectors"] = selectors.run()
+        measured |= ratios
+    if only in (None, "cliques"):
+        ratios, shown["cliques"] = cliques.run(n_cliques, seconds)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -156,6 +161,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
     if "selectors" in shown:
         took = ", ".join(f"{name} {ms:.2f} ms" for name, ms in shown["selectors"]["ms"].items())
         lines += ["", f"{shown['selectors']['n_looks']} looks at each of {selectors.N_LANDMARKS} landmarks: {took}"]
+    if "cliques" in shown:
+        lines += ["", cliques.as_text(shown["cliques"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

@@ -15,6 +15,8 @@ import pytest
 from evermap import se2
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import InputError
+from evermap.persistence import single
+from evermap.survival import Exponential
 
 SMALL = 150
 
@@ -86,6 +88,35 @@ def test_selectors_of_the_race_are_after_the_same_sequence(run: ModuleType) -> N
     for name in ("em", "mcts"):
         assert (joint[name] <= joint["viterbi"] + 1e-9).all()
         assert np.mean(joint[name] >= joint["viterbi"] - 1e-9) >= 0.5
+
+
+def test_filters_of_cliques_in_the_race_believe_the_same(run: ModuleType) -> None:
+    """The clique filter and its peer in arrays; and Rosen's algorithm what is right for each landmark by itself."""
+    scene = run.cliques.world(40)
+    ours, theirs, one_by_one = (
+        make(scene) for make in (run.cliques.by_jcf, run.cliques.by_arrays, run.cliques.by_rosen)
+    )
+    alone = single.init(len(scene.clique), Exponential(run.cliques.RATE_HZ))
+    for n in range(12):
+        np.testing.assert_allclose(theirs(), ours(), rtol=1e-9)
+        detected = scene.detected[n % len(scene.detected)]
+        alone = single.update(alone, n + 1.0, detected, run.cliques.P_MISS, run.cliques.P_FALSE)
+        np.testing.assert_allclose(one_by_one(), alone.probability, atol=1e-9)
+    assert np.ptp(ours()) > 5.0
+
+
+def test_learning_cliques_of_the_race_are_all_looked_at_and_learned_from(run: ModuleType) -> None:
+    """Nobody saves time by leaving something out, and the memory is that of all arrays."""
+    scene = run.cliques.world(40)
+    ours = run.cliques.WithLearning(scene)
+    for _ in range(6):
+        for step in (ours.look, ours.filter, ours.confirm):
+            step()
+    np.testing.assert_array_equal(ours.model.stamp_s, 6.0)
+    assert (ours.belief.probability > 0.99).mean() > 0.9
+    assert (ours.model.pending == 0.0).all(axis=1).mean() > 0.9  # what was learned has gone to the profile
+    assert ours.model.profile.range_hits.sum() > 500.0
+    assert ours.bytes_used > 4 * 12 * len(scene.clique)  # two places in doubles, two rows of six floats
 
 
 def test_worlds_are_what_they_say(worlds: dict[bool, Any]) -> None:
@@ -163,7 +194,7 @@ def test_a_small_run_writes_compares_and_reports(
 ) -> None:
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
-    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01)
+    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01, n_cliques=50)
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)
     assert all(abs(row["change"]) < 1e-3 for row in measured["metrics"])
