@@ -16,7 +16,7 @@ from typing import Any
 from evermap import __version__
 from evermap.experiments.bateman2020_examples import draw_examples, record_example
 from evermap.experiments.bateman2020_expected import verdicts
-from evermap.experiments.bateman2020_figures import draw_calibration, draw_sweeps
+from evermap.experiments.bateman2020_figures import draw_calibration, draw_learned_sensor, draw_removals, draw_sweeps
 from evermap.experiments.bateman2020_published import orderings
 from evermap.experiments.bateman2020_scores import Row, Scored, score_world, sweep, sweep_points, tuned_p_miss
 from evermap.experiments.bateman2020_settings import IN_THE_TABLE, NOMINAL, SENSORS, Settings, default_settings
@@ -75,8 +75,14 @@ def reproduce(
             "sweep": varied,
         }
         figures = draw_examples(settings, p_miss["lidar"]) | draw_sweeps(varied, settings)
-        calibration = draw_calibration(scored)
-        save_all(figures if calibration is None else figures | {"calibration": calibration}, folder.path)
+        figures["profile"] = draw_learned_sensor(settings)
+        for name, figure in {
+            "calibration": draw_calibration(scored),
+            "removals": draw_removals(scored, settings),
+        }.items():
+            if figure is not None:
+                figures[name] = figure
+        save_all(figures, folder.path)
         record_example(settings, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
         table["outputs"] = sorted([*folder.files(), "summary.json"])

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from evermap.experiments.bateman2020_scores import Row
-from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL
+from evermap.experiments.bateman2020_scores import OWN, Row
+from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL, ORACLE, WARM
 
 CEILINGS = ("brier", "delay_mean")
 PROMISED: dict[tuple[str, str], dict[str, float]] = {
@@ -20,17 +20,35 @@ PROMISED: dict[tuple[str, str], dict[str, float]] = {
 """By world and sensor, one configuration for all: at most for `CEILINGS`, else at least."""
 
 
+JUDGED: dict[str, tuple[str, str]] = {
+    "learned": (LEARNED, ""),
+    "learned, own decisions": (LEARNED, OWN),
+    "learned-warm, own decisions": (WARM, OWN),
+    "oracle": (ORACLE, ""),
+    "oracle, own decisions": (ORACLE, OWN),
+}
+"""By column of the table: the filter, and what stands before the names of its scores."""
+
+
 def verdicts(rows: Sequence[Row]) -> list[Row]:
-    """Every promise with what was measured; `measured` and `met` are None where the filter was not run."""
-    learned = {(row["world"], row["sensor"]): row for row in rows if row["filter"] == LEARNED}
+    """Every promise with what was measured; None where a filter was not run.
+
+    The oracle knows all probabilities of its world: where it fails, the promise cannot be kept there.
+    """
+    found = {(row["world"], row["sensor"], row["filter"]): row for row in rows}
     out = []
     for where, promises in PROMISED.items():
         for metric, limit in promises.items():
-            value = learned[where][metric] if where in learned else None
             ceiling = metric in CEILINGS
-            met = None if value is None else value <= limit if ceiling else value >= limit
+            measured, met = {}, {}
+            for column, (name, decisions) in JUDGED.items():
+                row = found.get((*where, name))
+                value = None if row is None else row[decisions + metric]
+                measured[column] = value
+                met[column] = None if value is None else value <= limit if ceiling else value >= limit
             bound = "at_most" if ceiling else "at_least"
+            world, sensor = where
             out.append(
-                {"world": where[0], "sensor": where[1], "metric": metric, bound: limit, "measured": value, "met": met}
+                {"world": world, "sensor": sensor, "metric": metric, bound: limit, "measured": measured, "met": met}
             )
     return out

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.experiments.bateman2020_learned import learned_beliefs
+from evermap.experiments.bateman2020_runs import simulate
 from evermap.experiments.bateman2020_scores import COMPARED, Row, Scored
-from evermap.experiments.bateman2020_settings import LEARNED, ORACLE, SUPPRESSION, TUNED
+from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL, ORACLE, SUPPRESSION, TUNED, WARM
 from evermap.experiments.bateman2020_table import NAMES, title
+from evermap.sensing.profile import Profile, facing_middles, range_middles
+from evermap.survival import Exponential
+from evermap.viz.profile_figure import RateCurve, draw_profile
 from evermap.viz.style import ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, house_style, new_figure, settle
 
 if TYPE_CHECKING:
@@ -22,6 +28,14 @@ if TYPE_CHECKING:
 _COLUMNS = 4
 _COLOURS = {"iff": ODOMETRY, "jff": MUTED, "jcf": LANDMARK, "jcfr": ESTIMATE}
 _CALIBRATED = {"jcf" + SUPPRESSION: MUTED, TUNED: ODOMETRY, ORACLE: INK, LEARNED: ESTIMATE}
+_REMOVING = {
+    "jcfr" + SUPPRESSION: (MUTED, "-"),
+    TUNED: (ODOMETRY, "-"),
+    ORACLE: (INK, "-"),
+    LEARNED: (ESTIMATE, "-"),
+    WARM: (ESTIMATE, "--"),
+}
+_REMOVED_IN = {NOMINAL, "angle60", "occlusion"}
 _FEWEST = 30
 """Beliefs in a bin below which its share says nothing."""
 _LOGARITHMIC = {"prior_mean_steps", "p_false", "rho_low"}
@@ -74,6 +88,76 @@ def _draw_over_values(axes: Axes, rows: Sequence[Row], metric: str) -> None:
         style: dict[str, Any] = {"color": _COLOURS[name.removesuffix(SUPPRESSION)], "marker": "o", "ms": 2.5, "lw": 1.1}
         dashes = "-" if name.endswith(SUPPRESSION) else "--"
         axes.plot([row["value"] for row in own], known, dashes, label=name, **style)
+
+
+def draw_removals(scored: Sequence[Scored], settings: Settings) -> Figure | None:
+    """MES/S over the delay, a point a `rho_low`, a panel a sensor and world; None where nothing of it was run."""
+    shown = [one for one in scored if one.row["filter"] in _REMOVING and one.row["world"] in _REMOVED_IN]
+    if not shown:
+        return None
+    panels_of = list(dict.fromkeys((one.row["sensor"], one.row["world"]) for one in shown))
+    across = min(3, len(panels_of))
+    down = -(-len(panels_of) // across)
+    with house_style():
+        figure = new_figure(2.4 * across + 0.3, 2.3 * down + 0.5)
+        panels = figure.subplots(down, across, sharey=True, squeeze=False)
+        for axes in panels.flat:
+            axes.set_visible(False)
+        for axes, where in zip(panels.flat, panels_of, strict=False):
+            axes.set_visible(True)
+            axes.set(title=", ".join(where), xscale="log", ylim=(-0.03, 1.04))
+            for one in shown:
+                if (one.row["sensor"], one.row["world"]) == where:
+                    colour, dashes = _REMOVING[one.row["filter"]]
+                    rho_low, delay, kept = one.removal.T
+                    axes.plot(delay, kept, dashes, color=colour, lw=1.1, label=one.row["filter"])
+                    marked = np.isin(rho_low, [settings.filters.rho_low])
+                    axes.plot(delay[marked], kept[marked], "o", color=colour, ms=4)
+        for axes in panels[:, 0]:
+            axes.set_ylabel("MES/S [1]")
+        for axes in panels[-1]:
+            axes.set_xlabel("mean delay of removal [looks]")
+        handles, labels = panels[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=3)
+        settle(figure)
+    return figure
+
+
+def draw_learned_sensor(settings: Settings) -> Figure:
+    """Detection by range and incidence as one run teaches it, in a world that is harsher in both than assumed."""
+    world = replace(
+        settings.world_of("range04", "lidar"),
+        viewing_angle_rad=settings.world_of("angle60", "lidar").viewing_angle_rad,
+    )
+    run = simulate(world, 1, settings.seed).runs[0]
+    _, after = learned_beliefs(run, Exponential.from_mean(settings.filters.prior_mean_steps))
+    before = Profile.of(after.assumed)
+    range_m, facing = np.linspace(0.0, world.field.range_max_m, 200), np.linspace(-1.0, 1.0, 801)
+    curves = [
+        RateCurve(
+            range_middles(world.field.range_max_m),
+            before.range_rate,
+            after.range_rate,
+            after.range_hits,
+            range_m,
+            np.exp(-range_m / world.fading_m),
+            "range [m]",
+        ),
+        RateCurve(
+            facing_middles(),
+            before.facing_rate,
+            after.facing_rate,
+            after.facing_hits,
+            facing,
+            np.where(facing >= np.cos(world.viewing_angle_rad), 1.0, 0.0),
+            "cosine of incidence [1]",
+        ),
+    ]
+    with house_style():
+        figure = new_figure(6.4, 2.9)
+        draw_profile(figure, curves)
+        settle(figure)
+    return figure
 
 
 def draw_calibration(scored: Sequence[Scored]) -> Figure | None:

@@ -14,10 +14,11 @@ import numpy as np
 
 from evermap.experiments.bateman2020_learned import learned_beliefs
 from evermap.experiments.bateman2020_runs import Stack
-from evermap.experiments.bateman2020_settings import LEARNED, ORACLE, SUPPRESSION, TUNED, FilterSettings
+from evermap.experiments.bateman2020_settings import LEARNED, ORACLE, SUPPRESSION, TUNED, WARM, FilterSettings
 from evermap.persistence import jff, joint, single
 from evermap.persistence.state import Belief
 from evermap.sensing.clique_range import nearest_per_clique, range_degraded_miss
+from evermap.sensing.profile import Profile
 from evermap.sensing.suppression import suppressed
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -26,7 +27,11 @@ State = TypeVar("State")
 
 
 def beliefs(
-    name: str, stack: Stack, assumed: FilterSettings, tuned_p_miss: float | None
+    name: str,
+    stack: Stack,
+    assumed: FilterSettings,
+    tuned_p_miss: float | None,
+    known_sensor: Profile | None = None,
 ) -> tuple[FloatArray, IntArray]:
     """What a filter believes after every step.
 
@@ -35,6 +40,7 @@ def beliefs(
         stack: of runs.
         assumed: by the filter.
         tuned_p_miss: of `jcf-tuned`, None where that is not asked for.
+        known_sensor: that `learned-warm` starts from.
 
     Returns:
         (F, N) probability that each thing is there, and (N,) the clique that it is (of): all cliques, or landmarks.
@@ -42,9 +48,12 @@ def beliefs(
     base = name.removesuffix(SUPPRESSION)
     every_clique = np.arange(stack.cliques)
     prior = Exponential.from_mean(assumed.prior_mean_steps)
-    if base == LEARNED:
-        return np.concatenate([learned_beliefs(run, prior)[0] for run in stack.runs], axis=1), every_clique
-    expected = stack.expected if base in {TUNED, ORACLE} else stack.in_view[:, stack.clique]
+    if base in {LEARNED, WARM}:
+        profile = known_sensor if base == WARM else None
+        return np.concatenate([learned_beliefs(run, prior, profile)[0] for run in stack.runs], axis=1), every_clique
+    if base == ORACLE:
+        return _all_knowing(stack, prior), every_clique
+    expected = stack.expected if base == TUNED else stack.in_view[:, stack.clique]
     looks = stack.looks()
     if name.endswith(SUPPRESSION):
         looks[_suppressed(stack, expected, assumed)] = np.nan
@@ -129,13 +138,38 @@ def _joint(
         p_miss = _degraded(stack, assumed)
     elif base == TUNED:
         p_miss, p_false = tuned_p_miss, assumed.tuned_p_false
-    elif base == ORACLE:
-        chance = stack.p_detect()
-        expected, p_miss, p_false = chance > 0.0, 1.0 - chance, stack.world.p_false
 
     def look(state: Belief, stamp_s: FloatArray, step: int) -> Belief:
         missed = p_miss[step] if np.ndim(p_miss) else p_miss
         return joint.jcf(state, stamp_s, stack.detected[step], missed, p_false, expected[step], stack.clique)
+
+    return _follow(single.init(stack.cliques, prior), look, single.predict, stack, looks)
+
+
+def _all_knowing(stack: Stack, prior: Exponential) -> FloatArray:
+    """Who knows every probability and nothing of what happened: the exact filter, with whether it is hidden summed out.
+
+    Like the clique filter, with the true probability of each detection, and the chain by which things are hidden.
+    """
+    world, chance = stack.world, stack.p_detect()
+    with np.errstate(divide="ignore"):
+        there = np.log(np.where(stack.detected, chance, 1.0 - chance))
+    gone = np.log(np.where(stack.detected, world.p_false, 1.0 - world.p_false))
+    begin = np.searchsorted(stack.clique, np.arange(stack.cliques))
+    log_there, log_gone = (np.add.reduceat(np.where(chance > 0.0, each, 0.0), begin, axis=1) for each in (there, gone))
+    reveal = 1.0 / world.occluded_steps
+    hide = reveal * world.occluded_share / (1.0 - world.occluded_share)
+    looks = np.where(np.logical_or.reduceat(chance > 0.0, begin, axis=1), stack.looks(), np.nan)
+    hidden = np.full(stack.cliques, world.occluded_share)
+
+    def look(state: Belief, stamp_s: FloatArray, step: int) -> Belief:
+        nonlocal hidden
+        before = hidden * (1.0 - reveal) + (1.0 - hidden) * hide
+        with np.errstate(divide="ignore"):
+            mixed = np.logaddexp(np.log1p(-before) + log_there[step], np.log(before) + log_gone[step])
+        after = before * np.exp(log_gone[step] - mixed)
+        hidden = np.where(np.isnan(stamp_s), before, after)
+        return single.observe(state, stamp_s, mixed, log_gone[step])
 
     return _follow(single.init(stack.cliques, prior), look, single.predict, stack, looks)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from evermap.persistence import single
@@ -37,7 +39,7 @@ def learned_beliefs(run: CliqueRun, prior: Exponential, profile: Profile | None 
     return p_there, model.profile
 
 
-def learned_profile(runs: list[CliqueRun], prior: Exponential) -> Profile:
+def learned_profile(runs: Sequence[CliqueRun], prior: Exponential) -> Profile:
     """What a sensor's profile is after some runs, one after the other past new objects."""
     profile = Profile.of(Assumed(field=runs[0].world.field))
     for run in runs:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from evermap.experiments.bateman2020_filters import beliefs
+from evermap.experiments.bateman2020_learned import learned_profile
 from evermap.experiments.bateman2020_runs import TUNING, Stack, miss_rate, simulate
 from evermap.experiments.bateman2020_settings import (
     IN_THE_TABLE,
     NOMINAL,
     SUPPRESSION,
+    WARM,
     FilterSettings,
     Settings,
 )
@@ -26,6 +28,7 @@ from evermap.metrics.removal import (
     removal_tally,
     standard_errors,
 )
+from evermap.survival import Exponential
 from evermap.types import FloatArray, IntArray
 
 Row = dict[str, Any]
@@ -33,6 +36,10 @@ Row = dict[str, Any]
 METRICS = tuple(f.name for f in fields(RemovalScores))
 COMPARED = ("accuracy", "survival_ratio")
 """The two that the thesis tells."""
+OWN = "own_"
+"""Before the name of a score by the decisions `own_rho_high` and `own_rho_low`."""
+REMOVALS = (0.5, 0.35, 0.2, 0.1, 0.05, 0.02, 0.01)
+"""Values of `rho_low` for the curve of MES/S over delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,11 +50,13 @@ class Scored:
         row: world, sensor, filter, and every score with its standard error.
         draws: (B,) those of `COMPARED`, of resampled runs: the same runs for all filters of a stack.
         reliability: of the beliefs in possible detections.
+        removal: (B, 3) `rho_low`, mean delay and MES/S: what is paid for what, by whoever decides.
     """
 
     row: Row
     draws: dict[str, FloatArray]
     reliability: Reliability
+    removal: FloatArray
 
 
 def score(
@@ -86,16 +95,40 @@ def score_world(
     settings: Settings, world: str, sensor: str, p_miss: float, done: Callable[[], None]
 ) -> Iterator[Scored]:
     """All filters that are asked for in one world, on the same runs."""
-    stack = simulate(settings.world_of(world, sensor), settings.runs, settings.seed)
+    drawn_from = settings.world_of(world, sensor)
+    stack = simulate(drawn_from, settings.runs, settings.seed)
     there = stack.there()
+    known_sensor = None
+    if WARM in settings.filters_in(world):
+        yesterday = simulate(drawn_from, settings.known_runs, settings.seed, TUNING)
+        known_sensor = learned_profile(yesterday.runs, Exponential.from_mean(settings.filters.prior_mean_steps))
     for name in settings.filters_in(world):
-        belief, clique = beliefs(name, stack, settings.filters, p_miss)
+        belief, clique = beliefs(name, stack, settings.filters, p_miss, known_sensor)
         row, drawn = score(belief, clique, stack, settings.filters, draws=settings.bootstrap_draws, seed=settings.seed)
         in_view = stack.in_view[:, clique]
         bins = reliability(belief[in_view], there[:, clique][in_view])
         done()
         at = {"world": world, "sensor": sensor, "filter": name}
-        yield Scored(at | row | {"calibration_error": _known(bins.error)}, drawn, bins)
+        own = _own_decisions(belief, clique, stack, settings)
+        curve = _removal_curve(belief, clique, stack)
+        yield Scored(at | row | own | {"calibration_error": _known(bins.error)}, drawn, bins, curve)
+
+
+def _own_decisions(belief: FloatArray, clique: IntArray, stack: Stack, settings: Settings) -> Row:
+    """Every score and standard error of who takes beliefs for what they say."""
+    assumed = replace(settings.filters, rho_high=settings.filters.own_rho_high, rho_low=settings.filters.own_rho_low)
+    row, _ = score(belief, clique, stack, assumed, draws=settings.bootstrap_draws, seed=settings.seed)
+    return {f"{OWN}{name}": value for name, value in row.items()}
+
+
+def _removal_curve(belief: FloatArray, clique: IntArray, stack: Stack) -> FloatArray:
+    weight = 1.0 / np.bincount(clique, minlength=stack.cliques)[clique]
+    in_view, first, survival = stack.in_view[:, clique], stack.first[clique], stack.survival_steps[clique]
+    rows = []
+    for rho_low in REMOVALS:
+        scores = removal_scores(removal_tally(belief, in_view, first, survival, rho_low=rho_low), weight)
+        rows.append((rho_low, scores.delay_mean, scores.survival_ratio))
+    return np.array(rows)
 
 
 def sweep(settings: Settings, sensor: str, done: Callable[[], None]) -> Iterator[Row]:

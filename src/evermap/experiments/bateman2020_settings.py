@@ -26,8 +26,8 @@ OF_THE_THESIS = ("iff", "jff", "jcf", "jcfr")
 IN_THE_TABLE = (*OF_THE_THESIS, *(name + SUPPRESSION for name in OF_THE_THESIS))
 OTHER_READINGS = tuple(name + tail for name in ("iff-observable", "jff-mixture") for tail in ("", SUPPRESSION))
 """Of what the thesis leaves open about its baselines."""
-TUNED, ORACLE, LEARNED = "jcf-tuned", "oracle", "learned"
-BEYOND = (TUNED, TUNED + SUPPRESSION, ORACLE, LEARNED)
+TUNED, ORACLE, LEARNED, WARM = "jcf-tuned", "oracle", "learned", "learned-warm"
+BEYOND = (TUNED, TUNED + SUPPRESSION, ORACLE, LEARNED, WARM)
 IN_ALL_WORLDS = ("jcf" + SUPPRESSION, "jcfr" + SUPPRESSION, *BEYOND)
 FILTERS = (*IN_THE_TABLE, *OTHER_READINGS, *BEYOND)
 
@@ -48,6 +48,7 @@ class FilterSettings:
         pairwise_own, pairwise_neighbours, pairwise_reach_m: of the pairwise Joint Feature Filter.
         mixture_weight: of the mixture form.
         tuned_p_false: of the tuned clique filter.
+        own_rho_high, own_rho_low: the two decisions of who takes a belief for what it says.
     """
 
     p_miss: float
@@ -64,6 +65,8 @@ class FilterSettings:
     pairwise_reach_m: float
     mixture_weight: float
     tuned_p_false: float
+    own_rho_high: float
+    own_rho_low: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +79,7 @@ class Settings:
         sweep: values of single parameters, by section (`world`, `filters`) and name.
         runs: simulated for every world and sensor.
         tuning_runs: of other seeds, for the miss rate of `jcf-tuned`.
+        known_runs: of other seeds, in which the sensor of `learned-warm` has been learned.
         sweep_runs: for every value of the sweep; no more than `runs`.
         bootstrap_draws: for every standard error.
         seed: of everything random.
@@ -89,6 +93,7 @@ class Settings:
     sweep: dict[str, dict[str, list[float]]]
     runs: int
     tuning_runs: int
+    known_runs: int
     sweep_runs: int
     bootstrap_draws: int
     seed: int
@@ -100,7 +105,14 @@ class Settings:
             unknown = [item for item in given if item not in known]
             if unknown:
                 raise ConfigError(f"there is no {unknown[0]!r}", field=name, hint=", ".join(known))
-        for name, least in (("runs", 2), ("tuning_runs", 1), ("sweep_runs", 2), ("bootstrap_draws", 2), ("seed", 0)):
+        for name, least in (
+            ("runs", 2),
+            ("tuning_runs", 1),
+            ("known_runs", 1),
+            ("sweep_runs", 2),
+            ("bootstrap_draws", 2),
+            ("seed", 0),
+        ):
             if getattr(self, name) < least:
                 raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
 

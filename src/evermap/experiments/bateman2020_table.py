@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from evermap.experiments.bateman2020_published import LIMIT, THESIS, TRIAL
-from evermap.experiments.bateman2020_scores import COMPARED, Row
+from evermap.experiments.bateman2020_scores import COMPARED, OWN, Row
 from evermap.experiments.bateman2020_settings import IN_THE_TABLE, LEARNED, OTHER_READINGS, READINGS, SUPPRESSION
 from evermap.experiments.markdown import markdown_table, number
 
@@ -34,7 +34,8 @@ def as_markdown(table: Mapping[str, Any]) -> str:
     if table["orderings"]:
         parts += ["### Orderings of the thesis", _orderings(table["orderings"])]
     for sensor in _distinct(rows, "sensor"):
-        parts += [f"### All worlds, {sensor}", _worlds([row for row in rows if row["sensor"] == sensor])]
+        own = [row for row in rows if row["sensor"] == sensor]
+        parts += [f"### All worlds, {sensor}", _worlds(own), _decisions(table), _worlds(own, OWN)]
     if table["sweep"]:
         parts += ["### What the parameters do that the thesis does not tell", _sweep(table)]
     return "\n\n".join(parts)
@@ -45,14 +46,17 @@ def _distinct(rows: Rows, key: str) -> list[Any]:
 
 
 def _expected(rows: Rows) -> str:
+    columns = list(rows[0]["measured"])
     lines = []
     for row in rows:
         form = _FORMS.get(row["metric"], "{:.3f}")
         bound = f"≤ {row['at_most']:g}" if "at_most" in row else f"≥ {row['at_least']:g}"
-        met = "–" if row["met"] is None else "yes" if row["met"] else "**no**"
-        what = f"`{LEARNED}`, {row['world']}, {row['sensor']}: {NAMES[row['metric']]}"
-        lines.append((what, bound, number(form, row["measured"]), met))
-    return markdown_table(("", "expected", "measured", "met"), lines)
+        cells = [
+            number(form, row["measured"][column]) + (" **no**" if row["met"][column] is False else "")
+            for column in columns
+        ]
+        lines.append((f"{row['world']}, {row['sensor']}: {NAMES[row['metric']]}", bound, *cells))
+    return markdown_table(("", "expected", *columns), lines)
 
 
 def _made(table: Mapping[str, Any]) -> str:
@@ -109,37 +113,42 @@ def _short(name: str) -> str:
     return name.replace(SUPPRESSION, "+s")
 
 
-def _worlds(rows: Rows) -> str:
-    header = (
-        "world",
-        "filter",
-        "accuracy",
-        "MES/S",
-        "Brier score",
-        "precision",
-        "recall",
-        "delay, mean [looks]",
-        "delay, 95 % [looks]",
-        "never removed",
-        "calibration error",
-    )
-    lines = [
-        (
-            row["world"],
-            f"`{row['filter']}`",
-            _value(row, "accuracy"),
-            _value(row, "survival_ratio"),
-            _value(row, "brier", "{:.4f}"),
-            number("{:.3f}", row["precision"]),
-            number("{:.3f}", row["recall"]),
-            _value(row, "delay_mean", "{:.1f}"),
-            number("{:.0f}", row["delay_p95"]),
-            f"{row['never_removed']:.0f} of {row['vanished']:.0f}",
-            number("{:.3f}", row["calibration_error"]),
-        )
-        for row in rows
-    ]
-    return markdown_table(header, lines, words=(0, 1))
+def _decisions(table: Mapping[str, Any]) -> str:
+    assumed = table["settings"]["filters"]
+    high, low = assumed["own_rho_high"], assumed["own_rho_low"]
+    return f"The same beliefs taken for what they say: used from {high:g} on, removed below {low:g}."
+
+
+_FORM_OF_SCORE = {
+    "accuracy": ("accuracy", "{:.3f}"),
+    "survival_ratio": ("MES/S", "{:.3f}"),
+    "brier": ("Brier score", "{:.4f}"),
+    "precision": ("precision", "{:.3f}"),
+    "recall": ("recall", "{:.3f}"),
+    "delay_mean": ("delay, mean [looks]", "{:.1f}"),
+    "delay_p95": ("delay, 95 % [looks]", "{:.0f}"),
+}
+_WITH_ERROR = ("accuracy", "survival_ratio", "brier", "delay_mean")
+
+
+def _worlds(rows: Rows, decisions: str = "") -> str:
+    """All scores by the thesis' decisions, or those that depend on them by the own ones."""
+    scores = {name: form for name, form in _FORM_OF_SCORE.items() if not decisions or name != "brier"}
+    lines = []
+    for row in rows:
+        cells = []
+        for name, (_, form) in scores.items():
+            cells.append((_value if name in _WITH_ERROR else _plain)(row, decisions + name, form))
+        cells.append(f"{row[f'{decisions}never_removed']:.0f} of {row[f'{decisions}vanished']:.0f}")
+        if not decisions:
+            cells.append(number("{:.3f}", row["calibration_error"]))
+        lines.append((row["world"], f"`{row['filter']}`", *cells))
+    header = ["world", "filter", *(title for title, _ in scores.values()), "never removed"]
+    return markdown_table((*header, *([] if decisions else ["calibration error"])), lines, words=(0, 1))
+
+
+def _plain(row: Row, metric: str, form: str) -> str:
+    return number(form, row[metric])
 
 
 def _sweep(table: Mapping[str, Any]) -> str:
