@@ -167,10 +167,10 @@ def draw_calibration(scored: Sequence[Scored]) -> Figure | None:
         return None
     sensors = list(dict.fromkeys(one.row["sensor"] for one in shown))
     worlds = list(dict.fromkeys(one.row["world"] for one in shown))
-    across = min(3, len(worlds))
+    across = min(4, len(worlds))
     down = -(-len(worlds) // across)
     with house_style():
-        figure = new_figure(2.4 * across + 0.3, 2.3 * down * len(sensors) + 0.5)
+        figure = new_figure(1.85 * across + 0.3, 1.95 * down * len(sensors) + 0.5)
         panels = figure.subplots(down * len(sensors), across, sharex=True, sharey=True, squeeze=False)
         for axes in panels.flat:
             axes.set_visible(False)
@@ -182,9 +182,10 @@ def draw_calibration(scored: Sequence[Scored]) -> Figure | None:
                 for one in shown:
                     if (one.row["sensor"], one.row["world"]) == (sensor, world):
                         _draw_bins(axes, one)
-                axes.set(xlim=(-0.03, 1.03), ylim=(-0.04, 1.04), title=f"{sensor}, {world}")
-        for axes in panels[:, 0]:
-            axes.set_ylabel("truly there [1]")
+                axes.tick_params(labelbottom=True)
+                axes.set(xlim=(-0.03, 1.03), ylim=(-0.04, 1.04), title=world, aspect="equal")
+        for row, axes in enumerate(panels[:, 0]):
+            axes.set_ylabel(f"{sensors[row // down]}: truly there [1]")
         for axes in panels[-1]:
             axes.set_xlabel("P(there) [1]")
         known: dict[str, Any] = {}
