@@ -18,7 +18,7 @@ NAMES = {
     "brier": "Brier score",
     "delay_mean": "mean delay [looks]",
 }
-_FORMS = {"brier": "{:.4f}", "delay_mean": "{:.1f}"}
+_FORMS_OF_PROMISES = {"accuracy": "{:.4f}", "brier": "{:.4f}", "delay_mean": "{:.1f}"}
 
 
 def as_markdown(table: Mapping[str, Any]) -> str:
@@ -49,7 +49,7 @@ def _expected(rows: Rows) -> str:
     columns = list(rows[0]["measured"])
     lines = []
     for row in rows:
-        form = _FORMS.get(row["metric"], "{:.3f}")
+        form = _FORMS_OF_PROMISES.get(row["metric"], "{:.3f}")
         bound = f"≤ {row['at_most']:g}" if "at_most" in row else f"≥ {row['at_least']:g}"
         cells = [
             number(form, row["measured"][column]) + (" **no**" if row["met"][column] is False else "")
