@@ -7,9 +7,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 OUT ?= out/demo
-# Tests run in this many processes, a file of tests in one of them.
+# Tests run in this many processes, a file of tests in one of them. Their matrices are small: more threads of BLAS than
+# cores only wait for each other.
 PROCESSES ?= 2
-PYTEST = $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist loadfile
+PYTEST = OPENBLAS_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist loadfile
 PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development
