@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import functools
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -52,6 +51,11 @@ def _keeper() -> Callable[[Any], Any]:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such lock: processes there do as numba alone has them do
+        yield
+        return
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "machine-code.lock").open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # until the file is closed
