@@ -36,6 +36,7 @@ _REMOVING = {
     WARM: (ESTIMATE, "--"),
 }
 _REMOVED_IN = {NOMINAL, "angle60", "occlusion"}
+_DELAYS = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _FEWEST = 30
 """Beliefs in a bin below which its share says nothing."""
 _LOGARITHMIC = {"prior_mean_steps", "p_false", "rho_low"}
@@ -105,7 +106,9 @@ def draw_removals(scored: Sequence[Scored], settings: Settings) -> Figure | None
             axes.set_visible(False)
         for axes, where in zip(panels.flat, panels_of, strict=False):
             axes.set_visible(True)
-            axes.set(title=", ".join(where), xscale="log", ylim=(-0.03, 1.04))
+            axes.set(title=", ".join(where), xscale="log", xlim=(1.5, 120.0), ylim=(-0.03, 1.04))
+            axes.set_xticks(_DELAYS, [f"{delay:g}" for delay in _DELAYS])
+            axes.minorticks_off()
             for one in shown:
                 if (one.row["sensor"], one.row["world"]) == where:
                     colour, dashes = _REMOVING[one.row["filter"]]
