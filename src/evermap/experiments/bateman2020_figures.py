@@ -12,7 +12,7 @@ import numpy as np
 from evermap.experiments.bateman2020_learned import learned_beliefs
 from evermap.experiments.bateman2020_runs import simulate
 from evermap.experiments.bateman2020_scores import COMPARED, Row, Scored
-from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL, ORACLE, SUPPRESSION, TUNED, WARM
+from evermap.experiments.bateman2020_settings import LEARNED, NOMINAL, ORACLE, REMOVING, SUPPRESSION, TUNED
 from evermap.experiments.bateman2020_table import NAMES, title
 from evermap.sensing.profile import Profile, facing_middles, range_middles
 from evermap.survival import Exponential
@@ -28,13 +28,9 @@ if TYPE_CHECKING:
 _COLUMNS = 4
 _COLOURS = {"iff": ODOMETRY, "jff": MUTED, "jcf": LANDMARK, "jcfr": ESTIMATE}
 _CALIBRATED = {"jcf" + SUPPRESSION: MUTED, TUNED: ODOMETRY, ORACLE: INK, LEARNED: ESTIMATE}
-_REMOVING = {
-    "jcfr" + SUPPRESSION: (MUTED, "-"),
-    TUNED: (ODOMETRY, "-"),
-    ORACLE: (INK, "-"),
-    LEARNED: (ESTIMATE, "-"),
-    WARM: (ESTIMATE, "--"),
-}
+_REMOVING = dict(
+    zip(REMOVING, ((MUTED, "-"), (ODOMETRY, "-"), (INK, "-"), (ESTIMATE, "-"), (ESTIMATE, "--")), strict=True)
+)
 _REMOVED_IN = {NOMINAL, "angle60", "occlusion"}
 _DELAYS = (2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _FEWEST = 30

@@ -15,6 +15,7 @@ from evermap.experiments.bateman2020_runs import TUNING, Stack, miss_rate, simul
 from evermap.experiments.bateman2020_settings import (
     IN_THE_TABLE,
     NOMINAL,
+    REMOVING,
     SUPPRESSION,
     WARM,
     FilterSettings,
@@ -50,7 +51,7 @@ class Scored:
         row: world, sensor, filter, and every score with its standard error.
         draws: (B,) those of `COMPARED`, of resampled runs: the same runs for all filters of a stack.
         reliability: of the beliefs in possible detections.
-        removal: (B, 3) `rho_low`, mean delay and MES/S: what is paid for what, by whoever decides.
+        removal: (B, 3) `rho_low`, mean delay and MES/S of those of `REMOVING`: what is paid for what.
     """
 
     row: Row
@@ -110,7 +111,7 @@ def score_world(
         done()
         at = {"world": world, "sensor": sensor, "filter": name}
         own = _own_decisions(belief, clique, stack, settings)
-        curve = _removal_curve(belief, clique, stack)
+        curve = _removal_curve(belief, clique, stack) if name in REMOVING else np.empty((0, 3))
         yield Scored(at | row | own | {"calibration_error": _known(bins.error)}, drawn, bins, curve)
 
 

@@ -28,6 +28,8 @@ OTHER_READINGS = tuple(name + tail for name in ("iff-observable", "jff-mixture")
 """Of what the thesis leaves open about its baselines."""
 TUNED, ORACLE, LEARNED, WARM = "jcf-tuned", "oracle", "learned", "learned-warm"
 BEYOND = (TUNED, TUNED + SUPPRESSION, ORACLE, LEARNED, WARM)
+REMOVING = ("jcfr" + SUPPRESSION, TUNED, ORACLE, LEARNED, WARM)
+"""Whose removals are drawn over the threshold."""
 IN_ALL_WORLDS = ("jcf" + SUPPRESSION, "jcfr" + SUPPRESSION, *BEYOND)
 FILTERS = (*IN_THE_TABLE, *OTHER_READINGS, *BEYOND)
 
