@@ -1,0 +1,46 @@
+"""What is no table of lifetimes is refused, with row and field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from evermap.errors import DataError
+from evermap.survival.censored import CensoredLifetimes
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (dict(left_s=[1, 3], right_s=[2, 2]), "right_s.*before its left_s.*row 1"),
+        (dict(left_s=[1, -1], right_s=[2, 2]), "left_s.*row 1"),
+        (dict(left_s=[INF], right_s=[INF]), "left_s.*finite.*row 0"),
+        (dict(left_s=[NAN], right_s=[2]), "left_s.*nan, row 0"),
+        (dict(left_s=[1], right_s=[NAN]), "right_s.*nan, row 0"),
+        (dict(left_s=[0], right_s=[0]), "right_s.*positive.*row 0"),
+        (dict(left_s=[1, 2], right_s=[1, 2], entry_s=[0.5, 2]), "entry_s.*after its right_s.*row 1"),
+        (dict(left_s=[1], right_s=[2], entry_s=[-1]), "entry_s.*row 0"),
+        (dict(left_s=[1], right_s=[2], entry_s=[NAN]), "entry_s.*row 0"),
+        (dict(left_s=[1, 2], right_s=[1, 2], weight=[1, -1]), "weight.*row 1"),
+        (dict(left_s=[1, 2], right_s=[1, 2], weight=[1, INF]), "weight.*row 1"),
+        (dict(left_s=[1, 2], right_s=[1, 2], weight=[0, 0]), "weight.*all weights are 0"),
+        (dict(left_s=[1, 2], right_s=[1]), "right_s.*as long as"),
+        (dict(left_s=[1, 2], right_s=[1, 2], weight=[1, 2, 3]), "weight.*as long as"),
+        (dict(left_s=[[1, 2]], right_s=[[1, 2]]), "left_s.*one dimension"),
+        (dict(left_s=[], right_s=[]), "no lifetimes"),
+    ],
+)
+def test_mistakes(columns: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        CensoredLifetimes.of(**columns)
+
+
+def test_defaults_and_kinds() -> None:
+    data = CensoredLifetimes.of([1, 0, 2, 3], [1, 2, INF, 4])
+    np.testing.assert_array_equal(data.exact, [True, False, False, False])
+    np.testing.assert_array_equal(data.entry_s, np.zeros(4))
+    np.testing.assert_array_equal(data.weight, np.ones(4))
