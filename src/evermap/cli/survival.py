@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.fit import fit
+from evermap.cli.learn import learn
 from evermap.cli.picture import check_picture, write_picture
 from evermap.cli.terminal import print_json, print_table, say
 from evermap.errors import ConfigError
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from evermap.survival import LifetimePrior
 
 app = typer.Typer(name="survival", help="How long features stay.", no_args_is_help=True, rich_markup_mode=None)
-app.command("fit")(fit)
+app.command("learn")(learn)
 
 
 @app.command("plot")

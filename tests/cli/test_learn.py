@@ -1,4 +1,4 @@
-"""`evermap survival fit`: a model learned from a table, kept in a file, and used by `evermap persist`."""
+"""`evermap survival learn`: a model learned from a table, kept in a file, and used by `evermap persist`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, kind, present in (("cart", "vehicle", cart), ("wall", "wall", np.ones(len(time_s), dtype=int))):
         seen = np.where(rng.random(len(time_s)) < P_ERROR, 1 - present, present)
         lines += [f"{t},{name},{kind},{d}" for t, d in zip(time_s, seen, strict=True)]
-    path = tmp_path_factory.mktemp("fit") / "looks.csv"
+    path = tmp_path_factory.mktemp("learn") / "looks.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -43,7 +43,7 @@ def errors() -> tuple[str, ...]:
 
 
 def test_rates_of_a_cart_and_of_a_wall(table: Path, tmp_path: Path) -> None:
-    result = run("survival", "fit", table, "--recurrent", "two-state", *errors(), "--out", tmp_path / "m.json")
+    result = run("survival", "learn", table, "--recurrent", "two-state", *errors(), "--out", tmp_path / "m.json")
     assert result.exit_code == 0, result.stderr
     data = json.loads((tmp_path / "m.json").read_text())
     assert data["per"] == "class"
@@ -59,7 +59,7 @@ def test_rates_of_a_cart_and_of_a_wall(table: Path, tmp_path: Path) -> None:
 
 def test_persist_uses_the_model_of_each_class(table: Path, tmp_path: Path) -> None:
     model, out = tmp_path / "m.json", tmp_path / "out"
-    assert run("survival", "fit", table, "--recurrent", "two-state", *errors(), "--out", model).exit_code == 0
+    assert run("survival", "learn", table, "--recurrent", "two-state", *errors(), "--out", model).exit_code == 0
     result = run("persist", table, "--model", model, *errors(), "--out", out, "--figures", "0")
     assert result.exit_code == 0, result.stderr
     rows = np.genfromtxt(table, delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -75,7 +75,7 @@ def test_persist_uses_the_model_of_each_class(table: Path, tmp_path: Path) -> No
 
 def test_what_is_printed_for_machines(table: Path, tmp_path: Path) -> None:
     result = run(
-        "survival", "fit", table, "--recurrent", "two-state", "--per", "all", "--out", tmp_path / "m.json", "--json",
+        "survival", "learn", table, "--recurrent", "two-state", "--per", "all", "--out", tmp_path / "m.json", "--json",
         "--figure", tmp_path / "m.png",
     )  # fmt: skip
     content = json.loads(result.stdout)
@@ -96,7 +96,7 @@ def test_what_is_printed_for_machines(table: Path, tmp_path: Path) -> None:
 def test_wrong_choices_are_one_line_and_write_nothing(
     table: Path, tmp_path: Path, options: tuple[str, ...], message: str
 ) -> None:
-    result = run("survival", "fit", table, *options, "--out", tmp_path / "m.json")
+    result = run("survival", "learn", table, *options, "--out", tmp_path / "m.json")
     assert result.exit_code == 2
     assert message in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
@@ -105,7 +105,7 @@ def test_wrong_choices_are_one_line_and_write_nothing(
 
 def test_a_model_that_lacks_a_feature_says_which(table: Path, tmp_path: Path) -> None:
     model = tmp_path / "m.json"
-    assert run("survival", "fit", table, "--recurrent", "two-state", "--out", model).exit_code == 0
+    assert run("survival", "learn", table, "--recurrent", "two-state", "--out", model).exit_code == 0
     other = tmp_path / "other.csv"
     other.write_text("stamp_s,feature_id,class_id,detected\n0,tree,plant,1\n1,tree,plant,1\n")
     result = run("persist", other, "--model", model, "--out", tmp_path / "out")

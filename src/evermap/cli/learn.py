@@ -1,4 +1,4 @@
-"""`evermap survival fit`: how features come and go, learned from a table of looks and kept in a file."""
+"""`evermap survival learn`: how features come and go, learned from a table of looks and kept in a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from evermap.recurrence.choose import Choice
 
 
-def fit(
+def learn(
     table_path: Annotated[
         Path, typer.Argument(metavar="INPUT", help="Table of looks, as `evermap persist` reads it.", show_default=False)
     ],
@@ -38,7 +38,7 @@ def fit(
 
     \b
     Example:
-      evermap survival fit looks.csv --out model.json --figure model.png
+      evermap survival learn looks.csv --out model.json --figure model.png
       evermap persist tomorrow.csv --model model.json
     """
     if figure is not None:
