@@ -19,6 +19,7 @@ from evermap.survival import (
     Mixture,
     PeriodicHazard,
     PiecewiseConstantHazard,
+    StepLifetime,
     Uniform,
     Weibull,
     gone_by_day,
@@ -26,6 +27,7 @@ from evermap.survival import (
     never_leaves,
     parse_prior,
 )
+from evermap.survival.as_text import prior_text
 from evermap.survival.durations import UNITS_S, duration_text, parse_duration_s, parse_hour, parse_rate_hz
 from evermap.survival.text import FORMS
 
@@ -49,6 +51,10 @@ DAY_S = 86400.0
         ("gone-overnight:p=0.3,seen=1,night=22..5:15", gone_overnight(0.3, first_seen_hour=1, night_hours=(22, 5.25))),
         ("gone-by-day:p=.2,seen=9,day=7:30..19", gone_by_day(0.2, first_seen_hour=9, day_hours=(7.5, 19))),
         ("hazard:0s=1/d,3d=0.01/d", PiecewiseConstantHazard((0, 3 * DAY_S), (1 / DAY_S, 0.01 / DAY_S))),
+        (
+            "mass:0s..1h=0.3,2d=0.5,never=0.2",
+            StepLifetime((0.0, 2 * DAY_S, math.inf), (3600.0, 2 * DAY_S, math.inf), (0.3, 0.5, 0.2)),
+        ),
         ("periodic:period=1s,0s=2/s,0.5s=0/s", PeriodicHazard(1, (0, 0.5), (2, 0))),
         ("periodic:period=1w,start=2d,0s=1/w", PeriodicHazard(7 * DAY_S, (0,), (1 / (7 * DAY_S),), start_s=2 * DAY_S)),
         (
@@ -65,6 +71,21 @@ def test_text_stands_for_its_prior(text: str, prior: LifetimePrior) -> None:
 def test_every_form_shows_an_example_of_itself(name: str) -> None:
     assert FORMS[name].example.startswith(name)
     assert isinstance(parse_prior(FORMS[name].example), LifetimePrior)
+
+
+@pytest.mark.parametrize("name", [name for name in FORMS if name not in {"periodic", "gone-overnight", "gone-by-day"}])
+def test_what_is_written_is_read_as_the_same_prior(name: str) -> None:
+    prior = parse_prior(FORMS[name].example)
+    written = parse_prior(prior_text(Mixture((prior, Exponential(1e-17 / 3)), (0.1, 0.9))))
+    assert isinstance(written, Mixture)
+    age_s = np.geomspace(1e-3, 1e9, 50)
+    np.testing.assert_allclose(written.components[0].log_survival(age_s), prior.log_survival(age_s), rtol=1e-12)
+    assert written.components[1] == Exponential(1e-17 / 3)
+
+
+def test_what_has_no_words_says_so() -> None:
+    with pytest.raises(ConfigError, match="PeriodicHazard cannot be written"):
+        prior_text(parse_prior(FORMS["periodic"].example))
 
 
 @given(

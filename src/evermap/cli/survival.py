@@ -52,6 +52,7 @@ def plot(
       gone-overnight:p=0.3,seen=10:00,night=20:00..6:00   a night takes 30 %, a day nothing; first seen at 10:00
       gone-by-day:p=0.3,seen=10:00,day=8:00..18:00        a day takes 30 %, a night nothing
       hazard:0s=1/d,3d=0.01/d                             a rate of 1 a day for 3 days, then 0.01 a day
+      mass:0s..1h=0.3,2d=0.5,never=0.2                    30 % leave within the first hour, 50 % after just 2 days
       periodic:period=1w,0s=0.2/d,5d=0/d,start=2d         a rate that repeats, here 5 days a week; first seen on day 2
     or a mixture of them:
       0.3*exponential:half-life=1h+0.7*never-leaves

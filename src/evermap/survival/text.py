@@ -7,6 +7,7 @@ A form is a name and, after a colon, values: `name:key=value,key=value`. Weighte
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -23,6 +24,7 @@ from evermap.survival.named import gone_by_day, gone_overnight, never_leaves, so
 from evermap.survival.periodic import PeriodicHazard
 from evermap.survival.piecewise import PiecewiseConstantHazard
 from evermap.survival.protocol import LifetimePrior
+from evermap.survival.step import StepLifetime
 from evermap.survival.uniform import Uniform
 from evermap.survival.weibull import Weibull
 
@@ -42,6 +44,7 @@ class Form:
         optional: keys that may be.
         bare: key whose value stands alone, without `key=`.
         steps: whether further keys are times at which a hazard begins.
+        spans: whether further keys are times, spans of time or `never`, with the share that leaves then.
     """
 
     example: str
@@ -51,6 +54,7 @@ class Form:
     optional: Mapping[str, Reader] = field(default_factory=dict)
     bare: str | None = None
     steps: bool = False
+    spans: bool = False
 
     @property
     def keys(self) -> dict[str, Reader]:
@@ -99,6 +103,7 @@ def _parse_form(text: str) -> LifetimePrior:
         raise ConfigError(f"no lifetime is called '{name}'", hint=_nearest(name, FORMS))
     values: dict[str, Any] = {}
     steps: list[tuple[float, float]] = []
+    spans: list[tuple[float, float, float]] = []
     for entry in filter(None, (item.strip() for item in body.split(","))):
         key, equals, value = (item.strip() for item in entry.partition("="))
         if not equals and form.bare is not None:
@@ -110,18 +115,34 @@ def _parse_form(text: str) -> LifetimePrior:
         if key in form.keys:
             values[key] = _read(form.keys[key], key, value)
         elif form.steps and key[:1].isdigit():
-            begin_s = 0.0 if re.fullmatch(r"0[a-z]*", key) else parse_duration_s(key)
-            steps.append((begin_s, _read(parse_rate_hz, key, value)))
+            steps.append((_time_s(key), _read(parse_rate_hz, key, value)))
+        elif form.spans and (key[:1].isdigit() or key == "never"):
+            spans.append((*_span_s(key), _read(parse_number, key, value)))
         else:
             raise ConfigError(f"{name} has no '{key}'", hint=_nearest(key, form.keys) if form.keys else form.example)
     missing = [key for key in form.needed if key not in values]
-    if missing or (form.steps and not steps):
-        raise ConfigError(f"needs {missing[0] if missing else 'rates'}", hint=form.example)
+    if missing or (form.steps and not steps) or (form.spans and not spans):
+        raise ConfigError(f"needs {missing[0] if missing else 'rates' if form.steps else 'shares'}", hint=form.example)
     if steps and steps[0][0] > 0.0:
         raise ConfigError("nothing is said of the time before the first rate", hint=form.example)
     if steps:
         values["edges_s"], values["rates"] = zip(*steps, strict=True)
+    if spans:
+        values["starts_s"], values["ends_s"], values["masses"] = zip(*spans, strict=True)
     return form.build(values)
+
+
+def _time_s(text: str) -> float:
+    """A duration, which may be 0."""
+    return 0.0 if re.fullmatch(r"0(\.0)?[a-z]*", text) else parse_duration_s(text)
+
+
+def _span_s(text: str) -> tuple[float, float]:
+    """Start and end of `1h..2h`, of `never`, and of a single time."""
+    if text == "never":
+        return math.inf, math.inf
+    start, dots, end = text.partition("..")
+    return _time_s(start), _time_s(end) if dots else _time_s(start)
 
 
 def _read(reader: Reader, key: str, value: str) -> Any:
@@ -237,6 +258,12 @@ FORMS: Mapping[str, Form] = {
         "a rate of 1 a day for 3 days, then 0.01 a day",
         lambda v: PiecewiseConstantHazard(v["edges_s"], v["rates"]),
         steps=True,
+    ),
+    "mass": Form(
+        "mass:0s..1h=0.3,2d=0.5,never=0.2",
+        "30 % leave within the first hour, 50 % after just 2 days",
+        lambda v: StepLifetime(v["starts_s"], v["ends_s"], v["masses"]),
+        spans=True,
     ),
     "periodic": Form(
         "periodic:period=1w,0s=0.2/d,5d=0/d,start=2d",
