@@ -1,0 +1,296 @@
+"""Lifetime models fitted to censored lifetimes by maximum likelihood (MATH.md section 6).
+
+A sample `left < T <= right`, known because `T > entry`, has the log likelihood
+
+    log q(entry, a) + log(1 - q(a, right))      a = max(left, entry); the second term only where right is finite
+    log p(T) - log S(entry)                     an exact one
+
+and a prior answers each term without cancellation, so any model that can be built from real numbers can be fitted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.errors import ConfigError, DataError, NumericalError
+from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.exponential import Exponential
+from evermap.survival.gamma import Gamma
+from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.lognormal import LogNormal
+from evermap.survival.mixture import Mixture
+from evermap.survival.named import never_leaves
+from evermap.survival.protocol import LifetimePrior
+from evermap.survival.weibull import Weibull
+from evermap.types import FloatArray
+
+_IMPOSSIBLE = 1e10
+"""Stands for an infinite mean of minus the log likelihood, which the search could not step back from."""
+_GRADIENT_STEP, _HESSIAN_STEP = 1e-5, 1e-3
+"""For central differences; parameters are logarithms, so these are relative changes."""
+_FARTHEST = 12.0
+"""How far from its start, in logarithms, a parameter is sought: what settles there has no maximum."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A family of lifetimes with P real parameters.
+
+    Attributes:
+        names: of the parameters, P words; times in seconds.
+        build: the prior with given (P,) parameters.
+        starts: where to search from, given a rough mean stay in seconds; the best maximum counts.
+    """
+
+    names: tuple[str, ...]
+    build: Callable[[FloatArray], LifetimePrior]
+    starts: Callable[[float], Sequence[Sequence[float]]]
+
+
+def _share(logit: float) -> float:
+    return 1.0 / (1.0 + math.exp(-logit))
+
+
+KINDS: Mapping[str, Kind] = {
+    "exponential": Kind(("log_rate",), lambda p: Exponential(math.exp(p[0])), lambda mean: [[-math.log(mean)]]),
+    "weibull": Kind(
+        ("log_scale_s", "log_shape"),
+        lambda p: Weibull(math.exp(p[0]), math.exp(p[1])),
+        lambda mean: [[math.log(mean), 0.0]],
+    ),
+    "lognormal": Kind(
+        ("mu", "log_sigma"),
+        lambda p: LogNormal(float(p[0]), math.exp(p[1])),
+        lambda mean: [[math.log(mean) - 0.5, 0.0]],
+    ),
+    "gamma": Kind(
+        ("log_scale_s", "log_shape"),
+        lambda p: Gamma(math.exp(p[0]), math.exp(p[1])),
+        lambda mean: [[math.log(mean), 0.0]],
+    ),
+    "general-purpose": Kind(
+        ("log_low", "log_decades"),
+        lambda p: GeneralPurpose(math.exp(p[0]), math.exp(p[0]) * 10.0 ** math.exp(p[1])),
+        lambda mean: [[-math.log(mean) - 1.0, 0.0]],
+    ),
+    "two-exponentials": Kind(
+        ("log_rate_of_first", "log_rate_of_second", "logit_share_of_first"),
+        lambda p: Mixture.of((Exponential(math.exp(p[0])), Exponential(math.exp(p[1]))), (_share(p[2]), _share(-p[2]))),
+        lambda mean: [
+            [math.log(ratio / mean), -math.log(2.0 * mean), logit] for ratio, logit in ((3.0, 0.0), (30.0, -1.0))
+        ],
+    ),
+    "some-never-leave": Kind(
+        ("log_rate", "logit_share_that_leaves"),
+        lambda p: Mixture.of((Exponential(math.exp(p[0])), never_leaves()), (_share(p[1]), _share(-p[1]))),
+        lambda mean: [[math.log(2.0 / mean), 0.0]],
+    ),
+}
+"""What can be fitted by name; a `Kind` of your own as well."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ParametricFit:
+    """The member of a family under which the samples are most probable.
+
+    Attributes:
+        kind: the family's name.
+        family: itself.
+        prior: its most probable member.
+        parameters: (P,) real numbers that it was built from, named by `names`.
+        covariance: (P, P) inverse of the observed information.
+        loglik: `sum w log P(left < T <= right | T > entry)`; densities in 1/s for exact samples.
+        n_samples: sum of the weights.
+    """
+
+    kind: str
+    family: Kind
+    prior: LifetimePrior
+    parameters: FloatArray
+    covariance: FloatArray
+    loglik: float
+    n_samples: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return self.family.names
+
+    @property
+    def n_parameters(self) -> int:
+        """How many numbers were fitted."""
+        return len(self.parameters)
+
+    @property
+    def standard_errors(self) -> FloatArray:
+        """(P,) of the parameters."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion, `2 P - 2 loglik`; smaller is better."""
+        return 2.0 * self.n_parameters - 2.0 * self.loglik
+
+    @property
+    def bic(self) -> float:
+        """The Bayesian criterion, `P log n - 2 loglik`."""
+        return self.n_parameters * math.log(self.n_samples) - 2.0 * self.loglik
+
+    def band(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper bound of `P(T > t)` at each time by itself, if the family is right.
+
+        By the delta method on the scale of `log(-log S)`, on which the bounds stay in [0, 1].
+
+        Raises:
+            ConfigError: `confidence` is not in (0, 1), or a time cannot be.
+        """
+        if not 0.0 < confidence < 1.0:
+            raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
+
+        def log_hazard(parameters: FloatArray) -> FloatArray:
+            with np.errstate(divide="ignore"):
+                return np.asarray(np.log(self.family.build(parameters).cumulative_hazard(t)))
+
+        middle = log_hazard(self.parameters)
+        with np.errstate(invalid="ignore"):
+            slopes = np.stack(
+                [
+                    (log_hazard(self.parameters + step) - log_hazard(self.parameters - step)) / (2.0 * _GRADIENT_STEP)
+                    for step in _GRADIENT_STEP * np.eye(self.n_parameters)
+                ]
+            )
+        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+        spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, self.covariance, slopes))
+        half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * spread
+        lower, upper = (np.exp(-np.exp(middle + sign * half_width)) for sign in (1.0, -1.0))
+        return lower[()], upper[()]
+
+
+def log_likelihood(prior: LifetimePrior, data: CensoredLifetimes) -> FloatArray:
+    """(N,) log probability of each sample, in 1/s for exact ones; weights are left to the caller."""
+    exact, ends = data.exact, np.isfinite(data.right_s)
+    since = np.maximum(data.left_s, data.entry_s)
+    result = np.asarray(prior.log_conditional_survival(np.where(exact, 0.0, data.entry_s), np.where(exact, 0.0, since)))
+    bounded = ends & ~exact
+    result[bounded] += prior.log_conditional_death(since[bounded], data.right_s[bounded])
+    result[exact] += prior.log_density(data.right_s[exact]) - prior.log_survival(data.entry_s[exact])
+    # -inf less -inf where even the entry is impossible
+    return np.where(np.isnan(result), -np.inf, result)
+
+
+def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
+    """Most probable parameters of one family.
+
+    Args:
+        kind: one of `KINDS`, by name or itself.
+        data: N samples; rows of weight 0 say nothing.
+
+    Raises:
+        ConfigError: no family has this name.
+        DataError: no lifetime has an end.
+        NumericalError: the likelihood has no maximum in this family, or one that a parameter makes no difference to.
+    """
+    name, family = _named(kind)
+    data = _counted(data)
+    total = float(data.weight.sum())
+
+    def cost(parameters: FloatArray) -> float:
+        try:
+            with np.errstate(all="ignore"):
+                value = -float(data.weight @ log_likelihood(family.build(parameters), data)) / total
+        except (ConfigError, OverflowError):  # parameters beyond what numbers can hold
+            return _IMPOSSIBLE
+        return min(_IMPOSSIBLE, value)  # which NaN is not less than either
+
+    found, least = min((_search(cost, np.array(s)) for s in family.starts(_rough_mean(data))), key=lambda r: r[1])
+    hessian = _hessian(cost, found)
+    if not (np.isfinite(found).all() and np.linalg.eigvalsh(hessian)[0] > 1e-7):
+        raise NumericalError(
+            f"the likelihood of these lifetimes has no clear maximum among '{name}' models",
+            field="kind",
+            hint="one with fewer parameters, as exponential, or more data",
+        )
+    covariance = np.asarray(np.linalg.inv(hessian)) / total
+    return ParametricFit(name, family, family.build(found), found, covariance, -least * total, total)
+
+
+def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)) -> ParametricFit:
+    """The family of least AIC among those whose likelihood has a maximum.
+
+    Raises:
+        ConfigError: no family to choose from, or one of unknown name.
+        DataError: no lifetime has an end.
+        NumericalError: none has a maximum.
+    """
+    if not kinds:
+        raise ConfigError("no kind of lifetime to choose from", field="kinds", hint=", ".join(KINDS))
+    fits, failures = [], []
+    for kind in kinds:
+        try:
+            fits.append(fit(kind, data))
+        except NumericalError as error:
+            failures.append(error)
+    if not fits:
+        raise failures[0]
+    return min(fits, key=lambda one: one.aic)
+
+
+def _named(kind: str | Kind) -> tuple[str, Kind]:
+    if isinstance(kind, Kind):
+        return "/".join(kind.names), kind
+    if kind not in KINDS:
+        raise ConfigError(f"no kind of lifetime is called '{kind}'", field="kind", hint=", ".join(KINDS))
+    return kind, KINDS[kind]
+
+
+def _counted(data: CensoredLifetimes) -> CensoredLifetimes:
+    """The rows that say something."""
+    rows = data.weight > 0.0
+    if not np.isfinite(data.right_s[rows]).any():
+        raise DataError(
+            "no lifetime has an end, so the longer the stays of a model the better it fits",
+            field="right_s",
+            hint="look again later, or state a prior in words",
+        )
+    return CensoredLifetimes(*(getattr(data, name)[rows] for name in CensoredLifetimes.__slots__))
+
+
+def _rough_mean(data: CensoredLifetimes) -> float:
+    """Time watched over ends seen; an end in an interval counts at its middle."""
+    ends = np.isfinite(data.right_s)
+    since = np.maximum(data.left_s, data.entry_s)
+    last = np.where(ends, 0.5 * (since + np.where(ends, data.right_s, 0.0)), since)
+    return float(data.weight @ (last - data.entry_s) / data.weight[ends].sum())
+
+
+def _search(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[FloatArray, float]:
+    """Least cost from one start; NaN where it lies at the end of what is searched."""
+    from scipy.optimize import minimize
+
+    limits: Any = [(value - _FARTHEST, value + _FARTHEST) for value in start]
+    options: Any = {"ftol": 1e-15, "gtol": 1e-9, "maxiter": 200}
+    result: Any = minimize(
+        cost, start, jac=lambda p: _gradient(cost, p), method="L-BFGS-B", bounds=limits, options=options
+    )
+    found, least = np.asarray(result.x), float(result.fun)
+    if least >= _IMPOSSIBLE or (np.abs(found - start) > _FARTHEST - 1e-3).any():
+        return np.full(len(start), np.nan), least
+    return found, least
+
+
+def _gradient(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
+    steps = _GRADIENT_STEP * np.eye(len(at))
+    return np.array([(cost(at + step) - cost(at - step)) / (2.0 * _GRADIENT_STEP) for step in steps])
+
+
+def _hessian(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
+    steps = _HESSIAN_STEP * np.eye(len(at))
+    rows = [[cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b) for b in steps] for a in steps]
+    return np.array(rows) / (4.0 * _HESSIAN_STEP**2)
