@@ -20,7 +20,7 @@ RULES = {
     "types": "",
     "se2": "types",
     "config": "errors types",
-    "survival": "errors types se2",
+    "survival": "errors types se2 compiled",
     "sensing": "errors types se2 compiled",
     "persistence": "errors types se2 compiled survival sensing",
     "recurrence": "errors types compiled survival persistence io",
