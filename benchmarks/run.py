@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, persistence, selectors
+from benchmarks import cliques, npmle, persistence, selectors
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -33,10 +33,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **persistence.METRICS,
     **selectors.METRICS,
     **cliques.METRICS,
+    **npmle.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -49,6 +50,7 @@ def run(
     n_features: int = persistence.N_FEATURES,
     seconds: float = persistence.SECONDS,
     n_cliques: int = cliques.N_CLIQUES,
+    n_lifetimes: int = npmle.N_LIFETIMES,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -57,6 +59,7 @@ def run(
         only: one of `PARTS`; all where None.
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
         n_features, seconds, n_cliques: the same for the persistence filter, and for the filters of cliques.
+        n_lifetimes: censored samples of each kind.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -83,6 +86,9 @@ def run(
         measured |= ratios
     if only in (None, "cliques"):
         ratios, shown["cliques"] = cliques.run(n_cliques, seconds)
+        measured |= ratios
+    if only in (None, "npmle"):
+        ratios, shown["npmle"] = npmle.run(n_lifetimes)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -163,6 +169,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", f"{shown['selectors']['n_looks']} looks at each of {selectors.N_LANDMARKS} landmarks: {took}"]
     if "cliques" in shown:
         lines += ["", cliques.as_text(shown["cliques"])]
+    if "npmle" in shown:
+        lines += ["", npmle.as_text(shown["npmle"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

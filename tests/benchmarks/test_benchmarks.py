@@ -17,6 +17,7 @@ from evermap.cli.bench import load_benchmarks
 from evermap.errors import InputError
 from evermap.persistence import single
 from evermap.survival import Exponential
+from evermap.survival.censored import CensoredLifetimes
 
 SMALL = 150
 
@@ -103,6 +104,17 @@ def test_filters_of_cliques_in_the_race_believe_the_same(run: ModuleType) -> Non
         alone = single.update(alone, n + 1.0, detected, run.cliques.P_MISS, run.cliques.P_FALSE)
         np.testing.assert_allclose(one_by_one(), alone.probability, atol=1e-9)
     assert np.ptp(ours()) > 5.0
+
+
+def test_lifetimes_of_the_race_are_as_probable_by_the_peer(run: ModuleType) -> None:
+    """Both survival functions at the ends of the cells, where they are determined."""
+    for draw in run.npmle.DATA.values():
+        left, right = draw(200, np.random.default_rng(1))
+        ours = run.npmle.npmle(CensoredLifetimes.of(left, right))
+        ends = ours.support_right[np.isfinite(ours.support_right)]
+        ends = ends[ends < ours.support_left[-1]]
+        theirs = run.npmle.by_surpyval(left, right).sf(ends, interp="step")
+        np.testing.assert_allclose(ours.survival(ends)[1], theirs, atol=1e-6)
 
 
 def test_learning_cliques_of_the_race_are_all_looked_at_and_learned_from(run: ModuleType) -> None:
@@ -194,7 +206,9 @@ def test_a_small_run_writes_compares_and_reports(
 ) -> None:
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
-    measured = run.run(update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01, n_cliques=50)
+    measured = run.run(
+        update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01, n_cliques=50, n_lifetimes=300
+    )
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)
     assert all(abs(row["change"]) < 1e-3 for row in measured["metrics"])

@@ -20,7 +20,7 @@ def bench(
     update_baseline: Annotated[
         bool, typer.Option("--update-baseline", help="Make these measurements the new baseline.")
     ] = False,
-    only: Annotated[str | None, typer.Option(help="Measure one part: slam, persistence, selectors or cliques.")] = None,
+    only: Annotated[str | None, typer.Option(help="Measure one part: slam, persistence, selectors, cliques or npmle.")] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
 
