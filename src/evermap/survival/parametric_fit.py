@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import NormalDist
 from typing import Any
 
@@ -276,9 +277,9 @@ def _search(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[Flo
 
     limits: Any = [(value - _FARTHEST, value + _FARTHEST) for value in start]
     options: Any = {"ftol": 1e-15, "gtol": 1e-9, "maxiter": 200}
-    result: Any = minimize(
-        cost, start, jac=lambda p: _gradient(cost, p), method="L-BFGS-B", bounds=limits, options=options
-    )
+    first: Any = start
+    slope: Any = partial(_gradient, cost)
+    result: Any = minimize(cost, first, jac=slope, method="L-BFGS-B", bounds=limits, options=options)
     found, least = np.asarray(result.x), float(result.fun)
     if least >= _IMPOSSIBLE or (np.abs(found - start) > _FARTHEST - 1e-3).any():
         return np.full(len(start), np.nan), least
