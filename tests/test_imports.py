@@ -24,7 +24,7 @@ RULES = {
     "sensing": "errors types se2 compiled",
     "persistence": "errors types se2 compiled survival sensing",
     "recurrence": "errors types compiled survival persistence io",
-    "tracking": "errors types se2 config survival sensing persistence recurrence",
+    "tracking": "errors types se2 compiled config survival sensing persistence recurrence",
     "slam": "errors types se2 compiled config survival sensing persistence recurrence",
     "maps": "errors types se2 config survival sensing persistence recurrence",
     "io": "errors types se2",
@@ -39,7 +39,8 @@ RULES = {
     "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
-    "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence server "
+    "objects": "errors types survival tracking io viz runsummary runfolder",
+    "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence objects server "
     "experiments demo",
 }
 

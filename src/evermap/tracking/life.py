@@ -1,0 +1,246 @@
+"""A frame in the life of the tracklets: what detections and misses do to filters, classes, beliefs and states.
+
+Belief is one number, as in the persistence filter (MATH.md section 2): inverse odds, multiplied by
+`p(detection | nobody known) / (P_D p(detection | it))` at a detection and by `1 / (1 - P_D)` at a miss. It confirms
+tracklets, and kills them; an object that cannot be seen (`P_D = 0`) loses nothing by not being seen.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evermap.tracking.assignment import NOBODY, assign
+from evermap.tracking.frame import EventTable, Frame, Rules, SpellTable
+from evermap.tracking.gating import NEVER_SURE, Evidence, candidates
+from evermap.tracking.kalman import update
+from evermap.tracking.kernels import kernel
+from evermap.tracking.rest import DISPLACED, displacement, end_spell, settle, start_rest
+from evermap.tracking.rows import noise_of, place_filter
+from evermap.tracking.tracklets import EventKind, Tracklets, TrackState
+from evermap.types import BoolArray, FloatArray, IntArray
+
+BIRTH, ALIVE, LOST = int(TrackState.BIRTH), int(TrackState.ALIVE), int(TrackState.LOST)
+WORKING_SET, DEAD = int(TrackState.WORKING_SET), int(TrackState.DEAD)
+EVENT_BORN, EVENT_LOST, EVENT_FOUND = int(EventKind.BORN), int(EventKind.LOST), int(EventKind.FOUND)
+EVENT_STORED, EVENT_DIED = int(EventKind.STORED), int(EventKind.DIED)
+NOTHING = -1
+MOST, LEAST = 1e30, 1e-12
+"""Bounds of inverse odds: however long an object was watched, a dozen misses may undo it."""
+
+
+@kernel
+def recognise(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray, memory: float) -> None:
+    """Class and appearance of tracklet `i` after detection `j`."""
+    detected = frame.class_id[j]
+    if detected >= 0:
+        total = 0.0
+        for c in range(t.class_p.shape[1]):
+            t.class_p[i, c] = max(t.class_p[i, c] * confusion[c, detected], 1e-12)  # nothing is ever out of question
+            total += t.class_p[i, c]
+        t.class_p[i] /= total
+    given = False
+    for k in range(t.appearance.shape[1]):
+        given |= frame.appearance[j, k] != 0.0
+    if given:
+        length = 0.0
+        kept = memory if np.any(t.appearance[i] != 0.0) else 0.0
+        for k in range(t.appearance.shape[1]):
+            t.appearance[i, k] = kept * t.appearance[i, k] + (1.0 - kept) * frame.appearance[j, k]
+            length += t.appearance[i, k] ** 2
+        t.appearance[i] /= max(math.sqrt(length), 1e-12)
+
+
+@kernel
+def live(
+    t: Tracklets,
+    n: int,
+    frame: Frame,
+    p_detect: FloatArray,
+    view_known: bool,
+    death_odds: float,
+    evidence: Evidence,
+    rules: Rules,
+    track_of_detection: IntArray,
+    events: EventTable,
+    spells: SpellTable,
+) -> tuple[int, int, int]:
+    """Give a frame's detections to the first `n` tracklets, which have been predicted to it, and draw the consequences.
+
+    Args:
+        t: changed in place.
+        n: rows in use.
+        frame: its detections.
+        p_detect: (N,) probability to detect each, if it is there.
+        view_known: whether that comes from a view; otherwise a confirmed object that is missed may be out of view.
+        death_odds: odds of having ceased to exist since the last frame, `(1 - q) / q`.
+        evidence: numbers of the settings.
+        rules: when states change.
+        track_of_detection: (M,) out, ids of those that have an object.
+        events: out.
+        spells: out, static spells that end now.
+
+    Returns:
+        How many events, how many static spells, and how many tracklets that are no longer active.
+    """
+    pairs = candidates(
+        t.mean,
+        t.covariance,
+        t.class_p,
+        t.appearance,
+        t.inverse_odds,
+        p_detect,
+        n,
+        frame.position,
+        frame.noise,
+        frame.class_id,
+        frame.appearance,
+        evidence,
+    )
+    chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
+    n_events, n_spells, n_gone = 0, 0, 0
+    for i in range(n):
+        predicted = t.inverse_odds[i] + (1.0 + t.inverse_odds[i]) * death_odds
+        if chosen[i] != NOBODY:
+            j = pairs.column[chosen[i]]
+            track_of_detection[j] = t.track_id[i]
+            gain = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0)) / max(p_detect[i], NEVER_SURE)
+            t.inverse_odds[i] = max(predicted * gain, LEAST)
+            update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
+            recognise(t, i, frame, j, evidence.confusion, rules.appearance_memory)
+            t.n_hits[i] += 1
+            t.n_missed[i] = 0
+            n_spells = settle(
+                t,
+                i,
+                frame.stamp_s,
+                frame.position[j],
+                noise_of(frame, j),
+                rules.class_speed_mps,
+                rules.rest_for_s,
+                spells,
+                n_spells,
+            )
+            if t.state[i] == LOST:
+                t.state[i] = ALIVE
+                events.kind[n_events], events.row[n_events] = EVENT_FOUND, i
+                n_events += 1
+            elif t.state[i] == BIRTH and t.n_hits[i] >= rules.warm_up and t.inverse_odds[i] <= rules.odds_confirm:
+                t.state[i] = ALIVE
+                events.kind[n_events], events.row[n_events] = EVENT_BORN, i
+                n_events += 1
+            continue
+        if view_known or t.state[i] == BIRTH:
+            t.inverse_odds[i] = min(predicted / max(1.0 - p_detect[i], 1e-12), MOST)
+        t.n_missed[i] += 1
+        what = NOTHING
+        if t.inverse_odds[i] > rules.odds_dead:
+            what = EVENT_DIED
+            if t.static[i] == 1 and t.state[i] != BIRTH:
+                n_spells = end_spell(t, i, frame.stamp_s, spells, n_spells)
+        elif t.n_missed[i] > rules.max_missed:
+            stays = t.state[i] != BIRTH and (t.static[i] == 1 or t.slow[i] == 1)
+            what = EVENT_STORED if stays else EVENT_DIED
+        elif t.state[i] == ALIVE and t.n_missed[i] >= rules.lost_after:
+            t.state[i], what = LOST, EVENT_LOST
+        if what in (EVENT_STORED, EVENT_DIED):
+            n_gone += 1
+            if t.state[i] == BIRTH:  # it never was anything
+                what = NOTHING
+            t.state[i] = WORKING_SET if what == EVENT_STORED else DEAD
+        if what != NOTHING:
+            events.kind[n_events], events.row[n_events] = what, i
+            n_events += 1
+    return n_events, n_spells, n_gone
+
+
+@kernel
+def match(
+    place: FloatArray,
+    covariance: FloatArray,
+    class_p: FloatArray,
+    appearance: FloatArray,
+    inverse_odds: FloatArray,
+    p_detect: FloatArray,
+    frame: Frame,
+    evidence: Evidence,
+) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+    """The best assignment of detections to K places of rest.
+
+    Returns:
+        (F,) places that have one, (F,) the detections, (F,) log-likelihood ratio of each to being of nobody known,
+        (F,) whether each is elsewhere than its place.
+    """
+    n = place.shape[0]
+    pairs = candidates(
+        place,
+        covariance,
+        class_p,
+        appearance,
+        inverse_odds,
+        p_detect,
+        n,
+        frame.position,
+        frame.noise,
+        frame.class_id,
+        frame.appearance,
+        evidence,
+    )
+    chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
+    found = np.flatnonzero(chosen != NOBODY)
+    pair = chosen[found]
+    detection = pairs.column[pair]
+    moved = np.empty(found.shape[0], dtype=np.bool_)
+    for k in range(found.shape[0]):
+        squared = displacement(
+            frame.position[detection[k]], noise_of(frame, detection[k]), place[found[k]], covariance[found[k]]
+        )
+        moved[k] = squared > DISPLACED
+    return found, detection, pairs.log_ratio[pair], moved
+
+
+@kernel
+def resume(
+    t: Tracklets,
+    n: int,
+    frame: Frame,
+    detection: IntArray,
+    moved: BoolArray,
+    confusion: FloatArray,
+    rules: Rules,
+    spells: SpellTable,
+) -> int:
+    """Follow again the objects behind row `n`, copied from the working set.
+
+    Args:
+        t: changed in place.
+        n: rows before the first of them.
+        frame: the frame in which they are found.
+        detection: (K,) what each is found by.
+        moved: (K,) whether that is elsewhere than it was left.
+        confusion: (C, C) `P(detected class | true class)`.
+        rules: when states change.
+        spells: out, static spells of those that moved.
+
+    Returns:
+        How many spells there are.
+    """
+    n_spells = 0
+    for k in range(detection.shape[0]):
+        i, j = n + k, detection[k]
+        if moved[k]:
+            if t.static[i] == 1:
+                n_spells = end_spell(t, i, frame.stamp_s, spells, n_spells)
+            t.elsewhere_s[i] = t.rest_seen_s[i]
+            start_rest(t, i, frame.stamp_s, frame.position[j], noise_of(frame, j))
+        else:
+            update(t.rest_mean[i], t.rest_covariance[i], frame.position[j], noise_of(frame, j))
+        t.state[i] = ALIVE
+        place_filter(t, i, frame.position[j], noise_of(frame, j), rules)
+        recognise(t, i, frame, j, confusion, rules.appearance_memory)
+        t.n_hits[i] += 1
+        t.n_missed[i] = 0
+        t.rest_seen_s[i] = frame.stamp_s
+        t.slow[i] = 1
+    return n_spells

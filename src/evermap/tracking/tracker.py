@@ -1,0 +1,339 @@
+"""The tracker (Bateman 2020, Algorithm 2), frame after frame; reads as the algorithm does.
+
+Predict; give the detections to the tracklets; give what is left to the working set; begin a tracklet with every
+detection that then remains; and let those die that should have been seen and were not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import ConfigError, InputError
+from evermap.survival import GeneralPurpose, LifetimePrior
+from evermap.tracking import detections
+from evermap.tracking.frame import EventTable, Frame, Rules, SpellTable
+from evermap.tracking.settings import TrackerSettings
+from evermap.tracking.spells import SpellLog, StaticSpells
+from evermap.tracking.tracklets import Event, EventKind, Followed, TrackState, grown, room_for
+from evermap.tracking.views import View, ViewMemory
+from evermap.tracking.working_set import WorkingSet
+from evermap.types import UNKNOWN, FloatArray, IntArray
+
+ROOM = 64
+FROM_MINUTES_TO_YEARS = (1e-8, 1e-2)
+"""Rates [1/s] of leaving a place, for objects of which nothing is known."""
+
+
+class Tracker:
+    """Follows objects in space, and finds them again where they were left.
+
+    Args:
+        settings: what is assumed about objects and their detector.
+        n_classes: number of classes.
+        confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
+        n_appearance: length of the appearance vectors that come with detections, 0 for none.
+        priors: lifetimes at rest, one for all classes or one a class; one that knows nothing where None.
+
+    Raises:
+        ConfigError: a matrix or priors that do not fit the classes.
+    """
+
+    def __init__(
+        self,
+        settings: TrackerSettings | None = None,
+        *,
+        n_classes: int = 1,
+        confusion: FloatArray | None = None,
+        n_appearance: int = 0,
+        priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
+    ) -> None:
+        from evermap.tracking import gating, kalman, life, rows
+
+        if n_classes < 1:
+            raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
+        self._gating, self._kalman, self._life, self._rows = gating, kalman, life, rows
+        self.settings = s = settings or TrackerSettings()
+        self._n_classes, self._n_appearance = n_classes, n_appearance
+        lifetimes = _as_priors(priors, n_classes)
+        self._evidence = gating.Evidence(
+            confusion=s.confusion_matrix(n_classes, confusion),
+            class_prior=np.full(n_classes, 1.0 / n_classes),
+            log_clutter=float(np.log(s.clutter_per_m3)),
+            gate=_chi_square_3(s.gate_probability),
+            appearance_nats=float(s.appearance_nats),
+            appearance_neutral=float(s.appearance_neutral),
+            moved_reach_m=0.0,
+            log_moved=-np.inf,
+        )
+        self._evidence_at_rest = self._evidence
+        if s.moved_reach_m > 0.0:
+            volume_m3 = 4.0 / 3.0 * np.pi * s.moved_reach_m**3
+            self._evidence_at_rest = self._evidence._replace(
+                moved_reach_m=float(s.moved_reach_m), log_moved=float(np.log(s.p_moved / volume_m3))
+            )
+        self._rules = Rules(
+            odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
+            odds_dead=(1.0 - s.p_dead) / s.p_dead,
+            warm_up=int(s.warm_up),
+            lost_after=int(s.lost_after),
+            max_missed=int(s.max_missed),
+            class_speed_mps=s.class_speeds(n_classes),
+            rest_for_s=float(s.rest_for_s),
+            appearance_memory=float(s.appearance_memory),
+            sigma_velocity_mps=float(s.sigma_velocity_mps),
+            sigma_acceleration_mps2=float(s.sigma_acceleration_mps2),
+            inverse_odds_new=(1.0 - s.p_real) / s.p_real,
+        )
+        self._noise = np.eye(3)[None] * s.sigma_position_m**2
+        self._tracklets = room_for(ROOM, s.order, n_classes, n_appearance)
+        self._n = 0
+        self._next_id = 0
+        self._stamp_s = -np.inf
+        self.working_set = WorkingSet(s.chunk_m, lifetimes, n_classes, n_appearance)
+        self._views = ViewMemory()
+        self._spells = SpellLog()
+        self._tables(ROOM)
+
+    def __len__(self) -> int:
+        """How many tracklets are active."""
+        return self._n
+
+    def step(
+        self,
+        stamp_s: float,
+        position_m: Any,
+        class_id: Any = None,
+        *,
+        covariance_m2: Any = None,
+        appearance: Any = None,
+        view: View | None = None,
+    ) -> tuple[IntArray, list[Event]]:
+        """Take in one frame, an empty one too.
+
+        Args:
+            stamp_s: when, after the frame before.
+            position_m: (M, 3) detected centroids, in the world.
+            class_id: (M,) detected classes, `UNKNOWN` for none; all unknown where None.
+            covariance_m2: (M, 3, 3) of the positions; the settings' noise where None.
+            appearance: (M, A) vectors of any length, zeros where there is none.
+            view: what can be seen. Without it all that is followed is in view, and nothing is learned about the
+                working set from what is not detected.
+
+        Returns:
+            (M,) ids of the objects that the detections are of, and what happened.
+
+        Raises:
+            InputError: time running back, or detections that are malformed.
+        """
+        frame = self._frame(stamp_s, position_m, class_id, covariance_m2, appearance)
+        events: list[Event] = []
+        self._predict(frame.stamp_s)
+        track_of_detection = self._associate(frame, view, events)
+        self._find_again(frame, view, track_of_detection, events)
+        self._begin(frame, track_of_detection)
+        if view is not None:
+            self._judge(frame.stamp_s, view, events)
+            self._views.add(frame.stamp_s, view)
+        return track_of_detection, events
+
+    def followed(self) -> Followed:
+        """The active tracklets after the last frame."""
+        t, n = self._tracklets, self._n
+        return Followed(
+            stamp_s=self._stamp_s,
+            track_id=t.track_id[:n].copy(),
+            state=t.state[:n].copy(),
+            position_m=t.mean[:n, :3].copy(),
+            velocity_mps=t.mean[:n, 3:6].copy(),
+            position_covariance_m2=t.covariance[:n, :3, :3].copy(),
+            velocity_covariance_m2ps2=t.covariance[:n, 3:6, 3:6].copy(),
+            class_p=t.class_p[:n].copy(),
+            p_exists=1.0 / (1.0 + t.inverse_odds[:n]),
+            n_missed=t.n_missed[:n].copy(),
+            static=t.static[:n] == 1,
+        )
+
+    def static_spells(self) -> StaticSpells:
+        """All static spells so far: those that have ended, and those that go on, whose end is open."""
+        return self._spells.with_open(self._tracklets, self._n, self.working_set)
+
+    def _frame(self, stamp_s: Any, position_m: Any, class_id: Any, covariance_m2: Any, appearance: Any) -> Frame:
+        stamp = float(stamp_s)
+        if not (stamp > self._stamp_s and stamp < np.inf):
+            raise InputError(
+                f"frame at {stamp_s} s does not come after the one at {self._stamp_s} s",
+                field="stamp_s",
+                hint="frames in the order of their stamps, all detections of one instant in one frame",
+            )
+        position = detections.positions(position_m)
+        m = len(position)
+        return Frame(
+            stamp_s=stamp,
+            position=position,
+            noise=detections.covariances(covariance_m2, m, self._noise),
+            class_id=detections.classes(class_id, m, self._n_classes),
+            appearance=detections.appearances(appearance, m, self._n_appearance),
+        )
+
+    def _predict(self, stamp_s: float) -> None:
+        """Move all filters on to the frame."""
+        gap = stamp_s - self._stamp_s if self._n else 0.0
+        self._stamp_s = stamp_s
+        t = self._tracklets
+        self._kalman.predict(t.mean, t.covariance, self._n, gap, self.settings.motion_density)
+        self._death_odds = float(np.expm1(min(self.settings.vanish_rate_hz * gap, 600.0)))
+
+    def _associate(self, frame: Frame, view: View | None, events: list[Event]) -> IntArray:
+        """Detections to tracklets, with all consequences; (M,) ids, `UNKNOWN` where nobody had a detection."""
+        t, n = self._tracklets, self._n
+        p_detect = np.full(n, self.settings.p_detect) if view is None else view.probability(t.mean[:n, :3])
+        track_of_detection = np.full(len(frame.position), UNKNOWN)
+        table, spells = self._event_table, self._spell_table
+        n_events, n_spells, n_gone = self._life.live(
+            t, n, frame, p_detect, view is not None, self._death_odds, self._evidence, self._rules,
+            track_of_detection, table, spells,
+        )  # fmt: skip
+        for kind, row in zip(table.kind[:n_events].tolist(), table.row[:n_events].tolist(), strict=True):
+            events.append(Event(frame.stamp_s, EventKind(kind), int(t.track_id[row])))
+            if kind == EventKind.BORN and np.isneginf(t.elsewhere_s[row]):
+                t.elsewhere_s[row] = self._views.last_empty_s(t.rest_mean[row], float(t.first_s[row]))
+        self._spells.add(self._spell_table, n_spells)
+        if n_gone:
+            leaving = np.flatnonzero(t.state[:n] == TrackState.WORKING_SET)
+            if len(leaving):
+                self.working_set.insert(t, leaving, frame.stamp_s)
+            self._n = self._rows.sweep(t, n)
+        return track_of_detection
+
+    def _find_again(self, frame: Frame, view: View | None, track_of_detection: IntArray, events: list[Event]) -> None:
+        """Detections that nobody had to objects of the working set, which are active again then."""
+        w, s = self.working_set, self.settings
+        free = np.flatnonzero(track_of_detection == UNKNOWN)
+        if len(w) == 0 or len(free) == 0:
+            return
+        place_m2 = s.place_sigma_m**2
+        position = frame.position[free]
+        noise = frame.noise if len(frame.noise) == 1 else frame.noise[free]
+        widest = noise[:, [0, 1, 2], [0, 1, 2]].max(axis=1) + w.widest_m2 + place_m2
+        reach = np.maximum(np.sqrt(3.0 * self._evidence.gate * widest), s.moved_reach_m)
+        reach = np.broadcast_to(reach, len(free))
+        rows = w.near(position, np.ascontiguousarray(reach))
+        if len(rows) == 0:
+            return
+        covariance = w.covariance(rows)
+        covariance[:, [0, 1, 2], [0, 1, 2]] += place_m2
+        place = w.stored.position[rows]
+        p_detect = np.full(len(rows), s.p_detect) if view is None else view.probability(place)
+        found, detection, log_ratio, moved = self._life.match(
+            place,
+            covariance,
+            w.class_p(rows),
+            w.stored.appearance[rows].astype(np.float64),
+            w.inverse_odds(rows, frame.stamp_s),
+            p_detect,
+            frame._replace(
+                position=position,
+                noise=np.ascontiguousarray(noise),
+                class_id=frame.class_id[free],
+                appearance=frame.appearance[free],
+            ),
+            self._evidence_at_rest,
+        )
+        if len(found) == 0:
+            return
+        self._reserve(self._n + len(found))
+        t, n = self._tracklets, self._n
+        self._wake(rows[found], covariance[found], p_detect[found], log_ratio, frame.stamp_s)
+        n_spells = self._life.resume(
+            t, n, frame, free[detection], moved, self._evidence.confusion, self._rules, self._spell_table
+        )
+        self._spells.add(self._spell_table, n_spells)
+        self._n = n + len(found)
+        track_of_detection[free[detection]] = t.track_id[n : self._n]
+        events.extend(Event(frame.stamp_s, EventKind.REIDENTIFIED, int(i)) for i in t.track_id[n : self._n])
+        w.remove(rows[found])
+
+    def _wake(
+        self, rows: IntArray, covariance: FloatArray, p_detect: FloatArray, log_ratio: FloatArray, stamp_s: float
+    ) -> None:
+        """Copy objects of the working set behind the active tracklets, as they were."""
+        t, w = self._tracklets, self.working_set
+        into = slice(self._n, self._n + len(rows))
+        gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self._gating.NEVER_SURE)
+        t.track_id[into] = w.stored.track_id[rows]
+        t.class_p[into] = w.class_p(rows)
+        t.appearance[into] = w.stored.appearance[rows]
+        t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._life.LEAST)
+        t.n_hits[into] = w.stored.n_hits[rows]
+        t.first_s[into] = w.stored.first_s[rows]
+        t.rest_seen_s[into] = w.stored.rest_seen_s[rows]
+        t.rest_mean[into] = w.stored.position[rows]
+        t.rest_covariance[into] = covariance
+        t.rest_since_s[into] = w.stored.rest_since_s[rows]
+        t.elsewhere_s[into] = w.stored.elsewhere_s[rows]
+        t.static[into] = w.stored.static[rows]
+
+    def _begin(self, frame: Frame, track_of_detection: IntArray) -> None:
+        """A new tracklet for every detection that nobody had, in the order of their places."""
+        free = np.flatnonzero(track_of_detection == UNKNOWN)
+        if len(free) == 0:
+            return
+        free = free[np.lexsort(frame.position[free].T)]
+        self._reserve(self._n + len(free))
+        self._rows.start_all(
+            self._tracklets, self._n, self._next_id, frame, free, self._evidence.confusion, self._rules,
+            track_of_detection,
+        )  # fmt: skip
+        self._n += len(free)
+        self._next_id += len(free)
+
+    def _judge(self, stamp_s: float, view: View, events: list[Event]) -> None:
+        """Objects of the working set that should have been seen, and were not."""
+        w = self.working_set
+        if len(w) == 0:
+            return
+        rows = w.near(view.centre_m[None], np.array([view.reach_m]))
+        rows = rows[stamp_s - w.stored.judged_s[rows] >= self.settings.judge_every_s]
+        p_detect = view.probability(w.stored.position[rows])
+        rows, p_detect = rows[p_detect > 0.0], p_detect[p_detect > 0.0]
+        if len(rows) == 0:
+            return
+        gone = rows[w.missed(rows, stamp_s, p_detect) > self._rules.odds_dead]
+        if len(gone):
+            events.extend(Event(stamp_s, EventKind.DIED, track) for track in w.stored.track_id[gone].tolist())
+            self._spells.add_stored(w.stored, gone[w.stored.static[gone] == 1], stamp_s)
+            w.remove(gone)
+
+    def _reserve(self, n: int) -> None:
+        """Room for `n` active tracklets."""
+        room = len(self._tracklets.track_id)
+        if n > room:
+            while room < n:
+                room *= 2
+            self._tracklets = grown(self._tracklets, room)
+            self._tables(room)
+
+    def _tables(self, room: int) -> None:
+        self._event_table = EventTable(np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64))
+        self._spell_table = SpellTable(
+            np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 4))
+        )
+
+
+def _as_priors(priors: LifetimePrior | Sequence[LifetimePrior] | None, n_classes: int) -> tuple[LifetimePrior, ...]:
+    if priors is None:
+        return (GeneralPurpose(*FROM_MINUTES_TO_YEARS),)
+    several = tuple(priors) if isinstance(priors, Sequence) else (priors,)
+    if len(several) not in {1, n_classes}:
+        raise ConfigError(f"{len(several)} lifetime priors for {n_classes} classes", field="priors")
+    return several
+
+
+def _chi_square_3(probability: float) -> float:
+    """Quantile of the chi-square distribution with 3 degrees of freedom."""
+    from scipy.special import chdtri
+
+    return float(chdtri(3.0, 1.0 - probability))

@@ -1,0 +1,157 @@
+"""What the tracker remembers of the objects that it follows: a struct of arrays, one row a tracklet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.types import BoolArray, FloatArray, IntArray
+
+
+class TrackState(IntEnum):
+    """The five states of a tracklet (Bateman 2020, section 4.1)."""
+
+    BIRTH = 0
+    """Warming up: too few detections, or too little belief, to be told from false alarms."""
+    ALIVE = 1
+    """Followed."""
+    LOST = 2
+    """Followed until a few frames ago."""
+    WORKING_SET = 3
+    """Static and out of view: may be seen again, where it was."""
+    DEAD = 4
+    """Given up."""
+
+
+class EventKind(IntEnum):
+    """What happens to a tracklet."""
+
+    BORN = 0
+    """It is ALIVE for the first time; the stamp is that of its first detection."""
+    LOST = 1
+    FOUND = 2
+    """ALIVE again before it was given up."""
+    STORED = 3
+    """Put into the working set."""
+    REIDENTIFIED = 4
+    DIED = 5
+
+
+class Tracklets(NamedTuple):
+    """The active tracklets: rows 0 to n - 1 are in use, those behind are room to grow. Changed in place by kernels.
+
+    States of a filter are (position xyz, velocity xyz, acceleration xyz), D = 9, or D = 6 without the last.
+
+    Attributes:
+        track_id: (N,) unique over all time.
+        state: (N,) a `TrackState`.
+        mean: (N, D) filtered motion; covariance: (N, D, D).
+        class_p: (N, C) posterior over classes.
+        appearance: (N, A) unit vectors, zeros where none was given.
+        inverse_odds: (N,) `(1 - p) / p` of being a real object that is there.
+        n_hits: (N,) detections so far; n_missed: (N,) frames in a row without one.
+        first_s: (N,) first detection.
+        rest_mean: (N, 3) the place where it has stayed lately; rest_covariance: (N, 3, 3).
+        rest_since_s, rest_seen_s: (N,) first and last detection that was in that place beyond doubt.
+        elsewhere_s: (N,) last stamp at which it was elsewhere, or its place was seen empty; -inf where unknown.
+        static: (N,) 1 where its stay has been long enough to be a static spell.
+        slow: (N,) 1 where its speed was not above its class' threshold at its last detection.
+    """
+
+    track_id: IntArray
+    state: IntArray
+    mean: FloatArray
+    covariance: FloatArray
+    class_p: FloatArray
+    appearance: FloatArray
+    inverse_odds: FloatArray
+    n_hits: IntArray
+    n_missed: IntArray
+    first_s: FloatArray
+    rest_seen_s: FloatArray
+    rest_mean: FloatArray
+    rest_covariance: FloatArray
+    rest_since_s: FloatArray
+    elsewhere_s: FloatArray
+    static: IntArray
+    slow: IntArray
+
+
+def room_for(n: int, order: int, n_classes: int, n_appearance: int) -> Tracklets:
+    """Room for `n` tracklets, with `order` derivatives of the position, itself included."""
+    d = 3 * order
+
+    def numbers(*shape: int) -> FloatArray:
+        return np.zeros((n, *shape))
+
+    def counts() -> IntArray:
+        return np.zeros(n, dtype=np.int64)
+
+    return Tracklets(
+        track_id=counts(),
+        state=counts(),
+        mean=numbers(d),
+        covariance=numbers(d, d),
+        class_p=numbers(n_classes),
+        appearance=numbers(n_appearance),
+        inverse_odds=numbers(),
+        n_hits=counts(),
+        n_missed=counts(),
+        first_s=numbers(),
+        rest_seen_s=numbers(),
+        rest_mean=numbers(3),
+        rest_covariance=numbers(3, 3),
+        rest_since_s=numbers(),
+        elsewhere_s=numbers(),
+        static=counts(),
+        slow=counts(),
+    )
+
+
+def grown(tracklets: Tracklets, n: int) -> Tracklets:
+    """The same tracklets with room for `n`."""
+    return Tracklets(*(np.concatenate([a, np.zeros((n - len(a), *a.shape[1:]), dtype=a.dtype)]) for a in tracklets))
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What happened to a tracklet, and when."""
+
+    stamp_s: float
+    kind: EventKind
+    track_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """The active tracklets at one instant, one row each, in no order. Copies.
+
+    Attributes:
+        stamp_s: when.
+        track_id: (N,).
+        state: (N,) a `TrackState`.
+        position_m, velocity_mps: (N, 3) in the world.
+        position_covariance_m2, velocity_covariance_m2ps2: (N, 3, 3).
+        class_p: (N, C) posterior over classes.
+        p_exists: (N,) probability of being a real object that is there.
+        n_missed: (N,) frames in a row without a detection.
+        static: (N,) whether it has been where it is for long enough to be static.
+    """
+
+    stamp_s: float
+    track_id: IntArray
+    state: IntArray
+    position_m: FloatArray
+    velocity_mps: FloatArray
+    position_covariance_m2: FloatArray
+    velocity_covariance_m2ps2: FloatArray
+    class_p: FloatArray
+    p_exists: FloatArray
+    n_missed: IntArray
+    static: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.track_id)

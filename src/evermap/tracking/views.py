@@ -1,0 +1,119 @@
+"""What the sensor could see: evidence from objects that were not detected, and when a place was last seen empty."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.types import FloatArray
+
+SURE_NATS = float(np.log(1e3))
+"""Misses that make a place empty: together they happen to one object in a thousand."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What can be seen in a frame.
+
+    Attributes:
+        centre_m: (3,) where the sensor is, in the world.
+        reach_m: beyond this distance nothing is detected.
+        p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there: a sensing model.
+    """
+
+    centre_m: FloatArray
+    reach_m: float
+    p_detect: Callable[[FloatArray], FloatArray]
+
+    def probability(self, position_m: FloatArray) -> FloatArray:
+        """(N,) `p_detect`, checked.
+
+        Raises:
+            InputError: not one probability a position.
+        """
+        if len(position_m) == 0:
+            return np.empty(0)
+        p = np.ascontiguousarray(self.p_detect(position_m), dtype=np.float64)
+        if p.shape != (len(position_m),):
+            raise InputError(f"shape {p.shape} instead of ({len(position_m)},)", field="p_detect")
+        if not np.all((p >= 0.0) & (p <= 1.0)):
+            row = int(np.flatnonzero(~((p >= 0.0) & (p <= 1.0)))[0])
+            raise InputError(f"position {row}: {p[row]} is no probability", field="p_detect")
+        return p
+
+
+class ViewMemory:
+    """Views of the past: every one of the last frames, and of those before a few from time to time or place to place.
+
+    Args:
+        n_recent: frames of which all views are kept.
+        n_burst: of older views so many in a row are kept, enough together to tell that a place was empty ...
+        every_s: ... whenever this time has passed ...
+        every_m: ... or the sensor has moved so far.
+    """
+
+    def __init__(self, n_recent: int = 32, n_burst: int = 4, every_s: float = 60.0, every_m: float = 5.0) -> None:
+        self._recent: deque[tuple[float, View]] = deque()
+        self._n_recent = n_recent
+        self._n_burst, self._every_s, self._every_m = n_burst, every_s, every_m
+        self._n_in_burst = n_burst
+        self._kept: dict[tuple[int, int], list[tuple[float, View]]] = {}
+        self._last: tuple[float, View] | None = None
+        self._chunk_m = 0.0
+        self._reach_m = 0.0
+
+    def add(self, stamp_s: float, view: View) -> None:
+        """Remember a view; stamps never decrease."""
+        self._recent.append((stamp_s, view))
+        self._chunk_m = self._chunk_m or max(view.reach_m, 1.0)
+        self._reach_m = max(self._reach_m, view.reach_m)
+        if len(self._recent) <= self._n_recent:
+            return
+        stamp, old = self._recent.popleft()
+        if (
+            self._last is None
+            or stamp - self._last[0] >= self._every_s
+            or np.linalg.norm(old.centre_m - self._last[1].centre_m) >= self._every_m
+        ):
+            self._last, self._n_in_burst = (stamp, old), 0
+        if self._n_in_burst < self._n_burst:
+            self._n_in_burst += 1
+            self._kept.setdefault(self._chunk_of(old.centre_m), []).append((stamp, old))
+
+    def last_empty_s(self, position_m: FloatArray, before_s: float) -> float:
+        """Last stamp before `before_s` from which on an object at `position_m` (3,) would surely have been detected.
+
+        Returns:
+            -inf where the place had not been looked at well enough.
+        """
+        nats = 0.0
+        for stamp, view in self._backwards(position_m):
+            if stamp >= before_s:
+                continue
+            if np.linalg.norm(position_m - view.centre_m) > view.reach_m:
+                continue
+            p = float(view.probability(position_m[None])[0])
+            nats -= np.log(max(1.0 - p, 1e-12))
+            if nats >= SURE_NATS:
+                return stamp
+        return -np.inf
+
+    def _backwards(self, position_m: FloatArray) -> list[tuple[float, View]]:
+        """Views that may show a place, the last first."""
+        x, y = self._chunk_of(position_m)
+        n = int(np.ceil(self._reach_m / self._chunk_m)) if self._chunk_m else 0
+        kept = [
+            entry
+            for i in range(x - n, x + n + 1)
+            for j in range(y - n, y + n + 1)
+            for entry in self._kept.get((i, j), ())
+        ]
+        return [*reversed(self._recent), *sorted(kept, key=lambda entry: -entry[0])]
+
+    def _chunk_of(self, position_m: FloatArray) -> tuple[int, int]:
+        chunk = self._chunk_m or 1.0
+        return int(np.floor(position_m[0] / chunk)), int(np.floor(position_m[1] / chunk))

@@ -1,0 +1,218 @@
+"""The working set: static objects out of view, by the million, to be found again by place, class and appearance."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evermap.persistence.death import log_death_odds
+from evermap.survival import LifetimePrior
+from evermap.tracking.tracklets import Tracklets
+from evermap.types import FloatArray, IntArray
+
+SMALLEST_ROOM = 64
+MOST_CLASSES = 2**15
+UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
+"""Entries of a symmetric (3, 3) that are kept."""
+
+
+class Stored(NamedTuple):
+    """What is kept of an object, 125 bytes and two for every number of its appearance; one row each.
+
+    Attributes:
+        track_id: (N,).
+        position: (N, 3) place of rest; covariance: (N, 6) its covariance, upper triangle.
+        class_id: (N,) the most probable class, and class_p: (N,) its probability; the others share the rest.
+        appearance: (N, A) unit vectors.
+        inverse_odds: (N,) of being there still, at `judged_s`.
+        n_hits: (N,) detections.
+        first_s, rest_seen_s, rest_since_s, elsewhere_s, static: (N,) as in `Tracklets`.
+        judged_s: (N,) when its place was last looked at.
+        following: (N,) the next row of its chunk.
+    """
+
+    track_id: IntArray
+    position: FloatArray
+    covariance: NDArray[np.float32]
+    class_id: NDArray[np.int16]
+    class_p: NDArray[np.float32]
+    appearance: NDArray[np.float16]
+    inverse_odds: FloatArray
+    n_hits: NDArray[np.int32]
+    first_s: FloatArray
+    rest_seen_s: FloatArray
+    rest_since_s: FloatArray
+    elsewhere_s: FloatArray
+    static: NDArray[np.int8]
+    judged_s: FloatArray
+    following: NDArray[np.int32]
+
+
+def empty_rows(n: int, n_appearance: int) -> Stored:
+    """Room for `n` objects with appearances of a length."""
+
+    def numbers(*shape: int) -> FloatArray:
+        return np.zeros((n, *shape))
+
+    return Stored(
+        track_id=np.zeros(n, dtype=np.int64),
+        position=numbers(3),
+        covariance=np.zeros((n, 6), dtype=np.float32),
+        class_id=np.zeros(n, dtype=np.int16),
+        class_p=np.zeros(n, dtype=np.float32),
+        appearance=np.zeros((n, n_appearance), dtype=np.float16),
+        inverse_odds=numbers(),
+        n_hits=np.zeros(n, dtype=np.int32),
+        first_s=numbers(),
+        rest_seen_s=numbers(),
+        rest_since_s=numbers(),
+        elsewhere_s=numbers(),
+        static=np.zeros(n, dtype=np.int8),
+        judged_s=numbers(),
+        following=np.full(n, -1, dtype=np.int32),
+    )
+
+
+class WorkingSet:
+    """Objects at rest, in square chunks of the ground; rows are given out, and used again when they are free.
+
+    Args:
+        chunk_m: side of a chunk.
+        priors: lifetimes at rest, one for all classes or one a class.
+        n_classes: number of classes.
+        n_appearance: length of appearance vectors.
+    """
+
+    def __init__(self, chunk_m: float, priors: tuple[LifetimePrior, ...], n_classes: int, n_appearance: int) -> None:
+        from evermap.tracking import chunks
+
+        self._chunks = chunks
+        self._chunk_m = chunk_m
+        self._priors = priors
+        self._n_classes = n_classes
+        self._stored = empty_rows(SMALLEST_ROOM, n_appearance)
+        self._head = np.full(SMALLEST_ROOM, chunks.END, dtype=np.int32)
+        self._free: list[int] = []
+        self._n_used = 0
+        self._widest_m2 = 0.0
+
+    def __len__(self) -> int:
+        return self._n_used - len(self._free)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of all that is kept, and of the room to grow."""
+        return sum(a.nbytes for a in self._stored) + self._head.nbytes + 8 * len(self._free)
+
+    @property
+    def widest_m2(self) -> float:
+        """No place has been known less well than this: largest variance of a coordinate."""
+        return self._widest_m2
+
+    @property
+    def stored(self) -> Stored:
+        """All rows, those that are free too; to be read."""
+        return self._stored
+
+    @property
+    def rows(self) -> IntArray:
+        """(len(self),) rows in use."""
+        used = np.ones(self._n_used, dtype=np.bool_)
+        used[self._free] = False
+        return np.flatnonzero(used)
+
+    def insert(self, t: Tracklets, rows: IntArray, stamp_s: float) -> None:
+        """Keep the places of rest of some tracklets."""
+        top = t.class_p[rows].argmax(axis=1)
+        self.insert_arrays(
+            empty_rows(0, 0)._replace(
+                track_id=t.track_id[rows],
+                position=t.rest_mean[rows],
+                covariance=t.rest_covariance[rows][:, UPPER[0], UPPER[1]].astype(np.float32),
+                class_id=top.astype(np.int16),
+                class_p=t.class_p[rows, top].astype(np.float32),
+                appearance=t.appearance[rows].astype(np.float16),
+                inverse_odds=t.inverse_odds[rows],
+                n_hits=t.n_hits[rows].astype(np.int32),
+                first_s=t.first_s[rows],
+                rest_seen_s=t.rest_seen_s[rows],
+                rest_since_s=t.rest_since_s[rows],
+                elsewhere_s=t.elsewhere_s[rows],
+                static=t.static[rows].astype(np.int8),
+                judged_s=np.full(len(rows), stamp_s),
+            )
+        )
+
+    def insert_arrays(self, objects: Stored) -> IntArray:
+        """Keep objects given as arrays (`following` is not read), and return the rows they have."""
+        count = len(objects.track_id)
+        n_again = min(count, len(self._free))
+        n_new = count - n_again
+        if self._n_used + n_new > len(self._head):
+            self._grow(self._n_used + n_new)
+        again = [self._free.pop() for _ in range(n_again)]
+        rows = np.concatenate([np.array(again, dtype=np.int64), self._n_used + np.arange(n_new)])
+        self._n_used += n_new
+        for name in Stored._fields[:-1]:
+            getattr(self._stored, name)[rows] = getattr(objects, name)
+        self._chunks.link(rows, self._stored.position, self._chunk_m, self._head, self._stored.following)
+        self._widest_m2 = max(self._widest_m2, float(objects.covariance[:, [0, 3, 5]].max(initial=0.0)))
+        return rows
+
+    def remove(self, rows: IntArray) -> None:
+        """Forget rows, each once."""
+        self._chunks.unlink(rows, self._stored.position, self._chunk_m, self._head, self._stored.following)
+        self._free.extend(rows.tolist())
+
+    def near(self, centre_m: FloatArray, reach_m: FloatArray) -> IntArray:
+        """Rows within `reach_m` (K,) of any of the points `centre_m` (K, 3), each once, in order."""
+        return np.asarray(
+            self._chunks.rows_near(
+                centre_m, reach_m, self._stored.position, self._chunk_m, self._head, self._stored.following
+            ),
+            dtype=np.int64,
+        )
+
+    def inverse_odds(self, rows: IntArray, stamp_s: float) -> FloatArray:
+        """(K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""
+        s = self._stored
+        prior = s.class_id[rows].astype(np.int64) if len(self._priors) > 1 else np.zeros(len(rows), dtype=np.int64)
+        since = s.rest_since_s[rows]
+        log_odds = log_death_odds(self._priors, prior, s.judged_s[rows] - since, stamp_s - since)
+        before = s.inverse_odds[rows]
+        return np.asarray(before + (1.0 + before) * np.exp(np.minimum(log_odds, 690.0)), dtype=np.float64)
+
+    def missed(self, rows: IntArray, stamp_s: float, p_detect: FloatArray) -> FloatArray:
+        """(K,) inverse odds after the places of these objects were looked at, and nothing was seen there."""
+        after = np.minimum(self.inverse_odds(rows, stamp_s) / np.maximum(1.0 - p_detect, 1e-12), 1e300)
+        self._stored.inverse_odds[rows] = after
+        self._stored.judged_s[rows] = stamp_s
+        return np.asarray(after, dtype=np.float64)
+
+    def covariance(self, rows: IntArray) -> FloatArray:
+        """(K, 3, 3) of places."""
+        full = np.empty((len(rows), 3, 3))
+        full[:, UPPER[0], UPPER[1]] = self._stored.covariance[rows]
+        full[:, UPPER[1], UPPER[0]] = self._stored.covariance[rows]
+        return full
+
+    def class_p(self, rows: IntArray) -> FloatArray:
+        """(K, C) posterior over classes, as far as it is kept."""
+        top = self._stored.class_p[rows].astype(np.float64)
+        others = max(self._n_classes - 1, 1)
+        out = np.repeat((1.0 - top)[:, None] / others, self._n_classes, axis=1)
+        out[np.arange(len(rows)), self._stored.class_id[rows]] = top
+        return out
+
+    def _grow(self, n: int) -> None:
+        size = before = len(self._head)
+        while size < n:
+            size *= 2
+        room = empty_rows(size, self._stored.appearance.shape[1])
+        for name in Stored._fields[:-1]:
+            getattr(room, name)[:before] = getattr(self._stored, name)
+        self._stored = room
+        self._head = np.full(size, self._chunks.END, dtype=np.int32)
+        self._chunks.link(self.rows, room.position, self._chunk_m, self._head, room.following)
