@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
+from evermap.cli.fit import fit
 from evermap.cli.learn import learn
+from evermap.cli.lifetime_numbers import lifetime_lines, lifetime_numbers
 from evermap.cli.picture import check_picture, write_picture
 from evermap.cli.terminal import print_json, print_table, say
 from evermap.errors import ConfigError
 
-if TYPE_CHECKING:
-    from evermap.survival import LifetimePrior
-
 app = typer.Typer(name="survival", help="How long features stay.", no_args_is_help=True, rich_markup_mode=None)
+app.command("fit")(fit)
 app.command("learn")(learn)
 
 
@@ -72,34 +70,10 @@ def plot(
     except ConfigError as error:
         raise ConfigError(error.problem, field="--until", hint=error.hint) from None
     write_picture(out, draw(named, until_s=until_s, log_time=log_time))
-    rows = {name: _numbers(prior) for name, prior in named.items()}
+    rows = {name: lifetime_numbers(prior) for name, prior in named.items()}
     if as_json:
         print_json({"out": str(out), "priors": rows})
         return
     for name, numbers in rows.items():
-        print_table(name, _lines(numbers))
+        print_table(name, lifetime_lines(numbers))
     say(f"drawn in {out}")
-
-
-def _numbers(prior: LifetimePrior) -> dict[str, float | None]:
-    """What the figure shows, in seconds; None for what never comes."""
-    quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
-    values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
-    values["mean_stay_s"] = prior.mean()
-    return {k: v if math.isfinite(v) else None for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
-
-
-def _lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
-    from evermap.survival.durations import duration_text
-
-    names = {
-        "quarter_gone_s": "a quarter is gone after",
-        "half_gone_s": "half are gone after",
-        "three_quarters_gone_s": "three quarters after",
-    }
-    lines = [(title, duration_text(math.inf if numbers[key] is None else numbers[key])) for key, title in names.items()]
-    if numbers["mean_stay_s"] is not None:
-        lines.append(("mean stay", duration_text(numbers["mean_stay_s"])))
-    if numbers["p_never_leaves"]:
-        lines.append(("never leave", f"{100.0 * numbers['p_never_leaves']:.3g} %"))
-    return lines

@@ -1,0 +1,230 @@
+"""The table of lifetimes that `evermap track` writes and `evermap survival fit` reads, by class or place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evermap.errors import ConfigError, InputError
+from evermap.io.columns import Columns, csv_bytes, named, read_columns
+from evermap.io.quantities import X_M, Y_M, Quantity
+from evermap.survival.censored import CensoredLifetimes
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+_LATEST_S = 1e13
+LEFT = Quantity("left", 0.0, _LATEST_S, hint="seconds; 0 where it was gone at the first look")
+RIGHT = Quantity(
+    "right", 0.0, _LATEST_S, positive=True, optional=True, hint="seconds; empty where it was never seen gone"
+)
+ENTRY = Quantity("entry", 0.0, _LATEST_S, optional=True, hint="seconds; empty or 0 where nothing is truncated")
+WEIGHT = Quantity("weight", 0.0, 1e15, optional=True, hint="how many lifetimes the row stands for; 1 where empty")
+_REQUIRED = ("left", "right")
+_OPTIONAL = ("entry", "weight", "class_id", "x_m", "y_m")
+BY_CLASS, BY_CHUNK = "class", "chunk"
+NO_CLASS = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LifetimeTable:
+    """N rows of a table, in its order.
+
+    Attributes:
+        data: what is known of each lifetime.
+        class_names: classes in use, in natural order.
+        class_of_row: (N,) index into them, `UNKNOWN` where the table names none.
+        position_m: (N, 2) where on the ground, nan where the table does not say.
+        has_classes, has_places: whether it has the columns at all.
+        source: file it came from, '' if none.
+        line: (N,) line of each row in that file.
+        warnings: remarks of the reader.
+    """
+
+    data: CensoredLifetimes
+    class_names: tuple[str, ...]
+    class_of_row: IntArray
+    position_m: FloatArray
+    has_classes: bool
+    has_places: bool
+    source: str
+    line: IntArray
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Rows of a table that belong together.
+
+    Attributes:
+        rows: their indices.
+        class_id: the class, '' for rows that name none; None where classes are not told apart.
+        chunk: (column, row) of the square on the ground; None where places are not told apart.
+    """
+
+    rows: IntArray
+    class_id: str | None = None
+    chunk: tuple[int, int] | None = None
+
+    @property
+    def label(self) -> str:
+        """For people: `car in chunk (0, -3)`; 'all' where nothing is told apart."""
+        what = None if self.class_id is None else self.class_id or "of no class"
+        where = None if self.chunk is None else f"chunk ({self.chunk[0]}, {self.chunk[1]})"
+        return " in ".join(part for part in (what, where) if part) or "all"
+
+
+def read_lifetimes(path: str | Path) -> LifetimeTable:
+    """A table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
+
+    Args:
+        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
+
+    Raises:
+        InputError: anything wrong in the file, by line and column.
+    """
+    warnings: list[str] = []
+    table = read_columns(path, warnings)
+    table.expect(_REQUIRED, _OPTIONAL)
+    if len(table) == 0:
+        raise InputError("has no rows below its header", path=path, hint="one row a lifetime")
+    left = table.numbers(LEFT)
+    right = _filled(table, RIGHT, np.inf)
+    entry = _filled(table, ENTRY, 0.0)
+    weight = _filled(table, WEIGHT, 1.0)
+    _refuse(
+        table, right < left, "right", lambda row: f"ends at {right[row]:g} s, before its left at {left[row]:g} s",
+        "left <= right; equal where the end was watched",
+    )  # fmt: skip
+    _refuse(
+        table, entry >= right, "entry",
+        lambda row: f"known only because it was there at {entry[row]:g} s, but gone by {right[row]:g} s",
+        "entry below right: what is gone before cannot be met",
+    )  # fmt: skip
+    if not weight.any():
+        raise InputError("all weights are 0", path=path, field="weight", hint="1 for a lifetime seen once")
+    class_names, class_of_row = table.labels("class_id") if "class_id" in table else ([], np.full(len(table), UNKNOWN))
+    return LifetimeTable(
+        data=CensoredLifetimes(left, right, entry, weight),
+        class_names=tuple(class_names),
+        class_of_row=class_of_row,
+        position_m=_positions(table),
+        has_classes="class_id" in table,
+        has_places="x_m" in table,
+        source=str(path),
+        line=table.line,
+        warnings=tuple(warnings),
+    )
+
+
+def lifetimes_csv(
+    data: CensoredLifetimes, class_names: Sequence[str], class_of_row: IntArray, xy_m: FloatArray
+) -> bytes:
+    """A table that `read_lifetimes` reads.
+
+    Args:
+        data: N lifetimes, of which `entry_s` and `weight` are written where they say something.
+        class_names: classes.
+        class_of_row: (N,) index into them.
+        xy_m: (N, 2) where on the ground.
+    """
+    right = np.where(np.isinf(data.right_s), np.nan, data.right_s)
+    columns = {"left": data.left_s, "right": right}
+    if data.entry_s.any():
+        columns["entry"] = data.entry_s
+    if (data.weight != 1.0).any():
+        columns["weight"] = data.weight
+    columns |= {"class_id": named(class_names, class_of_row), "x_m": xy_m[:, 0], "y_m": xy_m[:, 1]}
+    return csv_bytes(columns)
+
+
+def parse_by(text: str) -> tuple[str, ...]:
+    """`class,chunk` as words.
+
+    Raises:
+        ConfigError: another word.
+    """
+    words = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
+    for word in words:
+        if word not in {BY_CLASS, BY_CHUNK}:
+            raise ConfigError(f"'{word}' is no grouping", field="--by", hint="class, chunk, or class,chunk")
+    return words
+
+
+def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[Group]:
+    """The rows told apart by class, by square chunk of the ground, by both or not at all; in natural order.
+
+    Args:
+        table: the lifetimes.
+        by: some of 'class' and 'chunk'.
+        chunk_m: side of a chunk.
+
+    Raises:
+        ConfigError: a column that this needs is not in the table, or `chunk_m` cannot be.
+        InputError: a row without a position where places are told apart.
+    """
+    if not (np.isfinite(chunk_m) and chunk_m > 0.0):
+        raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="--chunk-m", hint="10")
+    keys = np.zeros((len(table), 3), dtype=np.int64)  # class, chunk's column and row
+    if BY_CLASS in by:
+        if not table.has_classes:
+            raise ConfigError("the table names no classes", field="--by", hint="a column class_id in the table")
+        keys[:, 0] = np.where(table.class_of_row == UNKNOWN, len(table.class_names), table.class_of_row)
+    if BY_CHUNK in by:
+        if not table.has_places:
+            raise ConfigError("the table has no places", field="--by", hint="columns x_m and y_m in the table")
+        nowhere = np.flatnonzero(np.isnan(table.position_m).any(axis=1))
+        if nowhere.size:
+            line = int(table.line[nowhere[0]])
+            raise InputError("is empty", path=table.source, line=line, field="x_m", hint="a place in every row")
+        keys[:, 1:] = np.floor(table.position_m / chunk_m)
+    different, group = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(group.ravel(), kind="stable")
+    parts = np.split(order, np.cumsum(np.bincount(group.ravel()))[:-1])
+    names = (*table.class_names, NO_CLASS)
+    return [
+        Group(
+            rows=rows,
+            class_id=names[key[0]] if BY_CLASS in by else None,
+            chunk=(int(key[1]), int(key[2])) if BY_CHUNK in by else None,
+        )
+        for key, rows in zip(different, parts, strict=True)
+    ]
+
+
+def rows_of(data: CensoredLifetimes, rows: IntArray) -> CensoredLifetimes:
+    """Some of the lifetimes.
+
+    Raises:
+        DataError: all of them have weight 0.
+    """
+    return CensoredLifetimes(*(getattr(data, name)[rows] for name in CensoredLifetimes.__slots__))
+
+
+def _filled(table: Columns, quantity: Quantity, default: float) -> FloatArray:
+    """An optional column, with what an empty cell or no column means."""
+    if quantity.name not in table:
+        return np.full(len(table), default)
+    values = table.numbers(quantity)
+    return np.where(np.isnan(values), default, values)
+
+
+def _refuse(table: Columns, bad: BoolArray, field: str, problem: Callable[[int], str], hint: str) -> None:
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise table.error(problem(row), row=row, field=field, hint=hint)
+
+
+def _positions(table: Columns) -> FloatArray:
+    """(N, 2), nan where there are none."""
+    if ("x_m" in table) != ("y_m" in table):
+        missing = "y_m" if "x_m" in table else "x_m"
+        raise table.error("missing column", row=None, field=missing, hint="both x_m and y_m, or neither")
+    if "x_m" not in table:
+        return np.full((len(table), 2), np.nan)
+    optional = [Quantity(q.name, q.low, q.high, optional=True, hint=q.hint) for q in (X_M, Y_M)]
+    return np.stack([table.numbers(quantity) for quantity in optional], axis=1)
