@@ -1,0 +1,116 @@
+"""Lifetimes of things of which nobody saw the coming (MATH.md section 6).
+
+```
+            elsewhere      arrival b       first ........... last       gone
+  looks  ------|--------------?--------------|-------|---------|----------|------
+                                left = last - b      right = gone - b
+                                entry = first - b
+```
+
+What arrives and leaves between two looks is never heard of, so those that are seen are the longer ones: a stay is
+known only because it lasted until the first look, `T > first - b`. To take `(last - first, gone - elsewhere]` for a
+plain interval forgets that, and overestimates lifetimes, the more the rarer the looks.
+
+When it arrived nobody knows either. Things come evenly in time, so before its end is known any instant since the look
+before is as good as any other, and afterwards as good as `S(last - b) - S(gone - b)`. A stay becomes some rows, one an
+instant, that share its weight so; for each of them bounds and entry are exact. The first time lifetimes are not known
+and the shares are equal; with an estimate the samples can be made again, and the estimate with them. Where that no
+longer changes anything, the score of the likelihood has mean 0 at the truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.errors import ConfigError, DataError
+from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import FloatArray, IntArray
+
+
+def lifetimes_of_sightings(
+    elsewhere_s: ArrayLike,
+    first_s: ArrayLike,
+    last_s: ArrayLike,
+    gone_s: ArrayLike,
+    *,
+    given: LifetimePrior | None = None,
+    instants: int = 5,
+    least_stay_s: float = 0.0,
+) -> tuple[CensoredLifetimes, IntArray]:
+    """Censored samples of stays of which only sightings are known.
+
+    Those that were there at the first look of all are left out: how long they had been there cannot be known.
+
+    Args:
+        elsewhere_s: (K,) last look before the first sighting, at which it was not there; -inf if there was none.
+        first_s: (K,) first sighting.
+        last_s: (K,) last sighting.
+        gone_s: (K,) first look after the last sighting, at which it was not there; inf if there was none.
+        given: an estimate of lifetimes, by which instants of arrival are weighed; equally where None.
+        instants: of arrival that are considered for each stay.
+        least_stay_s: a stay is counted only if it is seen to last this long.
+
+    Returns:
+        The samples, `instants` rows for each stay, and (N,) the stay that each row belongs to.
+
+    Raises:
+        ConfigError: `instants` is not positive.
+        DataError: columns of different lengths or out of order in time, no stay whose coming is bounded.
+    """
+    if instants < 1:
+        raise ConfigError(f"must be positive, not {instants}", field="instants")
+    columns = {"elsewhere_s": elsewhere_s, "first_s": first_s, "last_s": last_s, "gone_s": gone_s}
+    elsewhere, first, last, gone = (np.asarray(values, dtype=np.float64) for values in columns.values())
+    for name, column in zip(columns, (elsewhere, first, last, gone), strict=True):
+        if column.shape != (first.size,):
+            raise DataError(f"shape {column.shape} instead of ({first.size},)", field=name)
+    wrong = ~((elsewhere < first) & (first <= last) & (last < gone) & np.isfinite(first) & np.isfinite(last))
+    if wrong.any():
+        problem = f"not in order, row {int(np.argmax(wrong))}"
+        raise DataError(problem, field="first_s", hint="elsewhere_s < first_s <= last_s < gone_s")
+    stay = np.flatnonzero(np.isfinite(elsewhere) & (last - first >= least_stay_s))
+    if stay.size == 0:
+        hint = "look at the places more than once"
+        raise DataError("every stay began before the first look", field="elsewhere_s", hint=hint)
+    rows = np.repeat(stay, instants)
+    share = np.tile((np.arange(instants) + 0.5) / instants, stay.size)
+    arrival = elsewhere[rows] + share * (first[rows] - elsewhere[rows])
+    left, right = last[rows] - arrival, gone[rows] - arrival
+    weight = _weights(left, right, instants, given)
+    return CensoredLifetimes.of(left, right, first[rows] + least_stay_s - arrival, weight), rows
+
+
+def settled_samples(
+    estimate: Callable[[CensoredLifetimes], LifetimePrior],
+    samples_given: Callable[[LifetimePrior | None], CensoredLifetimes],
+    rounds: int = 4,
+) -> CensoredLifetimes:
+    """Samples whose weights agree with the lifetimes that are estimated from them.
+
+    Args:
+        estimate: lifetimes from samples; a quick one will do, for it only weighs the instants of arrival.
+        samples_given: samples with weights by an estimate, or without one: `lifetimes_of_sightings` for some stays.
+        rounds: times that both are done.
+    """
+    samples = samples_given(None)
+    for _ in range(rounds):
+        samples = samples_given(estimate(samples))
+    return samples
+
+
+def _weights(left: FloatArray, right: FloatArray, instants: int, given: LifetimePrior | None) -> FloatArray:
+    """(N,) shares of the instants of every stay: `S(left) - S(right)`, of sum 1 for each."""
+    if given is None:
+        return np.full(left.size, 1.0 / instants)
+    log_share = np.asarray(given.log_survival(left)).copy()
+    ended = np.isfinite(right)
+    log_share[ended] += given.log_conditional_death(left[ended], right[ended])
+    table = log_share.reshape(-1, instants)
+    most = table.max(axis=1, keepdims=True)
+    share = np.exp(table - np.where(np.isfinite(most), most, 0.0))
+    total = share.sum(axis=1, keepdims=True)
+    return np.asarray(np.where(total > 0.0, share / np.where(total > 0.0, total, 1.0), 1.0 / instants)).ravel()
