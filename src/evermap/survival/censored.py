@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError
-from evermap.types import BoolArray, FloatArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +64,10 @@ class CensoredLifetimes:
         right, entry, counts = (np.asarray(column, dtype=np.float64) for column in (right_s, entry_s, weight))
         entry, counts = (np.full(left.shape, c) if c.ndim == 0 else c for c in (entry, counts))
         return cls(left, right, entry, counts)
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        """The samples in some rows, by number or by a mask, at least one of positive weight."""
+        return type(self)(self.left_s[rows], self.right_s[rows], self.entry_s[rows], self.weight[rows])
 
     @property
     def exact(self) -> BoolArray:

@@ -30,7 +30,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 STRETCHES = 24
 DRAWS = 2000
 """From the posterior, half of them mirror images of the other half."""
-GUESS, GUESS_COUNTS = 0.5, 1.0
+GUESS, GUESS_COUNTS = 1.0, 1.0
 """A scale before data, and as how many directions it counts; it keeps scales of few directions from 0."""
 _ROUNDS, _SETTLED = 60, 0.02
 _NEWTON, _STEP = 30, 3.0
@@ -75,9 +75,9 @@ class Posterior:
     scales: FloatArray
     log_evidence: float
 
-    def draws(self, columns: FloatArray, seed: int = 0) -> FloatArray:
-        """(DRAWS, K) values of `columns @ u`, for (K, D) columns."""
-        spread = columns @ self.covariance @ columns.T
+    def draws(self, columns: FloatArray, unknown: float = 0.0, seed: int = 0) -> FloatArray:
+        """(DRAWS, K) values of `columns @ u` for (K, D) columns, plus a level of which only its variance is known."""
+        spread = columns @ self.covariance @ columns.T + unknown
         values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         noise = np.random.default_rng(seed).standard_normal((DRAWS // 2, len(columns))) @ root.T

@@ -155,23 +155,30 @@ class ParametricFit:
         if not 0.0 < confidence < 1.0:
             raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
 
-        def log_hazard(parameters: FloatArray) -> FloatArray:
-            with np.errstate(divide="ignore"):
-                return np.asarray(np.log(self.family.build(parameters).cumulative_hazard(t)))
-
-        middle = log_hazard(self.parameters)
-        with np.errstate(invalid="ignore"):
-            slopes = np.stack(
-                [
-                    (log_hazard(self.parameters + step) - log_hazard(self.parameters - step)) / (2.0 * _GRADIENT_STEP)
-                    for step in _GRADIENT_STEP * np.eye(self.n_parameters)
-                ]
-            )
-        slopes = np.where(np.isfinite(slopes), slopes, 0.0)
-        spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, self.covariance, slopes))
+        middle, spread = self._log_hazard(self.parameters, t), self._spread(t)
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * spread
         lower, upper = (np.exp(-np.exp(middle + sign * half_width)) for sign in (1.0, -1.0))
         return lower[()], upper[()]
+
+    def variance(self, t: ArrayLike) -> FloatArray:
+        """Of the estimated `P(T > t)`, by the delta method."""
+        cumulative = np.asarray(self.prior.cumulative_hazard(t))
+        finite = np.where(np.isfinite(cumulative), cumulative, 0.0)
+        return np.asarray(np.square(np.exp(-finite) * finite * self._spread(t)))[()]
+
+    def _log_hazard(self, parameters: FloatArray, t: ArrayLike) -> FloatArray:
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.log(self.family.build(parameters).cumulative_hazard(t)))
+
+    def _spread(self, t: ArrayLike) -> FloatArray:
+        """Standard deviation of the logarithm of the cumulative hazard."""
+        steps = _GRADIENT_STEP * np.eye(self.n_parameters)
+        with np.errstate(invalid="ignore"):
+            changes = np.stack(
+                [self._log_hazard(self.parameters + s, t) - self._log_hazard(self.parameters - s, t) for s in steps]
+            )
+        slopes = np.where(np.isfinite(changes), changes, 0.0) / (2.0 * _GRADIENT_STEP)
+        return np.asarray(np.sqrt(np.einsum("i...,ij,j...->...", slopes, self.covariance, slopes)))
 
 
 def log_likelihood(prior: LifetimePrior, data: CensoredLifetimes) -> FloatArray:
@@ -260,7 +267,7 @@ def _counted(data: CensoredLifetimes) -> CensoredLifetimes:
             field="right_s",
             hint="look again later, or state a prior in words",
         )
-    return CensoredLifetimes(*(getattr(data, name)[rows] for name in CensoredLifetimes.__slots__))
+    return data[rows]
 
 
 def _rough_mean(data: CensoredLifetimes) -> float:
