@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__
-from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival
+from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival, track
 from evermap.cli.terminal import fail, say
 from evermap.errors import EvermapError
 
@@ -80,6 +80,7 @@ app = typer.Typer(
 app.command("demo")(demo.demo)
 app.command("slam")(slam.slam)
 app.command("persist")(persist.persist)
+app.command("track")(track.track)
 app.command("convert")(convert.convert)
 app.add_typer(survival.app)
 app.command("simulate")(simulate.simulate)

@@ -23,6 +23,7 @@ ENTRY = Quantity("entry", 0.0, _LATEST_S, optional=True, hint="seconds; empty or
 WEIGHT = Quantity("weight", 0.0, 1e15, optional=True, hint="how many lifetimes the row stands for; 1 where empty")
 _REQUIRED = ("left", "right")
 _OPTIONAL = ("entry", "weight", "class_id", "x_m", "y_m")
+LIFETIME_COLUMNS = (*_REQUIRED, *_OPTIONAL)
 BY_CLASS, BY_CHUNK = "class", "chunk"
 NO_CLASS = ""
 

@@ -1,0 +1,202 @@
+"""The table of object detections that `evermap track` reads, put together into frames."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from evermap.errors import ConfigError, InputError
+from evermap.io.columns import Columns, read_columns
+from evermap.io.quantities import STAMP_S, X_M, Quantity
+from evermap.io.text import counted
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+_FARTHEST_M = X_M.high
+POSITION = tuple(
+    Quantity(name, -_FARTHEST_M, _FARTHEST_M, optional=True, hint="metres") for name in ("x_m", "y_m", "z_m")
+)
+SENSOR = tuple(
+    Quantity(name, -_FARTHEST_M, _FARTHEST_M, hint="metres, in every row")
+    for name in ("sensor_x_m", "sensor_y_m", "sensor_z_m")
+)
+SIGMA = Quantity("sigma_m", 0.0, 1e6, positive=True, optional=True, hint="metres; empty where unknown")
+SCORE = Quantity("score", 0.0, 1.0, optional=True, hint="the detector's confidence, between 0 and 1")
+COVARIANCE = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
+_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
+_OPTIONAL = ("class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in SENSOR))
+
+
+@dataclass(frozen=True, slots=True)
+class DetectionTable:
+    """M detections in F frames, by time.
+
+    Attributes:
+        stamp_s: (F,) increasing.
+        first: (F + 1,) where each frame's detections start; an empty frame has none.
+        position_m: (M, 3) in the world.
+        class_names: classes in use, in natural order; one without a name where the table names none.
+        class_id: (M,) index into them, `UNKNOWN` where none is given.
+        covariance_m2: (M, 3, 3) of the positions, nan where none is given; None if nowhere.
+        appearance: (M, A) vectors, zeros where there is none; None if nowhere.
+        sensor_m: (F, 3) where the sensor was; None where the table does not say.
+        line: (M,) line of each detection in the file.
+        source: file it came from, '' if none.
+        n_weak: detections left out because of their score.
+        warnings: remarks of the reader.
+    """
+
+    stamp_s: FloatArray
+    first: IntArray
+    position_m: FloatArray
+    class_names: tuple[str, ...]
+    class_id: IntArray
+    covariance_m2: FloatArray | None
+    appearance: FloatArray | None
+    sensor_m: FloatArray | None
+    line: IntArray
+    source: str
+    n_weak: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def n_frames(self) -> int:
+        """F."""
+        return len(self.stamp_s)
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+
+def read_detections(path: str | Path, *, min_score: float = 0.0) -> DetectionTable:
+    """A table with `stamp_s, x_m, y_m, z_m` and perhaps class, covariance, score, appearance and the sensor's position.
+
+    A row without a position is a frame in which nothing was detected.
+
+    Args:
+        path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order, those of one stamp are a frame.
+        min_score: detections with a lower score are left out; their frames stay.
+
+    Raises:
+        InputError: anything wrong in the file, by line and column.
+        ConfigError: `min_score` without scores.
+    """
+    warnings: list[str] = []
+    table = read_columns(path, warnings)
+    looks = _appearance_columns(table)
+    table.expect(_REQUIRED, (*_OPTIONAL, *looks))
+    if len(table) == 0:
+        raise InputError("has no rows below its header", path=path, hint="one row a detection")
+    stamp_s = table.numbers(STAMP_S)
+    position = np.stack([table.numbers(quantity) for quantity in POSITION], axis=1)
+    given = ~np.isnan(position)
+    partly = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
+    if partly.size:
+        row = int(partly[0])
+        field = POSITION[int(np.argmin(given[row]))].name
+        raise table.error("is empty", row=row, field=field, hint="all of x_m, y_m, z_m, or none for an empty frame")
+    kept = given.all(axis=1)
+    strong = kept & _strong(table, min_score)
+    if not strong.any():
+        hint = "a row with a position" if not kept.any() else "a lower --min-score"
+        raise InputError("holds no detection", path=path, field="x_m", hint=hint)
+    frames, frame = np.unique(stamp_s, return_inverse=True)
+    rows = np.flatnonzero(strong)
+    rows = rows[np.argsort(frame[rows], kind="stable")]
+    class_names, class_id = table.labels("class_id") if "class_id" in table else ([], np.full(len(table), UNKNOWN))
+    return DetectionTable(
+        stamp_s=frames,
+        first=np.searchsorted(frame[rows], np.arange(len(frames) + 1)),
+        position_m=position[rows],
+        class_names=tuple(class_names) or ("",),
+        class_id=class_id[rows],
+        covariance_m2=_covariances(table, rows),
+        appearance=_appearances(table, looks, rows),
+        sensor_m=_sensor(table, frame, len(frames)),
+        line=table.line[rows],
+        source=str(path),
+        n_weak=int((kept & ~strong).sum()),
+        warnings=tuple(warnings),
+    )
+
+
+def _strong(table: Columns, min_score: float) -> BoolArray:
+    """(R,) whether the score, where there is one, is high enough."""
+    if SCORE.name not in table:
+        if min_score > 0.0:
+            raise ConfigError("the table has no scores", field="--min-score", hint="a column score in the table")
+        return np.ones(len(table), dtype=np.bool_)
+    return np.asarray(~(table.numbers(SCORE) < min_score))
+
+
+def _appearance_columns(table: Columns) -> list[str]:
+    """`appearance_0` and so on, without a gap."""
+    found = sorted(int(name[11:]) for name in table.cells if re.fullmatch(r"appearance_\d+", name))
+    for number, name in enumerate(found):
+        if number != name:
+            raise table.error("missing column", row=None, field=f"appearance_{number}", hint="numbers from 0 on")
+    return [f"appearance_{number}" for number in found]
+
+
+def _appearances(table: Columns, names: Sequence[str], rows: IntArray) -> FloatArray | None:
+    if not names:
+        return None
+    columns = [table.numbers(Quantity(name, -1e30, 1e30, optional=True)) for name in names]
+    return np.nan_to_num(np.stack(columns, axis=1)[rows])
+
+
+def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
+    """(M, 3, 3), nan where a detection has none."""
+    named = [name for name in COVARIANCE if name in table]
+    if named and SIGMA.name in table:
+        raise table.error("says the same as sigma_m", row=None, field=named[0], hint="keep one of the two")
+    if SIGMA.name in table:
+        return np.asarray(np.square(table.numbers(SIGMA))[rows, None, None] * np.eye(3))
+    if not named:
+        return None
+    for name in COVARIANCE:
+        if name not in table:
+            raise table.error("missing column", row=None, field=name, hint=f"all of {', '.join(COVARIANCE)}, or none")
+    matrix = np.empty((len(rows), 3, 3))
+    for name, (i, j) in zip(COVARIANCE, _ENTRIES, strict=True):
+        matrix[:, i, j] = matrix[:, j, i] = table.numbers(Quantity(name, -1e12, 1e12, optional=True))[rows]
+    given = ~np.isnan(matrix)
+    whole = np.atleast_1d(given.all(axis=(1, 2)))
+    filled = np.where(whole[:, None, None], matrix, np.eye(3))
+    wrong = (given.any(axis=(1, 2)) & ~whole) | (np.linalg.eigvalsh(filled)[:, 0] <= 0.0)
+    if wrong.any():
+        row = int(rows[np.argmax(wrong)])
+        raise table.error(
+            "is no covariance: not positive definite", row=row, field=COVARIANCE[0], hint="or leave it empty"
+        )
+    return np.where(whole[:, None, None], matrix, np.nan)
+
+
+def _sensor(table: Columns, frame: IntArray, n_frames: int) -> FloatArray | None:
+    """(F, 3) where the sensor was."""
+    named = [quantity.name for quantity in SENSOR if quantity.name in table]
+    if not named:
+        return None
+    for quantity in SENSOR:
+        if quantity.name not in table:
+            raise table.error("missing column", row=None, field=quantity.name, hint="all three, or none")
+    of_row = np.stack([table.numbers(quantity) for quantity in SENSOR], axis=1)
+    sensor = np.empty((n_frames, 3))
+    sensor[frame[::-1]] = of_row[::-1]  # of several assignments the last one holds: the first row
+    elsewhere = np.flatnonzero(np.abs(of_row - sensor[frame]).max(axis=1) > 1e-6)
+    if elsewhere.size:
+        hint = "one position a stamp"
+        raise table.error(
+            "the sensor is in two places in one frame", row=int(elsewhere[0]), field=SENSOR[0].name, hint=hint
+        )
+    return sensor
+
+
+def said_of(table: DetectionTable) -> list[str]:
+    """Remarks on what was read: its own, and what was left out."""
+    weak = [f"{counted(table.n_weak, 'detection')} of low score left out"] if table.n_weak else []
+    return [*table.warnings, *weak]

@@ -1,0 +1,100 @@
+"""A small table of detections for `evermap track --init`: a robot passes through a yard seven times a day."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.io.atomic import write_atomic
+from evermap.io.table import csv_text
+from evermap.types import FloatArray
+
+RANGE_M = 12.0
+"""How far the example's sensor sees, for `--range-m`."""
+_HOUR_S = 3600.0
+_DAYS, _PATROL_HOURS = 4, range(8, 21, 2)
+_STEP_S, _FRAMES, _SPEED_MPS = 0.5, 40, 1.5
+_P_DETECT, _P_CLUTTER, _SIGMA_M = 0.95, 0.05, 0.1
+_PLACES = tuple((x, y) for y in (-5.0, 5.0) for x in (3.0, 9.0, 15.0, 21.0, 27.0))
+_MEAN_STAY_H = {"pallet": 20.0, "cart": 5.0}
+_PILLARS = ((0.0, 8.0), (30.0, 8.0))
+_COMMENT = """\
+Detections of objects in space: replace these rows by your own, in any order.
+stamp_s   seconds, of any clock; rows of one stamp are a frame
+x_m, y_m, z_m  where in the world; a row without is a frame in which nothing was detected, and as important
+optional  class_id: any name or number
+optional  cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2, or sigma_m: how exact
+optional  score: between 0 and 1, for --min-score
+optional  appearance_0, appearance_1, ...: any vector that looks alike for things that do
+optional  sensor_x_m, sensor_y_m, sensor_z_m: where the sensor was; with --range-m, what is missed in view is gone"""
+
+
+class _Stay(NamedTuple):
+    kind: str
+    place: tuple[float, float]
+    begin_h: float
+    end_h: float
+
+
+def write_example(path: str | Path) -> Path:
+    """Writes a commented table that `evermap track --range-m 12` takes as it is; the same bytes every time.
+
+    Raises:
+        InputError: the file exists, or cannot be written.
+    """
+    path = Path(path)
+    if path.exists():
+        raise InputError("exists already", path=path, hint="another name")
+    columns: dict[str, list[str]] = {
+        name: [] for name in ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
+    }
+    for cells in _rows(np.random.default_rng(12)):
+        for column, cell in zip(columns.values(), cells, strict=True):
+            column.append(cell)
+    return write_atomic(path, csv_text(columns, comment=_COMMENT))
+
+
+def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:
+    """Cells of each row, frame after frame."""
+    stays = list(_stays(random))
+    for day in range(_DAYS):
+        for hour in _PATROL_HOURS:
+            walker = random.random() < 0.5
+            for k in range(_FRAMES):
+                time_h = day * 24.0 + hour + k * _STEP_S / _HOUR_S
+                sensor = np.array([_SPEED_MPS * _STEP_S * k, 0.0, 1.0])
+                there = [(s.kind, np.array([*s.place, 0.5])) for s in stays if s.begin_h <= time_h < s.end_h]
+                if walker:
+                    there.append(("person", np.array([28.0 - 1.2 * _STEP_S * k, 1.5, 0.9])))
+                seen = _seen(random, there, sensor)
+                rows = [(kind, *(f"{value:.3f}" for value in position)) for kind, position in seen]
+                for cells in rows or [("", "", "", "")]:
+                    yield (f"{time_h * _HOUR_S:.1f}", *cells, *(f"{value:.2f}" for value in sensor))
+
+
+def _seen(
+    random: np.random.Generator, there: list[tuple[str, FloatArray]], sensor: FloatArray
+) -> Iterator[tuple[str, FloatArray]]:
+    """What is detected of what is there, and now and then what is not."""
+    for kind, position in there:
+        if np.linalg.norm(position - sensor) <= RANGE_M and random.random() < _P_DETECT:
+            yield kind, position + random.normal(0.0, _SIGMA_M, 3)
+    if random.random() < _P_CLUTTER:
+        yield str(random.choice(["pallet", "cart"])), sensor + random.uniform(-8.0, 8.0, 3) * [1.0, 1.0, 0.0]
+
+
+def _stays(random: np.random.Generator) -> Iterator[_Stay]:
+    """Pillars for ever; in each place, one pallet or cart after another, with a while between them."""
+    for place in _PILLARS:
+        yield _Stay("pillar", place, -np.inf, np.inf)
+    for place in _PLACES:
+        begin_h = random.exponential(8.0) - 8.0
+        while begin_h < 24.0 * _DAYS:
+            kind = str(random.choice(list(_MEAN_STAY_H)))
+            end_h = begin_h + random.exponential(_MEAN_STAY_H[kind])
+            yield _Stay(kind, place, begin_h, end_h)
+            begin_h = end_h + random.exponential(6.0)
