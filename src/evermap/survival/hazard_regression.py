@@ -34,6 +34,8 @@ GUESS, GUESS_COUNTS = 1.0, 1.0
 """A scale before data, and as how many directions it counts; it keeps scales of few directions from 0."""
 _ROUNDS, _SETTLED = 60, 0.02
 _NEWTON, _STEP = 30, 3.0
+_MOSTLY_EMPTY = 0.05
+"""Share of entries that are not 0 below which a sparse matrix is the faster one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,6 +241,8 @@ class _Model:
         n = len(samples.weight)
         levels = [sparse.csr_matrix((n, t.size) if t.levels is None else t.levels) for t in terms]
         self.levels: Any = sparse.hstack(levels, format="csr")
+        if self.levels.nnz > _MOSTLY_EMPTY * n * self.size:
+            self.levels = self.levels.toarray()
         self.rows = [np.flatnonzero(samples.group == g) for g in range(groups)]
         self.log_determinants = [float(np.linalg.slogdet(precision)[1]) for precision in self.precisions]
 
@@ -311,12 +315,8 @@ class _Model:
 
     def _second(self, diagonal: FloatArray, within: FloatArray, curvature: FloatArray) -> FloatArray:
         """`sum_i X_i' (diag(diagonal_i) + curvature_i within_i within_i') X_i`."""
-        from scipy import sparse
-
         total = within.sum(axis=1)
-        result = np.asarray(
-            (self.levels.T @ sparse.diags(diagonal.sum(axis=1) + curvature * total**2) @ self.levels).toarray()
-        )
+        result = _gram(self.levels, diagonal.sum(axis=1) + curvature * total**2)
         mixed = diagonal + (curvature * total)[:, None] * within
         for curve, rows in zip(self.curves, self.rows, strict=True):
             mine = within[rows]
@@ -324,3 +324,12 @@ class _Model:
             cross = curve.T @ np.asarray(self.levels[rows].T @ mixed[rows]).T
             result += curve.T @ own @ curve + cross + cross.T
         return result
+
+
+def _gram(columns: Any, weight: FloatArray) -> FloatArray:
+    """`columns' diag(weight) columns`, dense."""
+    if isinstance(columns, np.ndarray):
+        return np.asarray(columns.T @ (weight[:, None] * columns))
+    from scipy import sparse
+
+    return np.asarray((columns.T @ sparse.diags(weight) @ columns).toarray())
