@@ -138,7 +138,9 @@ def _follow(
         recorder.add(tracker, events)
         if k + 1 < table.n_frames and table.stamp_s[k + 1] - stamp_s > gap_s:
             n_gaps += 1
-            recorder.events.extend(_close_eyes(tracker, stamp_s, min(step_s, gap_s), float(table.stamp_s[k + 1])))
+            centre_m = np.zeros(3) if table.sensor_m is None else table.sensor_m[k]
+            until_s = float(table.stamp_s[k + 1])
+            recorder.events.extend(_close_eyes(tracker, centre_m, stamp_s, until_s, min(step_s, gap_s)))
         if progress and k % 100 == 99:
             progress(k + 1, table.n_frames)
     return recorder, found, n_gaps
@@ -156,12 +158,12 @@ def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
     return View(centre, reach, probability)
 
 
-def _close_eyes(tracker: Tracker, stamp_s: float, step_s: float, until_s: float) -> list[Event]:
+def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
     """Frames in which nothing can be seen, until what rests is kept and what moves is given up.
 
     A filter's prediction over hours says nothing, and the first frame after would take every object for another.
     """
-    nowhere = View(np.zeros(3), 0.0, lambda position_m: np.zeros(len(position_m)))
+    nowhere = View(centre_m, 0.0, lambda position_m: np.zeros(len(position_m)))
     n = tracker.settings.max_missed + 1
     step_s = min(step_s, 0.5 * (until_s - stamp_s) / n)
     events: list[Event] = []
@@ -215,6 +217,6 @@ def warm_up() -> None:
     for k in range(60):
         tracker.step(0.1 * k, here if k < 30 else nothing)
     tracker.step(7.0, here, view=seen)
-    _close_eyes(tracker, 7.0, 0.1, 9.0)
+    _close_eyes(tracker, np.zeros(3), 7.0, 9.0, 0.1)
     for k in range(20):
         tracker.step(10.0 + 2.0 * k, nothing, view=seen)
