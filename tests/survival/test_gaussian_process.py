@@ -111,6 +111,8 @@ def test_draws_answer_as_their_mean_and_as_a_prior() -> None:
     mean, lower, upper = draws.survival(t, confidence=0.8)
     np.testing.assert_allclose(mean, each.mean(axis=0))
     np.testing.assert_allclose([lower, upper], np.quantile(each, [0.1, 0.9], axis=0))
+    times = [PiecewiseConstantHazard(tuple(edges), tuple(r)).quantile(0.6) for r in draws.rates]
+    np.testing.assert_allclose(draws.quantile(0.6, 0.8), np.quantile(times, [0.5, 0.1, 0.9]))
     np.testing.assert_allclose(np.exp(draws.prior().log_survival(edges)), draws.survival(edges)[0])
     step = 1e-6
     hazard = -(math.log(draws.survival(4.0 + step)[0]) - math.log(draws.survival(4.0)[0])) / step
@@ -150,7 +152,7 @@ def test_curves_of_classes_come_near_the_truth() -> None:
 
 @pytest.mark.slow
 def test_bands_of_classes_cover_the_truth() -> None:
-    """Of 95 % bands about 93 % do: a lifetime whose hazard dies out faster than any power of time costs the rest."""
+    """Of 95 % bands 93 to 96 % do; the log-normal, whose hazard falls faster than any power of time, costs most."""
     covered = []
     for seed in range(40):
         data, class_id = of_classes(400, 100 + seed)
@@ -159,7 +161,6 @@ def test_bands_of_classes_cover_the_truth() -> None:
             gone = np.array([0.1, 0.25, 0.5, 0.75, 0.9])
             _, lower, upper = hazard.at(class_id=k).survival(truth.quantile(gone))
             covered.append((lower <= 1.0 - gone) & (1.0 - gone <= upper))
-    print(np.mean(covered, axis=0))
     assert 0.91 <= np.mean(covered) <= 0.99
 
 

@@ -114,6 +114,25 @@ class HazardDraws:
         expected, lower, upper = (np.asarray(values.reshape(times.shape))[()] for values in bounds)
         return expected, lower, upper
 
+    def quantile(self, p: float, confidence: float = 0.95) -> tuple[float, float, float]:
+        """Time by which a share `p` has gone: median of the draws, and lower and upper credible bound, in seconds.
+
+        Raises:
+            ConfigError: `p` or `confidence` is not in (0, 1).
+        """
+        for name, value in (("p", p), ("confidence", confidence)):
+            if not 0.0 < value < 1.0:
+                raise ConfigError(f"must lie in (0, 1), not {value!r}", field=name)
+        target = -np.log1p(-p)
+        reached = np.concatenate([np.zeros((len(self.rates), 1)), self._cumulative()], axis=1)
+        stretch = (reached < target).sum(axis=1) - 1
+        rows = np.arange(len(self.rates))
+        with np.errstate(divide="ignore"):
+            times = self.edges_s[stretch] + (target - reached[rows, stretch]) / self.rates[rows, stretch]
+        tail = 0.5 - 0.5 * confidence
+        middle, lower, upper = np.quantile(times, [0.5, tail, 1.0 - tail])
+        return float(middle), float(lower), float(upper)
+
     def prior(self) -> PiecewiseConstantHazard:
         """The lifetime prior whose survival is the expected one at every edge."""
         cumulative = np.concatenate([np.zeros((len(self.rates), 1)), self._cumulative()], axis=1)
