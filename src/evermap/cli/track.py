@@ -82,6 +82,7 @@ def track(
       warm_up=3               detections before an object is believed
       max_missed=10           frames without a detection until it is kept in mind, or given up if it moved
       rest_for_s=2            time without motion before an object counts as resting [s]
+      place_sigma_m=0.2       how exactly a resting object is found again in its place, beside the noise [m]
       moved_reach_m=0         how far objects may be moved while nobody looks; wants appearances [m]
 
     \b

@@ -50,7 +50,8 @@ def write_example(path: str | Path) -> Path:
     if path.exists():
         raise InputError("exists already", path=path, hint="another name")
     columns: dict[str, list[str]] = {
-        name: [] for name in ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
+        name: []
+        for name in ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sigma_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
     }
     for cells in _rows(np.random.default_rng(12)):
         for column, cell in zip(columns.values(), cells, strict=True):
@@ -71,8 +72,8 @@ def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:
                 if walker:
                     there.append(("person", np.array([28.0 - 1.2 * _STEP_S * k, 1.5, 0.9])))
                 seen = _seen(random, there, sensor)
-                rows = [(kind, *(f"{value:.3f}" for value in position)) for kind, position in seen]
-                for cells in rows or [("", "", "", "")]:
+                rows = [(kind, *(f"{value:.3f}" for value in position), str(_SIGMA_M)) for kind, position in seen]
+                for cells in rows or [("", "", "", "", "")]:
                     yield (f"{time_h * _HOUR_S:.1f}", *cells, *(f"{value:.2f}" for value in sensor))
 
 
@@ -88,13 +89,17 @@ def _seen(
 
 
 def _stays(random: np.random.Generator) -> Iterator[_Stay]:
-    """Pillars for ever; in each place, one pallet or cart after another, with a while between them."""
+    """Pillars for ever; in each place one pallet or cart after another, with a while between them.
+
+    Each stands elsewhere in its place than the one before, as nobody can tell two that look alike by less.
+    """
     for place in _PILLARS:
         yield _Stay("pillar", place, -np.inf, np.inf)
     for place in _PLACES:
-        begin_h = random.exponential(8.0) - 8.0
+        begin_h, side_m = random.exponential(8.0) - 8.0, 0.8
         while begin_h < 24.0 * _DAYS:
             kind = str(random.choice(list(_MEAN_STAY_H)))
             end_h = begin_h + random.exponential(_MEAN_STAY_H[kind])
-            yield _Stay(kind, place, begin_h, end_h)
+            yield _Stay(kind, (place[0] + side_m, place[1]), begin_h, end_h)
+            side_m = -side_m
             begin_h = end_h + random.exponential(6.0)
