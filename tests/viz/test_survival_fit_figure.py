@@ -78,7 +78,7 @@ def test_mass_of_an_interval_is_a_box() -> None:
     inside = (x > 10.0) & (x < 15.0)
     assert np.isnan(y[inside]).all()
     np.testing.assert_allclose(y[(x > 15.0) & (x < 30.0)], 1.0 / 3.0)
-    assert "N: anywhere in it" in [item.get_label() for item in axes.collections]
+    assert "anywhere in a box" in [item.get_label() for item in axes.collections]
 
 
 def test_survival_refuses_nothing_and_no_time() -> None:

@@ -114,9 +114,9 @@ def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> 
 
 
 def _draw(path: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
-    from evermap.viz.lifetime_figure import plot
+    from evermap.viz.survival_fit_figure import plot_survival
 
-    write_picture(path, plot({group.label: found.prior for group, found in zip(groups, estimates, strict=True)}))
+    write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
 
 
 def _remarks(table: LifetimeTable, groups: Sequence[Group]) -> list[str]:

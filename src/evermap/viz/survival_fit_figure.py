@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Estimate = Npmle | KaplanMeier | ParametricFit | HazardDraws | LifetimePrior
 
 _COLOURS = (ESTIMATE, ALERT, LANDMARK, ODOMETRY, GROUP)
+_DASHES = ("-", "--", ":")
+_BOX = "anywhere in a box"
 _POINTS = 1201
 _WIDE = 1e3
 """A ratio of the end of the axis to early lifetimes from which time is logarithmic."""
@@ -67,7 +69,10 @@ def plot_survival(
         figure = new_figure(6.4, 3.8)
         axes = figure.subplots()
         for k, (name, one) in enumerate(estimates.items()):
-            _draw(axes, one, name, time_s, unit, _COLOURS[k % len(_COLOURS)])
+            _draw(
+                axes, one, name, time_s, unit, _COLOURS[k % len(_COLOURS)], _DASHES[k // len(_COLOURS) % len(_DASHES)]
+            )
+        _name_boxes_once(axes)
         if truth is not None:
             axes.plot(
                 time_s / unit.seconds, np.exp(truth.log_survival(time_s)), color=INK, lw=1.0, ls="--", label="truth"
@@ -115,30 +120,36 @@ def plot_chunks(
     return figure
 
 
-def _draw(axes: Axes, one: Estimate, name: str, time_s: FloatArray, unit: TimeUnit, colour: str) -> None:
+def _draw(axes: Axes, one: Estimate, name: str, time_s: FloatArray, unit: TimeUnit, colour: str, dashes: str) -> None:
     x = time_s / unit.seconds
     match one:
         case Npmle():
             corners = _corners(one, time_s)
             lower, upper = one.survival(corners)
             at = corners / unit.seconds
-            axes.fill_between(at, lower, upper, color=MUTED, alpha=0.35, lw=0, label=f"{name}: anywhere in it")
+            axes.fill_between(at, lower, upper, color=MUTED, alpha=0.35, lw=0, label=_BOX)
             # outside the boxes both bounds agree
-            axes.plot(at, np.where(lower == upper, lower, np.nan), color=colour, lw=1.4, label=name)
+            axes.plot(at, np.where(lower == upper, lower, np.nan), color=colour, ls=dashes, lw=1.4, label=name)
         case KaplanMeier():
             lower, upper = one.band(time_s)
             axes.fill_between(x, lower, upper, color=colour, alpha=0.2, lw=0)
-            axes.plot(x, one.survival(time_s), color=colour, label=name)
+            axes.plot(x, one.survival(time_s), color=colour, ls=dashes, label=name)
         case ParametricFit():
             lower, upper = one.band(time_s)
             axes.fill_between(x, lower, upper, color=colour, alpha=0.2, lw=0)
-            axes.plot(x, np.exp(one.prior.log_survival(time_s)), color=colour, label=name)
+            axes.plot(x, np.exp(one.prior.log_survival(time_s)), color=colour, ls=dashes, label=name)
         case HazardDraws():
             mean, lower, upper = one.survival(time_s)
             axes.fill_between(x, lower, upper, color=colour, alpha=0.2, lw=0)
-            axes.plot(x, mean, color=colour, label=name)
+            axes.plot(x, mean, color=colour, ls=dashes, label=name)
         case _:
-            axes.plot(x, np.exp(one.log_survival(time_s)), color=colour, label=name)
+            axes.plot(x, np.exp(one.log_survival(time_s)), color=colour, ls=dashes, label=name)
+
+
+def _name_boxes_once(axes: Axes) -> None:
+    boxes = [drawn for drawn in axes.collections if drawn.get_label() == _BOX]
+    for drawn in boxes[1:]:
+        drawn.set_label("")
 
 
 def _corners(one: Npmle, time_s: FloatArray) -> FloatArray:
