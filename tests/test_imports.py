@@ -35,7 +35,7 @@ RULES = {
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence recurrence slam sim io metrics viz pipeline "
+    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam sim io metrics viz pipeline "
     "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
