@@ -109,7 +109,7 @@ def plot_chunks(
         raise ConfigError(f"{len(chunks)} chunks need as many hazards, at least one", field="hazards")
     median, lower, upper = np.array([one.quantile(0.5) for one in hazards]).T
     with house_style():
-        figure = new_figure(7.2, 3.5)
+        figure = new_figure(7.2, 3.8)
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         _map(left, chunks, size_m, median, "half have gone after", durations=True)
         _map(right, chunks, size_m, upper / lower, "upper over lower bound [1]", durations=False)
@@ -178,7 +178,7 @@ def _map(
     axes.set_title(label)
     axes.grid(visible=False)
     ticks = _duration_ticks(low, high) if durations else _plain_ticks(low, high)
-    bar = axes.figure.colorbar(drawn, ax=axes, shrink=0.85)
+    bar = axes.figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.9, aspect=30)
     bar.minorticks_off()
     bar.set_ticks([value for _, value in ticks], labels=[name for name, _ in ticks])
 
