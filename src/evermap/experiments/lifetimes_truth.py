@@ -64,9 +64,12 @@ class Stays:
 
 
 def chosen_family(stays: Stays, t: FloatArray) -> Curve:
-    """Maximum likelihood of the family with the least AIC, which one sample a stay is enough to choose."""
-    kind = fit_best(stays.samples(instants=1), KINDS).kind
-    found = fit(kind, stays.samples(fit(kind, stays.settled()).prior))
+    """Maximum likelihood of the family with the least AIC, which one sample a stay is enough to choose.
+
+    A mixture may have no clear maximum once the samples are settled; the Weibull model takes its place.
+    """
+    kinds = fit_best(stays.samples(instants=1), KINDS).kind, "weibull"
+    found = fit_best(stays.samples(fit_best(stays.settled(), kinds).prior), kinds)
     return np.exp(found.prior.log_survival(t)), *found.band(t)
 
 
