@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, npmle, persistence, selectors
+from benchmarks import cliques, npmle, persistence, selectors, tracking
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -34,10 +34,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **selectors.METRICS,
     **cliques.METRICS,
     **npmle.METRICS,
+    **tracking.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -51,6 +52,8 @@ def run(
     seconds: float = persistence.SECONDS,
     n_cliques: int = cliques.N_CLIQUES,
     n_lifetimes: int = npmle.N_LIFETIMES,
+    n_frames: int = tracking.N_FRAMES,
+    n_stored: int = tracking.N_STORED,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -60,6 +63,7 @@ def run(
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
         n_features, seconds, n_cliques: the same for the persistence filter, and for the filters of cliques.
         n_lifetimes: censored samples of each kind.
+        n_frames, n_stored: length of a scene for trackers, and objects in the working set.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -89,6 +93,9 @@ def run(
         measured |= ratios
     if only in (None, "npmle"):
         ratios, shown["npmle"] = npmle.run(n_lifetimes)
+        measured |= ratios
+    if only in (None, "tracking"):
+        ratios, shown["tracking"] = tracking.run(n_frames, n_stored)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -171,6 +178,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", cliques.as_text(shown["cliques"])]
     if "npmle" in shown:
         lines += ["", npmle.as_text(shown["npmle"])]
+    if "tracking" in shown:
+        lines += ["", tracking.as_markdown(shown["tracking"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

@@ -11,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from evermap import se2
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import InputError
+from evermap.metrics.tracking import score_tracks
 from evermap.persistence import single
 from evermap.survival import Exponential
 from evermap.survival.censored import CensoredLifetimes
+from evermap.tracking import kalman
 
 SMALL = 150
 
@@ -117,6 +120,67 @@ def test_lifetimes_of_the_race_are_as_probable_by_the_peer(run: ModuleType) -> N
         np.testing.assert_allclose(ours.survival(ends)[1], theirs, atol=1e-6)
 
 
+def test_the_peer_of_the_tracker_filters_as_ours_does(run: ModuleType) -> None:
+    """One object in both: the same mean, frame after frame, with constant velocity and the same noise."""
+    race = run.tracking
+    frame_s, sigma_m = race.FRAME_S, race.SIGMA_M
+    peer = race.Sort(frame_s, sigma_m, race.MAX_AGE)
+    mean, covariance = np.zeros((1, 6)), np.diag([sigma_m**2] * 3 + [1.0] * 3)[None]
+    rng = np.random.default_rng(0)
+    for k in range(30):
+        point = rng.normal([0.05 * k, 0.0, 1.0], 0.1)
+        reports = peer.step(point[None])
+        if k == 0:
+            mean[0, :3] = point
+        else:
+            kalman.predict(mean, covariance, 1, frame_s, 0.1)
+            kalman.update(mean[0], covariance[0], point, sigma_m**2 * np.eye(3))
+        assert reports.track_id.tolist() == [0]
+        np.testing.assert_allclose(reports.position_m, mean[:, :3], rtol=1e-9)
+
+
+def test_trackers_of_the_race_are_judged_as_our_own_scores_are(run: ModuleType) -> None:
+    race = run.tracking
+    scene = race.Scene(27, 3.0, 1)
+    recording = race.draw(scene, 5, 40)
+    everyone = np.arange(scene.n)
+    truth = [(everyone, there) for there in recording.truth_m]
+    assert race.judge(recording, truth) == {"mota": 1.0, "idf1": 1.0, "switches": 0.0}
+    for done in (race.by_evermap(scene, recording), race.by_sort(recording)):
+        for reported in (done.at_once, done.afterwards):
+            ours = score_tracks(truth, reported, race.MATCH_M)
+            expected = {"mota": ours.mota, "idf1": ours.idf1, "switches": ours.switches}
+            assert race.judge(recording, reported) == pytest.approx(expected, abs=1e-9)
+            assert ours.mota > 0.8
+
+
+def test_scenes_for_trackers_are_what_they_say(run: ModuleType) -> None:
+    race = run.tracking
+    scene = race.SCENES["1000"]
+    recording = race.draw(scene, 3, 50)
+    speed = np.linalg.norm(np.diff(recording.truth_m, axis=0), axis=2) / race.FRAME_S
+    assert speed.max() <= 2.0 + 1e-9
+    assert speed[0].mean() == pytest.approx(1.0, abs=0.1)
+    assert np.mean([len(points) for points in recording.detected_m]) == pytest.approx(950.0, rel=0.01)
+    distance = KDTree(recording.truth_m[0]).query(recording.detected_m[0])[0]
+    near = distance[distance < 5.0 * race.SIGMA_M]
+    assert np.mean(near**2) == pytest.approx(3.0 * race.SIGMA_M**2, rel=0.1)
+    gaps = KDTree(recording.truth_m[0]).query(recording.truth_m[0], 2)[0][:, 1]
+    np.testing.assert_allclose(gaps, scene.spacing_m)
+
+
+def test_the_working_set_and_the_tree_of_the_race_find_the_same(run: ModuleType) -> None:
+    race = run.tracking
+    objects = race.stored_objects(3000, np.random.default_rng(0))
+    kept = race.empty_working_set()
+    kept.insert_arrays(objects)
+    tree = KDTree(objects.position)
+    for place in objects.position[::100]:
+        near = kept.near(place[None], np.array([race.REACH_M])).tolist()
+        assert near == sorted(tree.query_ball_point(place, race.REACH_M))
+        assert len(near) > 1
+
+
 def test_learning_cliques_of_the_race_are_all_looked_at_and_learned_from(run: ModuleType) -> None:
     """Nobody saves time by leaving something out, and the memory is that of all arrays."""
     scene = run.cliques.world(40)
@@ -207,7 +271,15 @@ def test_a_small_run_writes_compares_and_reports(
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
     measured = run.run(
-        update_baseline=True, n_poses=80, turns=1, n_features=2000, seconds=0.01, n_cliques=50, n_lifetimes=300
+        update_baseline=True,
+        n_poses=80,
+        turns=1,
+        n_features=2000,
+        seconds=0.01,
+        n_cliques=50,
+        n_lifetimes=300,
+        n_frames=12,
+        n_stored=2000,
     )
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)

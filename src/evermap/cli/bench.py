@@ -20,7 +20,9 @@ def bench(
     update_baseline: Annotated[
         bool, typer.Option("--update-baseline", help="Make these measurements the new baseline.")
     ] = False,
-    only: Annotated[str | None, typer.Option(help="Measure one part: slam, persistence, selectors, cliques or npmle.")] = None,
+    only: Annotated[
+        str | None, typer.Option(help="Measure one part: slam, persistence, selectors, cliques, npmle or tracking.")
+    ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
 
