@@ -39,7 +39,7 @@ RULES = {
     "runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
-    "objects": "errors types survival tracking io runsummary runfolder",
+    "objects": "errors types survival tracking io viz runsummary runfolder",
     "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence objects server "
     "experiments demo",
 }

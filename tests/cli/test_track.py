@@ -118,7 +118,8 @@ def test_summary_counts_what_the_files_hold(yard: Path) -> None:
     assert counts["gaps"] == 4 * 7 - 1
     assert counts["frames"] == 4 * 7 * 40
     assert summary(yard)["schema_version"] == "1"
-    assert set(summary(yard)["outputs"]) == {path.name for path in (yard / "out").iterdir()}
+    out = yard / "out"
+    assert summary(yard)["outputs"] == sorted(str(path.relative_to(out)) for path in out.rglob("*") if path.is_file())
 
 
 def test_parquet_says_what_csv_says(yard: Path) -> None:
@@ -132,9 +133,20 @@ def test_parquet_says_what_csv_says(yard: Path) -> None:
 
 
 def test_same_table_same_files(yard: Path, tmp_path: Path) -> None:
-    result = run("track", yard / "detections.csv", "--range-m", "12", "--out", tmp_path / "again", "--json")
+    result = run(
+        "track", yard / "detections.csv", "--range-m", "12", "--no-scene", "--out", tmp_path / "again", "--json"
+    )
     assert result.exit_code == 0, result.stderr
-    for name in ("tracks.csv", "detections.csv", "events.jsonl", "spells.csv", "lifetimes.csv", "tracks.parquet"):
+    assert not (tmp_path / "again" / "scene.rrd").exists()
+    for name in (
+        "figures/objects.png",
+        "tracks.csv",
+        "detections.csv",
+        "events.jsonl",
+        "spells.csv",
+        "lifetimes.csv",
+        "tracks.parquet",
+    ):
         assert (tmp_path / "again" / name).read_bytes() == (yard / "out" / name).read_bytes()
     assert json.loads(result.stdout)["counts"] == summary(yard)["counts"]
 
@@ -151,7 +163,7 @@ def test_survival_fit_takes_the_lifetimes(yard: Path) -> None:
 
 
 def test_without_range_misses_count_for_nothing(yard: Path, tmp_path: Path) -> None:
-    result = run("track", yard / "detections.csv", "--out", tmp_path / "out")
+    result = run("track", yard / "detections.csv", "--no-scene", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
     assert "without --range-m" in result.stderr
     spells = rows(tmp_path / "out" / "spells.csv")

@@ -56,6 +56,7 @@ def track(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Set one of the numbers below; repeatable."),
     ] = None,
+    scene: Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for rerun, if installed.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
         bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
@@ -71,7 +72,7 @@ def track(
     The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a covariance
     (cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m, sensor_y_m, sensor_z_m. A row without a
     position is a frame in which nothing was detected. The folder gets tracks.csv and tracks.parquet, detections.csv,
-    events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`) and summary.json.
+    events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`), summary.json, figures and scene.rrd.
 
     \b
     Most useful with --set:
@@ -126,7 +127,9 @@ def track(
     with progress_bar(f"{table_path.name}: tracking", speed=False) as progress:
         result = run_track(table, config, progress=progress)
     with progress_bar(f"{table_path.name}: writing", speed=False) as progress:
-        summary = write_track(out, result, command=command_line(), read_s=read_s, force=force, progress=progress)
+        summary = write_track(
+            out, result, command=command_line(), read_s=read_s, scene=scene, force=force, progress=progress
+        )
     for remark in summary["warnings"]:
         warn(remark)
     _show(summary, out, as_json=as_json)
@@ -147,5 +150,7 @@ def _show(summary: Mapping[str, Any], out: Path, *, as_json: bool) -> None:
     for name, numbers in summary["classes"].items():
         spells = f"{numbers['objects']:,} objects, {numbers['spells']:,} spells at rest"
         rows.append((name, f"{spells}, {numbers['spells_with_lifetimes']:,} with a lifetime"))
-    rows += [(name.partition(".")[0], str(out / name)) for name in ("tracks.csv", "lifetimes.csv")]
+    rows += [
+        (name.partition(".")[0], str(out / name)) for name in ("tracks.csv", "lifetimes.csv", "figures/objects.png")
+    ]
     print_table(Path(summary["source"]).name, rows)

@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
+from evermap.errors import MissingExtraError
 from evermap.io.columns import csv_bytes, named
 from evermap.io.table import parquet_bytes
+from evermap.objects.draw import draw_run, write_recording
 from evermap.objects.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.objects.run import TrackResult
 from evermap.runfolder import SUMMARY, RunFolder, summary_text
 from evermap.runsummary import peak_memory_mb, versions
 from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.viz.style import save_png
 
 SCHEMA_VERSION = "1"
 
@@ -30,6 +33,7 @@ def write_track(
     *,
     command: str = "",
     read_s: float | None = None,
+    scene: bool = True,
     force: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> dict[str, Any]:
@@ -40,6 +44,7 @@ def write_track(
         result: of `run_track`.
         command: the command line, '' if there was none.
         read_s: wall time of reading the table.
+        scene: whether to write a recording for rerun; left out with a warning where rerun-sdk is missing.
         force: replace `out` whatever it holds.
         progress: told after each file.
 
@@ -59,13 +64,18 @@ def write_track(
         for k, (name, content) in enumerate(files.items()):
             folder.path(name).write_bytes(content())
             if progress:
-                progress(k + 1, len(files))
+                progress(k + 1, len(files) + 1)
+        written = perf_counter()
+        save_png(draw_run(result), folder.path("figures/objects.png"))
+        remarks = _scene(result, folder) if scene else []
         timing = {
             **({} if read_s is None else {"read_s": read_s}),
             "track_s": result.seconds,
-            "write_s": perf_counter() - start,
+            "write_s": written - start,
+            "draw_s": perf_counter() - written,
         }
         summary = track_summary(result, command=command, timing=timing)
+        summary["warnings"] += remarks
         summary["outputs"] = sorted([*folder.files(), SUMMARY])
         folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     return summary
@@ -105,6 +115,15 @@ def track_summary(result: TrackResult, *, command: str, timing: dict[str, float]
         },
         "warnings": list(result.warnings),
     }
+
+
+def _scene(result: TrackResult, folder: RunFolder) -> list[str]:
+    """Writes the recording; a remark where it cannot be."""
+    try:
+        write_recording(result, folder.path("scene.rrd"))
+    except MissingExtraError as error:
+        return [f"scene.rrd was left out: {error.one_line()}"]
+    return []
 
 
 def _of_class(result: TrackResult, class_id: int, class_of_track: IntArray) -> dict[str, Any]:

@@ -1,0 +1,44 @@
+"""The figure of a tracking run shows every spell, and does not pretend to know ends that nobody knows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evermap.viz.objects_figure import MOST_SPELLS, Rests, plot_objects
+
+HOUR_S = 3600.0
+
+
+def rests(n: int) -> Rests:
+    """Spell k is seen from k to 2 k + 1 hours; the first has no known beginning, the last no known end."""
+    hour = np.arange(n, dtype=np.float64)
+    elsewhere, gone = hour - 0.5, 2.0 * hour + 1.5
+    elsewhere[0], gone[-1] = -np.inf, np.inf
+    place = np.stack([hour, -hour], axis=1)
+    return Rests(np.arange(n) % 2, place, *(HOUR_S * h for h in (elsewhere, hour, 2.0 * hour + 1.0, gone)))
+
+
+def test_a_bar_for_each_spell_thin_where_it_can_have_come_and_gone() -> None:
+    figure = plot_objects(("a", "b"), [], rests(3), start_s=0.0, end_s=8 * HOUR_S)
+    _, bars = figure.axes
+    lines = [line for line in bars.lines if line.get_linestyle() == "-" and np.size(line.get_xdata()) == 2]
+    spans = sorted(
+        (float(line.get_linewidth()), *(round(float(x), 6) for x in np.asarray(line.get_xdata()))) for line in lines
+    )
+    # gone to last for the thin lines behind, elsewhere to first for those before
+    assert spans == [(0.8, 0.5, 1.0), (0.8, 1.5, 1.0), (0.8, 1.5, 2.0), (0.8, 3.5, 3.0)] + [
+        (3.0, 0.0, 1.0),
+        (3.0, 1.0, 3.0),
+        (3.0, 2.0, 5.0),
+    ]
+    arrows = {str(line.get_marker()): float(np.asarray(line.get_xdata())[0]) for line in bars.lines}
+    assert (arrows["<"], arrows[">"]) == pytest.approx((0.0, 5.0))
+
+
+def test_of_too_many_the_longest() -> None:
+    figure = plot_objects(("a", "b"), [], rests(MOST_SPELLS + 5), start_s=0.0, end_s=400 * HOUR_S)
+    _, bars = figure.axes
+    thick = [line for line in bars.lines if line.get_linewidth() == 3.0]
+    assert len(thick) == MOST_SPELLS
+    assert bars.get_title(loc="left") == f"the {MOST_SPELLS} longest of {MOST_SPELLS + 5} spells at rest"
