@@ -37,7 +37,7 @@ class TrackResult:
         tracks: of objects that were confirmed, one row an object and frame.
         track_of_detection: (M,) the object that each detection is of, `UNKNOWN` for one never confirmed.
         events: all that happened, in order.
-        spells: times at which objects stayed where they were.
+        spells: times at which objects were seen to rest for at least `rest_for_s`.
         lifetimes: samples of how long things stay, several rows a spell (see `survival.sightings`); None where the
             beginning of no spell is bounded.
         spell_of_lifetime: (N,) the spell that each row of `lifetimes` belongs to.
@@ -99,7 +99,7 @@ def run_track(
     if len(tracks) == 0:
         hint = f"fewer detections to be believed: --set warm_up={max(1, config.settings.warm_up - 1)}"
         raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
-    spells = tracker.static_spells()
+    spells = _long_enough(tracker.static_spells(), config.settings.rest_for_s)
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.settings.rest_for_s)
     confirmed = np.isin(track_of_detection, tracks.track_id)
     return TrackResult(
@@ -179,15 +179,18 @@ def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
     return np.where(np.isnan(table.covariance_m2), sigma_m**2 * np.eye(3), table.covariance_m2)
 
 
+def _long_enough(spells: StaticSpells, rest_for_s: float) -> StaticSpells:
+    """Those seen to last: a slow object is where it was for a moment again and again, and does not rest."""
+    rows = np.flatnonzero(spells.last_s - spells.first_s >= rest_for_s)
+    return StaticSpells(*(getattr(spells, name)[rows] for name in StaticSpells.__slots__))
+
+
 def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
     if not _bounded(spells).any():
         return None, np.zeros(0, dtype=np.int64)
-    try:
-        return lifetimes_of_sightings(
-            spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s, least_stay_s=rest_for_s
-        )
-    except DataError:  # all of them were too short
-        return None, np.zeros(0, dtype=np.int64)
+    return lifetimes_of_sightings(
+        spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s, least_stay_s=rest_for_s
+    )
 
 
 def _bounded(spells: StaticSpells) -> BoolArray:
