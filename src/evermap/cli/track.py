@@ -44,6 +44,15 @@ def track(
             show_default="0.5 for all",
         ),
     ] = None,
+    confusion_path: Annotated[
+        Path | None,
+        typer.Option(
+            "--confusion",
+            metavar="FILE",
+            help="Table of P(detected class | true class): class_id, and a column a class.",
+            show_default="5 % mistakes",
+        ),
+    ] = None,
     min_score: Annotated[float, typer.Option(help="Leave out detections of a lower score.")] = 0.0,
     gap_s: Annotated[
         float | None,
@@ -101,6 +110,7 @@ def track(
     if table_path is None:
         raise ConfigError("a table is needed", field="INPUT", hint="--init detections.csv writes an example")
     from evermap.objects.config import DEFAULT_PRIOR, TrackConfig, parse_settings, parse_speeds
+    from evermap.objects.confusion import read_confusion
     from evermap.objects.detections import read_detections
     from evermap.objects.run import run_track
     from evermap.objects.run import warm_up as compile_kernels
@@ -122,10 +132,11 @@ def track(
     )
     start = time.perf_counter()
     table = read_detections(table_path, min_score=min_score)
+    confusion = None if confusion_path is None else read_confusion(confusion_path, table.class_names)
     read_s = time.perf_counter() - start
     warm_up(compile_kernels)
     with progress_bar(f"{table_path.name}: tracking", speed=False) as progress:
-        result = run_track(table, config, progress=progress)
+        result = run_track(table, config, confusion=confusion, progress=progress)
     with progress_bar(f"{table_path.name}: writing", speed=False) as progress:
         summary = write_track(
             out, result, command=command_line(), read_s=read_s, scene=scene, force=force, progress=progress

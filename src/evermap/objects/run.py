@@ -69,13 +69,18 @@ class TrackResult:
 
 
 def run_track(
-    table: DetectionTable, config: TrackConfig | None = None, *, progress: Callable[[float, float], None] | None = None
+    table: DetectionTable,
+    config: TrackConfig | None = None,
+    *,
+    confusion: FloatArray | None = None,
+    progress: Callable[[float, float], None] | None = None,
 ) -> TrackResult:
     """Track all frames of a table.
 
     Args:
         table: of `read_detections`.
         config: the choices.
+        confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
         progress: told after every hundredth frame what is done, and how many there are.
 
     Raises:
@@ -90,6 +95,7 @@ def run_track(
     tracker = Tracker(
         replace(config.settings, class_speed_mps=config.speeds(names)),
         n_classes=len(names),
+        confusion=confusion,
         n_appearance=0 if table.appearance is None else table.appearance.shape[1],
         priors=config.priors(names),
     )
