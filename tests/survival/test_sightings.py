@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from evermap.errors import ConfigError, DataError
 from evermap.survival import Exponential, LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import fit
-from evermap.survival.sightings import lifetimes_of_sightings, settled_samples
+from evermap.survival.sightings import fit_sightings, lifetimes_of_sightings, settled_samples
 
 
 def test_bounds_by_hand() -> None:
@@ -68,6 +69,28 @@ def test_true_lifetimes_come_out_though_many_are_never_seen(scale_s: float, shap
     elsewhere, first, last, gone = stays[:, np.isfinite(stays[0])]
     naive = fit("weibull", CensoredLifetimes.of(last - first, gone - elsewhere))
     assert (naive.parameters[0] - math.log(scale_s)) / naive.standard_errors[0] > 5.0
+
+
+@pytest.mark.parametrize(("scale_s", "shape"), [(2.0, 1.0), (3.0, 2.0), (1.0, 2.0)])
+def test_likelihood_of_the_stays_finds_the_truth_too(scale_s: float, shape: float) -> None:
+    """Over twenty runs errors are as large as standard errors say."""
+    off = []
+    for seed in range(20):
+        found = fit_sightings("weibull", *lifetimes_of_sightings(*patrols(seed, scale_s, shape)))
+        off.append((found.parameters - np.log([scale_s, shape])) / found.standard_errors)
+    assert chi2.sf(np.square(off).sum(axis=0), 20).min() > 1e-3
+    assert chi2.cdf(np.square(off).sum(axis=0), 20).min() > 1e-3
+
+
+def test_without_memory_it_makes_no_difference_when_it_came() -> None:
+    """What is left of an exponential stay at the first sighting is exponential again."""
+    stays = patrols(5, 2.0, 1.0)
+    first, last, gone = stays[1:, np.isfinite(stays[0])]
+    found = fit_sightings("exponential", *lifetimes_of_sightings(*stays))
+    left = fit("exponential", CensoredLifetimes.of(last - first, gone - first))
+    np.testing.assert_allclose(found.parameters, left.parameters, atol=1e-6)
+    np.testing.assert_allclose(found.covariance, left.covariance, rtol=1e-4)
+    assert found.loglik == pytest.approx(left.loglik)
 
 
 def test_weights_are_the_probabilities_of_the_sighting() -> None:

@@ -11,10 +11,8 @@ import numpy as np
 from evermap.experiments.lifetimes_truth import Value
 from evermap.metrics.tracking import TrackingScores, score_tracks
 from evermap.sim.moving import MovingRun, MovingWorld, simulate_moving
-from evermap.survival import LifetimePrior
-from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.parametric_fit import ParametricFit, fit
-from evermap.survival.sightings import lifetimes_of_sightings, settled_samples
+from evermap.survival.parametric_fit import ParametricFit
+from evermap.survival.sightings import fit_sightings, lifetimes_of_sightings
 from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
@@ -93,11 +91,8 @@ def learn(spells: list[StaticSpells], class_id: int, least_stay_s: float) -> tup
         for name in ("elsewhere_s", "first_s", "last_s", "gone_s")
     ]
 
-    def samples(given: LifetimePrior | None) -> CensoredLifetimes:
-        return lifetimes_of_sightings(*columns, given=given, least_stay_s=least_stay_s)[0]
-
-    settled = settled_samples(lambda known: fit("weibull", known).prior, samples)
-    return fit("weibull", settled), round(float(settled.weight.sum()))
+    samples, stay = lifetimes_of_sightings(*columns, least_stay_s=least_stay_s)
+    return fit_sightings("weibull", samples, stay), len(np.unique(stay))
 
 
 def study(

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
+from evermap.errors import NumericalError
 from evermap.sim.patrol_lifetimes import PatrolRun, PatrolWorld, simulate_patrols
 from evermap.survival import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import gp_fit
 from evermap.survival.kaplan_meier import kaplan_meier
 from evermap.survival.parametric_fit import fit, fit_best
-from evermap.survival.sightings import lifetimes_of_sightings, settled_samples
+from evermap.survival.sightings import fit_sightings, lifetimes_of_sightings, settled_samples
 from evermap.types import FloatArray
 
 SHARES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
@@ -50,12 +51,12 @@ class Stays:
 
     def samples(self, given: LifetimePrior | None = None, instants: int = INSTANTS) -> CensoredLifetimes:
         """Censored samples that know of the unseen ones."""
-        columns = self.elsewhere_s, self.first_s, self.last_s, self.gone_s
-        return lifetimes_of_sightings(*columns, given=given, instants=instants)[0]
+        return lifetimes_of_sightings(*self.columns, given=given, instants=instants)[0]
 
-    def settled(self) -> CensoredLifetimes:
-        """The same, with weights that agree with a Weibull model of them."""
-        return settled_samples(lambda samples: fit("weibull", samples).prior, self.samples, rounds=3)
+    @property
+    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """In order of time."""
+        return self.elsewhere_s, self.first_s, self.last_s, self.gone_s
 
     def begun_in_view(self) -> Stays:
         """Those whose coming is bounded."""
@@ -66,10 +67,14 @@ class Stays:
 def chosen_family(stays: Stays, t: FloatArray) -> Curve:
     """Maximum likelihood of the family with the least AIC, which one sample a stay is enough to choose.
 
-    A mixture may have no clear maximum once the samples are settled; the Weibull model takes its place.
+    A mixture may have no clear maximum with more of them; the Weibull model takes its place.
     """
-    kinds = fit_best(stays.samples(instants=1), KINDS).kind, "weibull"
-    found = fit_best(stays.samples(fit_best(stays.settled(), kinds).prior), kinds)
+    kind = fit_best(stays.samples(instants=1), KINDS).kind
+    samples = lifetimes_of_sightings(*stays.columns, instants=INSTANTS)
+    try:
+        found = fit_sightings(kind, *samples)
+    except NumericalError:
+        found = fit_sightings("weibull", *samples)
     return np.exp(found.prior.log_survival(t)), *found.band(t)
 
 

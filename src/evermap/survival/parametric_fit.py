@@ -205,19 +205,40 @@ def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
         DataError: no lifetime has an end.
         NumericalError: the likelihood has no maximum in this family, or one that a parameter makes no difference to.
     """
-    name, family = _named(kind)
     data = _counted(data)
-    total = float(data.weight.sum())
+
+    def of_samples(prior: LifetimePrior) -> float:
+        return float(data.weight @ log_likelihood(prior, data))
+
+    return fit_likelihood(kind, of_samples, _rough_mean(data), float(data.weight.sum()))
+
+
+def fit_likelihood(
+    kind: str | Kind, log_likelihood_of: Callable[[LifetimePrior], float], rough_mean_s: float, n_samples: float
+) -> ParametricFit:
+    """Most probable parameters of one family, whatever the likelihood is made of.
+
+    Args:
+        kind: one of `KINDS`, by name or itself.
+        log_likelihood_of: of all samples together under a prior; -inf or NaN where they are impossible.
+        rough_mean_s: about how long a stay is, to start from.
+        n_samples: how many there are.
+
+    Raises:
+        ConfigError: no family has this name.
+        NumericalError: the likelihood has no maximum in this family, or one that a parameter makes no difference to.
+    """
+    name, family = _named(kind)
 
     def cost(parameters: FloatArray) -> float:
         try:
             with np.errstate(all="ignore"):
-                value = -float(data.weight @ log_likelihood(family.build(parameters), data)) / total
+                value = -log_likelihood_of(family.build(parameters)) / n_samples
         except (ConfigError, OverflowError):  # parameters beyond what numbers can hold
             return _IMPOSSIBLE
         return min(_IMPOSSIBLE, value)  # which NaN is not less than either
 
-    found, least = min((_search(cost, np.array(s)) for s in family.starts(_rough_mean(data))), key=lambda r: r[1])
+    found, least = min((_search(cost, np.array(s)) for s in family.starts(rough_mean_s)), key=lambda r: r[1])
     hessian = _hessian(cost, found)
     if not (np.isfinite(found).all() and np.linalg.eigvalsh(hessian)[0] > 1e-7):
         raise NumericalError(
@@ -225,8 +246,8 @@ def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
             field="kind",
             hint="one with fewer parameters, as exponential, or more data",
         )
-    covariance = np.asarray(np.linalg.inv(hessian)) / total
-    return ParametricFit(name, family, family.build(found), found, covariance, -least * total, total)
+    covariance = np.asarray(np.linalg.inv(hessian)) / n_samples
+    return ParametricFit(name, family, family.build(found), found, covariance, -least * n_samples, n_samples)
 
 
 def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)) -> ParametricFit:
