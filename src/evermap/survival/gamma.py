@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,22 +42,23 @@ class Gamma(Lifetime):
         """`log H(t) = log(-log Q(shape, x))`."""
         from scipy.special import gammainc, gammaincc
 
-        x = t / self.scale_s
-        below, above = gammainc(self.shape, x), gammaincc(self.shape, x)
-        log_below = np.where(below > _UNDERFLOW, np.log(below), self._log_lower_series(x))
+        x = np.asarray(t / self.scale_s)
+        below, above = np.asarray(gammainc(self.shape, x), np.float64), np.asarray(gammaincc(self.shape, x), np.float64)
         # -log(1 - F) / F tends to 1 as F vanishes.
         bracket = np.where(below > _UNDERFLOW, -np.log1p(-below) / np.maximum(below, _UNDERFLOW), 1.0)
-        log_above = np.where(above > _UNDERFLOW, np.log(above), self._log_upper_tail(x))
+        log_below = _log_or_else(below, x, self._log_lower_series)
+        log_above = _log_or_else(above, x, self._log_upper_tail)
         return np.where(below < 0.5, log_below + np.log(bracket), np.log(-log_above))
 
     def _log_hazard(self, t: FloatArray) -> FloatArray:
         from scipy.special import gammaincc, gammaln, xlogy
 
-        x = t / self.scale_s
+        x = np.asarray(t / self.scale_s)
         above = gammaincc(self.shape, x)
         far = self._is_far(x)
-        near = xlogy(self.shape - 1.0, x) - x - gammaln(self.shape) - np.log(above)
-        return np.where(far, -np.log(x * self._continued_fraction(x)), near) - math.log(self.scale_s)
+        log_hazard = np.asarray(xlogy(self.shape - 1.0, x) - x - gammaln(self.shape) - np.log(above))
+        log_hazard[far] = -np.log(x[far] * self._continued_fraction(x[far]))
+        return log_hazard - math.log(self.scale_s)
 
     def _is_far(self, x: FloatArray) -> FloatArray:
         """Where the continued fraction converges in a few dozen steps."""
@@ -91,3 +93,12 @@ class Gamma(Lifetime):
         hazard = np.exp(log_target)
         early = gammaincinv(self.shape, -np.expm1(-hazard))
         return np.asarray(self.scale_s * np.where(hazard < 0.5, early, gammainccinv(self.shape, np.exp(-hazard))))
+
+
+def _log_or_else(values: FloatArray, x: FloatArray, series: Callable[[FloatArray], FloatArray]) -> FloatArray:
+    """`log values`, or `series(x)` where they underflow; series are long, and hardly ever needed."""
+    tiny = np.asarray(values <= _UNDERFLOW)
+    result = np.asarray(np.log(np.where(tiny, 1.0, values)))
+    if tiny.any():
+        result[tiny] = series(x[tiny])
+    return result
