@@ -12,8 +12,8 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "slam", "persist", "convert", "simulate", "reproduce", "bench"]
-GROUPS = {"survival": ["fit", "plot"]}
+VERBS = ["demo", "slam", "persist", "track", "convert", "simulate", "reproduce", "bench"]
+GROUPS = {"survival": ["fit", "learn", "plot"]}
 
 
 def run(*arguments: str) -> Result:

@@ -75,7 +75,7 @@ def track(
         typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False),
     ] = None,
 ) -> None:
-    """Follow objects in space, find them again, and learn how long they stay.
+    """Follow objects in space, and learn how long they stay.
 
     \b
     The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a covariance
