@@ -22,6 +22,7 @@ class Experiment(StrEnum):
     PRESENCE = "presence"
     NIELSEN2024 = "nielsen2024"
     BATEMAN2020 = "bateman2020"
+    LIFETIMES = "lifetimes"
 
 
 DATA = {
@@ -29,6 +30,7 @@ DATA = {
     Experiment.ROSEN2016: Path("../shared/golden"),
     Experiment.PRESENCE: Path("../shared/data/presence"),
     Experiment.NIELSEN2024: Path("../shared/data/mrclam"),
+    Experiment.LIFETIMES: Path("../shared/data/presence"),
 }
 """Where the data of each experiment are looked for; bateman2020 has none."""
 
@@ -73,7 +75,11 @@ def reproduce(
         int | None, typer.Option(help="nielsen2024: runs at a time; 1 for timings that mean something.", min=1)
     ] = None,
     runs: Annotated[
-        int | None, typer.Option(help="bateman2020: simulated for every world and sensor.", show_default="100")
+        int | None,
+        typer.Option(
+            help="bateman2020: simulated for every world and sensor. lifetimes: months of patrols that are simulated.",
+            show_default="100; lifetimes 10",
+        ),
     ] = None,
     world: Annotated[
         list[str] | None,
@@ -100,7 +106,8 @@ def reproduce(
     mrclam: all robots of the UTIAS recordings against the truth. rosen2016: figures 1 to 4 of the persistence filter's
     paper against reference numbers. presence: models of things that come and go against simple and published ones, in
     a room and at a door. nielsen2024: landmarks that moved, by all methods, in simulation and in the UTIAS recordings.
-    bateman2020: landmarks on rigid bodies seen in space, by filters of single landmarks and of whole bodies.
+    bateman2020: landmarks on rigid bodies seen in space, by filters of single landmarks and of whole bodies. lifetimes:
+    how long things stay, learned from tracks, from months of patrols and from looks at rooms, against the truth.
     Runs follow one another on one core, so that the timings mean something.
 
     \b
@@ -165,6 +172,14 @@ def reproduce(
             plan = bateman2020.default_settings(**{name: value for name, value in asked.items() if value is not None})
             table = bateman2020.reproduce(target, plan, progress=progress, force=force)
             as_text = bateman2020.as_markdown
+        elif experiment is Experiment.LIFETIMES:
+            from evermap.experiments import lifetimes
+
+            usual = lifetimes.Settings()
+            simulated = replace(usual, seed=seed or 0, repetitions=runs or usual.repetitions)
+            rooms = _reference(experiment, data, lifetimes.ROOMS, "nothing is said about rooms")
+            table = lifetimes.reproduce(target, simulated, data=rooms, progress=progress, force=force)
+            as_text = lifetimes.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -174,7 +189,8 @@ def reproduce(
                 seed=paper.seed if seed is None else seed,
                 sequences=paper.sequences if sequences is None else sequences,
             )
-            reference = _reference(data)
+            without = "the numbers are computed, and compared with nothing"
+            reference = _reference(experiment, data, "rosen2016.json", without)
             table = rosen2016.reproduce(target, settings, data=reference, progress=progress, force=force)
             as_text = rosen2016.as_markdown
     if as_json:
@@ -192,19 +208,20 @@ def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
         Experiment.PRESENCE: {"--data", "--seed"},
         Experiment.NIELSEN2024: {"--data", "--seed", "--part", "--dataset", "--method", "--quick", "--jobs"},
         Experiment.BATEMAN2020: {"--seed", "--runs", "--world", "--filters"},
+        Experiment.LIFETIMES: {"--data", "--seed", "--runs"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))
 
 
-def _reference(data: Path | None) -> Path | None:
-    """Where the reference numbers are; None, and a warning, if they are not where they are looked for unasked."""
+def _reference(experiment: Experiment, data: Path | None, file: str, without: str) -> Path | None:
+    """Where a file that can be done without is; None, and a warning, if it is not where it is looked for unasked."""
     if data is not None:
         return data
-    folder = DATA[Experiment.ROSEN2016]
-    if (folder / "rosen2016.json").is_file():
+    folder = DATA[experiment]
+    if (folder / file).is_file():
         return folder
-    warn(f"no {folder / 'rosen2016.json'}: the numbers are computed, and compared with nothing (try: --data FOLDER)")
+    warn(f"no {folder / file}: {without} (try: --data FOLDER)")
     return None
 
 

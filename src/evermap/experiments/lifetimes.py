@@ -23,6 +23,7 @@ from evermap.experiments.lifetimes_moving import TrackedRun, study
 from evermap.experiments.lifetimes_rooms import as_values, study_rooms
 from evermap.experiments.lifetimes_table import as_markdown
 from evermap.experiments.lifetimes_truth import ESTIMATORS, coverage, judge
+from evermap.experiments.presence_tasks import HOME
 from evermap.sim.moving import MovingWorld
 from evermap.sim.patrol_lifetimes import PatrolWorld, simulate_patrols
 
@@ -30,6 +31,8 @@ Progress = Callable[[float, float], None]
 """Called with what is done and the total, in runs."""
 
 SCHEMA_VERSION = "1"
+ROOMS = HOME
+"""File with the recording of rooms."""
 EXPECTED_COVERAGE = 0.93
 RECORDED_EVERY = 5
 """Frames between two in the recording."""
@@ -62,19 +65,19 @@ class Settings:
 
 
 def reproduce(
-    data: str | Path | None,
     out: str | Path,
     settings: Settings | None = None,
     *,
+    data: str | Path | None = None,
     progress: Progress | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
     """Compute all values, and write `summary.json`, `table.md`, the figures as PNG and SVG, and a recording.
 
     Args:
-        data: folder with the recording of rooms; None leaves the rooms out.
         out: folder; replaced if it holds an older reproduction, untouched if this one fails.
         settings: the defaults where None.
+        data: folder with the recording of rooms; None leaves the rooms out.
         progress: told as runs are done.
         force: replace `out` whatever it holds.
 
@@ -164,4 +167,4 @@ def _record(tracked: TrackedRun, path: Path) -> None:
         return
 
 
-__all__ = ["Settings", "as_markdown", "reproduce"]
+__all__ = ["ROOMS", "Settings", "as_markdown", "reproduce"]
