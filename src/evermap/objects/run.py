@@ -104,6 +104,8 @@ def run_track(
     tracks = recorder.tracks()
     if len(tracks) == 0:
         hint = f"fewer detections to be believed: --set warm_up={max(1, config.settings.warm_up - 1)}"
+        if _usual_step_s(table) > _SLOW_STEP_S:
+            hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
     spells = _long_enough(tracker.static_spells(), config.settings.rest_for_s)
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.settings.rest_for_s)
@@ -128,7 +130,7 @@ def _follow(
 ) -> tuple[Recorder, IntArray, int]:
     """Frame after frame; between them, where nobody looked for long, blind ones."""
     noise = _noise(table, config.settings.sigma_position_m)
-    step_s = float(np.median(np.diff(table.stamp_s))) if table.n_frames > 1 else 1.0
+    step_s = _usual_step_s(table)
     gap_s = config.gap_s or _GAP_STEPS * step_s
     recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
@@ -204,9 +206,14 @@ def _bounded(spells: StaticSpells) -> BoolArray:
     return np.asarray(np.isfinite(spells.elsewhere_s))
 
 
+def _usual_step_s(table: DetectionTable) -> float:
+    """Median time from frame to frame; any for a single frame."""
+    return float(np.median(np.diff(table.stamp_s))) if table.n_frames > 1 else 1.0
+
+
 def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -> list[str]:
     remarks = said_of(table)
-    step_s = float(np.median(np.diff(table.stamp_s))) if table.n_frames > 1 else 0.0
+    step_s = _usual_step_s(table)
     if step_s > _SLOW_STEP_S:
         remarks.append(f"frames are {step_s:.3g} s apart: what moves is hardly followed at that pace")
     if config.range_m is None and table.sensor_m is not None:
