@@ -114,9 +114,8 @@ def test_draws_answer_as_their_mean_and_as_a_prior() -> None:
     times = [PiecewiseConstantHazard(tuple(edges), tuple(r)).quantile(0.6) for r in draws.rates]
     np.testing.assert_allclose(draws.quantile(0.6, 0.8), np.quantile(times, [0.5, 0.1, 0.9]))
     np.testing.assert_allclose(np.exp(draws.prior().log_survival(edges)), draws.survival(edges)[0])
-    step = 1e-6
-    hazard = -(math.log(draws.survival(4.0 + step)[0]) - math.log(draws.survival(4.0)[0])) / step
-    assert draws.prior().hazard(4.0) == pytest.approx(hazard, rel=1e-4)
+    for late in (8.0, 64.0, 512.0):  # not a constant hazard: the draws that leave late are those that are left
+        assert draws.prior().log_survival(late) == pytest.approx(math.log(draws.survival(late)[0]))
     with pytest.raises(ConfigError, match=r"confidence"):
         draws.survival(t, 0.0)
 
@@ -211,6 +210,24 @@ def test_without_covariates_and_a_filter_takes_it() -> None:
     np.testing.assert_allclose(np.exp(prior.log_survival(truth.quantile([0.2, 0.5, 0.8]))), [0.8, 0.5, 0.2], atol=0.05)
     belief = single.predict(single.init(1, prior), 2e4)
     assert belief[0] == pytest.approx(math.exp(prior.log_survival(2e4)))
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ([5.0], [5.0]),
+        ([5.0], [9.0]),
+        ([3.0] * 50, [3.0] * 50),
+        ([3e-9, 5e-9], [3e-9, 6e-9]),
+        ([1e3, 5e12], [1e4, 6e12]),
+    ],
+)
+def test_few_and_equal_samples_have_an_answer_near_them(left: list[float], right: list[float]) -> None:
+    hazard = gp_fit(CensoredLifetimes.of(left, right)).at()
+    median, lower, upper = hazard.quantile(0.5)
+    assert 0.3 * min(left) < median < 3.0 * max(right)
+    assert 0.0 < lower < median < upper
+    assert math.isfinite(hazard.prior().mean())
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -30,6 +30,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 STRETCHES = 24
 DRAWS = 2000
 """From the posterior, half of them mirror images of the other half."""
+TAIL = 10
+"""Stretches of a prior beyond the last of the hazard, each as long as all before: doubt makes hazards fall there."""
 GUESS, GUESS_COUNTS = 1.0, 1.0
 """A scale before data, and as how many directions it counts; it keeps scales of few directions from 0."""
 _ROUNDS, _SETTLED = 60, 0.02
@@ -134,14 +136,17 @@ class HazardDraws:
         return float(middle), float(lower), float(upper)
 
     def prior(self) -> PiecewiseConstantHazard:
-        """The lifetime prior whose survival is the expected one at every edge."""
-        cumulative = np.concatenate([np.zeros((len(self.rates), 1)), self._cumulative()], axis=1)
+        """The lifetime prior whose survival is the expected one at every edge, and at later times for the tail."""
+        reach_s = self.edges_s[-1] if len(self.edges_s) > 1 else 1.0 / self.rates.max()
+        edges_s = np.concatenate([self.edges_s, reach_s * 2.0 ** np.arange(1, TAIL + 1)])
+        steps = np.diff(edges_s)
+        rates = np.concatenate([self.rates, np.repeat(self.rates[:, -1:], TAIL, axis=1)], axis=1)
+        cumulative = np.cumsum(np.column_stack([np.zeros(len(rates)), rates[:, :-1] * steps]), axis=1)
         lightest = cumulative.min(axis=0)
         log_expected = np.log(np.exp(lightest - cumulative).mean(axis=0)) - lightest
-        rates = -np.diff(log_expected) / np.diff(self.edges_s)
         weight = np.exp(lightest[-1] - cumulative[:, -1])
-        last = float(weight @ self.rates[:, -1] / weight.sum())
-        return PiecewiseConstantHazard(tuple(self.edges_s), (*np.maximum(rates, 0.0), last))
+        last = float(weight @ rates[:, -1] / weight.sum())
+        return PiecewiseConstantHazard(tuple(edges_s), (*np.maximum(-np.diff(log_expected) / steps, 0.0), last))
 
     def _cumulative(self) -> FloatArray:
         return np.asarray(np.cumsum(self.rates[:, :-1] * np.diff(self.edges_s), axis=1))
@@ -160,7 +165,8 @@ def stretches_for(data: CensoredLifetimes, count: int = STRETCHES) -> FloatArray
     finite = np.where(np.isfinite(data.right_s), data.right_s, data.left_s)[seen]
     high = float(max(finite.max(), data.left_s[seen].max()))
     low = float(np.quantile(finite[finite > 0.0], 0.02))
-    return np.concatenate([[0.0], np.geomspace(min(low, 0.1 * high), high, count - 1)])
+    # The latest of all ends within the last stretch: at its start there would be an end without any exposure.
+    return np.concatenate([[0.0], np.geomspace(min(low, 0.1 * high), high, count)[:-1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -312,6 +318,7 @@ class _Model:
         """(N, K) log hazards over the baseline."""
         return np.asarray((self.curves @ u)[self.samples.group] + (self.levels @ u)[:, None])
 
+    @np.errstate(over="ignore")
     def derivatives(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Slope, minus the second derivative, and a positive definite bound of it."""
         samples, weight = self.samples, self.samples.weight[:, None]

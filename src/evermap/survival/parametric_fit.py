@@ -244,7 +244,7 @@ def fit_likelihood(
         raise NumericalError(
             f"the likelihood of these lifetimes has no clear maximum among '{name}' models",
             field="kind",
-            hint="one with fewer parameters, as exponential, or more data",
+            hint="more data" if len(found) == 1 else "one with fewer parameters, as exponential, or more data",
         )
     covariance = np.asarray(np.linalg.inv(hessian)) / n_samples
     return ParametricFit(name, family, family.build(found), found, covariance, -least * n_samples, n_samples)
