@@ -116,6 +116,7 @@ def reproduce(
       evermap reproduce rosen2016 --seed 1
       evermap reproduce presence --out out/presence
       evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
+      evermap reproduce lifetimes --runs 3
       evermap reproduce bateman2020 --runs 20 --world nominal --world occlusion --filters jcf+suppression,oracle
     """
     _one_core()
