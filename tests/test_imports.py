@@ -35,8 +35,8 @@ RULES = {
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam sim io metrics viz pipeline "
-    "runsummary runfolder",
+    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam sim io metrics viz "
+    "pipeline runsummary runfolder",
     "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types survival tracking io viz runsummary runfolder",
