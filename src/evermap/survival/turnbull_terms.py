@@ -116,7 +116,7 @@ class Point:
             before=_bent(terms.before, self.below),
             after=_bent(terms.after - terms.entered if truncated else terms.after, self.above),
             entered=np.zeros(terms.entered.size),
-            weight=terms.weight / np.square(self.span),
+            weight=_bent(terms.weight, self.span),
         )
 
     def hazard_curvature(self) -> Terms:
@@ -130,7 +130,7 @@ class Point:
             before=_bent(terms.before * s, self.below),
             after=np.zeros(s.size),
             entered=np.zeros(s.size),
-            weight=terms.weight * s[terms.first] * s[terms.last] / np.square(self.span),
+            weight=_bent(terms.weight * s[terms.first] * s[terms.last], self.span),
         )
         diagonal = np.empty(s.size)
         laplacian.diagonal(curvature, diagonal)
