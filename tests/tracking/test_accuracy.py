@@ -222,9 +222,9 @@ def parked(seed: int, duration_s: float = 200.0) -> tuple[StaticSpells, FloatArr
 )
 def test_static_spells_contain_the_true_length(seed: int) -> None:
     spells, place, came, left = parked(seed)
-    samples = spells.lifetimes()
+    seen_s, possible_s = spells.last_s - spells.first_s, spells.gone_s - spells.elsewhere_s
     for k in range(len(place)):
         mine = np.flatnonzero(np.linalg.norm(spells.position_m - place[k], axis=1) < 1.0)
         assert len(mine), f"object {k}"
-        longest = mine[samples.left_s[mine].argmax()]
-        assert samples.left_s[longest] <= left[k] - came[k] <= samples.right_s[longest], f"object {k}"
+        longest = mine[seen_s[mine].argmax()]
+        assert seen_s[longest] <= left[k] - came[k] <= possible_s[longest], f"object {k}"

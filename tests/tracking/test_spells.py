@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.survival.sightings import lifetimes_of_sightings
 from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
@@ -27,10 +28,12 @@ def test_lifetimes_by_hand() -> None:
         last_s=np.full(4, 500.0),
         gone_s=np.array([560.0, np.inf, 560.0, np.inf]),
     )
-    samples = spells.lifetimes()
-    assert samples.left_s.tolist() == [400.0] * 4
-    assert samples.right_s.tolist() == [470.0, np.inf, np.inf, np.inf]
-    assert samples.origin_seen.tolist() == [True, True, False, False]
+    samples, spell = lifetimes_of_sightings(spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s)
+    assert set(spell.tolist()) == {0, 1}  # of the others nobody knows when they came
+    assert samples.left_s.min() >= 400.0
+    assert samples.right_s[spell == 0].max() <= 470.0
+    assert (samples.right_s[spell == 1] == np.inf).all()
+    np.testing.assert_array_equal(spells[spell].track_id, spell)
 
 
 def test_one_that_is_there_all_the_time_is_open_at_both_ends() -> None:
@@ -55,8 +58,8 @@ def test_one_that_comes_and_goes_in_view_is_an_interval(here: View) -> None:
     assert spells.last_s[0] == pytest.approx(24.9)
     assert spells.elsewhere_s[0] == pytest.approx(4.7)  # three misses at P_D = 0.9 are one in a thousand
     assert 25.0 < spells.gone_s[0] < 26.5
-    samples = spells.lifetimes()
-    assert 17.0 < samples.left_s[0] < 20.0 < samples.right_s[0] < 22.0
+    seen_s, possible_s = spells.last_s - spells.first_s, spells.gone_s - spells.elsewhere_s
+    assert 17.0 < seen_s[0] < 20.0 < possible_s[0] < 22.0
 
 
 def test_an_absence_from_view_is_part_of_the_spell(here: View, elsewhere: View) -> None:
@@ -105,7 +108,7 @@ def test_a_parked_one_that_drives_off_ends_its_spell_and_starts_another() -> Non
         tracker.step(stamp, ONE + [x, 0.0, 0.0] + rng.normal(0.0, 0.1, 3))
     spells = tracker.static_spells()
     assert spells.track_id.tolist() == [0, 0]
-    assert 16.0 <= spells.lifetimes().left_s[0] <= 20.0 < spells.gone_s[0] <= 22.0
+    assert 16.0 <= spells.last_s[0] - spells.first_s[0] <= 20.0 < spells.gone_s[0] <= 22.0
     assert 20.0 <= spells.elsewhere_s[1] <= 24.0 <= spells.first_s[1] <= 27.0
     assert spells.gone_s[1] == np.inf
     np.testing.assert_allclose(spells.position_m, ONE + [[0.0, 0.0, 0.0], [4.0, 0.0, 0.0]], atol=0.3)
@@ -130,5 +133,6 @@ def test_a_slow_drift_is_no_rest() -> None:
     tracker = Tracker(TrackerSettings(sigma_position_m=0.1))
     for k in range(600):
         tracker.step(0.1 * k, ONE + [0.03 * k, 0.0, 0.0] + rng.normal(0.0, 0.1, 3))
-    lengths = tracker.static_spells().lifetimes().left_s
+    spells = tracker.static_spells()
+    lengths = spells.last_s - spells.first_s
     assert lengths.max(initial=0.0) < 6.0

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import ConfigError, EvermapError
-from evermap.objects.lifetimes import Group, LifetimeTable, rows_of
+from evermap.objects.lifetimes import Group, LifetimeTable
 from evermap.survival.as_text import prior_text
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.protocol import LifetimePrior
@@ -78,7 +78,7 @@ def estimates(name: str, table: LifetimeTable, groups: Sequence[Group]) -> Itera
         return
     for group in groups:
         try:
-            yield estimate(name, rows_of(table.data, group.rows))
+            yield estimate(name, table.data[group.rows])
         except EvermapError as error:
             whose = f"{group.label}: " if len(groups) > 1 else ""
             raise type(error)(whose + error.problem, path=table.source, field=error.field, hint=error.hint) from error
@@ -113,7 +113,7 @@ def _npmle(data: CensoredLifetimes) -> Estimate:
         "support_right": _nulls(fitted.support_right),
         "mass": fitted.mass.tolist(),
     }
-    return Estimate(NPMLE, fitted, fitted.prior(), prior_text(fitted.prior()), numbers)
+    return _with_prior(NPMLE, fitted, fitted.prior(), numbers)
 
 
 def _kaplan_meier(data: CensoredLifetimes) -> Estimate:
@@ -129,7 +129,7 @@ def _kaplan_meier(data: CensoredLifetimes) -> Estimate:
         "at_risk": fitted.at_risk.tolist(),
         "deaths": fitted.deaths.tolist(),
     }
-    return Estimate(KAPLAN_MEIER, fitted, fitted.prior(), prior_text(fitted.prior()), numbers)
+    return _with_prior(KAPLAN_MEIER, fitted, fitted.prior(), numbers)
 
 
 def _parametric(name: str, data: CensoredLifetimes) -> Estimate:
@@ -143,7 +143,7 @@ def _parametric(name: str, data: CensoredLifetimes) -> Estimate:
         "parameters": dict(zip(fitted.names, fitted.parameters.tolist(), strict=True)),
         "standard_errors": dict(zip(fitted.names, _nulls(fitted.standard_errors), strict=True)),
     }
-    return Estimate(fitted.kind, fitted, fitted.prior, prior_text(fitted.prior), numbers)
+    return _with_prior(fitted.kind, fitted, fitted.prior, numbers)
 
 
 def _gaussian_process(table: LifetimeTable, groups: Sequence[Group]) -> Iterator[Estimate]:
@@ -168,8 +168,13 @@ def _gaussian_process(table: LifetimeTable, groups: Sequence[Group]) -> Iterator
             "lower_95": lower.tolist(),
             "upper_95": upper.tolist(),
         }
-        prior = draws.prior()
-        yield Estimate(GP, draws, prior, prior_text(prior), numbers)
+        yield _with_prior(GP, draws, draws.prior(), numbers)
+
+
+def _with_prior(
+    name: str, fitted: Npmle | KaplanMeier | ParametricFit | HazardDraws, prior: LifetimePrior, numbers: dict[str, Any]
+) -> Estimate:
+    return Estimate(name, fitted, prior, prior_text(prior), numbers)
 
 
 def _nulls(values: FloatArray) -> list[float | None]:

@@ -170,6 +170,8 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[G
     """
     if not (np.isfinite(chunk_m) and chunk_m > 0.0):
         raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="--chunk-m", hint="10")
+    from evermap.survival.locality import chunks_of
+
     keys = np.zeros((len(table), 3), dtype=np.int64)  # class, chunk's column and row
     if BY_CLASS in by:
         if not table.has_classes:
@@ -182,7 +184,7 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[G
         if nowhere.size:
             line = int(table.line[nowhere[0]])
             raise InputError("is empty", path=table.source, line=line, field="x_m", hint="a place in every row")
-        keys[:, 1:] = np.floor(table.position_m / chunk_m)
+        keys[:, 1:] = chunks_of(table.position_m, chunk_m)
     different, group = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(group.ravel()))[:-1])
@@ -195,15 +197,6 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[G
         )
         for key, rows in zip(different, parts, strict=True)
     ]
-
-
-def rows_of(data: CensoredLifetimes, rows: IntArray) -> CensoredLifetimes:
-    """Some of the lifetimes.
-
-    Raises:
-        DataError: all of them have weight 0.
-    """
-    return CensoredLifetimes(*(getattr(data, name)[rows] for name in CensoredLifetimes.__slots__))
 
 
 def _filled(table: Columns, quantity: Quantity, default: float) -> FloatArray:

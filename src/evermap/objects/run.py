@@ -158,12 +158,7 @@ def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
     """What could be seen in frame `k`, if that is known: a ball around the sensor."""
     if config.range_m is None or table.sensor_m is None:
         return None
-    centre, reach, p_detect = table.sensor_m[k], config.range_m, config.settings.p_detect
-
-    def probability(position_m: FloatArray) -> FloatArray:
-        return np.where(np.linalg.norm(position_m - centre, axis=1) <= reach, p_detect, 0.0)
-
-    return View(centre, reach, probability)
+    return View.ball(table.sensor_m[k], config.range_m, config.settings.p_detect)
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
@@ -171,7 +166,7 @@ def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s:
 
     A filter's prediction over hours says nothing, and the first frame after would take every object for another.
     """
-    nowhere = View(centre_m, 0.0, lambda position_m: np.zeros(len(position_m)))
+    nowhere = View.ball(centre_m, 0.0, 0.0)
     n = tracker.settings.max_missed + 1
     step_s = min(step_s, 0.5 * (until_s - stamp_s) / n)
     events: list[Event] = []
@@ -189,8 +184,7 @@ def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
 
 def _long_enough(spells: StaticSpells, rest_for_s: float) -> StaticSpells:
     """Those seen to last: a slow object is where it was for a moment again and again, and does not rest."""
-    rows = np.flatnonzero(spells.last_s - spells.first_s >= rest_for_s)
-    return StaticSpells(*(getattr(spells, name)[rows] for name in StaticSpells.__slots__))
+    return spells[spells.last_s - spells.first_s >= rest_for_s]
 
 
 def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
@@ -229,7 +223,7 @@ def warm_up() -> None:
     """Compile the kernels, or load them: a few frames with one object that comes, stays, goes, and comes back."""
     tracker = Tracker()
     here, nothing = np.zeros((1, 3)), np.empty((0, 3))
-    seen = View(np.zeros(3), 1.0, lambda position_m: np.full(len(position_m), 0.9))
+    seen = View.ball(np.zeros(3), 1.0, 0.9)
     for k in range(60):
         tracker.step(0.1 * k, here if k < 30 else nothing)
     tracker.step(7.0, here, view=seen)

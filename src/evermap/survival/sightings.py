@@ -128,8 +128,7 @@ def fit_sightings(kind: str | Kind, samples: CensoredLifetimes, stay: IntArray) 
     n_stays = stay.size // instants
 
     def of_stays(prior: LifetimePrior) -> float:
-        log_sighting = np.asarray(prior.log_survival(samples.left_s)).copy()
-        log_sighting[ended] += prior.log_conditional_death(samples.left_s[ended], samples.right_s[ended])
+        log_sighting = _log_sighting(prior, samples.left_s, samples.right_s)
         log_known = np.asarray(prior.log_survival(samples.entry_s))
         return float(_log_sums(log_sighting, instants).sum() - _log_sums(log_known, instants).sum())
 
@@ -138,20 +137,24 @@ def fit_sightings(kind: str | Kind, samples: CensoredLifetimes, stay: IntArray) 
     return fit_likelihood(kind, of_stays, max(watched_s / n_ended, float(np.median(samples.left_s))), float(n_stays))
 
 
+def _log_sighting(prior: LifetimePrior, left: FloatArray, right: FloatArray) -> FloatArray:
+    """(N,) `log(S(left) - S(right))`."""
+    ended = np.isfinite(right)
+    value = np.asarray(prior.log_survival(left)).copy()
+    value[ended] += prior.log_conditional_death(left[ended], right[ended])
+    return value
+
+
 def _log_sums(log_values: FloatArray, instants: int) -> FloatArray:
     """(K,) logarithms of sums over the instants of each stay."""
-    table = log_values.reshape(-1, instants)
-    most = table.max(axis=1)
-    return np.asarray(most + np.log(np.exp(table - most[:, None]).sum(axis=1)))
+    return np.asarray(np.logaddexp.reduce(log_values.reshape(-1, instants), axis=1))
 
 
 def _weights(left: FloatArray, right: FloatArray, instants: int, given: LifetimePrior | None) -> FloatArray:
     """(N,) shares of the instants of every stay: `S(left) - S(right)`, of sum 1 for each."""
     if given is None:
         return np.full(left.size, 1.0 / instants)
-    log_share = np.asarray(given.log_survival(left)).copy()
-    ended = np.isfinite(right)
-    log_share[ended] += given.log_conditional_death(left[ended], right[ended])
+    log_share = _log_sighting(given, left, right)
     table = log_share.reshape(-1, instants)
     most = table.max(axis=1, keepdims=True)
     share = np.exp(table - np.where(np.isfinite(most), most, 0.0))

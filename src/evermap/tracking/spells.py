@@ -1,15 +1,13 @@
-"""Static spells, and the lifetimes that they are samples of (MATH.md section 6).
+"""Static spells: times at which objects stayed where they were, and what is known of their ends.
 
 An object was seen in a place from `first_s` to `last_s`. It came after `elsewhere_s`, when it was elsewhere or its
-place was empty, and was found moved or gone at `gone_s`. So its lifetime there lies in
-`(last_s - first_s, gone_s - elsewhere_s]`: an interval; without an upper end where it was never seen gone (right
-censored), or where it was there already when its place was first looked at. Of the latter nobody knows the age: those
-samples are longer than others (whoever stays long is more likely to be met), and say so.
+place was empty, and was found moved or gone at `gone_s`. What that says of lifetimes is in `survival.sightings`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -43,37 +41,9 @@ class StaticSpells:
     def __len__(self) -> int:
         return len(self.track_id)
 
-    def lifetimes(self) -> Lifetimes:
-        """The censored samples that these spells are."""
-        return Lifetimes(
-            left_s=self.last_s - self.first_s,
-            right_s=self.gone_s - self.elsewhere_s,
-            origin_seen=np.isfinite(self.elsewhere_s),
-            class_id=self.class_id,
-            position_m=self.position_m,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Lifetimes:
-    """Censored samples of lifetimes, one row each: longer than `left_s` and at most `right_s`.
-
-    Attributes:
-        left_s: (K,) for how long it was seen to stay.
-        right_s: (K,) the longest that it can have stayed; inf where it was never seen gone, or never seen to come.
-        origin_seen: (K,) False where it was there at first sight: `left_s` then counts from an unknown age.
-        class_id: (K,).
-        position_m: (K, 3).
-    """
-
-    left_s: FloatArray
-    right_s: FloatArray
-    origin_seen: BoolArray
-    class_id: IntArray
-    position_m: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.left_s)
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        """Some of them, by number or by a mask."""
+        return type(self)(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 class SpellLog:
@@ -111,7 +81,7 @@ class SpellLog:
         parts = [*self._parts, going_on, _of_stored(working_set.stored, stored, np.inf)]
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in StaticSpells.__slots__}
         order = np.lexsort((columns["first_s"], columns["track_id"]))
-        return StaticSpells(**{name: column[order] for name, column in columns.items()})
+        return StaticSpells(**columns)[order]
 
 
 def _of_stored(stored: Stored, rows: IntArray, gone_s: float) -> StaticSpells:
