@@ -70,18 +70,11 @@ def track(run: MovingRun) -> TrackedRun:
     followed, resting = [], []
     for k, stamp_s in enumerate(run.stamp_s):
         frame = run.detections(k)
-        view = _view(run.sensor_m[k], world)
+        view = View.ball(run.sensor_m[k], world.reach_m, world.p_detect)
         tracker.step(stamp_s, run.detected_m[frame], run.detected_class[frame], view=view)
         followed.append(tracker.followed())
         resting.append(tracker.working_set.stored.position[tracker.working_set.rows].copy())
     return TrackedRun(run, followed, resting, tracker.static_spells())
-
-
-def _view(sensor_m: FloatArray, world: MovingWorld) -> View:
-    def p_detect(position_m: FloatArray) -> FloatArray:
-        return np.where(np.linalg.norm(position_m - sensor_m, axis=1) <= world.reach_m, world.p_detect, 0.0)
-
-    return View(sensor_m, world.reach_m, p_detect)
 
 
 def learn(spells: list[StaticSpells], class_id: int, least_stay_s: float) -> tuple[ParametricFit, int]:

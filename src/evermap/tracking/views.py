@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -28,6 +29,15 @@ class View:
     centre_m: FloatArray
     reach_m: float
     p_detect: Callable[[FloatArray], FloatArray]
+
+    @classmethod
+    def ball(cls, centre_m: FloatArray, reach_m: float, p_detect: float) -> Self:
+        """Everything up to `reach_m` from the sensor is seen equally well."""
+
+        def within(position_m: FloatArray) -> FloatArray:
+            return np.where(np.linalg.norm(position_m - centre_m, axis=1) <= reach_m, p_detect, 0.0)
+
+        return cls(centre_m, reach_m, within)
 
     def probability(self, position_m: FloatArray) -> FloatArray:
         """(N,) `p_detect`, checked.
