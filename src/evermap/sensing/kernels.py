@@ -119,7 +119,7 @@ def look(
         largest = max(largest, first[c + 1] - first[c])
     row = np.empty(largest, np.int64)
     inside = np.empty(largest)
-    base = np.empty(largest)  # detection by range and incidence
+    by_range, by_facing = np.empty(largest), np.empty(largest)  # detection by range and incidence
     own = np.empty(largest)  # the landmark's own factor, by direction
     face = np.empty(largest, np.int64)
     low_r, part_r = np.empty(largest, np.int64), np.empty(largest)
@@ -157,16 +157,16 @@ def look(
             if seen < OUT_OF_FIELD:
                 continue
             low, part = between(range_m / limits[0] * ranges, ranges)
-            by_range = range_rate[low] + part * (range_rate[low + 1] - range_rate[low])
+            by_range[n] = range_rate[low] + part * (range_rate[low + 1] - range_rate[low])
             low_r[n], part_r[n] = low, part
             cosine = (dx * outward[k, 0] + dy * outward[k, 1] + dz * outward[k, 2]) / range_m
             low, part = between(0.5 * (cosine + 1.0) * facings, facings)
-            by_facing = facing_rate[low] + part * (facing_rate[low + 1] - facing_rate[low])
+            by_facing[n] = facing_rate[low] + part * (facing_rate[low + 1] - facing_rate[low])
             low_f[n], part_f[n] = low, part
             side = face_of(dx, dy, dz)
             row[n], inside[n], face[n] = k, seen, side
-            base[n], own[n] = by_range * by_facing, hits[k, side] / expected[k, side]
-            p_detect = seen * min(base[n] * own[n], HIGHEST)
+            own[n] = hits[k, side] / expected[k, side]
+            p_detect = seen * min(by_range[n] * by_facing[n] * own[n], HIGHEST)
             p_alarm = seen * p_false
             p_either = p_alarm + (1.0 - p_alarm) * p_detect
             if detected[k]:
@@ -218,9 +218,7 @@ def look(
         for i in range(n):
             k, seen = row[i], inside[i]
             low_range, low_facing = low_r[i], low_f[i]
-            by_range = range_rate[low_range] + part_r[i] * (range_rate[low_range + 1] - range_rate[low_range])
-            by_facing = facing_rate[low_facing] + part_f[i] * (facing_rate[low_facing + 1] - facing_rate[low_facing])
-            p_detect = min(base[i] * own[i], HIGHEST)
+            p_detect = min(by_range[i] * by_facing[i] * own[i], HIGHEST)
             hit = 0.0
             if detected[k]:
                 true = clear * p_detect / (p_detect + (1.0 - p_detect) * p_false)
@@ -231,8 +229,8 @@ def look(
             view = clear * seen
             pending[c, at_false + 1] += seen * (1.0 - clear * p_detect)
             pending[c, at_false + 3] += seen
-            expected[k, face[i]] += view * base[i]
-            for_range, for_facing = view * by_facing * own[i], view * by_range * own[i]
+            expected[k, face[i]] += view * (by_range[i] * by_facing[i])
+            for_range, for_facing = view * by_facing[i] * own[i], view * by_range[i] * own[i]
             part = part_r[i]
             pending[c, low_range] += hit * (1.0 - part)
             pending[c, low_range + 1] += hit * part

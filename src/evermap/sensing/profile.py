@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.sensing.field import Field
-from evermap.sensing.sight import DetectionModel, Fading, InField, Sight, ViewingAngle
+from evermap.sensing.sight import Fading, InField, Sight, ViewingAngle
 from evermap.types import FloatArray
 
 RANGE_BINS = 16
@@ -111,13 +111,12 @@ class Profile:
     @classmethod
     def of(cls, assumed: Assumed) -> Profile:
         """The profile before anything was seen."""
-        by_range = _at(assumed.fades, range_m=range_middles(assumed.field.range_max_m))
-        by_facing = np.maximum(_at(assumed.faces, facing=facing_middles()), SMALLEST_RATE)
+        near, far = np.zeros(FACING_BINS), range_middles(assumed.field.range_max_m)
+        by_range = assumed.fades.probability(_sight(far, np.ones(RANGE_BINS)))
+        by_facing = np.maximum(assumed.faces.probability(_sight(near, facing_middles())), SMALLEST_RATE)
         chains = len(assumed.occlusion_rates_hz) * len(assumed.occlusion_lengths_s)
         weight = np.append(assumed.p_never_occluded, np.full(chains, (1.0 - assumed.p_never_occluded) / chains))
-        # a bin that is worth `hits` expected hits where the other factor is 1, and the facing bins at a middle range
-        expected_by_range = np.full(RANGE_BINS, assumed.hits)
-        expected_by_facing = np.full(FACING_BINS, assumed.hits)
+        expected_by_range, expected_by_facing = np.full(RANGE_BINS, assumed.hits), np.full(FACING_BINS, assumed.hits)
         return cls(
             assumed=assumed,
             range_hits=by_range * expected_by_range,
@@ -164,12 +163,10 @@ class Profile:
     def occlusion(self) -> Occlusion:
         """The chains that may govern occlusions, with their posterior probabilities."""
         weight = np.exp(self.log_weight - self.log_weight.max())
-        pairs = [
-            (rate, length) for rate in self.assumed.occlusion_rates_hz for length in self.assumed.occlusion_lengths_s
-        ]
+        rates, lengths = self.assumed.occlusion_rates_hz, self.assumed.occlusion_lengths_s
         return Occlusion(
-            come_hz=np.array([0.0, *(rate for rate, _ in pairs)]),
-            go_hz=np.array([1.0, *(1.0 / length for _, length in pairs)]),
+            come_hz=np.append(0.0, np.repeat(rates, len(lengths))),
+            go_hz=np.append(1.0, np.tile(1.0 / np.array(lengths), len(rates))),
             weight=weight / weight.sum(),
         )
 
@@ -204,11 +201,7 @@ def facing_middles() -> FloatArray:
     return np.asarray((np.arange(FACING_BINS) + 0.5) * (2.0 / FACING_BINS) - 1.0)
 
 
-def _at(model: DetectionModel, *, range_m: FloatArray | None = None, facing: FloatArray | None = None) -> FloatArray:
-    """A model where only one thing matters."""
-    n = len(range_m) if range_m is not None else len(facing) if facing is not None else 0
-    empty = np.zeros((n, 3))
-    zero = np.zeros(n)
-    return model.probability(
-        Sight(empty, zero if range_m is None else range_m, zero if facing is None else facing, empty)
-    )
+def _sight(range_m: FloatArray, facing: FloatArray) -> Sight:
+    """Landmarks of which nothing matters but how far they are, and how they face."""
+    nowhere = np.zeros((len(range_m), 3))
+    return Sight(nowhere, range_m, facing, nowhere)

@@ -142,7 +142,8 @@ class CliqueRun:
 
     def p_detect(self) -> FloatArray:
         """(F, K) true probability that each landmark is detected while its object is there and nobody hides it."""
-        return _chance_there(self.world, self.position_m, self.rotation, self.landmark_m, self.normal)
+        in_field = self.world.field.contains(in_sensor_frame(self.landmark_m, self.position_m, self.rotation))
+        return _chance_there(self.world, self.position_m, self.landmark_m, self.normal, in_field)
 
 
 def in_sensor_frame(point_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> FloatArray:
@@ -181,7 +182,7 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
     hidden = _occlusions(world, rng)
 
     there = np.arange(world.steps)[:, None] <= first + survival
-    chance_there = _chance_there(world, position, rotation, landmark, normal)
+    chance_there = _chance_there(world, position, landmark, normal, in_field)
     chance = np.where((there & ~hidden)[:, clique], chance_there, world.p_false * in_field)
     detected = rng.random(chance.shape) < chance
 
@@ -205,13 +206,12 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
 
 
 def _chance_there(
-    world: CliqueWorld, position: FloatArray, rotation: FloatArray, landmark: FloatArray, normal: FloatArray
+    world: CliqueWorld, position: FloatArray, landmark: FloatArray, normal: FloatArray, in_field: BoolArray
 ) -> FloatArray:
     """(F, K) probability of a detection: fading with range where the landmark faces the sensor, 0 outside the field."""
     to_sensor = position[:, None, :] - landmark[None, :, :]
     distance = np.linalg.norm(to_sensor, axis=2)
     facing = np.einsum("fki,ki->fk", to_sensor, normal) >= math.cos(world.viewing_angle_rad) * distance
-    in_field = world.field.contains(in_sensor_frame(landmark, position, rotation))
     return np.where(facing, np.exp(-distance / world.fading_m), world.p_false) * in_field
 
 
