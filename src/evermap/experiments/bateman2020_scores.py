@@ -68,7 +68,7 @@ def score(
     Returns:
         Every score and `<score>_se`, None where unknown; and (B,) draws of those of `COMPARED`.
     """
-    weight = 1.0 / np.bincount(clique, minlength=stack.cliques)[clique]
+    weight = _share_of_clique(clique, stack)
     tally = removal_tally(
         belief,
         stack.in_view[:, clique],
@@ -81,6 +81,11 @@ def score(
     values, errors = asdict(removal_scores(tally, weight)), asdict(standard_errors(drawn))
     row = {name: _known(values[name]) for name in METRICS} | {f"{name}_se": _known(errors[name]) for name in METRICS}
     return row, {name: np.array([getattr(scores, name) for scores in drawn]) for name in COMPARED}
+
+
+def _share_of_clique(clique: IntArray, stack: Stack) -> FloatArray:
+    """(N,) weight of each column: one for all of a clique."""
+    return np.asarray(1.0 / np.bincount(clique, minlength=stack.cliques)[clique])
 
 
 def _known(value: float) -> float | None:
@@ -123,7 +128,7 @@ def _own_decisions(belief: FloatArray, clique: IntArray, stack: Stack, settings:
 
 
 def _removal_curve(belief: FloatArray, clique: IntArray, stack: Stack) -> FloatArray:
-    weight = 1.0 / np.bincount(clique, minlength=stack.cliques)[clique]
+    weight = _share_of_clique(clique, stack)
     in_view, first, survival = stack.in_view[:, clique], stack.first[clique], stack.survival_steps[clique]
     rows = []
     for rho_low in REMOVALS:
