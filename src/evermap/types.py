@@ -325,6 +325,12 @@ class ChangeKind(StrEnum):
     """Like a rigid body: turned about their centroid, and moved."""
     SWAPPED = "swapped"
     """Two landmarks carry each other's identity."""
+    APPEARED = "appeared"
+    """Never seen before, in a place that was looked at."""
+    VANISHED = "vanished"
+    """Not where the map has it, and nowhere else."""
+    RETURNED = "returned"
+    """It had vanished before; its displacement says whether to the place it had left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,9 +341,10 @@ class MapChange:
         landmark_ids: the group, sorted.
         kind: what happened to it.
         stamp_from_s, stamp_to_s: it happened between these two; nan and the first stamp for 'before the session'.
-        displacement_m: (x, y) of the group's centroid, in the map's frame.
+        displacement_m: (x, y) of the group's centroid, in the map's frame; nan where it was not, or is not, there.
         rotation_rad: about the centroid, counter-clockwise; 0 where it did not turn.
         probability: of this very group at this time, over all hypotheses that were weighed.
+        n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come.
     """
 
     landmark_ids: tuple[int, ...]
@@ -347,6 +354,8 @@ class MapChange:
     displacement_m: tuple[float, float]
     rotation_rad: float
     probability: float
+    n_hits: int = 0
+    n_misses: int = 0
 
 
 @dataclass(frozen=True, slots=True)

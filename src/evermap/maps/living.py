@@ -1,0 +1,249 @@
+"""The nouns of a living map: frozen dataclasses of arrays, one row an item, joined by ids.
+
+    landmark --(belongs to)--> clique --(stands at one of)--> site --(has one for each landmark)--> place
+
+A *clique* is a rigid body: landmarks that come, move and go together. A *site* is one way in which it stood somewhere,
+and a *place* is where one of its landmarks is then. At most one site of a clique is true at a time, none while it is
+away: gone, or where the map does not know. So one chain a clique, with the states 'away, site 1, site 2 ...', is
+Rosen's persistence filter (one site, absorbing 'away'), Bateman's joint clique filter (one chain for many landmarks)
+and Nielsen's modes (many sites), see MATH.md section 5.
+
+All arrays are sorted by their id. Ids are never used twice, so that revisions of a map can be compared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from typing import Self
+
+import numpy as np
+
+from evermap.maps.lives import Lives
+from evermap.sensing.sightlines import SightLines
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
+
+
+class _Rows:
+    """Columns of equal length that are taken and joined together."""
+
+    __slots__ = ()
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        """Some of the rows, by number or by a mask."""
+        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))  # type: ignore[arg-type]
+
+    def joined(self, other: Self) -> Self:
+        """These rows, then those of another."""
+        columns = [(getattr(self, item.name), getattr(other, item.name)) for item in fields(self)]  # type: ignore[arg-type]
+        return type(self)(*(np.concatenate(both) for both in columns))
+
+
+@dataclass(frozen=True, slots=True)
+class Members(_Rows):
+    """Landmarks: (L,) rows, sorted by `landmark_id`.
+
+    Attributes:
+        landmark_id: as the front end calls it.
+        class_id: row of `LivingMap.class_names`, or `UNKNOWN`.
+        clique_id: the body it belongs to; a landmark that moves alone is a clique of its own.
+        pinned: an operator said that it is never to be removed.
+        deleted: an operator said that it is not to be used; its detections are ignored until that is taken back.
+    """
+
+    landmark_id: IntArray
+    class_id: IntArray
+    clique_id: IntArray
+    pinned: BoolArray
+    deleted: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.landmark_id)
+
+    @classmethod
+    def empty(cls) -> Members:
+        """No landmark."""
+        return cls(*np.zeros((3, 0), dtype=np.int64), *np.zeros((2, 0), dtype=np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Sites(_Rows):
+    """Ways in which cliques stand or stood: (S,) rows, sorted by `site_id`.
+
+    Attributes:
+        site_id: unique, never used again.
+        clique_id: whose.
+        p_here: probability that the clique stands there at `LivingMap.stamp_s`; the rest to 1 of a clique is 'away'.
+        since_s: first sighting of the newest stay there.
+        seen_s: last sighting there.
+    """
+
+    site_id: IntArray
+    clique_id: IntArray
+    p_here: FloatArray
+    since_s: FloatArray
+    seen_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.site_id)
+
+    @classmethod
+    def empty(cls) -> Sites:
+        """No site."""
+        return cls(*np.zeros((2, 0), dtype=np.int64), *np.zeros((3, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class Places(_Rows):
+    """Positions: (P,) rows, sorted by `site_id`, then by `landmark_id`.
+
+    Attributes:
+        site_id, landmark_id: where this landmark is while its clique stands at this site.
+        position_m: (P, 2) in the map's frame.
+        n_hits, n_misses: (P,) detections there, and looks without one that expected it.
+    """
+
+    site_id: IntArray
+    landmark_id: IntArray
+    position_m: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+
+    def __len__(self) -> int:
+        return len(self.site_id)
+
+    @classmethod
+    def empty(cls) -> Places:
+        """No place."""
+        none = np.zeros(0, dtype=np.int64)
+        return cls(none, none, np.zeros((0, 2)), none, none)
+
+
+@dataclass(frozen=True, slots=True)
+class Stays(_Rows):
+    """Stays of cliques at sites: (K,) rows, sorted by `first_s`; what lifetimes are learned from.
+
+    Attributes:
+        clique_id, site_id, class_id: what and where.
+        position_m: (K, 2) middle of the clique there.
+        elsewhere_s: last look before `first_s` at which it was not there; -inf where its place was never looked at.
+        first_s, last_s: first and last sighting.
+        gone_s: first look after `last_s` at which it was not there; inf while it is believed to stand there.
+    """
+
+    clique_id: IntArray
+    site_id: IntArray
+    class_id: IntArray
+    position_m: FloatArray
+    elsewhere_s: FloatArray
+    first_s: FloatArray
+    last_s: FloatArray
+    gone_s: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.clique_id)
+
+    @classmethod
+    def empty(cls) -> Stays:
+        """No stay."""
+        return cls(*np.zeros((3, 0), dtype=np.int64), np.zeros((0, 2)), *np.zeros((4, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class LivingMap:
+    """All that is known of a place at one instant; what one session hands to the next.
+
+    Attributes:
+        stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
+        members, sites, places, stays: see there.
+        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns.
+        lives: how long things of a class stay, stay away, and where they turn up again.
+        sightlines: from where to where the sensor sees.
+        class_names: names of the classes.
+        clock: of all stamps.
+        n_cliques_ever, n_sites_ever: next free ids.
+    """
+
+    stamp_s: float = -np.inf
+    members: Members = field(default_factory=Members.empty)
+    sites: Sites = field(default_factory=Sites.empty)
+    places: Places = field(default_factory=Places.empty)
+    stays: Stays = field(default_factory=Stays.empty)
+    covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    lives: Lives = field(default_factory=Lives)
+    sightlines: SightLines = field(default_factory=SightLines.empty)
+    class_names: tuple[str, ...] = ()
+    clock: Clock = Clock.RECORDING
+    n_cliques_ever: int = 0
+    n_sites_ever: int = 0
+
+    def p_exists(self) -> FloatArray:
+        """(L,) probability that each landmark stands at one of its known places."""
+        cliques, row = np.unique(self.sites.clique_id, return_inverse=True)
+        total = np.bincount(row, self.sites.p_here, minlength=len(cliques))
+        at = np.minimum(np.searchsorted(cliques, self.members.clique_id), max(len(cliques) - 1, 0))
+        found = cliques[at] == self.members.clique_id if len(cliques) else np.zeros(len(self.members), np.bool_)
+        return np.where(found, total[at] if len(total) else 0.0, 0.0)
+
+    def site_of(self) -> IntArray:
+        """(L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
+        order = np.lexsort((self.sites.p_here, self.sites.clique_id))
+        clique = self.sites.clique_id[order]
+        last = np.flatnonzero(np.append(clique[1:] != clique[:-1], True)) if len(clique) else np.zeros(0, np.int64)
+        best = order[last]  # one a clique, by clique
+        at = np.searchsorted(clique[last], self.members.clique_id)
+        ok = at < len(last)
+        ok[ok] = clique[last][at[ok]] == self.members.clique_id[ok]
+        site = np.full(len(self.members), UNKNOWN, dtype=np.int64)
+        site[ok] = self.sites.site_id[best[at[ok]]]
+        return site
+
+    def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
+        """(K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
+        known = {
+            (int(site), int(name)): k
+            for k, (site, name) in enumerate(zip(self.places.site_id, self.places.landmark_id, strict=True))
+        }
+        return np.array(
+            [known.get((int(s), int(n)), -1) for s, n in zip(site_id, landmark_id, strict=True)], dtype=np.int64
+        )
+
+    def landmarks(self, *, p_least: float = 0.0) -> Landmarks:
+        """The map as plain records: every landmark at its most probable place, deleted ones left out.
+
+        Args:
+            p_least: leave out what exists with a smaller probability.
+        """
+        row = self.place_row(self.members.landmark_id, self.site_of())
+        p_exists = self.p_exists()
+        kept = np.flatnonzero((row >= 0) & ~self.members.deleted & (p_exists >= p_least))
+        row = row[kept]
+        corner = 2 * row[:, None] + np.arange(2)
+        site = np.searchsorted(self.sites.site_id, self.places.site_id[row])
+        return Landmarks(
+            landmark_id=self.members.landmark_id[kept],
+            position_m=self.places.position_m[row],
+            covariance_m2=self.covariance_m2[corner[:, :, None], corner[:, None, :]],
+            class_id=self.members.class_id[kept],
+            p_exists=p_exists[kept],
+            n_hits=self.places.n_hits[row],
+            n_misses=self.places.n_misses[row],
+            first_seen_s=self.sites.since_s[site],
+            last_seen_s=self.sites.seen_s[site],
+            class_names=self.class_names,
+            frame="prior_map",
+            clock=self.clock,
+        )
+
+    def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
+        """The map with an operator's word on one landmark; None leaves it as it is.
+
+        Raises:
+            KeyError: no landmark has this id.
+        """
+        row = int(np.searchsorted(self.members.landmark_id, landmark_id))
+        if row >= len(self.members) or self.members.landmark_id[row] != landmark_id:
+            raise KeyError(landmark_id)
+        pins, deletions = self.members.pinned.copy(), self.members.deleted.copy()
+        pins[row] = pins[row] if pinned is None else pinned
+        deletions[row] = deletions[row] if deleted is None else deleted
+        return replace(self, members=replace(self.members, pinned=pins, deleted=deletions))
