@@ -145,7 +145,39 @@ class Stays(_Rows):
     @classmethod
     def empty(cls) -> Stays:
         """No stay."""
-        return cls(*np.zeros((3, 0), dtype=np.int64), np.zeros((0, 2)), *np.zeros((4, 0)))
+        names, stamp_s = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return cls(names, names, names, np.zeros((0, 2)), stamp_s, stamp_s, stamp_s, stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence(_Rows):
+    """What was said about cliques when their places were looked at: (E,) rows, by clique, then by time.
+
+    Attributes:
+        clique_id: whose.
+        stamp_s: of the frame.
+        n_hits, n_misses: landmarks of it that were detected at its most probable site, and expected but not detected.
+        expected: mean number of hits, had it stood there.
+        log_odds: what the frame said for 'it stands there' against 'it is away' [nats].
+        p_exists: probability that it stands at one of its sites, after the frame.
+    """
+
+    clique_id: IntArray
+    stamp_s: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+    expected: FloatArray
+    log_odds: FloatArray
+    p_exists: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.clique_id)
+
+    @classmethod
+    def empty(cls) -> Evidence:
+        """Nothing was looked at."""
+        names, numbers = np.zeros(0, dtype=np.int64), np.zeros(0)
+        return cls(names, numbers, names, names, numbers, numbers, numbers)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ class SightLines:
 
     Attributes:
         key: (K,) of a pair of cells: the sensor's and the landmark's.
-        hits, looks: (K,) detections, and looks at landmarks that were there, both weighted by the belief that they were.
+        hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
         cell_m: side of a cell.
     """
 
