@@ -24,7 +24,7 @@ class Life:
 
     Attributes:
         stay: prior of the time at one site.
-        absence: prior of the time away, of those that return.
+        absence: prior of the time away; its `p_never_leaves` is the share that never returns.
         p_hop: probability that who leaves a site stands at another one at once, instead of being away.
         p_known: probability that who turns up again does so at a site that the map knows.
         n_stays, n_ended: stays that this was learned from, and how many of them were seen to end.
@@ -47,12 +47,14 @@ class Lives:
         chunk: (E, 2) column and row of the chunk it holds for; `EVERYWHERE` in both for the whole floor.
         life: (E,) what was learned.
         chunk_m: side of a chunk.
+        looks_s: (M,) ends of the sessions that were learned from: between two of them things come back unseen.
     """
 
     class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     chunk: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     life: tuple[Life, ...] = ()
     chunk_m: float = 10.0
+    looks_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def of(self, class_id: int, position_m: FloatArray) -> Life:
         """What is known of a class (or `UNKNOWN`) at a position (2,)."""
