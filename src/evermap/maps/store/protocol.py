@@ -1,0 +1,165 @@
+"""What every map store answers, and what it says of a revision."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Protocol, Self
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.maps.living import Evidence, LivingMap
+from evermap.types import ChangeKind, MapChange
+
+
+class RevisionKind(StrEnum):
+    """What made a revision."""
+
+    SESSION = "session"
+    """A recording went into the map."""
+    EDIT = "edit"
+    """An operator pinned or deleted something."""
+    REVERT = "revert"
+    """An operator went back to an older revision."""
+
+
+class StaleRevisionError(InputError):
+    """Somebody else committed since the map was read; nothing was written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Provenance:
+    """Where a revision comes from.
+
+    Attributes:
+        kind: what made it.
+        recording, source: name of the recording, and where it was read from; '' where there is none.
+        command: what was typed.
+        config: the configuration in force, as TOML.
+        seed: of everything random; None where nothing is.
+        stamp_from_s, stamp_to_s: first and last stamp of what went in; nan where nothing did.
+        wall_s: what making it took [s]; nan where nobody measured.
+        note: an operator's word on it, for example 'pinned landmark 12'.
+    """
+
+    kind: RevisionKind = RevisionKind.SESSION
+    recording: str = ""
+    source: str = ""
+    command: str = ""
+    config: str = ""
+    seed: int | None = None
+    stamp_from_s: float = float("nan")
+    stamp_to_s: float = float("nan")
+    wall_s: float = float("nan")
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """One line of a map's history.
+
+    Attributes:
+        number: counted from 1; 0 is the empty map before the first session.
+        parent: the revision before it.
+        restores: the revision whose content this one brought back; None if it is no revert.
+        created_at: when it was committed, ISO 8601, UTC.
+        evermap_version: who wrote it.
+        provenance: where it comes from.
+        n_landmarks, n_existing: landmarks that it knows, and those of them that more probably exist than not.
+        n_changes: number of changes by kind, kinds without any left out.
+    """
+
+    number: int
+    parent: int
+    restores: int | None
+    created_at: str
+    evermap_version: str
+    provenance: Provenance
+    n_landmarks: int
+    n_existing: int
+    n_changes: Mapping[ChangeKind, int] = field(default_factory=dict)
+
+
+class MapStore(Protocol):
+    """Revisions of one living map. A revision is written whole or not at all, and never changed afterwards.
+
+    History is a line: a commit names the revision that it was made from, and fails if that is not the newest any more.
+    Methods raise `InputError` where the store cannot be read or written, is damaged, or has no such revision. Where
+    `revision` is None the newest is meant.
+    """
+
+    @property
+    def where(self) -> str:
+        """Path or address, for messages."""
+        ...
+
+    def head(self) -> int:
+        """The newest revision; 0 where there is none yet."""
+        ...
+
+    def log(self) -> tuple[Revision, ...]:
+        """All revisions, the oldest first."""
+        ...
+
+    def lineage(self, revision: int | None = None) -> tuple[int, ...]:
+        """The revisions that one was made from, oldest first, itself included; what was reverted is not among them."""
+        ...
+
+    def load(self, revision: int | None = None) -> LivingMap:
+        """The map as it was committed, bit by bit; revision 0 is the empty map."""
+        ...
+
+    def commit(
+        self,
+        living: LivingMap,
+        provenance: Provenance,
+        changes: Sequence[MapChange] = (),
+        evidence: Evidence | None = None,
+        *,
+        parent: int,
+    ) -> int:
+        """A new revision, durable when this returns its number.
+
+        Args:
+            living: the map.
+            provenance: where it comes from.
+            changes: how it differs from its parent, as its session says.
+            evidence: what the session saw of every clique; kept with 7 digits.
+            parent: the revision that the map was made from.
+
+        Raises:
+            StaleRevisionError: `parent` is not the newest revision.
+        """
+        ...
+
+    def revert(self, revision: int, provenance: Provenance | None = None) -> int:
+        """A new revision with the content of an older one; reverting to the one before takes it back.
+
+        Ids that were given since are not given again.
+        """
+        ...
+
+    def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
+        """What was committed as the changes of one revision."""
+        ...
+
+    def evidence(
+        self,
+        *,
+        clique_id: int | None = None,
+        landmark_id: int | None = None,
+        since_s: float = -np.inf,
+        revision: int | None = None,
+    ) -> Evidence:
+        """What was seen over all sessions in `lineage(revision)`, by time; of one clique or of a landmark's cliques."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the file or the connection."""
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *error: object) -> None: ...

@@ -1,0 +1,253 @@
+"""What every map store must do, and what comes back is what went in."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from random_maps import assert_same, random_changes, random_evidence, random_map
+
+from evermap.errors import ConfigError, InputError
+from evermap.maps.living import LivingMap
+from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, open_store
+from evermap.types import ChangeKind
+
+SESSION = Provenance(
+    recording="robot 1",
+    source="/data/one.zip",
+    command="evermap slam one.zip --map m",
+    config="[slam]\nseed = 3\n",
+    seed=3,
+    stamp_from_s=10.0,
+    stamp_to_s=20.5,
+    wall_s=1.25,
+)
+
+
+@pytest.fixture(params=["sqlite"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[MapStore]:
+    """An empty store of every kind."""
+    with open_store(tmp_path / "m.evermap", create=True) as empty:
+        yield empty
+
+
+def test_revision_zero_is_the_empty_map(store: MapStore) -> None:
+    assert store.head() == 0
+    assert store.log() == ()
+    assert store.lineage() == ()
+    assert_same(store.load(), LivingMap())
+    assert_same(store.load(0), LivingMap())
+
+
+def test_every_revision_reads_back_bit_by_bit(store: MapStore) -> None:
+    maps = [random_map(seed, cliques=1 + 2 * seed) for seed in range(8)]
+    for number, living in enumerate(maps):
+        assert store.commit(living, SESSION, parent=number) == number + 1
+    for number, living in enumerate(maps):
+        assert_same(store.load(number + 1), living)
+    assert_same(store.load(), maps[-1])
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_any_numbers_read_back_bit_by_bit(data: st.DataObject, store: MapStore) -> None:
+    """Minus zero, infinities, subnormal numbers and nan too; matrices that are not quite symmetric too."""
+    living = random_map(data.draw(st.integers(0, 5)), cliques=2)
+    anything = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
+    count, size = len(living.places), len(living.covariance_m2)
+    matrix = data.draw(hnp.arrays(np.float64, (size, size), elements=anything))
+    symmetric = np.where(np.tri(size, dtype=bool), matrix, matrix.T)
+    living = replace(
+        living,
+        stamp_s=data.draw(anything.filter(lambda x: x == x)),
+        covariance_m2=data.draw(st.sampled_from([matrix, symmetric])),
+        places=replace(living.places, position_m=data.draw(hnp.arrays(np.float64, (count, 2), elements=anything))),
+        members=replace(
+            living.members,
+            class_id=data.draw(hnp.arrays(np.int64, len(living.members), elements=st.integers(-(2**63), 2**63 - 1))),
+        ),
+        class_names=tuple(data.draw(st.lists(st.text(), max_size=3))),
+    )
+    number = store.commit(living, SESSION, parent=store.head())
+    assert_same(store.load(number), living)
+
+
+def test_the_log_says_where_a_revision_comes_from(store: MapStore) -> None:
+    living = random_map(1)
+    changes = random_changes(1, living)
+    store.commit(living, SESSION, (*changes, changes[0]), parent=0)
+    edit = replace(SESSION, kind=RevisionKind.EDIT, note="pinned landmark 7", seed=None, wall_s=float("nan"))
+    store.commit(living, edit, parent=1)
+    first, second = store.log()
+    assert (first.number, first.parent, first.restores) == (1, 0, None)
+    assert first.provenance == SESSION
+    assert first.n_changes == {ChangeKind.MOVED: 2, ChangeKind.APPEARED: 1}
+    assert first.n_landmarks == len(living.members)
+    assert first.n_existing == len(living.landmarks(p_least=0.5))
+    assert second.provenance.note == "pinned landmark 7"
+    assert second.provenance.seed is None
+    assert np.isnan(second.provenance.wall_s)
+    assert second.n_changes == {}
+    assert first.created_at <= second.created_at
+
+
+def test_changes_read_back(store: MapStore) -> None:
+    living = random_map(4)
+    changes = random_changes(4, living)
+    store.commit(living, SESSION, changes, parent=0)
+    store.commit(living, SESSION, parent=1)
+    for mine, theirs in zip(store.changes(1), changes, strict=True):
+        assert_same(mine, theirs)
+    assert store.changes() == ()
+
+
+def test_a_writer_that_comes_late_is_refused(store: MapStore) -> None:
+    store.commit(random_map(1), SESSION, parent=0)
+    with pytest.raises(StaleRevisionError, match="revision 1 came in after revision 0 was read"):
+        store.commit(random_map(2), SESSION, parent=0)
+    with pytest.raises(StaleRevisionError):
+        store.commit(random_map(2), SESSION, parent=5)
+    assert store.head() == 1
+    assert_same(store.load(), random_map(1))
+
+
+def test_of_many_writers_at_once_one_wins(store: MapStore) -> None:
+    maps = [random_map(seed) for seed in range(8)]
+    for head in range(3):
+        won, gate = [], threading.Barrier(len(maps))
+
+        def write(seed: int, parent: int = head, won: list[int] = won, gate: threading.Barrier = gate) -> None:
+            gate.wait()
+            try:
+                store.commit(maps[seed], SESSION, parent=parent)
+            except StaleRevisionError:
+                return
+            won.append(seed)
+
+        threads = [threading.Thread(target=write, args=(seed,)) for seed in range(len(maps))]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(won) == 1
+        assert store.head() == head + 1
+        assert_same(store.load(), maps[won[0]])
+
+
+def test_a_revert_is_a_revision_and_can_be_reverted(store: MapStore) -> None:
+    old, new = random_map(1), random_map(2)
+    new = replace(new, n_cliques_ever=50, n_sites_ever=70)
+    store.commit(old, SESSION, parent=0)
+    store.commit(new, SESSION, parent=1)
+    assert store.revert(1) == 3
+    # what was given an id since then keeps it: the same id never means two things
+    assert_same(store.load(), replace(old, n_cliques_ever=50, n_sites_ever=70))
+    assert store.revert(2, Provenance(note="that was wrong")) == 4
+    assert_same(store.load(), new)
+    assert [(r.restores, r.provenance.kind, r.provenance.note) for r in store.log()[2:]] == [
+        (1, RevisionKind.REVERT, "back to revision 1"),
+        (2, RevisionKind.REVERT, "that was wrong"),
+    ]
+    assert [store.lineage(number) for number in range(5)] == [(), (1,), (1, 2), (1, 3), (1, 2, 4)]
+    store.revert(0)
+    assert len(store.load().members) == 0
+    assert store.lineage() == (5,)
+
+
+def test_evidence_by_clique_by_landmark_and_by_time(store: MapStore) -> None:
+    first, second = random_map(1, stamp_s=1000.0), random_map(1, stamp_s=2000.0)
+    # in the second session landmark 0's clique has another number
+    renamed = replace(second.members, clique_id=np.where(second.members.clique_id == 0, 99, second.members.clique_id))
+    second = replace(second, members=renamed)
+    early, late = random_evidence(5, first), random_evidence(6, second)
+    store.commit(first, SESSION, (), early, parent=0)
+    store.commit(second, SESSION, (), late, parent=1)
+    landmark = int(first.members.landmark_id[0])
+
+    found = store.evidence(landmark_id=landmark)
+    wanted = early[early.clique_id == 0].joined(late[late.clique_id == 99])
+    for name in ("clique_id", "stamp_s", "n_hits", "n_misses"):
+        assert_same(getattr(found, name), getattr(wanted, name))
+    for name in ("expected", "log_odds", "p_exists"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-6)
+
+    assert_same(store.evidence(clique_id=0).stamp_s, early[early.clique_id == 0].stamp_s)
+    assert len(store.evidence()) == len(early) + len(late)
+    middle = float(early.stamp_s[10])
+    assert len(store.evidence(clique_id=0, since_s=middle)) == 30
+    assert len(store.evidence(landmark_id=landmark, revision=1)) == 40
+    store.revert(1)  # what a session saw that was taken back says nothing any more
+    assert_same(store.evidence(landmark_id=landmark).stamp_s, early[early.clique_id == 0].stamp_s)
+    assert len(store.evidence(landmark_id=-5)) == 0
+
+
+def test_an_unknown_revision_is_one_line(store: MapStore) -> None:
+    store.commit(random_map(1), SESSION, parent=0)
+    for ask in (store.load, store.revert, store.changes, store.lineage):
+        with pytest.raises(InputError, match=r"no revision 7; it has 1 of them \(try: evermap map log"):
+            ask(7)
+    with pytest.raises(InputError, match="no revision -1"):
+        store.load(-1)
+    with pytest.raises(InputError, match="is the newest already"):
+        store.revert(1)
+
+
+def test_what_did_not_change_is_kept_once(tmp_path: Path) -> None:
+    """An edit of a large map, and a session that only adds stays, cost little."""
+    path = tmp_path / "m.evermap"
+    living = random_map(3, cliques=80)
+    with open_store(path, create=True) as store:
+        store.commit(living, SESSION, parent=0)
+        before = path.stat().st_size
+        for number in range(1, 11):
+            pinned = living.members.pinned.copy()
+            pinned[number] = ~pinned[number]
+            living = replace(living, members=replace(living.members, pinned=pinned))
+            store.commit(living, SESSION, parent=number)
+        assert (path.stat().st_size - before) / 10 < before / 50
+
+
+def test_the_cost_of_a_revision_does_not_grow_with_the_history(tmp_path: Path) -> None:
+    """Three hundred sessions, each with twenty more stays: the last hundred cost what the first did."""
+    path = tmp_path / "m.evermap"
+    living, sizes = random_map(0, cliques=10), []
+    with open_store(path, create=True) as store:
+        for number in range(301):
+            new = random_map(number + 1, cliques=10, stamp_s=living.stamp_s + 3600.0)
+            new = replace(new, stays=living.stays.joined(new.stays))
+            store.commit(new, SESSION, parent=number)
+            living = new
+            sizes.append(path.stat().st_size)
+    assert len(living.stays) > 4000
+    grown = np.diff(sizes)
+    # a chunk of stays is open, and rewritten, at any time: that is the bound
+    assert grown[200:].sum() < 2.0 * grown[:100].sum()
+
+
+@pytest.mark.parametrize("address", ["postgresql://host/db", "mysql+driver://x"])
+def test_other_databases_are_named(address: str) -> None:
+    with pytest.raises(ConfigError, match=r"no map store for '(postgresql|mysql\+driver)'"):
+        open_store(address)
+
+
+def test_an_address_is_a_path_with_a_name_in_front(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    open_store(tmp_path / "m.evermap", create=True).commit(random_map(1), SESSION, parent=0)
+    assert open_store(f"sqlite:///{tmp_path}/m.evermap").head() == 1
+    monkeypatch.chdir(tmp_path)
+    assert open_store("sqlite:///m.evermap").head() == 1
+    assert open_store("m.evermap").head() == 1
+
+
+def test_the_database_library_is_loaded_by_opening_only() -> None:
+    code = "import evermap.maps.store, sys; print('sqlalchemy' in sys.modules, 'numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "False"]
