@@ -1,0 +1,264 @@
+"""Lifetimes of several classes learned together, so that one or two stays make no wild curve.
+
+    T of class c      Weibull with mean and shape of its own
+    log mean_c        normal about a level that all classes share, level and spread unknown
+    log shape_c       normal about 0: constant hazard, until the data say otherwise
+
+Every unknown lives on a grid, so posteriors are sums: nothing is searched, nothing can fail to converge, and the same
+numbers come out every time. The curve of a class is the mean of its posterior, which is what forecasts need. A class
+of which there are no stays gets what its fellows have in common; without any data that is a constant hazard of
+unknown size, as the general-purpose prior (Rosen 2016, eq. 26).
+
+The likelihood of a stay is that of `sightings`, with the arrival marginalised between the look before and the first
+sighting. A stay of which the look before is missing came any time before: then the same sum over arrivals is the law
+of what is left of a stay that one comes upon, `int_r^inf S / mean`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.survival.piecewise import PiecewiseConstantHazard
+from evermap.types import FloatArray
+
+LOG_MEAN = np.arange(math.log(1200.0), math.log(1.5e9), 0.25)
+"""Logarithms of mean durations in seconds, 20 minutes to 45 years."""
+LOG_SHAPE = np.arange(-1.0, 1.3, 0.25)
+"""Of Weibull shapes, 0.37 to 3.5."""
+LOGIT_RETURN = np.arange(-4.5, 4.6, 1.0)
+"""Of the probability that what went away ever returns."""
+FINE = 4
+"""Likelihoods are smooth: they are computed on the grid above and interpolated to one this many times finer."""
+SHAPE_SPREAD = 0.5
+"""Standard deviation of the logarithms of shapes."""
+_LEVELS = np.linspace(math.log(3600.0), math.log(3650.0 * 86400.0), 12)
+_SPREADS = np.array([0.5, 1.0, 2.0, 4.0])
+"""Between classes: means of log mean durations (an hour to ten years), and standard deviations about them."""
+_EDGES_S = np.concatenate([[0.0], np.geomspace(600.0, 1e9, 42)])
+"""Curves have constant hazards between these ages."""
+_INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
+"""Gauss-Legendre: where between two looks something arrived, as shares of the gap."""
+_LEAST = 1e-300
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ClassPosterior:
+    """What is known of the durations of C classes, and of a class that was never seen.
+
+    Attributes:
+        weight: (C + 1, M, A) posterior probabilities of `mean_s` and `second`; the last row for a new class.
+        mean_s: (M,) mean durations of those that end.
+        second: (A,) Weibull shapes of stays, probabilities of return of absences.
+        improper: whether `second` are probabilities of return.
+    """
+
+    weight: FloatArray
+    mean_s: FloatArray
+    second: FloatArray
+    improper: bool
+
+    def curve(self, row: int) -> PiecewiseConstantHazard:
+        """Posterior mean of the survival function of a class; -1 for one that was never seen."""
+        survival = _survival_table(self.improper) @ self.weight[row].ravel()
+        known = survival > 1e-9
+        log_s = np.log(survival[known])
+        rates = np.maximum((log_s[:-1] - log_s[1:]) / np.diff(_EDGES_S[known]), 0.0)
+        last = 0.0 if self.improper else rates[-1]
+        return PiecewiseConstantHazard(tuple(_EDGES_S[known]), (*rates, last))
+
+    def band(self, row: int, ages_s: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Posterior mean of `P(T > age)` at each age (N,), and the bounds of its central credible interval."""
+        survival = _survival(np.asarray(ages_s, dtype=np.float64), self.mean_s, self.second, self.improper)
+        weight = self.weight[row].ravel()
+        order = np.argsort(survival, axis=1)
+        ordered = np.take_along_axis(survival, order, axis=1)
+        below = np.cumsum(weight[order], axis=1)
+        tail = 0.5 * (1.0 - confidence)
+        lower, upper = (
+            ordered[np.arange(len(ordered)), np.minimum(np.sum(below < level, axis=1), ordered.shape[1] - 1)]
+            for level in (tail, 1.0 - tail)
+        )
+        return survival @ weight, lower, upper
+
+    def rate(self, row: int) -> float:
+        """Posterior mean rate in 1/s at which they end at first, were the hazard constant."""
+        share = self.second if self.improper else np.ones(len(self.second))
+        return float(np.sum(self.weight[row] / self.mean_s[:, None] * share))
+
+
+def stay_posterior(log_likelihood: FloatArray) -> ClassPosterior:
+    """Of stays, from the (C, M, A) log likelihoods of C classes on `LOG_MEAN` and `LOG_SHAPE`."""
+    second = _finer(LOG_SHAPE)
+    weight = _posterior(log_likelihood, -0.5 * np.square(second / SHAPE_SPREAD))
+    return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), np.exp(second), improper=False)
+
+
+def absence_posterior(log_likelihood: FloatArray) -> ClassPosterior:
+    """Of absences, from the (C, M, A) log likelihoods of C classes on `LOG_MEAN` and `LOGIT_RETURN`."""
+    share = 1.0 / (1.0 + np.exp(-_finer(LOGIT_RETURN)))
+    weight = _posterior(log_likelihood, np.log(share * (1.0 - share)))  # even over probabilities
+    return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), share, improper=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """K stays as they were seen, and how what was not seen may have interrupted them.
+
+    Attributes:
+        elsewhere_s, first_s, last_s, gone_s: (K,) as of `sightings.lifetimes_of_sightings`.
+        gap_s: (K, 2) lengths of the gaps between the looks at a stay; half of the gaps have the one, half the other.
+        back_by_stay: (K,) probability that who leaves is elsewhere for one more stay, and then back.
+        back_rate: (K,) rate in 1/s at which others come back.
+    """
+
+    elsewhere_s: FloatArray
+    first_s: FloatArray
+    last_s: FloatArray
+    gone_s: FloatArray
+    gap_s: FloatArray
+    back_by_stay: FloatArray
+    back_rate: FloatArray
+
+
+def stay_log_likelihood(seen: Sightings) -> FloatArray:
+    """(K, M, A) log probabilities of what was seen of K stays, on `LOG_MEAN` and `LOG_SHAPE`."""
+    result = np.empty((len(seen.first_s), len(LOG_MEAN), len(LOG_SHAPE)))
+    came, ended = np.isfinite(seen.elsewhere_s), np.isfinite(seen.gone_s)
+    watched_s = seen.last_s - seen.first_s
+    lasted = watched_s > 0.0
+    share = seen.gap_s[lasted] / seen.gap_s[lasted].sum(axis=1, keepdims=True)
+    pairs = np.maximum(watched_s[lasted] / seen.gap_s[lasted].sum(axis=1), 0.5)[:, None, None]
+    last_gap_s = seen.gone_s[ended] - seen.last_s[ended]
+    by_stay, rate = seen.back_by_stay[:, None, None], seen.back_rate[:, None, None]
+    begin = seen.elsewhere_s[came, None] + _INSTANTS * (seen.first_s - seen.elsewhere_s)[came, None]
+    stamps = np.stack([seen.first_s, seen.last_s, np.where(ended, seen.gone_s, seen.last_s)])
+    ages = stamps[:, came, None] - begin  # (3, came, 2)
+    found = stamps[:, ~came] - seen.first_s[~came]
+    hazard = np.empty((3, len(result), len(_INSTANTS), len(LOG_MEAN)))
+    for a, shape in enumerate(np.exp(LOG_SHAPE)):
+        per_scale = np.exp(-shape * (LOG_MEAN - math.lgamma(1.0 + 1.0 / shape)))
+        hazard[:, came] = (ages**shape)[..., None] * per_scale
+        hazard[:, ~came] = _of_found((found**shape)[..., None] * per_scale, shape)[:, :, None]
+        first, last, gone = hazard
+        log_seen = -first
+        for part in (0, 1):
+            x = (last - first)[lasted] * share[:, part, None, None] / pairs
+            y = by_stay[lasted] * x + rate[lasted] * (watched_s[lasted] * share[:, part])[:, None, None] / pairs
+            with np.errstate(divide="ignore"):
+                log_seen[lasted] += pairs * (np.logaddexp(np.log(y), np.log(x) - x - y) - np.log(x + y))
+        x = np.maximum((gone - last)[ended], _LEAST)
+        both = x + by_stay[ended] * x + rate[ended] * last_gap_s[:, None, None]
+        log_seen[ended] += np.log(x / both * -np.expm1(-both))
+        result[:, :, a] = _log_sum(log_seen) - _log_sum(-first)
+    return result
+
+
+def _log_sum(log_values: FloatArray) -> FloatArray:
+    """(K, M) over two instants."""
+    return np.asarray(np.logaddexp(log_values[:, 0], log_values[:, 1]))
+
+
+def _of_found(hazard: FloatArray, shape: float) -> FloatArray:
+    """Cumulative hazard of what is left of stays that one comes upon: `-log R(r)`, `R(r) = int_r^inf S / mean`."""
+    from scipy.special import gammaincc, gammaln
+
+    order = 1.0 / shape
+    left = gammaincc(order, hazard)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        late = hazard - (order - 1.0) * np.log(hazard) + gammaln(order)
+        return np.asarray(np.where(left > 1e-290, -np.log(left), late))
+
+
+def absence_log_likelihood(
+    there_s: FloatArray, first_s: FloatArray, last_s: FloatArray, back_s: FloatArray
+) -> FloatArray:
+    """(K, M, A) of absences on `LOG_MEAN` and `LOGIT_RETURN`.
+
+    Args:
+        there_s: (K,) last sighting before.
+        first_s: (K,) first look at which it was away.
+        last_s: (K,) last look at which it was away.
+        back_s: (K,) next sighting; inf if there was none.
+    """
+    share = 1.0 / (1.0 + np.exp(-LOGIT_RETURN))
+    first, last, back = (_away(ages) for ages in _ages(there_s, first_s, last_s, back_s))  # (K, 2, M)
+    ended = np.isfinite(back_s)
+    seen = last[..., None] * share + (1.0 - share)
+    seen[ended] = np.maximum(last[ended] - back[ended], _LEAST)[..., None] * share
+    return np.asarray(np.log(seen.mean(axis=1)) - np.log((first[..., None] * share + (1.0 - share)).mean(axis=1)))
+
+
+def _away(ages: FloatArray) -> FloatArray:
+    """(K, 2, M) probability that one that returns is still away."""
+    return np.asarray(np.exp(-ages[..., None] * np.exp(-LOG_MEAN)))
+
+
+def _ages(
+    before: FloatArray, first: FloatArray, last: FloatArray, after: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(K, 2) ages at the three later stamps, for two instants of beginning."""
+    begin = before[:, None] + _INSTANTS * (first - before)[:, None]
+    return first[:, None] - begin, last[:, None] - begin, after[:, None] - begin
+
+
+def _posterior(log_likelihood: FloatArray, log_second: FloatArray) -> FloatArray:
+    """(C + 1, M, A) on the finer grid, with level and spread of the classes summed over."""
+    fine = _cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T
+    fine = np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
+    second = np.exp(log_second - log_second.max())
+    second /= second.sum()
+    means = _finer(LOG_MEAN)
+    common = np.exp(-0.5 * np.square((means - _LEVELS[:, None, None]) / _SPREADS[:, None])).reshape(-1, len(means))
+    common /= common.sum(axis=1, keepdims=True)  # (H, M)
+    evidence = np.maximum((fine @ second) @ common.T, _LEAST)  # (C, H)
+    log_hyper = np.log(evidence).sum(axis=0)
+    hyper = np.exp(log_hyper - log_hyper.max())
+    hyper /= hyper.sum()
+    weight = (
+        np.concatenate(
+            [((hyper / evidence) @ common)[:, :, None] * fine, (hyper @ common)[None, :, None] * np.ones_like(second)]
+        )
+        * second
+    )
+    return np.asarray(weight / weight.sum(axis=(1, 2), keepdims=True))
+
+
+def _finer(nodes: FloatArray) -> FloatArray:
+    return np.asarray(np.interp(np.arange(FINE * (len(nodes) - 1) + 1) / FINE, np.arange(len(nodes)), nodes))
+
+
+@lru_cache
+def _cubic(n: int) -> FloatArray:
+    """(N, n) from values at n nodes to those at N finer ones: Lagrange through the four nodes around each."""
+    at = np.arange(FINE * (n - 1) + 1) / FINE
+    start = np.clip(np.floor(at).astype(np.int64) - 1, 0, n - 4)
+    matrix = np.zeros((len(at), n))
+    for i in range(4):
+        weight = np.ones(len(at))
+        for j in range(4):
+            if j != i:
+                weight *= (at - start - j) / (i - j)
+        matrix[np.arange(len(at)), start + i] = weight
+    return matrix
+
+
+def _survival(ages_s: FloatArray, mean_s: FloatArray, second: FloatArray, improper: bool) -> FloatArray:
+    """(N, M A) of every member at every age."""
+    if improper:
+        left = np.exp(-ages_s[:, None, None] / mean_s[:, None])
+        return np.asarray(1.0 - second * (1.0 - left)).reshape(len(ages_s), -1)
+    scale = mean_s[:, None] / np.array([math.gamma(1.0 + 1.0 / shape) for shape in second])
+    return np.asarray(np.exp(-((ages_s[:, None, None] / scale) ** second))).reshape(len(ages_s), -1)
+
+
+@lru_cache
+def _survival_table(improper: bool) -> FloatArray:
+    """(J, M A) at the edges of curves."""
+    nodes = LOGIT_RETURN if improper else LOG_SHAPE
+    second = 1.0 / (1.0 + np.exp(-_finer(nodes))) if improper else np.exp(_finer(nodes))
+    return _survival(_EDGES_S, np.exp(_finer(LOG_MEAN)), second, improper)

@@ -1,0 +1,135 @@
+"""Lifetimes learned from the history of a map, against the laws that the history was drawn from."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy import stats as law
+from simulated_stays import as_seen, histories, two_looks_a_day
+
+from evermap.maps.learning import class_survival, learned_lives
+from evermap.maps.lives import Lives
+from evermap.maps.living import Stays
+from evermap.sim.classes import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
+from evermap.survival.general_purpose import GeneralPurpose
+from evermap.types import UNKNOWN
+
+LOOKS_S = two_looks_a_day(28)
+END_S = 28 * DAY_S
+SEEDS = range(30)
+
+
+def seen_in_four_weeks(seed: int, warmup_days: float = 60.0) -> Stays:
+    """Of the demo's classes, which lived on for some time before the first look."""
+    return as_seen(histories(DEFAULT_CLASSES, END_S, np.random.default_rng(seed), warmup_days * DAY_S), LOOKS_S)
+
+
+@pytest.mark.parametrize("warmup_days", [0.0, 60.0])
+def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float) -> None:
+    """Between the ages by which 10 % and 90 % are gone: there is nothing to be seen of rarer things in four weeks."""
+    covered = []
+    for seed in SEEDS:
+        stays = seen_in_four_weeks(seed, warmup_days)
+        lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+        for kind, item in enumerate(DEFAULT_CLASSES):
+            if item.stay is None:
+                continue
+            truth = law.gamma(item.stay.shape, scale=item.stay.mean_days / item.stay.shape)
+            ages_days = truth.ppf([0.1, 0.3, 0.5, 0.7, 0.9])
+            _, lower, upper = class_survival(stays, lives, kind, ages_days * DAY_S)
+            survival = truth.sf(ages_days)
+            covered.append((lower <= survival) & (survival <= upper))
+    assert np.mean(covered) >= 0.9
+    assert np.mean(covered, axis=1).reshape(len(SEEDS), -1).mean(axis=0).min() >= 0.75  # every class by itself
+
+
+def test_a_class_that_never_leaves_is_believed_to_stay() -> None:
+    stays = seen_in_four_weeks(0)
+    life = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).of(0, np.zeros(2))
+    assert life.n_stays == DEFAULT_CLASSES[0].count
+    assert life.n_ended == 0
+    assert np.exp(life.stay.log_conditional_survival(28 * DAY_S, 29 * DAY_S)) > 0.99
+
+
+def test_returns_hops_and_known_sites_are_learned() -> None:
+    classes = (
+        ObjectClass("swing", "hinge", count=5, stay=Duration(1.5)),
+        ObjectClass(
+            "comes-back", count=8, stay=Duration(2.0), absence=Duration(2.0),
+            p_vanish=1.0, p_return=1.0, p_same_place=1.0,
+        ),
+        ObjectClass("wanders", count=8, stay=Duration(2.0), p_vanish=0.0),
+        ObjectClass("is-taken", count=25, stay=Duration(2.0), p_vanish=1.0, p_return=0.0),
+    )  # fmt: skip
+    stays = as_seen(histories(classes, END_S, np.random.default_rng(1), 0.0), LOOKS_S)
+    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    swing, comes_back, wanders, is_taken = (lives.of(kind, np.zeros(2)) for kind in range(4))
+    assert swing.p_hop > 0.9
+    assert swing.p_known > 0.9
+    assert comes_back.p_hop < 0.1
+    assert comes_back.p_known > 0.9
+    assert np.exp(comes_back.absence.log_survival(14 * DAY_S)) < 0.1  # of those away, after two weeks
+    assert wanders.p_hop > 0.9
+    assert wanders.p_known < 0.1
+    assert np.exp(is_taken.absence.log_survival(14 * DAY_S)) > 0.9
+
+
+def test_without_stays_nothing_is_believed_but_looks_are_counted() -> None:
+    lives = learned_lives(Stays.empty(), Lives(), 100.0)
+    assert len(lives.life) == 0
+    assert lives.looks_s.tolist() == [100.0]
+
+
+def test_a_new_class_gets_what_the_others_have_in_common() -> None:
+    """Of everything that leaves within days, the next thing does so, too; with less certainty than its fellows."""
+    classes = tuple(ObjectClass(f"kind-{n}", count=12, stay=Duration(2.0), p_vanish=0.0) for n in range(6))
+    stays = as_seen(histories(classes, END_S, np.random.default_rng(3), 0.0), LOOKS_S)
+    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    unknown = lives.of(17, np.zeros(2)).stay
+    assert unknown is lives.of(UNKNOWN, np.zeros(2)).stay
+    assert 0.5 * DAY_S < unknown.quantile(0.5) < 4.0 * DAY_S
+    _, lower, upper = class_survival(stays, lives, 17, [2.0 * DAY_S])
+    _, lower_known, upper_known = class_survival(stays, lives, 3, [2.0 * DAY_S])
+    assert upper - lower > 2.0 * (upper_known - lower_known)
+
+
+def test_order_of_stays_does_not_matter() -> None:
+    stays = seen_in_four_weeks(2)
+    shuffled = stays[np.random.default_rng(0).permutation(len(stays))]
+    one, other = (learned_lives(s, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]) for s in (stays, shuffled))
+    np.testing.assert_allclose([life.p_hop for life in one.life], [life.p_hop for life in other.life], rtol=1e-12)
+    for a, b in zip(one.life, other.life, strict=True):
+        np.testing.assert_allclose(a.stay.log_survival(DAY_S), b.stay.log_survival(DAY_S), rtol=1e-6)
+
+
+def test_forecasts_of_the_next_session_beat_the_general_purpose_prior_and_are_calibrated() -> None:
+    """What is there now: will it be there at the next look? Learned day by day, of what was seen until then."""
+    general = GeneralPurpose(1.0 / (3650.0 * DAY_S), 1.0 / 3600.0)
+    said, said_in_general, was = [], [], []
+    for seed in range(4):
+        true = histories(DEFAULT_CLASSES, END_S, np.random.default_rng(seed), 0.0)
+        for until in range(20, len(LOOKS_S) - 1, 4):
+            stays = as_seen(true, LOOKS_S[:until])
+            now_s, next_s = LOOKS_S[until - 1], LOOKS_S[until]
+            lives = learned_lives(stays, Lives(looks_s=LOOKS_S[: until - 1]), now_s)
+            there = {(stay.thing, stay.site) for stay in true if stay.start_s <= next_s < stay.end_s}
+            for row in np.flatnonzero(np.isinf(stays.gone_s)):
+                age_s = now_s - stays.first_s[row]
+                stay = lives.of(int(stays.class_id[row]), stays.position_m[row]).stay
+                kind = DEFAULT_CLASSES[stays.class_id[row]]
+                if kind.mount == "hinge":
+                    continue  # may be back: a forecast of returns, which lifetimes alone do not make
+                said.append(np.exp(stay.log_conditional_survival(age_s, age_s + next_s - now_s)))
+                said_in_general.append(np.exp(general.log_conditional_survival(age_s, age_s + next_s - now_s)))
+                site = int(stays.site_id[row]) % 1000
+                was.append((int(stays.clique_id[row]), site) in there)
+    p, q, y = np.array(said), np.array(said_in_general), np.array(was)
+    scores = [-np.mean(np.log(np.where(y, s, 1.0 - s))) for s in (p, q)]
+    assert scores[0] < scores[1]
+    edges = np.quantile(p, [0.0, 0.25, 0.5, 0.75, 1.0])
+    for low, high in itertools.pairwise(edges):
+        rows = (p >= low) & (p <= high)
+        error = np.sqrt(np.mean(p[rows] * (1.0 - p[rows])) / rows.sum())
+        assert abs(np.mean(y[rows]) - np.mean(p[rows])) < 3.0 * error + 0.01
