@@ -279,3 +279,18 @@ class LivingMap:
         pins[row] = pins[row] if pinned is None else pinned
         deletions[row] = deletions[row] if deleted is None else deleted
         return replace(self, members=replace(self.members, pinned=pins, deleted=deletions))
+
+    def without(self, landmark_ids: IntArray) -> LivingMap:
+        """The map as if these landmarks had never been seen; bodies of which nothing is left go, too."""
+        members = self.members[~np.isin(self.members.landmark_id, landmark_ids)]
+        kept = np.flatnonzero(~np.isin(self.places.landmark_id, landmark_ids))
+        places = self.places[kept]
+        corner = (2 * kept[:, None] + np.arange(2)).ravel()
+        return replace(
+            self,
+            members=members,
+            sites=self.sites[np.isin(self.sites.site_id, places.site_id)],
+            places=places,
+            stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
+            covariance_m2=self.covariance_m2[np.ix_(corner, corner)],
+        )
