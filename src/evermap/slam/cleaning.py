@@ -1,0 +1,215 @@
+"""What a live robot logs, made a valid `Recording`: what can be saved is saved, the rest is left out and counted.
+
+Readers of files refuse what looks like a mistake of whoever wrote the file. A robot on duty cannot ask anybody: it gets
+messages late, twice or never, its clocks are set, its drivers send numbers that are none. A recording that is valid
+comes back as it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from evermap.slam.clocks import restored, running_median, set_forward
+from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording
+
+FASTEST = 100.0
+"""No robot drives [m/s] or turns [rad/s] faster."""
+HARDEST = 100.0
+"""No robot speeds up and slows down again by more than this, [m/s^2] or [rad/s^2]: that is a spike of an encoder."""
+SHARPEST = 2.0
+"""But by so much [m/s or rad/s] it may at any rate: some robots log what they were told, not what they did."""
+TOO_FAR = 2.0
+"""Readings beyond the sensor's largest range by this factor are none; calibration and noise explain less."""
+FAR_FROM_MEDIAN = 100.0
+"""The same, as a factor on the median of all ranges, for a sensor without a largest range."""
+MOVED = 0.1
+"""A robot that moved by so much [m or rad] does not read the very same numbers again, not even in whole pixels."""
+
+
+def clean(recording: Recording) -> Recording:
+    """The recording with what is impossible left out, in the order of time; every kind of repair is a counted warning.
+
+    Args:
+        recording: columns of equal length; everything else may be wrong. Rows stand in the order of arrival.
+
+    Returns:
+        A valid recording, maybe an empty one; the same object where nothing was wrong. Repaired are:
+
+        * stamps that are none or stand alone: their rows are left out;
+        * late rows: sorted in; rows with equal stamps: the last odometry is kept, frames are united;
+        * clocks that were set back, and clocks of one sensor that were set forward, by more than a second: taken back,
+          to within a few periods of the sensor;
+        * odometry that is no number, beyond `FASTEST`, or a spike: left out, the row before holds on;
+        * readings that are no number, not positive, or beyond the sensor's reach: left out;
+        * readings repeated in the same frame, or in the next one though the robot moved: left out;
+        * identities below -1 and classes without a name: unknown; standard deviations that are none: not given.
+    """
+    remarks: list[str] = []
+    odometry = _odometry(recording.odometry, remarks)
+    detections = _readings(recording, remarks)
+    frames, detections = _in_time(recording.frames, detections, remarks)
+    frames, odometry = _one_clock(frames, odometry, remarks)
+    frames, detections = _fresh(frames, detections, odometry, remarks)
+    if not remarks:
+        return recording
+    warnings = (*recording.warnings, *remarks)
+    return replace(recording, odometry=odometry, frames=frames, detections=detections, warnings=warnings)
+
+
+def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
+    """Possible velocities at increasing stamps."""
+    stamps = _mended("odometry", odometry.stamp_s, remarks)
+    order = np.argsort(stamps, kind="stable")
+    order = order[np.isfinite(stamps[order])]
+    last = np.append(stamps[order][1:] != stamps[order][:-1], True)[: len(order)]
+    _remark(remarks, "odometry rows with the stamp of another left out", int(np.sum(~last)))
+    kept = order[last]
+    if len(kept) < len(stamps) or np.any(np.diff(kept) != 1) or np.any(stamps != odometry.stamp_s):
+        odometry = replace(_rows(odometry, kept), stamp_s=stamps[kept])
+    velocity = np.stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    possible = np.all(np.abs(velocity) <= FASTEST, axis=0)
+    _remark(remarks, "odometry rows that no robot can drive left out", int(np.sum(~possible)))
+    odometry, velocity = _rows(odometry, possible), velocity[:, possible]
+    if len(odometry) < 3:
+        return odometry
+    step_s = np.diff(odometry.stamp_s)
+    step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
+    step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
+    usual = np.stack([running_median(column) for column in velocity])
+    spike = np.any(np.abs(velocity - usual) > np.maximum(HARDEST * step_s, SHARPEST), axis=0)
+    _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
+    return _rows(odometry, ~spike)
+
+
+def _readings(recording: Recording, remarks: list[str]) -> Detections:
+    """Detections that a sensor can have made, of frames that exist."""
+    detections, sensor = recording.detections, recording.sensor
+    ranges = detections.range_m
+    real = np.isfinite(ranges) & (ranges > 0.0)
+    reach_m = TOO_FAR * sensor.range_max_m
+    if not np.isfinite(reach_m):
+        reach_m = FAR_FROM_MEDIAN * float(np.median(ranges[real])) if real.any() else 0.0
+    real &= (ranges <= reach_m) & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
+    real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
+    _remark(remarks, "readings that no sensor can make left out", int(np.sum(~real)))
+    if not real.all():
+        detections = _rows(detections, real)
+    strange = detections.landmark_id < UNKNOWN
+    unnamed = (detections.class_id < UNKNOWN) | (detections.class_id >= max(len(recording.class_names), 1))
+    unnamed &= len(recording.class_names) > 0
+    _remark(remarks, "identities and classes that do not exist taken as unknown", int(np.sum(strange | unnamed)))
+    if np.any(strange | unnamed):
+        names = np.where(strange, UNKNOWN, detections.landmark_id)
+        detections = replace(detections, landmark_id=names, class_id=np.where(unnamed, UNKNOWN, detections.class_id))
+    for name in ("sigma_range_m", "sigma_bearing_rad"):
+        sigma = getattr(detections, name)
+        bad = ~np.isnan(sigma) & ~((sigma > 0.0) & (sigma < np.inf))
+        _remark(remarks, f"values of {name} that are none taken as not given", int(np.sum(bad)))
+        if bad.any():
+            detections = replace(detections, **{name: np.where(bad, np.nan, sigma)})
+    return detections
+
+
+def _in_time(frames: Frames, detections: Detections, remarks: list[str]) -> tuple[Frames, Detections]:
+    """Frames at increasing stamps, those with equal stamps united, and detections sorted by frame."""
+    stamps = _mended("sensor", frames.stamp_s, remarks)
+    instants: FloatArray = np.unique(stamps[np.isfinite(stamps)])
+    sorted_already = np.all(np.diff(detections.frame) >= 0)
+    if len(instants) == len(frames) and np.array_equal(instants, frames.stamp_s) and sorted_already:
+        return frames, detections
+    _remark(remarks, "frames that came more than once united", int(np.isfinite(stamps).sum()) - len(instants))
+    row: IntArray = np.searchsorted(instants, stamps).astype(np.int64)[detections.frame]
+    order = np.argsort(row, kind="stable")
+    order = order[np.isfinite(stamps[detections.frame[order]])]
+    detections = replace(_rows(detections, order), frame=row[order])
+    same = np.column_stack([detections.frame, detections.landmark_id, detections.range_m, detections.bearing_rad])
+    _, first = np.unique(same, axis=0, return_index=True)
+    _remark(remarks, "readings that a frame has twice left out", len(same) - len(first))
+    if not sorted_already:
+        remarks.append("detections sorted by frame")
+    return replace(frames, stamp_s=instants), _rows(detections, np.sort(first))
+
+
+def _one_clock(frames: Frames, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Odometry]:
+    """Steps forward that one of the two clocks made alone are taken back, the last one first."""
+    for _ in range(len(frames)):
+        step = set_forward(frames.stamp_s, odometry.stamp_s)
+        if step is not None:
+            frames = replace(frames, stamp_s=_taken_back(frames.stamp_s, step, "sensor", remarks))
+            continue
+        step = set_forward(odometry.stamp_s, frames.stamp_s)
+        if step is None:
+            break
+        odometry = replace(odometry, stamp_s=_taken_back(odometry.stamp_s, step, "odometry", remarks))
+    return frames, odometry
+
+
+def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks: list[str]) -> FloatArray:
+    row, by_s = step
+    remarks.append(f"clock of the {what} was set forward by {by_s:.1f} s, taken back")
+    return np.append(stamp_s[:row], stamp_s[row:] - by_s)
+
+
+def _fresh(frames: Frames, detections: Detections, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Detections]:
+    """Without frames that repeat the one before, number by number, though the robot moved: the sensor hangs.
+
+    A single reading may repeat by chance, where a camera counts whole pixels.
+    """
+    if len(frames) < 2 or len(odometry) < 2:
+        return frames, detections
+    first = np.searchsorted(detections.frame, np.arange(len(frames) + 1))
+    count = np.diff(first)
+    before = detections.frame - 1
+    alike = (before >= 0) & (count[detections.frame] == count[before])
+    at = np.where(alike, first[before] + np.arange(len(detections)) - first[detections.frame], 0)
+    for name in ("landmark_id", "range_m", "bearing_rad"):
+        column = getattr(detections, name)
+        alike &= column == column[at]
+    repeated = (count > 1) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
+    repeated &= _moved_since(np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry)
+    if not repeated.any():
+        return frames, detections
+    _remark(remarks, "frames left out that repeat the one before, though the robot moved", int(repeated.sum()))
+    kept = _rows(detections, ~repeated[detections.frame])
+    row: IntArray = (np.cumsum(~repeated) - 1).astype(np.int64)
+    return replace(frames, stamp_s=frames.stamp_s[~repeated]), replace(kept, frame=row[kept.frame])
+
+
+def _moved_since(row: IntArray, frames: Frames, odometry: Odometry) -> BoolArray:
+    """(F,) whether the robot drove or turned by more than `MOVED` since the frames in `row` (F,)."""
+    speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
+    way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
+    at = np.stack([np.interp(frames.stamp_s, odometry.stamp_s, column) for column in way])
+    moved: BoolArray = np.any(at - at[:, row] > MOVED, axis=0)
+    return moved
+
+
+def _mended(what: str, stamp_s: FloatArray, remarks: list[str]) -> FloatArray:
+    """(N,) stamps as a clock that is never set back would have shown them, nan where one is none."""
+    stamps, back_s = restored(stamp_s)
+    real = stamps[np.isfinite(stamps)]
+    _remark(remarks, f"stamps of the {what} that are none left out with their rows", len(stamps) - len(real))
+    late = int(np.sum(real < np.maximum.accumulate(real))) if len(real) else 0
+    _remark(remarks, f"late stamps of the {what} sorted in", late)
+    if len(back_s):
+        steps = ", ".join(f"{step:.1f}" for step in back_s[:3]) + (", ..." if len(back_s) > 3 else "")
+        remarks.append(f"clock of the {what} was set back, by {steps} s; what follows goes on from there")
+    return stamps
+
+
+def _remark(remarks: list[str], what: str, count: int) -> None:
+    if count:
+        remarks.append(f"{what}: {count}")
+
+
+Table = TypeVar("Table", Detections, Odometry)
+
+
+def _rows(table: Table, rows: BoolArray | IntArray) -> Table:
+    """Some rows of a table of columns, in that order."""
+    columns = {item.name: getattr(table, item.name) for item in fields(table)}
+    some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    return replace(table, **some)
