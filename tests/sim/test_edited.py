@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.sim.edited import DEPTH_LAW, edited, limited
+from evermap.sim.edited import DEPTH_LAW, edited, later, limited
 from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor
 
 SENSOR = Sensor(
@@ -34,8 +34,9 @@ def made(places: list[Landmarks], law: tuple[float, float, float]) -> Recording:
     """All landmarks in every frame, each frame with its own map; two detections of an unknown one."""
     rows = []
     for frame, (pose, landmarks) in enumerate(zip(poses(), places, strict=True)):
-        for k, (identity, at) in enumerate(zip(landmarks.landmark_id, landmarks.position_m, strict=True)):
+        for identity, at in zip(landmarks.landmark_id, landmarks.position_m, strict=True):
             r, b = reading(pose, at, law)
+            k = BEFORE.landmark_id.tolist().index(identity)  # every landmark has its own noise
             rows.append((frame, identity, r + NOISE[frame, k, 0], b + NOISE[frame, k, 1]))
     rows.append((39, 77, 2.0, 0.1))
     frame, identity, r, b = np.array(rows).T
@@ -73,6 +74,38 @@ def test_who_leaves_the_view_is_not_seen() -> None:
     found = edited(recording, poses(), BEFORE, far, float(STAMPS[20]))
     assert np.all(found.detections.frame[found.detections.landmark_id == 5] < 20)
     assert np.sum(found.detections.landmark_id == 3) == 40
+
+
+def test_who_vanishes_is_not_seen_and_the_looks_stay() -> None:
+    recording = made([BEFORE] * 40, DEPTH_LAW)
+    some = Landmarks.at([3, 9], [(3.0, 0.5), (4.0, -0.5)])
+    found = edited(recording, poses(), BEFORE, some, float(STAMPS[20]))
+    kept = (recording.detections.landmark_id != 5) | (recording.detections.frame < 20)
+    np.testing.assert_array_equal(found.detections.source_line, recording.detections.source_line[kept])
+    np.testing.assert_array_equal(found.detections.range_m, recording.detections.range_m[kept])
+    np.testing.assert_array_equal(found.frames.stamp_s, recording.frames.stamp_s)
+    empty = Landmarks.at([], np.zeros((0, 2)))
+    nothing = edited(recording, poses(), BEFORE, empty, -np.inf)
+    np.testing.assert_array_equal(nothing.detections.landmark_id, [77])
+
+
+def test_moved_vanished_and_back_are_what_would_have_been_seen() -> None:
+    now = Landmarks.at([3, 9], [(3.3, 0.1), (4.0, -0.5)])
+    found = edited(made([BEFORE] * 40, DEPTH_LAW), poses(), BEFORE, now, -np.inf).detections
+    wanted = made([now] * 40, DEPTH_LAW).detections
+    kept = np.isin(10 * wanted.frame + wanted.landmark_id, 10 * found.frame + found.landmark_id)
+    np.testing.assert_allclose(found.range_m, wanted.range_m[kept], atol=1e-12)
+    np.testing.assert_allclose(found.bearing_rad, wanted.bearing_rad[kept], atol=1e-12)
+    assert np.all((np.abs(wanted.bearing_rad) > 0.8)[~kept] | (wanted.range_m > 6.0)[~kept])
+
+
+def test_later_is_the_same_recording_with_all_its_stamps_moved() -> None:
+    recording = made([BEFORE] * 40, DEPTH_LAW)
+    moved = later(recording, 86_400.0)
+    np.testing.assert_array_equal(moved.frames.stamp_s, STAMPS + 86_400.0)
+    np.testing.assert_array_equal(moved.odometry.stamp_s, STAMPS + 86_400.0)
+    assert moved.truth is None
+    assert moved.detections is recording.detections
 
 
 def test_no_move_is_no_edit() -> None:
