@@ -32,10 +32,9 @@ def looks(rows: list[tuple[float, int, int, int, bool]]) -> SiteLooks:
 def dynamics(**changed: Any) -> SiteDynamics:
     """Of one clique with three sites."""
     values: dict[str, Any] = {
-        "priors": (Weibull(400.0, 0.7), Exponential.from_half_life(150.0), GENERAL),
-        "stay": np.array([0, 2, 1]),
+        "stay": (Weibull(400.0, 0.7), GENERAL, Exponential.from_half_life(150.0)),
         "since_s": np.array([-100.0, -20.0, -3.0]),
-        "absence": np.array([1]),
+        "absence": (Exponential.from_half_life(150.0),),
         "away_since_s": np.array([-50.0]),
         "p_hop": np.array([0.4]),
         "return_share": np.array([0.5, 0.2, 0.1]),
@@ -46,8 +45,8 @@ def dynamics(**changed: Any) -> SiteDynamics:
 def alone(prior: Any, since_s: FloatArray) -> SiteDynamics:
     """Of cliques with one site each, that never return: Rosen's world."""
     n = len(since_s)
-    nought, nil = np.zeros(n, dtype=np.int64), np.zeros(n)
-    return SiteDynamics((prior,), nought, since_s, nought, nil, nil, nil)
+    nil = np.zeros(n)
+    return SiteDynamics((prior,) * n, since_s, (prior,) * n, nil, nil, nil)
 
 
 def sum_over_paths(
@@ -59,7 +58,7 @@ def sum_over_paths(
     """
     n = len(p_here)
     states = [(seat, new) for seat in range(n + 1) for new in (False, True)]
-    prior = [known.priors[i] for i in (known.absence[0], *known.stay)]
+    prior = [known.absence[0], *known.stay]
     since = [known.away_since_s[0], *known.since_s]
     share = known.return_share
 
@@ -189,10 +188,8 @@ def test_constant_hazard_and_hops_are_the_chain_of_modes() -> None:
     modes = smoothed(ModeLooks(np.array([0, t]), stamp, np.log(ratio)), chain)
 
     at, site = np.divmod(np.arange(t * k), k)
-    zero = np.zeros(1, np.int64)
-    known = SiteDynamics(
-        (Exponential(1e-3),), np.zeros(k, np.int64), np.zeros(k), zero, np.zeros(1), np.ones(1), np.full(k, 1 / k)
-    )
+    hazard = (Exponential(1e-3),)
+    known = SiteDynamics(hazard * k, np.zeros(k), hazard, np.zeros(1), np.ones(1), np.full(k, 1 / k))
     found = follow_sites(
         np.full(k, 1 / k), np.zeros(k, np.int64), known,
         SiteLooks(stamp[at], np.zeros(t * k, np.int64), site, np.arange(t * k), hit.ravel()),
@@ -209,9 +206,8 @@ def test_a_long_gap_is_that_of_a_continuous_chain() -> None:
 
     stay, absence, p_hop, share = 1 / 300.0, 1 / 200.0, 0.3, np.array([0.5, 0.3])
     known = SiteDynamics(
-        (Exponential(stay), Exponential(absence)), np.zeros(2, np.int64), np.zeros(2), np.ones(1, np.int64),
-        np.zeros(1), np.array([p_hop]), share,
-    )  # fmt: skip
+        (Exponential(stay),) * 2, np.zeros(2), (Exponential(absence),), np.zeros(1), np.array([p_hop]), share
+    )
     hop = p_hop * share[::-1] / (1 - share)
     rate = np.array([[0.0, *(absence * share)], [stay * (1 - hop[0]), 0, stay * hop[0]], [0, stay * hop[1], 0]])
     rate[2, 0] = stay * (1 - hop[1])
@@ -330,7 +326,8 @@ def _worlds(draw: st.DrawFn) -> dict[str, Any]:
         "p_here": rng.random(s) / total,
         "clique_of_site": clique_of_site,
         "dynamics": SiteDynamics(
-            priors, rng.integers(0, 3, s), -rng.exponential(1e3, s), rng.integers(0, 3, c), -rng.exponential(1e3, c),
+            tuple(priors[i] for i in rng.integers(0, 3, s)), -rng.exponential(1e3, s),
+            tuple(priors[i] for i in rng.integers(0, 3, c)), -rng.exponential(1e3, c),
             rng.choice([0.0, 0.5, 1.0], c), rng.random(s) * rng.choice([0.0, 1.0]) / total,
         ),
         "looks": SiteLooks(
@@ -369,7 +366,7 @@ def test_laws(world: dict[str, Any], which: int) -> None:
             "p_here": world["p_here"][site],
             "clique_of_site": clique[site],
             "dynamics": SiteDynamics(
-                known.priors, known.stay[site], known.since_s[site], known.absence, known.away_since_s, known.p_hop,
+                tuple(known.stay[i] for i in site), known.since_s[site], known.absence, known.away_since_s, known.p_hop,
                 known.return_share[site],
             ),
             "looks": SiteLooks(
@@ -413,9 +410,8 @@ def test_beliefs_drawn_from_the_model_are_calibrated() -> None:
     rate = rng.beta(2.0, 1.0, n)
     veiled = rng.random((n, 6)) < 0.05
     hit = np.where(truth & ~veiled, rng.random((n, 6)) < rate[:, None], rng.random((n, 6)) < 0.02)
-    each = np.zeros(n, dtype=np.int64)
     known = SiteDynamics(
-        (Exponential(stay), Exponential(absence)), each, np.zeros(n), each + 1, np.zeros(n), np.zeros(n), np.ones(n)
+        (Exponential(stay),) * n, np.zeros(n), (Exponential(absence),) * n, np.zeros(n), np.zeros(n), np.ones(n)
     )
     clique = np.repeat(np.arange(n), 6)
     found = follow_sites(
@@ -438,7 +434,7 @@ def test_beliefs_drawn_from_the_model_are_calibrated() -> None:
 
 def test_nothing_to_follow() -> None:
     none = np.zeros(0, dtype=np.int64)
-    known = SiteDynamics((), none, np.zeros(0), none, np.zeros(0), np.zeros(0), np.zeros(0))
+    known = SiteDynamics((), np.zeros(0), (), np.zeros(0), np.zeros(0), np.zeros(0))
     found = follow_sites(
         np.zeros(0), none, known, looks([]), np.zeros(0), np.zeros(0), start_s=0.0, until_s=1.0, p_false=0.1
     )
@@ -458,7 +454,7 @@ def test_nothing_to_follow() -> None:
         ({"looks": looks([(10.0, 0, 3, 0, True)])}, "site.*does not exist"),
         ({"looks": looks([(10.0, 0, 0, 1, True)])}, "key.*does not exist"),
         ({"dynamics": dynamics(since_s=np.array([0.0, np.nan, 0.0]))}, "since_s.*row 1"),
-        ({"dynamics": dynamics(stay=np.array([0, 1, 3]))}, "stay.*does not exist"),
+        ({"dynamics": dynamics(stay=(GENERAL, GENERAL))}, "stay.*shape"),
         ({"dynamics": dynamics(p_hop=np.array([1.5]))}, "p_hop"),
     ],
 )

@@ -75,6 +75,23 @@ class Chains:
         return route, np.where(free, 1.0, moves)
 
 
+def distinct(priors: tuple[LifetimePrior, ...]) -> tuple[tuple[LifetimePrior, ...], IntArray]:
+    """The different ones among priors, and which of these each is."""
+    number: dict[object, int] = {}
+    row = np.array([number.setdefault(_name(prior), len(number)) for prior in priors], dtype=np.int64)
+    first = np.unique(row, return_index=True)[1]
+    return tuple(priors[k] for k in first), row
+
+
+def _name(prior: LifetimePrior) -> object:
+    """What equal priors have in common; of one that cannot be compared, what it alone has."""
+    try:
+        hash(prior)
+    except TypeError:
+        return id(prior)
+    return prior
+
+
 def odds(priors: tuple[LifetimePrior, ...], prior: IntArray, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
     """(R, M) odds of leaving within gaps [start, stop) of age."""
     log_odds = log_death_odds(priors, np.repeat(prior, start_s.shape[1]), start_s.ravel(), stop_s.ravel())

@@ -68,7 +68,7 @@ def frame_evidence(
             high, total = low, 0.0
             while high < first[f + 1] and seat[high] == k:
                 a, b = hits[slot[high]], misses[slot[high]]
-                p = a / (a + b)
+                p = max(a / (a + b), p_false)  # what is there is no harder to detect than what is not
                 expected[f, k] += p
                 if hit[high]:
                     n_hits[f, k] += 1
@@ -78,7 +78,7 @@ def frame_evidence(
                     n_misses[f, k] += 1
                     if use_misses:
                         misses[slot[high]] += 1.0
-                        total += np.log(b / (a + b) / (1.0 - p_false))
+                        total += np.log(min(b / (a + b), 1.0 - p_false) / (1.0 - p_false))
                 high += 1
             if p_occluded > 0.0:
                 seen = np.log1p(-p_occluded) + total

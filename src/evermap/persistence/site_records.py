@@ -40,10 +40,9 @@ class SiteDynamics:
     """How S sites of C cliques are left and returned to.
 
     Attributes:
-        priors: lifetimes of stays and of absences.
-        stay: (S,) which of them a stay at each site has.
+        stay: S lifetimes of a stay at each site.
         since_s: (S,) when the newest stay there began.
-        absence: (C,) which of them the time away of each clique has.
+        absence: C lifetimes of the time away of each clique.
         away_since_s: (C,) when it went away, if it is away.
         p_hop: (C,) probability that who leaves a site stands at another site at once.
         return_share: (S,) probability that who turns up does so at this site, at most 1 in sum of a clique; the rest
@@ -51,10 +50,9 @@ class SiteDynamics:
             others and of unknown places, scaled to sum 1. 0 for a clique that never returns.
     """
 
-    priors: tuple[LifetimePrior, ...]
-    stay: IntArray
+    stay: tuple[LifetimePrior, ...]
     since_s: FloatArray
-    absence: IntArray
+    absence: tuple[LifetimePrior, ...]
     away_since_s: FloatArray
     p_hop: FloatArray
     return_share: FloatArray
@@ -126,14 +124,13 @@ def check_sites(
         "key": (looks.key, n_looks), "hit": (looks.hit, n_looks), "beta": (beta, len(alpha)),
     }  # fmt: skip
     for field, (column, n) in lengths.items():
-        if np.shape(column) != (n,):
-            raise InputError(f"shape {np.shape(column)} instead of ({n},)", field=field)
+        shape = (len(column),) if isinstance(column, tuple) else np.shape(column)
+        if shape != (n,):
+            raise InputError(f"shape {shape} instead of ({n},)", field=field)
     checks.check_rows(clique_of_site, n_cliques, twice=True, field="clique_of_site")
     checks.check_rows(looks.clique, n_cliques, twice=True, field="clique")
     checks.check_rows(looks.site, n_sites, twice=True, field="site")
     checks.check_rows(looks.key, len(alpha), twice=True, field="key")
-    for field, prior in (("stay", dynamics.stay), ("absence", dynamics.absence)):
-        checks.check_rows(prior, len(dynamics.priors), twice=True, field=field)
     for field, values in (("p_here", p_here), ("p_hop", dynamics.p_hop), ("return_share", dynamics.return_share)):
         checks.check_probability(np.asarray(values, dtype=np.float64), field)
     for field, summed in (("p_here", p_here), ("return_share", dynamics.return_share)):

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.persistence import checks
-from evermap.persistence.site_chains import Chains, odds, transitions
+from evermap.persistence.site_chains import Chains, distinct, odds, transitions
 from evermap.persistence.site_records import SiteBeliefs, SiteDynamics, SiteLooks, SiteTrace, check_sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -110,7 +110,8 @@ def follow_sites(
     )
 
     # From the last session to the first look, in steps; then from look to look.
-    prior = chains.by_row(dynamics.stay, dynamics.absence)
+    priors, number = distinct((*dynamics.stay, *dynamics.absence))
+    prior = chains.by_row(number[:n_sites], number[n_sites:])
     since = chains.by_row(dynamics.since_s, dynamics.away_since_s)
     gap_s = (frame_stamp[first_frame[:-1]] - start)[chains.clique]
     step = np.arange(STEPS + 1) / STEPS * gap_s[:, None]
@@ -121,14 +122,14 @@ def follow_sites(
         chains.first,
         route,
         moves,
-        odds(dynamics.priors, prior, age[:, None] + step[:, :-1], age[:, None] + step[:, 1:]),
-        odds(dynamics.priors, prior, middle, middle + (gap_s / STEPS)[:, None]),
+        odds(priors, prior, age[:, None] + step[:, :-1], age[:, None] + step[:, 1:]),
+        odds(priors, prior, middle, middle + (gap_s / STEPS)[:, None]),
         old,
         new,
         came,
     )
     came = start[chains.clique] + came * gap_s / STEPS
-    log_rest, log_leave = transitions(chains, dynamics.priors, prior, since, came, moves, frame_clique, frame_stamp)
+    log_rest, log_leave = transitions(chains, priors, prior, since, came, moves, frame_clique, frame_stamp)
 
     filtered, smoothed = np.empty((shape[0], 2, width)), np.empty((shape[0], 2, width))
     log_odds, log_evidence = np.empty(shape[0]), np.empty(n_cliques)
