@@ -31,13 +31,14 @@ RULES = {
     "sim": "errors types se2 survival sensing",
     "metrics": "errors types se2 survival",
     "viz": "errors types se2 survival recurrence metrics",
-    "pipeline": "errors types se2 config survival sensing persistence recurrence tracking slam maps",
+    "lifelong": "errors types se2 config survival sensing persistence slam maps",
+    "pipeline": "errors types se2 config survival sensing persistence recurrence tracking slam maps lifelong",
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam sim io metrics viz "
+    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam maps sim io metrics viz "
     "pipeline runsummary runfolder",
-    "demo": "errors types se2 config sim io metrics viz pipeline runfolder",
+    "demo": "errors types se2 config survival maps sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types survival tracking io viz runsummary runfolder",
     "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence objects server "

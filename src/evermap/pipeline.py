@@ -1,18 +1,23 @@
-"""From a recording to a trajectory and a map: the main job, told in the order in which it happens."""
+"""From recordings to trajectories and maps: the main jobs, told in the order in which they happen.
+
+`run_slam` is one recording by itself, or in a map that is given. `run_session` is one session of a map that lives on.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.types import FloatArray, Landmarks, Recording, SlamResult
+from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult
 
 if TYPE_CHECKING:
-    from evermap.config import Config
+    from evermap.config import Config, SlamConfig
+    from evermap.lifelong.session import Visit
+    from evermap.maps.living import Evidence, LivingMap
     from evermap.slam.calibration import CalibrationPrior
     from evermap.slam.method import Method
     from evermap.slam.problem import Noise
@@ -63,6 +68,81 @@ def run_slam(
         slam = _estimator(prepared, prior, noise, recording, config)
         step_s, interrupted = _feed(slam, prepared, realtime=realtime, progress=progress)
         return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """What a session made of a map.
+
+    Attributes:
+        living: the map after it; the very map that was given where the session could not be found in it.
+        slam: trajectory, landmarks and all else, in the map's frame.
+        changes: what appeared, vanished, moved, was exchanged or returned since the session before.
+        evidence: what was seen of every clique, frame by frame.
+    """
+
+    living: LivingMap
+    slam: SlamResult
+    changes: tuple[MapChange, ...]
+    evidence: Evidence
+
+
+def run_session(
+    recording: Recording,
+    living: LivingMap | None = None,
+    config: Config | None = None,
+    *,
+    progress: Progress | None = None,
+) -> Session:
+    """One session of a living map: localise in it from an unknown pose, find what changed, extend it (MATH.md 5).
+
+    Args:
+        recording: the session; its truth is not looked at. Its stamps are later than all that the map has seen.
+        living: the map; None begins one, in the frame of the first pose.
+        config: settings; None for the defaults.
+        progress: told after every frame.
+
+    Raises:
+        DataError: nothing can be estimated, or the session is earlier than the map.
+        NumericalError: no finite optimum.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from evermap.config import Config
+    from evermap.lifelong import believe
+    from evermap.lifelong import session as lifelong
+    from evermap.maps.living import LivingMap
+    from evermap.slam.session import prepare
+
+    config = config or Config()
+    living = LivingMap(clock=recording.clock) if living is None else living
+    recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    recording, living = lifelong.admitted(recording, living)
+    prior, noise = _beliefs(recording, config)
+    prepared = prepare(recording)
+    warm_up()
+    with threadpool_limits(limits=1, user_api="blas"):
+        # the session by itself: poses and landmarks as one Gaussian, in a frame of its own
+        slam = _estimator(prepared, prior, noise, recording, config.model_copy(update={"slam": _alone(config)}))
+        step_s, interrupted = _feed(slam, prepared, realtime=False, progress=progress)
+        visit = lifelong.Visit(recording, prepared, slam.finish())
+        # over the map as it is believed to be by now, and solved again with the map as its prior
+        expected = believe.predicted(living, config.living, visit.start_s)
+        where = lifelong.laid(living, expected, visit, config.living)
+        if where is None and len(living.places):
+            return _lost(visit, slam, prior, step_s, living, interrupted=interrupted)
+        if where is not None:
+            visit = lifelong.refit(living, where, visit, prior, robust=config.slam.robust)
+        # what was found goes into the map, then hits and misses into beliefs, and those into decisions
+        entry = lifelong.entered(living, expected, where, visit, config.living)
+        looks = lifelong.looks(entry, visit)
+        now = lifelong.believed(entry, looks, visit, config.living)
+        after, changes = lifelong.decided(living, now, looks, visit, config.living)
+        after = lifelong.learned(after, now, looks, config.living)
+        frame = "first_pose" if where is None else "prior_map"
+        landmarks = replace(after.landmarks(p_least=0.5), frame=frame)
+        result = _result(visit, slam, prior, step_s, frame, landmarks=landmarks, interrupted=interrupted)
+    return Session(after, replace(result, changes=changes), changes, now.evidence)
 
 
 def warm_up() -> None:
@@ -168,32 +248,56 @@ def _conclude(
     *,
     interrupted: bool,
 ) -> SlamResult:
-    """Smooth, bridge the blind stretches, count the misses, and put all of it into plain arrays."""
-    from evermap.sensing.visibility import find_misses
+    """Smooth, and say what moved and what may have moved instead."""
+    from evermap.lifelong.session import Visit
     from evermap.slam import session
 
     outcome = slam.finish()
     frame = "prior_map" if outcome.aligned else "first_pose"
-    trajectory = session.trajectory(prepared, outcome, recording, frame)
     landmarks = session.landmarks(prepared, outcome, recording, frame)
-    rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9).astype(np.int64)
-    poses = trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)]
-    misses = find_misses(rows, poses, recording.detections, landmarks, recording.frames.stamp_s, recording.sensor)
-    landmarks = session.with_misses(landmarks, misses)
-    warnings = list(prepared.warnings)
+    visit = Visit(recording, prepared, outcome)
+    result = _result(visit, slam, prior, step_s, frame, landmarks=landmarks, interrupted=interrupted)
+    warnings = list(result.warnings)
     if prepared.prior_map is not None and not outcome.aligned:
         warnings.append(
             "cannot localise in the prior map: too few of its landmarks were seen standing to each other as it says; "
             "the map is in the frame of the first pose"
         )
-    warnings.extend(outcome.revision.warnings)
+    return replace(
+        result,
+        warnings=(*warnings, *outcome.revision.warnings),
+        changes=session.changes(prepared, outcome, outcome.revision.changes),
+        alternatives=session.alternatives(prepared, outcome, recording, frame),
+    )
+
+
+def _result(
+    visit: Visit,
+    slam: StreamingSlam,
+    prior: CalibrationPrior,
+    step_s: FloatArray,
+    frame: str,
+    *,
+    landmarks: Landmarks,
+    interrupted: bool,
+) -> SlamResult:
+    """Bridge the blind stretches, count the misses, and put all of it into plain arrays."""
+    from evermap.sensing.visibility import find_misses
+    from evermap.slam import session
+
+    recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
+    trajectory = session.trajectory(prepared, outcome, recording, frame)
+    rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9).astype(np.int64)
+    poses = trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)]
+    misses = find_misses(rows, poses, recording.detections, landmarks, recording.frames.stamp_s, recording.sensor)
+    warnings = list(prepared.warnings)
     if interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (trajectory.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
     return SlamResult(
         trajectory=trajectory,
         online=session.online(prepared, slam, recording, frame),
-        landmarks=landmarks,
+        landmarks=session.with_misses(landmarks, misses),
         parameters=session.parameters(outcome, prior),
         innovations=session.innovations(prepared, slam, outcome, recording),
         misses=misses,
@@ -201,6 +305,28 @@ def _conclude(
         dead_reckoning=session.dead_reckoning(prepared, trajectory),
         warnings=tuple(warnings),
         interrupted=interrupted,
-        changes=session.changes(prepared, outcome, outcome.revision.changes),
-        alternatives=session.alternatives(prepared, outcome, recording, frame),
     )
+
+
+def _alone(config: Config) -> SlamConfig:
+    """Settings of a session that is solved by itself: what moved is asked when it lies over the map."""
+    return config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
+
+
+def _lost(
+    visit: Visit,
+    slam: StreamingSlam,
+    prior: CalibrationPrior,
+    step_s: FloatArray,
+    living: LivingMap,
+    *,
+    interrupted: bool,
+) -> Session:
+    """The session cannot be found in the map: it stands by itself, and the map as it was."""
+    from evermap.maps.living import Evidence
+    from evermap.slam import session
+
+    landmarks = session.landmarks(visit.prepared, visit.outcome, visit.recording, "first_pose")
+    result = _result(visit, slam, prior, step_s, "first_pose", landmarks=landmarks, interrupted=interrupted)
+    warning = "cannot localise in the map: too few of its landmarks were seen standing to each other as it says"
+    return Session(living, replace(result, warnings=(*result.warnings, warning)), (), Evidence.empty())

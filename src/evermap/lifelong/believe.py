@@ -1,0 +1,253 @@
+"""Beliefs of the map's cliques: carried to a session by their lifetimes, and through it by hits and misses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap import se2
+from evermap.config import LivingConfig
+from evermap.maps.lives import Life
+from evermap.maps.living import Evidence, LivingMap, Sites
+from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
+from evermap.sensing.sightlines import SightLines
+from evermap.sensing.visibility import detection_probability
+from evermap.survival.named import never_leaves
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor
+
+WORTH_A_LOOK = 0.3
+"""Share of the sensor's detection probability from which on a place counts as looked at."""
+SETTLED_S = 300.0
+"""What is seen within this time of a look was there at that look."""
+AT_ONCE = 2_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What a session saw of the places of a map.
+
+    Attributes:
+        stamp_s: (F,) of the frames.
+        pose_map_robot: (F, 3).
+        frame, place: (H,) detections: in which frame, and of which row of the map's places.
+    """
+
+    stamp_s: FloatArray
+    pose_map_robot: FloatArray
+    frame: IntArray
+    place: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """Places that were looked at: rows by clique, then by time.
+
+    Attributes:
+        rows: as the chain wants them.
+        place: (N,) row of the map's places.
+        key: (N,) line of sight.
+        sight_key: (K,) different lines; `rows.key` are rows of these.
+        p_nominal: (K,) mean nominal probability of a detection along each.
+    """
+
+    rows: SiteLooks
+    place: IntArray
+    sight_key: IntArray
+    p_nominal: FloatArray
+
+
+def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
+    """Ids of the cliques that have sites, and for every site the row of its own."""
+    cliques, row = np.unique(sites.clique_id, return_inverse=True)
+    return cliques, row.ravel().astype(np.int64)
+
+
+def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
+    """How the cliques of a map stay, leave and return, by what was learned of their class and place."""
+    sites = living.sites
+    cliques, row = clique_rows(sites)
+    class_id = _class_of(living, cliques)
+    middle = site_middles(living)
+    lives = [_life(living, config, int(class_id[c]), middle[s]) for s, c in enumerate(row)]
+    seen = np.full(len(cliques), -np.inf)
+    np.maximum.at(seen, row, sites.seen_s)
+    newest = np.zeros(len(cliques), dtype=np.int64)
+    for s in np.lexsort((sites.seen_s, row)):
+        newest[row[s]] = s
+    of_clique = [lives[s] for s in newest]
+    count = np.bincount(row, minlength=len(cliques))
+    p_known = np.array([life.p_known for life in of_clique])
+    # whoever comes back does so to the site it left as often as to all other known ones together
+    share = np.where(np.arange(len(row)) == newest[row], 1.0, 1.0 / np.maximum(count[row] - 1, 1))
+    total = np.bincount(row, share, minlength=len(cliques))
+    share *= p_known[row] / np.where(total > 0.0, total, 1.0)[row]
+    if not config.returns:
+        share[:] = 0.0
+    return SiteDynamics(
+        stay=tuple(life.stay for life in lives),
+        since_s=sites.since_s,
+        absence=tuple(life.absence for life in of_clique),
+        away_since_s=seen,
+        p_hop=np.array([life.p_hop for life in of_clique]) * float(config.returns),
+        return_share=share,
+    )
+
+
+def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
+    """(S,) probability of every site to be where its clique stands, at a later instant."""
+    if not config.existence or len(living.sites) == 0:
+        return living.sites.p_here
+    none = np.zeros(0, dtype=np.int64)
+    nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
+    return _followed(
+        living, living.sites.p_here, nothing, np.zeros((2, 0)), config, living.stamp_s, until_s, 0.01
+    ).p_here
+
+
+def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, sightlines: SightLines) -> Looks:
+    """Which places of a map were looked at, frame by frame, and which of them were seen."""
+    places = living.places
+    in_view: list[IntArray] = []
+    seen_from: list[IntArray] = []
+    nominal: list[FloatArray] = []
+    step = max(1, AT_ONCE // max(len(places), 1))
+    hit = np.zeros((len(sighting.stamp_s), 0), dtype=np.bool_)
+    for start in range(0, len(sighting.stamp_s), step):
+        poses = sighting.pose_map_robot[start : start + step]
+        p = detection_probability(poses, places.position_m, sensor)
+        mine = (sighting.frame >= start) & (sighting.frame < start + len(poses))
+        hit = np.zeros(p.shape, dtype=np.bool_)
+        hit[sighting.frame[mine] - start, sighting.place[mine]] = True
+        frame, place = np.nonzero((p >= WORTH_A_LOOK * sensor.p_detect) | hit)
+        in_view.append(place)
+        seen_from.append(frame + start)
+        nominal.append(np.where(hit, 1.0, -1.0)[frame, place] * np.maximum(p[frame, place], 1e-3))
+    place, frame, signed = np.concatenate(in_view), np.concatenate(seen_from), np.concatenate(nominal)
+    site = np.searchsorted(living.sites.site_id, places.site_id[place])
+    order = np.lexsort((place, site, frame, clique_rows(living.sites)[1][site]))
+    place, frame, signed, site = place[order], frame[order], signed[order], site[order]
+    clique = clique_rows(living.sites)[1][site]
+    eye = se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor))[:, :2]
+    key = sightlines.rows(eye[frame], places.position_m[place])
+    sight_key, number = np.unique(key, return_inverse=True)
+    number = number.ravel().astype(np.int64)
+    p_nominal = np.bincount(number, np.abs(signed), minlength=len(sight_key)) / np.maximum(
+        np.bincount(number, minlength=len(sight_key)), 1
+    )
+    rows = SiteLooks(sighting.stamp_s[frame], clique, site, number, signed > 0.0)
+    return Looks(rows, place, sight_key, p_nominal)
+
+
+def believed(
+    living: LivingMap,
+    p_start: FloatArray,
+    looks: Looks,
+    sensor: Sensor,
+    config: LivingConfig,
+    start_s: float,
+    until_s: float,
+) -> SiteBeliefs:
+    """Beliefs after the looks of a session.
+
+    Args:
+        living: the map, with the sites that the session found.
+        p_start: (S,) beliefs at `start_s`.
+        looks: of the session.
+        sensor: whose false detections are counted with.
+        config: which parts of the engine are on.
+        start_s: beginning of the session.
+        until_s: its end.
+    """
+    known = SightLines.empty()
+    if config.learn_sight:
+        stood = surely_there(looks.rows)
+        lines, hit = looks.sight_key[looks.rows.key[stood]], looks.rows.hit[stood]
+        known = living.sightlines.learned(lines, hit, np.ones(len(hit)))
+    alpha, beta = known.prior_counts(looks.sight_key, looks.p_nominal)
+    return _followed(
+        living, p_start, looks.rows, np.stack([alpha, beta]), config, start_s, until_s, p_false_of(sensor, living)
+    )
+
+
+def surely_there(rows: SiteLooks) -> BoolArray:
+    """(N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
+
+    They teach lines of sight before anything is judged by these, so that a robot on a way that it never took does not
+    take what stands behind a wall for gone.
+    """
+    order = np.lexsort((rows.stamp_s, rows.site))
+    site, stamp = rows.site[order], np.where(rows.hit, rows.stamp_s, np.nan)[order]
+    near = np.zeros(len(rows), dtype=np.bool_)
+    for step, sign in ((order, 1.0), (order[::-1], -1.0)):
+        along, times = (site, stamp) if sign > 0 else (site[::-1], stamp[::-1])
+        last = np.maximum.accumulate(np.where(np.isfinite(times), np.arange(len(times)), -1))
+        seen = (last >= 0) & (along[last] == along)
+        gap = np.abs(rows.stamp_s[step] - times[last])
+        near[step[seen]] |= gap[seen] <= SETTLED_S
+    return near
+
+
+def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
+    """What was seen of every clique, frame by frame."""
+    cliques, _ = clique_rows(living.sites)
+    told = beliefs.trace
+    return Evidence(
+        cliques[told.clique], told.stamp_s, told.n_hits, told.n_misses, told.expected, told.log_odds, told.p_exists
+    )
+
+
+def p_false_of(sensor: Sensor, living: LivingMap) -> float:
+    """Probability that a look at an empty place gives a detection of its landmark: a wrong identity, by chance."""
+    return min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
+
+
+def _followed(
+    living: LivingMap,
+    p_start: FloatArray,
+    rows: SiteLooks,
+    counts: FloatArray,
+    config: LivingConfig,
+    start_s: float,
+    until_s: float,
+    p_false: float,
+) -> SiteBeliefs:
+    cliques, row = clique_rows(living.sites)
+    return follow_sites(
+        p_start,
+        row,
+        dynamics_of(living, config),
+        rows,
+        counts[0],
+        counts[1],
+        start_s=start_s,
+        until_s=until_s,
+        p_false=p_false,
+        use_misses=config.misses,
+        held=_pinned(living, cliques),
+    )
+
+
+def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
+    """(C,) cliques of which an operator said that they are never to be removed."""
+    return np.isin(cliques, living.members.clique_id[living.members.pinned])
+
+
+def _class_of(living: LivingMap, cliques: IntArray) -> IntArray:
+    """(C,) class of every clique: that of its members."""
+    order = np.argsort(living.members.clique_id, kind="stable")
+    first = np.searchsorted(living.members.clique_id[order], cliques)
+    return np.asarray(living.members.class_id[order[first]])
+
+
+def site_middles(living: LivingMap) -> FloatArray:
+    """(S, 2) mean position of the places of every site."""
+    row = np.searchsorted(living.sites.site_id, living.places.site_id)
+    count = np.maximum(np.bincount(row, minlength=len(living.sites)), 1)
+    columns = [np.bincount(row, living.places.position_m[:, k], minlength=len(living.sites)) / count for k in (0, 1)]
+    return np.column_stack(columns)
+
+
+def _life(living: LivingMap, config: LivingConfig, class_id: int, position_m: FloatArray) -> Life:
+    life = living.lives.of(class_id, position_m) if config.learn_lifetimes else Life()
+    return life if config.returns else replace(life, absence=never_leaves())

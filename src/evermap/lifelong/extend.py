@@ -1,0 +1,197 @@
+"""The map with what a session found: new cliques, new sites of old ones, new places, all with one joint covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.config import LivingConfig
+from evermap.lifelong.geometry import of_places, with_session
+from evermap.maps.grouping import group
+from evermap.maps.living import LivingMap, Members, Places, Sites
+from evermap.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Landmarks of a session, in the map's frame, in the order of their ids.
+
+    Attributes:
+        landmark_id, class_id: (K,).
+        place: (K,) row of the old map's places, -1 where it stands at none of its own.
+        probability: (K,) of that.
+        position_m: (K, 2) posterior.
+        covariance_m2: (2 K, 2 K) joint covariance of it.
+        first_s: (K,) first sighting.
+        last_s: (K,) last sighting.
+    """
+
+    landmark_id: IntArray
+    class_id: IntArray
+    place: IntArray
+    probability: FloatArray
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    first_s: FloatArray
+    last_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Extended:
+    """The map, before its beliefs are updated.
+
+    Attributes:
+        living: with the session's places and sites.
+        landmark_id: (K,) landmarks of the session.
+        place: (K,) row of the map's places at which each of them stands.
+        p_start: (S,) beliefs in its sites at the beginning of the session.
+        is_new: (S,) sites that the session found.
+    """
+
+    living: LivingMap
+    landmark_id: IntArray
+    place: IntArray
+    p_start: FloatArray
+    is_new: BoolArray
+
+
+NEW_CLIQUE_P = 0.9
+"""Belief in a body that nobody knew, before its sightings are counted."""
+
+
+def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig) -> Extended:
+    """Enter what a session found.
+
+    Args:
+        living: the map as it was.
+        p_site: (S,) belief in its sites, at the beginning of the session.
+        found: the session's landmarks.
+        config: how far landmarks of one body may be apart.
+    """
+    members, cliques_ever = _with_members(living, found, config)
+    clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
+    site_of = _standing_at(living, found, clique)
+    members, clique, cliques_ever = _parted(living, members, clique, found, site_of, cliques_ever)
+
+    new = np.flatnonzero(found.place < 0)
+    fresh = np.unique(clique[new][[int(c) not in site_of for c in clique[new]]])  # cliques that get a new site
+    new_ids = living.n_sites_ever + np.arange(len(fresh))
+    site_of |= {int(c): int(s) for c, s in zip(fresh, new_ids, strict=True)}
+    site = np.array([site_of[int(c)] for c in clique[new]], dtype=np.int64)
+
+    order = np.concatenate([np.flatnonzero(found.place >= 0), new])
+    seen = found.place[found.place >= 0]
+    position, covariance = with_session(
+        living.places.position_m,
+        living.covariance_m2,
+        seen,
+        found.position_m[order],
+        of_places(found.covariance_m2, order),
+    )
+    nothing = np.zeros(len(new), dtype=np.int64)
+    places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
+    places = replace(places, position_m=position)
+    sites, p_start, is_new = _with_sites(living, p_site, found, clique, fresh, new_ids)
+    sorted_rows = np.lexsort((places.landmark_id, places.site_id))
+    rank = np.empty(len(sorted_rows), dtype=np.int64)
+    rank[sorted_rows] = np.arange(len(sorted_rows))
+    place = found.place.copy()
+    place[new] = len(living.places) + np.arange(len(new))
+    return Extended(
+        replace(
+            living,
+            members=members,
+            sites=sites,
+            places=places[sorted_rows],
+            covariance_m2=of_places(covariance, sorted_rows),
+            n_cliques_ever=cliques_ever,
+            n_sites_ever=living.n_sites_ever + len(fresh),
+        ),
+        found.landmark_id,
+        rank[place],
+        p_start,
+        is_new,
+    )
+
+
+def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tuple[Members, int]:
+    """The map's landmarks and the new ones, these with cliques of their own or in those they stand among."""
+    members = living.members
+    is_new = ~np.isin(found.landmark_id, members.landmark_id)
+    new = np.flatnonzero(is_new)
+    if not len(new):
+        return members, living.n_cliques_ever
+    if config.cliques:
+        number = group(found.position_m[new], found.class_id[new], reach_m=config.clique_reach_m)
+        clique = living.n_cliques_ever + number
+        _join_neighbours(clique, new, members, found, config.clique_reach_m)
+    else:
+        clique = living.n_cliques_ever + np.arange(len(new))
+    off = np.zeros(len(new), dtype=np.bool_)
+    both = members.joined(Members(found.landmark_id[new], found.class_id[new], clique, off, off))
+    return both[np.argsort(both.landmark_id, kind="stable")], int(clique.max(initial=living.n_cliques_ever - 1)) + 1
+
+
+def _join_neighbours(clique: IntArray, new: IntArray, members: Members, found: Found, reach_m: float) -> None:
+    """A body of which another landmark was missed at first: all of a new clique within reach of all of an old one."""
+    old = np.flatnonzero(np.isin(found.landmark_id, members.landmark_id))
+    old_clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id[old])]
+    for name in np.unique(clique):
+        mine = new[clique == name]
+        kind = found.class_id[mine[0]]
+        if kind < 0:
+            continue
+        near = {}
+        for other in np.unique(old_clique[found.class_id[old] == kind]):
+            theirs = old[old_clique == other]
+            gap = np.linalg.norm(found.position_m[mine][:, None] - found.position_m[theirs][None], axis=2).max()
+            if gap <= reach_m:
+                near[float(gap)] = int(other)
+        if near:
+            clique[clique == name] = near[min(near)]
+
+
+def _parted(
+    living: LivingMap, members: Members, clique: IntArray, found: Found, site_of: dict[int, int], cliques_ever: int
+) -> tuple[Members, IntArray, int]:
+    """Members of a body that stands at a site, but that don't: they are a body of their own."""
+    clique, renamed = clique.copy(), members.clique_id.copy()
+    for name in np.unique(clique[found.place < 0]):
+        if int(name) not in site_of:
+            continue
+        gone = np.flatnonzero((clique == name) & (found.place < 0))
+        had = living.place_row(found.landmark_id[gone], np.full(len(gone), site_of[int(name)])) >= 0
+        if not had.any():
+            continue
+        clique[gone[had]] = cliques_ever
+        renamed[np.searchsorted(members.landmark_id, found.landmark_id[gone[had]])] = cliques_ever
+        cliques_ever += 1
+    return replace(members, clique_id=renamed), clique, cliques_ever
+
+
+def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:
+    """For every clique that stands at a known site which one."""
+    rows = np.flatnonzero(found.place >= 0)
+    return {int(clique[k]): int(living.places.site_id[found.place[k]]) for k in rows}
+
+
+def _with_sites(
+    living: LivingMap,
+    p_site: FloatArray,
+    found: Found,
+    clique: IntArray,
+    fresh: IntArray,
+    new_ids: IntArray,
+) -> tuple[Sites, FloatArray, BoolArray]:
+    """The map's sites and the new ones, with beliefs before the session's looks are counted."""
+    p_start = p_site.copy()
+    p_new, first, last = np.zeros(len(fresh)), np.zeros(len(fresh)), np.zeros(len(fresh))
+    for k, name in enumerate(fresh):
+        mine = np.flatnonzero((clique == name) & (found.place < 0))
+        first[k], last[k] = found.first_s[mine].min(), found.last_s[mine].max()
+        old = np.flatnonzero(living.sites.clique_id == name)
+        p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else NEW_CLIQUE_P
+        p_start[old] *= 1.0 - p_new[k]
+    sites = living.sites.joined(Sites(new_ids, fresh, p_new, first, last))
+    return sites, np.append(p_start, p_new), np.arange(len(sites)) >= len(living.sites)

@@ -1,0 +1,77 @@
+"""The joint Gaussian of a map's places, after a session that saw some of them and found others.
+
+The poses of the session were marginalised, so nothing of it remains but this: the cost of a map is that of its size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evermap.lifelong.overlaying import drifted
+from evermap.types import FloatArray, IntArray
+
+
+def with_session(
+    position_m: FloatArray,
+    covariance_m2: FloatArray,
+    seen: IntArray,
+    session_m: FloatArray,
+    session_covariance_m2: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Positions and joint covariance of the old places, then of the new ones.
+
+    What the session says of the places it saw moves those that it did not see, by their correlation.
+
+    Args:
+        position_m: (P, 2) as the map had them.
+        covariance_m2: (2 P, 2 P).
+        seen: (K,) rows of those that the session saw.
+        session_m: (K + N, 2) posterior of these, then of N new ones.
+        session_covariance_m2: (2 (K + N), 2 (K + N)) joint posterior.
+
+    Returns:
+        (P + N, 2) and (2 (P + N), 2 (P + N)).
+    """
+    count, new = len(position_m), len(session_m) - len(seen)
+    s = _coordinates(seen)
+    k = len(s)
+    u = np.setdiff1d(np.arange(2 * count), s)
+    before = drifted(covariance_m2[np.ix_(s, s)])
+    gain = np.linalg.solve(before, covariance_m2[np.ix_(s, u)]).T if k else np.zeros((len(u), 0))
+    mean = np.zeros(2 * (count + new))
+    mean[s] = session_m[: len(seen)].ravel()
+    mean[u] = position_m.ravel()[u] + gain @ (session_m[: len(seen)] - position_m[seen]).ravel()
+    mean[2 * count :] = session_m[len(seen) :].ravel()
+    joint = np.zeros((len(mean), len(mean)))
+    place = np.concatenate([s, np.arange(2 * count, 2 * (count + new))])
+    joint[np.ix_(place, place)] = session_covariance_m2
+    joint[np.ix_(u, u)] = covariance_m2[np.ix_(u, u)] + gain @ (session_covariance_m2[:k, :k] - before) @ gain.T
+    across = gain @ session_covariance_m2[:k]
+    joint[np.ix_(u, place)] = across
+    joint[np.ix_(place, u)] = across.T
+    return mean.reshape(-1, 2), 0.5 * (joint + joint.T)
+
+
+def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
+    """The joint covariance of a new map in the frame that its places define: as a whole they neither move nor turn.
+
+    A session knows its landmarks in the frame of its first pose, whose heading is no better known than the robot saw.
+    Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
+    This is the S-transformation of geodesy (Baarda 1973) to inner constraints.
+    """
+    middle = position_m - position_m.mean(axis=0)
+    motion = np.zeros((2 * len(position_m), 3))
+    motion[0::2, 0] = motion[1::2, 1] = 1.0
+    motion[0::2, 2], motion[1::2, 2] = -middle[:, 1], middle[:, 0]
+    onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
+    return np.asarray(onto @ covariance_m2 @ onto.T)
+
+
+def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
+    """(2 K, 2 K) joint covariance of some places, in their order."""
+    at = _coordinates(rows)
+    return np.asarray(covariance_m2[np.ix_(at, at)])
+
+
+def _coordinates(rows: IntArray) -> IntArray:
+    return (2 * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(2)).ravel()

@@ -1,0 +1,98 @@
+"""A session laid over the map: which of the map's places its landmarks stand at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.maps.living import LivingMap
+from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
+from evermap.types import FloatArray, IntArray
+
+DRIFT_M = 0.01
+"""Standard deviation by which a landmark is not quite where it was, from session to session."""
+SMALLEST_P = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """Where the landmarks of a session stand in the map.
+
+    Attributes:
+        landmark_id: (K,) landmarks of the session, sorted.
+        pose_map_session: (3,) motion from the session's frame to the map's.
+        place: (K,) row of the map's places, `ELSEWHERE` where a landmark stands at none of its own, or is new.
+        probability: (K,) of that.
+        misfit: factor on variances that the session wanted.
+    """
+
+    landmark_id: IntArray
+    pose_map_session: FloatArray
+    place: IntArray
+    probability: FloatArray
+    misfit: float
+
+
+def laid_over(
+    living: LivingMap,
+    p_site: FloatArray,
+    landmark_id: IntArray,
+    position_m: FloatArray,
+    covariance_m2: FloatArray,
+    search: str,
+) -> Laid | None:
+    """Find a session in the map.
+
+    Args:
+        living: the map.
+        p_site: (S,) probability of its sites, at the beginning of the session.
+        landmark_id: (K,) landmarks of the session.
+        position_m: (K, 2) in its own frame.
+        covariance_m2: (2 K, 2 K).
+        search: see `overlay.lay_over`.
+
+    Returns:
+        None where the session shows nothing that stands as in the map.
+    """
+    members, places, sites = living.members, living.places, living.sites
+    at = np.minimum(np.searchsorted(members.landmark_id, landmark_id), max(len(members) - 1, 0))
+    known = members.landmark_id[at] == landmark_id if len(members) else np.zeros(len(landmark_id), np.bool_)
+    seen = np.flatnonzero(known)
+    row_of = {int(landmark_id[k]): n for n, k in enumerate(seen)}
+    landmark = np.array([row_of.get(int(name), -1) for name in places.landmark_id], dtype=np.int64)
+    used = np.flatnonzero(landmark >= 0)
+    if len(used) < 2:
+        return None
+    clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
+    used_sites, site = np.unique(places.site_id[used], return_inverse=True)
+    site_rows = np.searchsorted(sites.site_id, used_sites)
+    corner = (2 * used[:, None] + np.arange(2)).ravel()
+    inner = (2 * seen[:, None] + np.arange(2)).ravel()
+    total = np.zeros(len(clique_ids))
+    of_known = np.isin(sites.clique_id, clique_ids)
+    np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
+    found = lay_over(
+        Sighted(position_m[seen], covariance_m2[np.ix_(inner, inner)], clique.ravel().astype(np.int64)),
+        Known(
+            position_m=places.position_m[used],
+            covariance_m2=drifted(living.covariance_m2[np.ix_(corner, corner)]),
+            landmark=landmark[used],
+            site=site.ravel().astype(np.int64),
+            log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
+            log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
+        ),
+        search,
+    )
+    if found is None:
+        return None
+    place = np.full(len(landmark_id), ELSEWHERE, dtype=np.int64)
+    place[seen] = np.where(found.place >= 0, used[found.place], ELSEWHERE)
+    probability = np.ones(len(landmark_id))
+    probability[seen] = found.probability
+    return Laid(landmark_id, found.pose_map_session, place, probability, found.misfit)
+
+
+def drifted(covariance_m2: FloatArray) -> FloatArray:
+    """Joint covariance (2 K, 2 K) of places, a session later."""
+    return np.asarray(covariance_m2 + DRIFT_M**2 * np.eye(len(covariance_m2)))

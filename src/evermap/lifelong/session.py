@@ -1,0 +1,224 @@
+"""The steps of a session in a living map, in the order in which `pipeline.run_session` takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from evermap.config import LivingConfig
+from evermap.errors import DataError
+from evermap.lifelong import believe, decide
+from evermap.lifelong.believe import Looks, Sighting
+from evermap.lifelong.extend import Extended, Found, extended
+from evermap.lifelong.geometry import anchored, of_places
+from evermap.lifelong.overlaying import Laid, drifted, laid_over
+from evermap.maps.learning import learned_lives
+from evermap.maps.living import Evidence, LivingMap
+from evermap.slam import session as of_slam
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.living.own import own_landmarks
+from evermap.slam.living.refit import refitted
+from evermap.slam.session import Prepared
+from evermap.slam.streaming import Outcome
+from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording
+
+INLIER = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A session as it was recorded, as the estimator wants it, and what the estimator made of it."""
+
+    recording: Recording
+    prepared: Prepared
+    outcome: Outcome
+
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first frame that has a pose."""
+        return float(self.recording.frames.stamp_s[self.prepared.pose_frame[0]])
+
+    @property
+    def end_s(self) -> float:
+        """Stamp of the last frame that was processed."""
+        return self.prepared.start_s + float(self.outcome.problem.stamp_s[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Believed:
+    """The map with the session's beliefs.
+
+    Attributes:
+        living: all but stays and what is learned.
+        weight: (N,) probability of every look that its clique stood there.
+        evidence: of every clique and frame.
+    """
+
+    living: LivingMap
+    weight: FloatArray
+    evidence: Evidence
+
+
+def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, LivingMap]:
+    """The recording without landmarks that an operator deleted, and with the map's class numbers.
+
+    Raises:
+        DataError: another clock than the map's, or a session that is earlier than what the map has seen.
+    """
+    stamps = recording.frames.stamp_s
+    if len(living.places) and recording.clock != living.clock:
+        raise DataError(
+            f"{recording.name}: its stamps count '{recording.clock}', the map's '{living.clock}'",
+            field="stamp_s",
+            hint="sessions of one map need one clock, best seconds since 1970",
+        )
+    if len(stamps) and stamps[0] < living.stamp_s:
+        raise DataError(
+            f"{recording.name}: begins at {stamps[0]:.1f} s, but the map has seen {living.stamp_s:.1f} s already",
+            field="stamp_s",
+            hint="feed sessions in their order in time",
+        )
+    names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
+    number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
+    detections = recording.detections
+    kept = ~np.isin(detections.landmark_id, living.members.landmark_id[living.members.deleted])
+    columns = {item.name: getattr(detections, item.name)[kept] for item in fields(detections)}
+    columns["class_id"] = number[columns["class_id"]]
+    detections = replace(detections, **columns)
+    return replace(recording, detections=detections, class_names=names), replace(
+        living, class_names=names, clock=recording.clock
+    )
+
+
+def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConfig) -> Laid | None:
+    """Where the session lies in the map; None where it shows nothing that stands as in the map."""
+    own = own_landmarks(alone.outcome)
+    names = alone.prepared.landmark_id[own.row]
+    return laid_over(living, p_site, names, own.position_m, own.covariance_m2, config.search)
+
+
+def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool) -> Visit:
+    """The session solved again, its landmarks held by the map's places at which they stand."""
+    stand = np.flatnonzero(where.place >= 0)
+    places = where.place[stand]
+    outcome = refitted(
+        alone.outcome,
+        prior,
+        where.pose_map_session,
+        np.searchsorted(alone.prepared.landmark_id, where.landmark_id[stand]),
+        living.places.position_m[places],
+        where.misfit * drifted(of_places(living.covariance_m2, places)),
+        robust=robust,
+    )
+    return replace(alone, outcome=outcome)
+
+
+def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
+    """The map with the places and sites that the session found."""
+    own = own_landmarks(visit.outcome)
+    detection, landmark = _inliers(visit)
+    stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
+    count = len(visit.prepared.landmark_id)
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, landmark, stamps)
+    np.maximum.at(last, landmark, stamps)
+    kind = np.full(count, UNKNOWN, dtype=np.int64)
+    kind[landmark] = visit.recording.detections.class_id[detection]
+    seen = np.flatnonzero(np.isfinite(last[own.row]))
+    row = own.row[seen]
+    names = visit.prepared.landmark_id[row]
+    place, probability = np.full(len(names), -1, dtype=np.int64), np.ones(len(names))
+    if where is not None:
+        _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
+        place[here], probability[here] = where.place[there], where.probability[there]
+    covariance = of_places(own.covariance_m2, seen)
+    if where is None:
+        covariance = anchored(own.position_m[seen], covariance)
+    found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, first[row], last[row])
+    return extended(living, p_site, found, config)
+
+
+def looks(entry: Extended, visit: Visit) -> Looks:
+    """Which places of the map were looked at in the session, and which of them were seen."""
+    recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
+    trajectory = of_slam.trajectory(prepared, outcome, recording, "")
+    stamps = recording.frames.stamp_s
+    frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
+    pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
+    detection, landmark = _inliers(visit)
+    place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
+    _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
+    place_of[rows] = entry.place[found]
+    hit = place_of[landmark]
+    frame = np.searchsorted(frames, recording.detections.frame[detection])
+    sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
+    return believe.looked_at(entry.living, sighting, recording.sensor, entry.living.sightlines)
+
+
+def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -> Believed:
+    """The map with the beliefs and the counts of the session."""
+    living, rows = entry.living, seen.rows
+    hit = rows.hit
+    places = replace(
+        living.places,
+        n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
+        n_misses=living.places.n_misses + np.bincount(seen.place[~hit], minlength=len(living.places)),
+    )
+    count = len(living.sites)
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, rows.site[hit], rows.stamp_s[hit])
+    np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
+    if config.existence:
+        beliefs = believe.believed(
+            living, entry.p_start, seen, visit.recording.sensor, config, visit.start_s, visit.end_s
+        )
+        p_here, weight, evidence = beliefs.p_here, beliefs.weight, believe.evidence(living, beliefs)
+    else:
+        p_here, weight, evidence = _as_seen(living, rows.site[hit], last), np.ones(len(hit)), Evidence.empty()
+    stood = (entry.p_start >= decide.EXISTS) & ~entry.is_new
+    arrived = np.isfinite(first) & ~stood & (p_here >= decide.EXISTS)
+    sites = replace(
+        living.sites,
+        p_here=p_here,
+        since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
+        seen_s=np.maximum(living.sites.seen_s, last),
+    )
+    return Believed(replace(living, stamp_s=visit.end_s, places=places, sites=sites), weight, evidence)
+
+
+def decided(
+    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """The map with its stays up to date and without what is forgotten, and what changed since the session before."""
+    after = decide.with_stays(before, now.living, seen, visit.start_s)
+    changes = decide.changes_between(before, after, seen) if len(before.places) else ()
+    return decide.without_forgotten(after, config.most_sites), changes
+
+
+def learned(after: LivingMap, now: Believed, seen: Looks, config: LivingConfig) -> LivingMap:
+    """The map with what the session taught of lifetimes, and of from where to where the sensor sees."""
+    if config.learn_sight and config.existence:
+        lines = after.sightlines.learned(seen.sight_key[seen.rows.key], seen.rows.hit, now.weight)
+        after = replace(after, sightlines=lines)
+    if config.learn_lifetimes:
+        after = replace(after, lives=learned_lives(after.stays, after.lives, after.stamp_s))
+    return after
+
+
+def _inliers(visit: Visit) -> tuple[IntArray, IntArray]:
+    """Rows of the detections that fit, and of their landmarks."""
+    good = np.flatnonzero(visit.outcome.inlier >= INLIER)
+    return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]
+
+
+def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
+    """Beliefs of a map that never doubts: a clique stands where it was seen last."""
+    p_here = living.sites.p_here.copy()
+    _, clique = believe.clique_rows(living.sites)
+    seen = np.unique(hit_site)
+    for row in np.unique(clique[seen]):
+        mine = np.flatnonzero(clique == row)
+        p_here[mine] = 0.0
+        p_here[mine[np.argmax(last_s[mine])]] = 1.0
+    return p_here
