@@ -1,15 +1,16 @@
 """From where to where the sensor sees: detection rates between cells of the floor, learned from hits and misses.
 
 Nobody gives a map of the walls, but whoever has looked from here to there a few times knows whether one is between.
-A *line of sight* is a pair of cells, the sensor's and the landmark's; the probability of a detection along it has a
-Beta distribution. What is expected of a line that nobody has looked along is learned too: from all lines as long as it
-is, and how far they differ from each other (most of them are either free or blocked).
+A *line of sight* is a pair of cells, the sensor's and the landmark's. It is free or blocked; each kind has a Beta
+distribution of the detection probability, that of the free ones depends on their length. How many are free and how
+often one detects along either kind is learned from all lines together (empirical Bayes), so that something is known of
+a line that nobody has looked along before.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,16 +19,35 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_LOOKS = 200.0
 """Along one line: with more, old ones fade. So a wall that is moved is learned, and misses by chance are not."""
+STRENGTH = 8.0
+"""Looks along one line that the rate of its kind is worth."""
 NOMINAL_LOOKS = 20.0
-"""Along lines of one length, that the sensor's nominal detection probability is worth."""
-RATES = (0.02, 0.98)
-"""No rate is expected outside: nothing is certain of a line that nobody has looked along."""
-STRENGTHS = np.geomspace(0.25, 16.0, 13)
-"""Looks that what all lines have in common may be worth for one of them."""
-STRENGTH = 2.0
-"""The same, of a table from which it cannot be told yet."""
+"""Looks that the nominal rate is worth against those along all lines of a length; one line counts no more than that."""
+BLOCKED = 0.03
+"""Rate along blocked lines to begin with: round corners, through glass, and because places are not quite known."""
+RATES = (0.002, 0.98)
+"""No kind of line has a rate outside: nothing is certain."""
+LONGEST = 40
+"""Cells; lines longer than this are taken together."""
+ROUNDS = 10
+KNOWN = 1e9
+"""Looks that are worth certainty."""
 _SENSOR_CELLS = 1 << 20
-_LONGEST = 1 << 10
+_REACH = 1 << 10
+
+
+class _Kinds(NamedTuple):
+    """The two kinds of lines.
+
+    Attributes:
+        p_free: (LONGEST + 1,) share of the free ones, by length.
+        free: (LONGEST + 1,) rate along these.
+        blocked: rate along the others.
+    """
+
+    p_free: FloatArray
+    free: FloatArray
+    blocked: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,31 +77,43 @@ class SightLines:
         """(N,) keys of the lines of sight from sensors (N, 2) to landmarks (N, 2).
 
         Raises:
-            InputError: a place that is not finite, or farther away than keys reach: 500,000 cells from the origin,
-                1,000 from the sensor.
+            InputError: a place that is not finite, or out of reach: 500,000 cells from the origin, 1,000 from the
+                sensor.
         """
-        own, other = (np.floor(np.asarray(place) / self.cell_m) for place in (sensor_m, landmark_m))
-        away = other - own
-        reach = (np.abs(own) < _SENSOR_CELLS / 2) & (np.abs(away) < _LONGEST)  # False for nan
-        if not reach.all():
-            row = int(np.argmin(reach.all(axis=1)))
-            problem = f"row {row}: nobody sees from {np.asarray(sensor_m)[row]} to {np.asarray(landmark_m)[row]}"
-            raise InputError(problem, field="sensor_m", hint="finite metres, in one frame")
+        sensor, landmark = np.asarray(sensor_m, dtype=np.float64), np.asarray(landmark_m, dtype=np.float64)
+        own = np.floor(sensor / self.cell_m)
+        away = np.floor(landmark / self.cell_m) - own
+        fine = ((np.abs(own) < _SENSOR_CELLS / 2) & (np.abs(away) < _REACH)).all(axis=1)  # False for nan
+        if not fine.all():
+            row = int(np.argmin(fine))
+            problem = f"row {row}: nobody sees from {sensor[row]} to {landmark[row]}"
+            raise InputError(problem, field="landmark_m", hint="finite metres, both in one frame")
         x, y = (own.astype(np.int64) + _SENSOR_CELLS // 2).T
-        dx, dy = (away.astype(np.int64) + _LONGEST).T
-        return np.asarray(((x * _SENSOR_CELLS + y) * (2 * _LONGEST) + dx) * (2 * _LONGEST) + dy, dtype=np.int64)
+        dx, dy = (away.astype(np.int64) + _REACH).T
+        return np.asarray(((x * _SENSOR_CELLS + y) * (2 * _REACH) + dx) * (2 * _REACH) + dy, dtype=np.int64)
 
     def prior_counts(self, keys: IntArray, p_detect: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Beta distributions of the detection probability along lines of sight: pseudo counts (N,) of hits and misses.
 
+        That of a line which may be free or blocked is the Beta distribution of the same mean and variance.
+
         Args:
             keys: (N,) lines of sight.
-            p_detect: (N,) what the sensor's nominal field of view says (`visibility.detection_probability`).
+            p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along free
+                lines that is started from, and by how much it is less at the field's edge.
         """
-        mean = self._expected(keys, p_detect)
-        strength = self._strength()
-        hits, looks = self._counts(keys)
-        return hits + strength * mean, looks - hits + strength * (1.0 - mean)
+        nominal = np.asarray(p_detect, dtype=np.float64)
+        middle = float(np.max(nominal, initial=0.0)) or 1.0
+        kinds, length, (hits, looks) = self._kinds(middle), _length(keys), self._counts(keys)
+        free, blocked = np.clip(kinds.free[length] * nominal / middle, *RATES), np.full(len(length), kinds.blocked)
+        p_free = _p_free(hits, looks, kinds.p_free[length], free, blocked)
+        share = np.stack([p_free, 1.0 - p_free])
+        mean = (hits + STRENGTH * np.stack([free, blocked])) / (looks + STRENGTH)
+        spread = mean * (1.0 - mean) / (looks + STRENGTH + 1.0)
+        both = (share * mean).sum(axis=0)
+        variance = (share * (spread + (mean - both) ** 2)).sum(axis=0)
+        count = both * (1.0 - both) / variance - 1.0  # positive: no distribution on [0, 1] of this mean is wider
+        return count * both, count * (1.0 - both)
 
     def learned(self, keys: IntArray, hit: BoolArray, weight: FloatArray) -> SightLines:
         """The table after looks at what was there with some probability.
@@ -92,13 +124,12 @@ class SightLines:
             weight: (N,) probability that it was there.
         """
         every, row = np.unique(np.append(self.key, keys), return_inverse=True)
-        old, new = row[: len(self.key)], row[len(self.key) :]
-        n = len(every)
+        old, new, n = row[: len(self.key)], row[len(self.key) :], len(every)
         looks = np.bincount(old, self.looks, n) + np.bincount(new, weight, n)
         hits = np.bincount(old, self.hits, n) + np.bincount(new, weight * hit, n)
-        scale = np.minimum(1.0, MOST_LOOKS / np.maximum(looks, 1e-300))
         kept = looks > 0.0
-        return SightLines(every[kept], (hits * scale)[kept], (looks * scale)[kept], self.cell_m)
+        scale = MOST_LOOKS / np.maximum(looks[kept], MOST_LOOKS)
+        return SightLines(every[kept], hits[kept] * scale, looks[kept] * scale, self.cell_m)
 
     def _counts(self, keys: IntArray) -> tuple[FloatArray, FloatArray]:
         """(N,) hits and looks along lines, 0 along unknown ones."""
@@ -108,28 +139,46 @@ class SightLines:
         known = self.key[at] == keys
         return np.where(known, self.hits[at], 0.0), np.where(known, self.looks[at], 0.0)
 
-    def _expected(self, keys: IntArray, p_detect: Any) -> FloatArray:
-        """(N,) rate along lines as long as these, one line one voice, starting from the nominal one."""
-        length, wanted = _length(self.key), _length(keys)
-        n = int(max(length.max(initial=0), wanted.max(initial=0))) + 1
-        voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))  # often used lines do not outvote others
-        hits, looks = np.bincount(length, voice * self.hits, n), np.bincount(length, voice * self.looks, n)
-        rate = (hits[wanted] + NOMINAL_LOOKS * np.asarray(p_detect)) / (looks[wanted] + NOMINAL_LOOKS)
-        return np.clip(rate, *RATES)
+    def _kinds(self, nominal: float) -> _Kinds:
+        """The two kinds of lines, by expectation maximisation; what few lines say gives way to what is nominal."""
+        length, n = _length(self.key), LONGEST + 1
+        lines = np.bincount(length, minlength=n)
+        voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))
+        hits, looks = voice * self.hits, voice * self.looks
+        kinds = _Kinds(np.full(n, 0.5), np.full(n, np.clip(nominal, *RATES)), BLOCKED)
+        for _ in range(ROUNDS if len(self.key) else 0):
+            blocked = np.full(len(length), kinds.blocked)
+            p_free = _p_free(self.hits, self.looks, kinds.p_free[length], kinds.free[length], blocked)
+            own = np.bincount(length, p_free * hits, n), np.bincount(length, p_free * looks, n)
+            rest = np.sum((1.0 - p_free) * hits), np.sum((1.0 - p_free) * looks)
+            kinds = _Kinds(
+                (np.bincount(length, p_free, n) + 2.0) / (lines + 4.0),
+                np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES),
+                float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES)),
+            )
+        return kinds
 
-    def _strength(self) -> float:
-        """Looks that the rate of all lines is worth for one: of the largest likelihood of the table (beta-binomial)."""
-        from scipy.special import betaln
 
-        if len(self.key) < 50:
-            return STRENGTH
-        mean = self._expected(self.key, 0.5)
-        a, b = STRENGTHS[:, None] * mean, STRENGTHS[:, None] * (1.0 - mean)
-        likelihood = betaln(a + self.hits, b + self.looks - self.hits) - betaln(a, b)
-        return float(STRENGTHS[np.argmax(likelihood.sum(axis=1))])
+def nominal_counts(p_detect: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pseudo counts of one who takes the sensor's nominal field of view for the truth, whatever is looked at."""
+    nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
+    return KNOWN * nominal, KNOWN * (1.0 - nominal)
+
+
+def _p_free(
+    hits: FloatArray, looks: FloatArray, prior: FloatArray, free: FloatArray, blocked: FloatArray
+) -> FloatArray:
+    """(N,) probability that lines are free, given hits and looks along them (beta-binomial)."""
+    from scipy.special import expit, gammaln
+
+    def log_likelihood(rate: FloatArray) -> FloatArray:
+        a, b = STRENGTH * rate, STRENGTH * (1.0 - rate)
+        return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + np.maximum(looks - hits, 0.0)) - gammaln(b))
+
+    return np.asarray(expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(blocked)))
 
 
 def _length(key: IntArray) -> IntArray:
-    """(N,) lengths of lines of sight, in cells."""
-    dx, dy = key // (2 * _LONGEST) % (2 * _LONGEST) - _LONGEST, key % (2 * _LONGEST) - _LONGEST
-    return np.rint(np.hypot(dx, dy)).astype(np.int64)
+    """(N,) lengths of lines of sight in cells, at most `LONGEST`."""
+    dx, dy = key // (2 * _REACH) % (2 * _REACH) - _REACH, key % (2 * _REACH) - _REACH
+    return np.minimum(np.rint(np.hypot(dx, dy)).astype(np.int64), LONGEST)
