@@ -70,10 +70,11 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
     assert swing.p_known > 0.9
     assert comes_back.p_hop < 0.1
     assert comes_back.p_known > 0.9
-    assert np.exp(comes_back.absence.log_survival(14 * DAY_S)) < 0.1  # of those away, after two weeks
+    # of those that were missed at a look, after two weeks
+    assert np.exp(comes_back.absence.log_conditional_survival(DAY_S, 14 * DAY_S)) < 0.1
     assert wanders.p_hop > 0.9
     assert wanders.p_known < 0.1
-    assert np.exp(is_taken.absence.log_survival(14 * DAY_S)) > 0.9
+    assert np.exp(is_taken.absence.log_conditional_survival(DAY_S, 14 * DAY_S)) > 0.9
 
 
 def test_without_stays_nothing_is_believed_but_looks_are_counted() -> None:

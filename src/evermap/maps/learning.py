@@ -185,6 +185,7 @@ class _History:
         n_gaps = np.maximum(last - first, 1)
         squares = np.append(0.0, np.cumsum(np.square(np.diff(looks_s))))
         mean_s = np.where(last > first, looks_s[last] - looks_s[first], stays.last_s - stays.first_s) / n_gaps
+        mean_s = np.maximum(mean_s, 1.0)  # seen once: no gap, no matter how long
         spread_s = np.sqrt(np.maximum((squares[last] - squares[first]) / n_gaps - np.square(mean_s), 0.0))
         spread_s = np.minimum(spread_s, 0.9 * mean_s)
         gap_s = np.stack([mean_s - spread_s, mean_s + spread_s], axis=1)
@@ -298,6 +299,5 @@ def _newest(kind: IntArray, first_s: FloatArray) -> BoolArray:
 
 def _by_class(values: FloatArray, kind: IntArray, n_classes: int) -> FloatArray:
     """(C, ...) sums over the rows of each class."""
-    total = np.zeros((n_classes, *values.shape[1:]))
-    np.add.at(total, kind, values)
-    return total
+    member = (kind == np.arange(n_classes)[:, None]).astype(np.float64)
+    return np.asarray(np.tensordot(member, values, axes=1))

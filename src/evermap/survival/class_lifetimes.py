@@ -111,7 +111,8 @@ class Sightings:
 
     Attributes:
         elsewhere_s, first_s, last_s, gone_s: (K,) as of `sightings.lifetimes_of_sightings`.
-        gap_s: (K, 2) lengths of the gaps between the looks at a stay; half of the gaps have the one, half the other.
+        gap_s: (K, 2) lengths of the gaps between the looks at a stay; half of the gaps have the one, half the other;
+            positive.
         back_by_stay: (K,) probability that who leaves is elsewhere for one more stay, and then back.
         back_rate: (K,) rate in 1/s at which others come back.
     """
@@ -129,38 +130,46 @@ def stay_log_likelihood(seen: Sightings) -> FloatArray:
     """(K, M, A) log probabilities of what was seen of K stays, on `LOG_MEAN` and `LOG_SHAPE`."""
     result = np.empty((len(seen.first_s), len(LOG_MEAN), len(LOG_SHAPE)))
     came, ended = np.isfinite(seen.elsewhere_s), np.isfinite(seen.gone_s)
-    watched_s = seen.last_s - seen.first_s
-    lasted = watched_s > 0.0
-    share = seen.gap_s[lasted] / seen.gap_s[lasted].sum(axis=1, keepdims=True)
-    pairs = np.maximum(watched_s[lasted] / seen.gap_s[lasted].sum(axis=1), 0.5)[:, None, None]
-    last_gap_s = seen.gone_s[ended] - seen.last_s[ended]
-    by_stay, rate = seen.back_by_stay[:, None, None], seen.back_rate[:, None, None]
-    begin = seen.elsewhere_s[came, None] + _INSTANTS * (seen.first_s - seen.elsewhere_s)[came, None]
+    watched_s, both_gaps_s = seen.last_s - seen.first_s, seen.gap_s.sum(axis=1)
+    share = seen.gap_s / both_gaps_s[:, None]
+    pairs = np.maximum(watched_s / both_gaps_s, 0.5)
+    back, rate = seen.back_by_stay[:, None, None], seen.back_rate
+    left_s = seen.gone_s[ended] - seen.last_s[ended]
+    begin_s = seen.elsewhere_s[came, None] + _INSTANTS * (seen.first_s - seen.elsewhere_s)[came, None]
     stamps = np.stack([seen.first_s, seen.last_s, np.where(ended, seen.gone_s, seen.last_s)])
-    ages = stamps[:, came, None] - begin  # (3, came, 2)
-    found = stamps[:, ~came] - seen.first_s[~came]
-    hazard = np.empty((3, len(result), len(_INSTANTS), len(LOG_MEAN)))
+    ages = stamps[:, came, None] - begin_s
+    found = [(row, rows, stamps[row, rows] - seen.first_s[rows]) for row, rows in ((1, ~came), (2, ~came & ended))]
+    hazard = np.zeros((3, len(result), len(_INSTANTS), len(LOG_MEAN)))
     for a, shape in enumerate(np.exp(LOG_SHAPE)):
         per_scale = np.exp(-shape * (LOG_MEAN - math.lgamma(1.0 + 1.0 / shape)))
         hazard[:, came] = (ages**shape)[..., None] * per_scale
-        hazard[:, ~came] = _of_found((found**shape)[..., None] * per_scale, shape)[:, :, None]
+        for row, rows, since_s in found:
+            hazard[row, rows] = _of_found((since_s**shape)[:, None] * per_scale, shape)[:, None]
         first, last, gone = hazard
         log_seen = -first
         for part in (0, 1):
-            x = (last - first)[lasted] * share[:, part, None, None] / pairs
-            y = by_stay[lasted] * x + rate[lasted] * (watched_s[lasted] * share[:, part])[:, None, None] / pairs
-            with np.errstate(divide="ignore"):
-                log_seen[lasted] += pairs * (np.logaddexp(np.log(y), np.log(x) - x - y) - np.log(x + y))
-        x = np.maximum((gone - last)[ended], _LEAST)
-        both = x + by_stay[ended] * x + rate[ended] * last_gap_s[:, None, None]
-        log_seen[ended] += np.log(x / both * -np.expm1(-both))
+            each = (share[:, part] / pairs)[:, None, None]
+            leave = np.maximum((last - first) * each, _LEAST)
+            come = back * leave + (rate * watched_s)[:, None, None] * each
+            log_seen += pairs[:, None, None] * _log_there_again(leave, come)
+        leave = np.maximum((gone - last)[ended], _LEAST)
+        change = (1.0 + back[ended]) * leave + (rate[ended] * left_s)[:, None, None]
+        log_seen[ended] += np.log(leave / change * -np.expm1(-change))
+        # less the probability to be there at the first look, relative to which both instants are taken
         result[:, :, a] = _log_sum(log_seen) - _log_sum(-first)
     return result
 
 
+def _log_there_again(leave: FloatArray, come: FloatArray) -> FloatArray:
+    """Of being found again where one was, by the mean numbers of goings and comings in a gap."""
+    both = leave + come
+    return np.asarray(np.log(np.maximum((come + leave * np.exp(-both)) / both, _LEAST)))
+
+
 def _log_sum(log_values: FloatArray) -> FloatArray:
     """(K, M) over two instants."""
-    return np.asarray(np.logaddexp(log_values[:, 0], log_values[:, 1]))
+    one, other = log_values[:, 0], log_values[:, 1]
+    return np.asarray(np.maximum(one, other) + np.log1p(np.exp(-np.abs(one - other))))
 
 
 def _of_found(hazard: FloatArray, shape: float) -> FloatArray:
@@ -169,9 +178,8 @@ def _of_found(hazard: FloatArray, shape: float) -> FloatArray:
 
     order = 1.0 / shape
     left = gammaincc(order, hazard)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        late = hazard - (order - 1.0) * np.log(hazard) + gammaln(order)
-        return np.asarray(np.where(left > 1e-290, -np.log(left), late))
+    late = hazard - (order - 1.0) * np.log(np.maximum(hazard, _LEAST)) + gammaln(order)
+    return np.asarray(np.where(left > 1e-290, -np.log(np.maximum(left, _LEAST)), late))
 
 
 def absence_log_likelihood(
