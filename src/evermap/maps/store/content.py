@@ -65,7 +65,7 @@ class Chunk:
         try:
             planes = np.frombuffer(zlib.decompress(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
         except (zlib.error, ValueError) as error:
-            raise DamagedError(str(error)) from None
+            raise DamagedError(f"a part cannot be unpacked: {error}") from None
         chunk = cls(dtype, planes.T.tobytes())
         if chunk.name != name:
             raise DamagedError("a checksum does not match")

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -80,7 +79,6 @@ def change_to_row(revision: int, position: int, change: MapChange) -> dict[str, 
         "revision": revision,
         "position": position,
         "kind": change.kind.value,
-        "landmark_ids": json.dumps([int(name) for name in change.landmark_ids]),
         **{name: None if math.isnan(value) else float(value) for name, value in numbers.items()},
         "n_hits": int(change.n_hits),
         "n_misses": int(change.n_misses),
@@ -88,10 +86,10 @@ def change_to_row(revision: int, position: int, change: MapChange) -> dict[str, 
 
 
 @_damage()
-def change_from_row(row: Mapping[str, Any]) -> MapChange:
-    """What `change_to_row` was given."""
+def change_from_row(row: Mapping[str, Any], landmark_ids: Sequence[int]) -> MapChange:
+    """What `change_to_row` was given, and the rows of `change_landmark`."""
     return MapChange(
-        landmark_ids=tuple(json.loads(row["landmark_ids"])),
+        landmark_ids=tuple(landmark_ids),
         kind=ChangeKind(row["kind"]),
         stamp_from_s=_or_nan(row["stamp_from_s"]),
         stamp_to_s=_or_nan(row["stamp_to_s"]),

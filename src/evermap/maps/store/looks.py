@@ -39,7 +39,7 @@ def looks_from_bytes(clique_id: int, stored: bytes) -> Evidence:
     try:
         planes = np.frombuffer(zlib.decompress(stored), np.uint8)
     except zlib.error as error:
-        raise DamagedError(str(error)) from None
+        raise DamagedError(f"a part cannot be unpacked: {error}") from None
     sizes = [np.dtype(dtype).itemsize for dtype in _COLUMNS.values()]
     count = len(planes) // sum(sizes)
     parts = np.split(planes, np.cumsum(np.multiply(sizes, count))[:-1])

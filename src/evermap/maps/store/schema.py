@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Column, Double, ForeignKey, Index, Integer, LargeBinary, MetaData, Table, Text
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Double,
+    ForeignKey,
+    ForeignKeyConstraint,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Table,
+    Text,
+)
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 
 metadata = MetaData()
 
@@ -52,7 +64,6 @@ change = Table(
     Column("revision", Integer, ForeignKey("revision.number"), primary_key=True),
     Column("position", Integer, primary_key=True),
     Column("kind", Text, nullable=False),
-    Column("landmark_ids", Text, nullable=False),
     Column("stamp_from_s", Double),
     Column("stamp_to_s", Double),
     Column("dx_m", Double),
@@ -63,11 +74,22 @@ change = Table(
     Column("n_misses", Integer, nullable=False),
 )
 
+change_landmark = Table(
+    "change_landmark",
+    metadata,
+    Column("revision", Integer, primary_key=True),
+    Column("position", Integer, primary_key=True),
+    Column("rank", Integer, primary_key=True),
+    Column("landmark_id", BigInteger, nullable=False),
+    ForeignKeyConstraint(["revision", "position"], ["change.revision", "change.position"]),
+    Index("changes_of_landmark", "landmark_id"),
+)
+
 evidence = Table(
     "evidence",
     metadata,
     Column("revision", Integer, ForeignKey("revision.number"), primary_key=True),
-    Column("clique_id", Integer, primary_key=True),
+    Column("clique_id", BigInteger, primary_key=True),
     Column("first_s", Double),
     Column("last_s", Double),
     Column("looks", LargeBinary, nullable=False),

@@ -134,8 +134,13 @@ class SqlStore:
         """Changes of one revision."""
         with self._reading() as connection:
             number = self._known(connection, revision)
-            wanted = select(schema.change).where(schema.change.c.revision == number).order_by(schema.change.c.position)
-            return tuple(change_from_row(dict(row)) for row in connection.execute(wanted).mappings())
+            whole, named = schema.change, schema.change_landmark
+            groups: dict[int, list[int]] = {}
+            listed = select(named).where(named.c.revision == number).order_by(named.c.position, named.c.rank)
+            for row in connection.execute(listed):
+                groups.setdefault(row.position, []).append(row.landmark_id)
+            rows = connection.execute(select(whole).where(whole.c.revision == number).order_by(whole.c.position))
+            return tuple(change_from_row(dict(row), groups.get(row["position"], [])) for row in rows.mappings())
 
     def evidence(
         self,
@@ -199,6 +204,11 @@ class SqlStore:
             "content": name,
         }
         change_rows = [change_to_row(number, position, change) for position, change in enumerate(changes)]
+        named_rows = [
+            {"revision": number, "position": position, "rank": rank, "landmark_id": int(landmark)}
+            for position, change in enumerate(changes)
+            for rank, landmark in enumerate(change.landmark_ids)
+        ]
         evidence_rows = [] if evidence is None else list(_evidence_rows(number, evidence))
         with self._writing() as connection:
             head = _head(connection)
@@ -210,6 +220,7 @@ class SqlStore:
                 (schema.chunk, rows),
                 (schema.revision, [row]),
                 (schema.change, change_rows),
+                (schema.change_landmark, named_rows),
                 (schema.evidence, evidence_rows),
             ):
                 if content_rows:
@@ -271,7 +282,7 @@ class SqlStore:
         """What went wrong in the database, in one line."""
         try:
             yield
-        except DamagedError as error:
+        except (DamagedError, UnicodeDecodeError) as error:  # the latter even from the driver's own messages
             hint = "evermap map log, then load an older --revision, or a copy of the file"
             raise InputError(f"damaged: {error}", path=self._where, hint=hint) from error
         except IntegrityError as error:
@@ -304,7 +315,7 @@ def _head(connection: Connection) -> int:
 def _content(connection: Connection, number: int) -> bytes:
     """Name of the map of a revision."""
     wanted = select(schema.revision.c.content).where(schema.revision.c.number == number)
-    return bytes(connection.execute(wanted).scalar_one())
+    return _bytes(connection.execute(wanted).scalar())
 
 
 def _fetched(connection: Connection, names: Iterable[bytes]) -> Mapping[bytes, bytes]:
@@ -314,8 +325,8 @@ def _fetched(connection: Connection, names: Iterable[bytes]) -> Mapping[bytes, b
     found: dict[bytes, bytes] = {}
     for at in range(0, len(wanted), _AT_ONCE):
         rows = connection.execute(question, {"names": wanted[at : at + _AT_ONCE]})
-        found.update((bytes(name), bytes(data)) for name, data in rows)
-    if len(found) < len(wanted):
+        found.update((_bytes(name), _bytes(data)) for name, data in rows)
+    if found.keys() != set(wanted):
         raise DamagedError("a part of the map is missing")
     return found
 
@@ -326,7 +337,7 @@ def _present(connection: Connection, names: Iterable[bytes]) -> set[bytes]:
     question = select(schema.chunk.c.name).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
     found: set[bytes] = set()
     for at in range(0, len(wanted), _AT_ONCE):
-        found |= {bytes(row[0]) for row in connection.execute(question, {"names": wanted[at : at + _AT_ONCE]})}
+        found |= {_bytes(row[0]) for row in connection.execute(question, {"names": wanted[at : at + _AT_ONCE]})}
     return found
 
 
@@ -356,6 +367,13 @@ def _evidence_rows(number: int, evidence: Evidence) -> Iterator[dict[str, Any]]:
             "last_s": float(mine.stamp_s.max()),
             "looks": looks_to_bytes(mine),
         }
+
+
+def _bytes(value: Any) -> bytes:
+    """Of a column of bytes, in which a damaged file may have anything."""
+    if not isinstance(value, bytes | memoryview):
+        raise DamagedError("a part of the map is missing")
+    return bytes(value)
 
 
 def _no_nan(value: float) -> float | None:

@@ -1,0 +1,141 @@
+"""A store survives being killed: at every statement of a commit, and at random instants of many."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sqlite3
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_maps import assert_same, random_changes, random_evidence, random_map
+from sqlalchemy import Engine, event
+
+from evermap.maps.store import MapStore, Provenance, open_store
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+
+
+def the_map(number: int):
+    """What revision `number` holds in these tests."""
+    return random_map(number, cliques=6 + number % 5, stamp_s=1000.0 * number)
+
+
+def commit_next(store: MapStore) -> None:
+    number = store.head() + 1
+    living = the_map(number)
+    changes, evidence = random_changes(number, living), random_evidence(number, living)
+    store.commit(living, Provenance(recording=f"session {number}"), changes, evidence, parent=number - 1)
+
+
+def killed(work: Callable[[], None], signal_fd: int | None = None, after_s: float = 0.0) -> bool:
+    """Whether a child process that did some work was killed before it was through.
+
+    With `signal_fd` it is killed from outside: a while after it has written its first byte there.
+    """
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    if signal_fd is not None:
+        assert os.read(signal_fd, 1)
+        time.sleep(after_s)
+        os.kill(child, signal.SIGKILL)
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status)
+
+
+def check_all(path: Path) -> int:
+    """The number of revisions, every one of which is whole."""
+    with open_store(path, create=True) as store:
+        head = store.head()
+        for number in range(1, head + 1):
+            living = the_map(number)
+            assert_same(store.load(number), living)
+            assert len(store.changes(number)) == 2
+        looks = [len(random_evidence(number, the_map(number))) for number in range(1, head + 1)]
+        assert len(store.evidence()) == sum(looks)
+        assert [r.provenance.recording for r in store.log()] == [f"session {k}" for k in range(1, head + 1)]
+    with sqlite3.connect(path) as database:
+        assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        assert database.execute("PRAGMA foreign_key_check").fetchall() == []
+        # nothing is left of what was not committed
+        revisions = {
+            row[0] for row in database.execute("SELECT revision FROM evidence UNION SELECT revision FROM change")
+        }
+    database.close()
+    assert revisions == set(range(1, head + 1))
+    return head
+
+
+def test_killed_at_every_statement_of_a_commit(tmp_path: Path) -> None:
+    """Before each statement and each commit in turn, the first opening of the file included."""
+    path = tmp_path / "m.evermap"
+
+    def work(fatal: int) -> None:
+        count = 0
+
+        def step(*_: object) -> None:
+            nonlocal count
+            if count == fatal:
+                os.kill(os.getpid(), signal.SIGKILL)
+            count += 1
+
+        event.listen(Engine, "before_cursor_execute", step)
+        event.listen(Engine, "commit", step)
+        with open_store(path, create=True) as store:
+            commit_next(store)
+
+    fatal, heads = 0, []
+    while killed(partial(work, fatal)):
+        heads.append(check_all(path))
+        fatal += 1
+    assert fatal > 15  # statements there are, and each of them was the last one once
+    assert set(heads) <= {0}
+    assert check_all(path) == 1
+
+
+def test_killed_at_random_instants(tmp_path: Path) -> None:
+    """Sixty times while it commits as fast as it can: nothing is lost that was there, nothing is there by half."""
+    path = tmp_path / "m.evermap"
+    random = np.random.default_rng(5)
+    heard, told = os.pipe()
+
+    def work() -> None:
+        with open_store(path, create=True) as store:
+            while True:
+                commit_next(store)
+                os.write(told, b".")
+
+    head = 0
+    for _ in range(60):
+        assert killed(work, heard, after_s=float(random.uniform(0.0, 0.04)))
+        more = len(os.read(heard, 1000)) if select.select([heard], [], [], 0)[0] else 0
+        with open_store(path) as store:
+            now = store.head()
+            assert_same(store.load(), the_map(now))
+        # what it said was committed is there; the last one it may not have got to say
+        assert head + 1 + more <= now <= head + 2 + more
+        head = now
+    assert check_all(path) == head
+
+
+def test_what_was_committed_is_seen_by_others_at_once(tmp_path: Path) -> None:
+    """The child is killed right after `commit` returned: its revision is there."""
+    path = tmp_path / "m.evermap"
+
+    def work() -> None:
+        with open_store(path, create=True) as store:
+            commit_next(store)
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    for number in range(1, 6):
+        assert killed(work)
+        assert check_all(path) == number

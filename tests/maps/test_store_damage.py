@@ -1,0 +1,184 @@
+"""Files that are no maps, are damaged, or may not be written: one line that says so and what to try."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_maps import assert_same, random_changes, random_evidence, random_map
+
+from evermap.errors import EvermapError, InputError
+from evermap.maps.store import Provenance, open_store, sqlite
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A map with three revisions."""
+    path = tmp_path / "m.evermap"
+    with open_store(path, create=True) as store:
+        for seed in range(3):
+            living = random_map(seed)
+            changes, evidence = random_changes(seed, living), random_evidence(seed, living)
+            store.commit(living, Provenance(config="x = 1"), changes, evidence, parent=seed)
+    return path
+
+
+def use_all(path: Path) -> None:
+    """Everything that reads. What it gives of maps is what was written."""
+    with open_store(path) as store:
+        for number in range(1, store.head() + 1):
+            assert_same(store.load(number), random_map(number - 1))
+            store.changes(number)
+        store.log()
+        store.lineage()
+        store.evidence(landmark_id=1)
+        store.evidence()
+
+
+def said_of(path: Path) -> str:
+    """The line with which reading ended; '' where it went well."""
+    try:
+        use_all(path)
+    except EvermapError as error:
+        return error.one_line()
+    return ""
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_flipped_bytes_give_the_truth_or_a_line(path: Path, seed: int) -> None:
+    random = np.random.default_rng(seed)
+    content = bytearray(path.read_bytes())
+    for _ in range(int(random.integers(1, 20))):
+        content[random.integers(len(content))] = random.integers(256)
+    path.write_bytes(content)
+    line = said_of(path)
+    assert not line or (line.startswith(f"{path}: ") and "(try: " in line)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.03, 0.3, 0.7, 0.99])
+def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=r"damaged|is no evermap map"):
+        use_all(path)
+
+
+def test_a_part_that_is_missing_or_another_is_found(path: Path) -> None:
+    with sqlite3.connect(path) as database:
+        names = [row[0] for row in database.execute("SELECT name FROM chunk")]
+        kept = database.execute("SELECT content FROM revision WHERE number = 1").fetchone()[0]
+        database.execute("UPDATE revision SET content = ? WHERE number = 2", (kept,))
+        database.execute("PRAGMA foreign_keys = OFF")
+        database.execute("DELETE FROM chunk WHERE name = ?", (kept,))
+    database.close()
+    assert len(names) > 30
+    with open_store(path) as store:
+        assert_same(store.load(3), random_map(2))
+        with pytest.raises(InputError, match=r"damaged: a part of the map is missing \(try: evermap map log"):
+            store.load(1)
+
+
+@pytest.mark.parametrize("content", [b"not a database, but long enough to be one" * 50, b"PK\3\4", b"\0" * 5000])
+def test_another_file_is_no_map(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "photo.jpg"
+    path.write_bytes(content)
+    for create in (False, True):
+        with pytest.raises(InputError, match=r"photo.jpg: is no evermap map \(try: another file\)"):
+            open_store(path, create=create)
+    assert path.read_bytes() == content
+
+
+def test_another_database_is_no_map(tmp_path: Path) -> None:
+    path = tmp_path / "phone.db"
+    with sqlite3.connect(path) as database:
+        database.execute("CREATE TABLE store (name TEXT)")
+    database.close()
+    with pytest.raises(InputError, match="is a database, but no evermap map"):
+        open_store(path, create=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "line"),
+    [
+        (lambda p: None, r"no such map \(try: evermap slam INPUT --map .*m\.evermap starts one\)"),
+        (lambda p: p.mkdir(), r"is a folder; a map is one file \(try: .*m\.evermap"),
+        (lambda p: p.touch(), r"holds no map \(try: evermap slam INPUT --map FILE writes one\)"),
+    ],
+)
+def test_no_map_at_all(tmp_path: Path, make: Callable[[Path], None], line: str) -> None:
+    path = tmp_path / "m.evermap"
+    make(path)
+    with pytest.raises(InputError, match=line):
+        open_store(path)
+
+
+def test_a_store_is_made_where_its_folder_is(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"the folder .*nowhere does not exist \(try: mkdir -p .*nowhere\)"):
+        open_store(tmp_path / "nowhere" / "m.evermap", create=True)
+    path = tmp_path / "m.evermap"
+    path.touch()  # what is left of a store whose making was cut short
+    assert open_store(path, create=True).head() == 0
+
+
+def test_a_read_only_file_can_be_read(path: Path) -> None:
+    """As somebody without rights sees it: of root, who may do anything, a child process without them."""
+    path.chmod(0o444)
+    path.parent.chmod(0o555)
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        said = "nothing"
+        try:
+            if os.getuid() == 0:
+                for folder in path.parents:
+                    if folder.owner() == "root" and folder != path.parent and not folder.stat().st_mode & 0o001:
+                        folder.chmod(folder.stat().st_mode | 0o011)
+                os.setuid(65534)
+            use_all(path)
+            with open_store(path) as store:
+                store.commit(random_map(3), Provenance(), parent=3)
+        except InputError as error:
+            said = error.one_line()
+        except BaseException as error:
+            said = repr(error)
+        finally:
+            os.write(writer, said.encode())
+            os._exit(0)
+    os.waitpid(child, 0)
+    path.parent.chmod(0o755)
+    said = os.read(reader, 10_000).decode()
+    assert said == f"{path}: cannot be written: it is read-only (try: chmod u+w, or a copy of it)"
+    assert open_store(path).head() == 3
+
+
+def test_a_store_that_somebody_keeps_locked(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sqlite, "_PATIENCE_S", 0.05)
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    with open_store(path) as store:
+        assert store.head() == 3  # readers are not in the way
+        with pytest.raises(InputError, match=r"another process keeps it locked \(try: wait for that one to end\)"):
+            store.commit(random_map(3), Provenance(), parent=3)
+    other.execute("ROLLBACK")
+    other.close()
+    assert open_store(path).commit(random_map(3), Provenance(), parent=3) == 4
+
+
+def test_a_full_disk_loses_nothing(path: Path) -> None:
+    with open_store(path) as store:
+        engine = store._engine  # type: ignore[attr-defined]
+        from sqlalchemy import event
+
+        pages = path.stat().st_size // 4096
+
+        @event.listens_for(engine, "connect")
+        def full(connection: sqlite3.Connection, _: object) -> None:
+            connection.execute(f"PRAGMA max_page_count = {pages + 2}")
+
+        with pytest.raises(InputError, match=r"cannot be written: the disk is full \(try: make room\)"):
+            store.commit(random_map(5, cliques=100), Provenance(), parent=3)
+    use_all(path)

@@ -1,0 +1,123 @@
+"""Stores of an older schema become ones of today, whole or not at all; ones of tomorrow are left alone."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+
+import pytest
+from random_maps import assert_same, random_changes, random_evidence, random_map
+from sqlalchemy import create_engine, inspect
+
+from evermap.errors import InputError
+from evermap.maps.store import Provenance, migrations, open_store, schema
+
+# as a database told of itself when schema 1 was that of the day
+CHANGE_OF_SCHEMA_1 = """
+CREATE TABLE change (
+    revision INTEGER NOT NULL, position INTEGER NOT NULL, kind TEXT NOT NULL, landmark_ids TEXT NOT NULL,
+    stamp_from_s DOUBLE, stamp_to_s DOUBLE, dx_m DOUBLE, dy_m DOUBLE, rotation_rad DOUBLE, probability DOUBLE,
+    n_hits INTEGER NOT NULL, n_misses INTEGER NOT NULL,
+    PRIMARY KEY (revision, position), FOREIGN KEY(revision) REFERENCES revision (number)
+)"""
+
+
+def write(path: Path, revisions: int = 3) -> None:
+    with open_store(path, create=True) as store:
+        for seed in range(revisions):
+            living = random_map(seed)
+            store.commit(living, Provenance(), random_changes(seed, living), random_evidence(seed, living), parent=seed)
+
+
+def make_old(path: Path) -> None:
+    """A store as schema 1 had it, with the same content."""
+    with sqlite3.connect(path) as database:
+        rows = database.execute("SELECT * FROM change ORDER BY revision, position").fetchall()
+        named: dict[tuple[int, int], list[int]] = {}
+        for revision, position, landmark in database.execute(
+            "SELECT revision, position, landmark_id FROM change_landmark ORDER BY rank"
+        ):
+            named.setdefault((revision, position), []).append(landmark)
+        database.execute("DROP TABLE change_landmark")
+        database.execute("DROP TABLE change")
+        database.execute(CHANGE_OF_SCHEMA_1)
+        database.executemany(
+            f"INSERT INTO change VALUES ({', '.join('?' * 12)})",
+            [(*row[:3], json.dumps(named[row[:2]]), *row[3:]) for row in rows],
+        )
+        database.execute("UPDATE store SET schema_version = 1")
+    database.close()
+
+
+def tables(path: Path) -> object:
+    """Columns, keys and indices of every table."""
+    look = inspect(create_engine(f"sqlite:///{path}"))
+    return {
+        name: (
+            [(c["name"], str(c["type"]), c["nullable"]) for c in look.get_columns(name)],
+            look.get_pk_constraint(name)["constrained_columns"],
+            [(k["constrained_columns"], k["referred_table"]) for k in look.get_foreign_keys(name)],
+            [(i["name"], i["column_names"]) for i in look.get_indexes(name)],
+        )
+        for name in sorted(look.get_table_names())
+    }
+
+
+def test_schema_1_becomes_that_of_today(tmp_path: Path) -> None:
+    today, old = tmp_path / "today.evermap", tmp_path / "old.evermap"
+    write(today)
+    write(old)
+    make_old(old)
+    assert tables(old) != tables(today)
+    with open_store(old) as store:
+        assert store.head() == 3
+        for seed in range(3):
+            living = random_map(seed)
+            assert_same(store.load(seed + 1), living)
+            for mine, theirs in zip(store.changes(seed + 1), random_changes(seed, living), strict=True):
+                assert_same(mine, theirs)
+        assert len(store.evidence()) == sum(len(random_evidence(seed, random_map(seed))) for seed in range(3))
+        living = random_map(9)
+        store.commit(living, Provenance(), random_changes(9, living), parent=3)
+    assert tables(old) == tables(today)
+
+
+def test_a_migration_that_fails_leaves_the_old_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.evermap"
+    write(path)
+    make_old(path)
+    before = tables(path)
+
+    def fail(connection: object) -> None:
+        migrations.MIGRATIONS[0](connection)  # type: ignore[arg-type]
+        raise RuntimeError("half way")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(migrations, "migrate", None)
+        patch.setattr("evermap.maps.store.sql.migrate", lambda connection, version: fail(connection))
+        with pytest.raises(RuntimeError, match="half way"):
+            open_store(path)
+    assert tables(path) == before
+    with open_store(path) as store:
+        assert_same(store.load(), random_map(2))
+
+
+def test_there_is_a_step_from_every_schema_to_the_next() -> None:
+    assert len(migrations.MIGRATIONS) == schema.SCHEMA_VERSION - 1
+
+
+def test_a_newer_schema_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "m.evermap"
+    write(path, 1)
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE store SET schema_version = 99")
+    database.close()
+    content = path.read_bytes()
+    with pytest.raises(InputError) as caught:
+        open_store(path, create=True)
+    line = caught.value.one_line()
+    assert line.startswith(f"{path}: a map of schema version 99; this evermap, ")
+    assert f"knows up to {schema.SCHEMA_VERSION}" in line
+    assert "try: a newer evermap" in line
+    assert path.read_bytes() == content
