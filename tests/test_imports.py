@@ -36,9 +36,9 @@ RULES = {
     "runsummary": "errors types",
     "runfolder": "errors types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam maps sim io metrics viz "
-    "pipeline runsummary runfolder",
-    "demo": "errors types se2 config survival maps sim io metrics viz pipeline runfolder",
+    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam maps sim io metrics "
+    "viz pipeline runsummary runfolder demo",
+    "demo": "errors types se2 config survival maps lifelong sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types survival tracking io viz runsummary runfolder",
     "cli": "errors types config survival recurrence io sim metrics viz maps pipeline runfolder presence objects server "

@@ -136,7 +136,7 @@ class LivingConfig(Section):
     learn_sight: bool = Field(
         default=True, description="learn from where to where the sensor sees; off: its nominal field of view"
     )
-    most_sites: int = Field(default=5, ge=1, le=100, description="sites that are remembered of one clique, at most")
+    most_sites: int = Field(default=3, ge=1, le=100, description="sites that are remembered of one clique, at most")
 
 
 class SensorConfig(Section):

@@ -145,6 +145,51 @@ def run_session(
     return Session(after, replace(result, changes=changes), changes, now.evidence)
 
 
+def run_localization(
+    recording: Recording,
+    living: LivingMap,
+    config: Config | None = None,
+    *,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> SlamResult:
+    """Localise in a living map that stays as it is: causal, from an unknown pose, at a fixed cost per frame.
+
+    Args:
+        recording: what a reader returned; its truth is not looked at.
+        living: the map.
+        config: settings; None for the defaults.
+        realtime: process at the recording's pace.
+        progress: told after every frame.
+
+    Raises:
+        DataError: the map is empty, or the robot's place in it could not be found.
+    """
+    from evermap.config import Config
+    from evermap.errors import DataError
+    from evermap.lifelong.believe import predicted
+    from evermap.lifelong.session import admitted
+    from evermap.slam.localize_recording import localize
+
+    config = config or Config()
+    if not len(living.places):
+        raise DataError("the map is empty", field="--map", hint="evermap slam RECORDING --map FILE, without --localize")
+    recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    recording, living = admitted(recording, living)
+    p_site = predicted(living, config.living, float(recording.frames.stamp_s[0]))
+    prior, noise = _beliefs(recording, config)
+    warm_up()
+    return localize(
+        recording,
+        living.sighted_rows(p_site),
+        prior,
+        noise,
+        joint_m2=living.covariance_m2,
+        realtime=realtime,
+        progress=progress,
+    )
+
+
 def warm_up() -> None:
     """Compile the kernels, or load them where that was done before; `run_slam` does it by itself.
 

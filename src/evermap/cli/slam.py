@@ -79,6 +79,18 @@ def slam(
         float,
         typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
     ] = 0.02,
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="Continue this living map, or begin it: localise in it, find what changed, extend it.",
+            show_default=False,
+        ),
+    ] = None,
+    localize: Annotated[
+        bool, typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map stays.")
+    ] = False,
     shift: Annotated[
         list[str] | None,
         typer.Option(
@@ -107,6 +119,8 @@ def slam(
       evermap slam my-recording --out out/mine
       evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
       evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
+      evermap slam monday --map building.evermap
+      evermap slam tuesday --map building.evermap --localize
     """
     if init is not None:
         _write_template(init)
@@ -130,12 +144,18 @@ def slam(
     shifts = [parse_shift(text) for text in shift or []]
     if shifts and prior_map is None:
         raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force)
     recording = read_recording(recording_path, robot=robot)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force)
+    if map_file is not None:
+        from evermap.cli.slam_in_map import run_in_map
+
+        run_in_map(recording, config, map_file, out, localize=localize, realtime=realtime, as_json=as_json, force=force)
+        return
     prior = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
     run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force)
 
@@ -172,6 +192,19 @@ def run_and_write(
     show_run(summary, out, as_json=as_json, findings=explanations(result))
     if result.interrupted:
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
+
+
+def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: Method | None) -> None:
+    if map_file is None:
+        if localize:
+            raise ConfigError("needs a map", field="--localize", hint="--map FILE")
+        return
+    if prior_map is not None:
+        raise ConfigError("a living map takes no other one", field="--prior-map", hint="either --map or --prior-map")
+    if method is not None:
+        raise ConfigError(
+            "a living map finds changes by itself", field="--method", hint="--set living.search=gate, for example"
+        )
 
 
 def default_out(name: str) -> Path:

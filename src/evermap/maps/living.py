@@ -266,6 +266,31 @@ class LivingMap:
             clock=self.clock,
         )
 
+    def sighted_rows(self, p_site: FloatArray) -> Landmarks:
+        """Every place as a record of its own, in the order of `places`: what a robot may meet.
+
+        Args:
+            p_site: (S,) probability of every site.
+        """
+        site = np.searchsorted(self.sites.site_id, self.places.site_id)
+        member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)
+        rows = np.arange(len(self.places))
+        blocks = self.covariance_m2.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
+        return Landmarks(
+            landmark_id=self.places.landmark_id,
+            position_m=self.places.position_m,
+            covariance_m2=blocks,
+            class_id=self.members.class_id[member],
+            p_exists=np.where(self.members.deleted[member], 0.0, p_site[site]),
+            n_hits=self.places.n_hits,
+            n_misses=self.places.n_misses,
+            first_seen_s=self.sites.since_s[site],
+            last_seen_s=self.sites.seen_s[site],
+            class_names=self.class_names,
+            frame="prior_map",
+            clock=self.clock,
+        )
+
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
         """The map with an operator's word on one landmark; None leaves it as it is.
 

@@ -1,0 +1,100 @@
+"""`evermap slam --map`: one session of a living map, or localisation in it."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evermap.cli.summary import show_run
+from evermap.cli.terminal import command_line, progress_bar, warm_up, warn
+from evermap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.types import Recording, SlamResult
+
+
+def run_in_map(
+    recording: Recording,
+    config: Config,
+    map_file: Path,
+    out: Path,
+    *,
+    localize: bool,
+    realtime: bool,
+    as_json: bool,
+    force: bool,
+) -> None:
+    """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
+    from evermap.config import to_toml
+    from evermap.maps.store import Provenance, RevisionKind, open_store
+    from evermap.pipeline import run_localization, run_session
+
+    if realtime and not localize:
+        raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
+    if config.slam.unknown_ids:
+        raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
+    warm_up()
+    with open_store(map_file, create=not localize) as store:
+        parent = store.head()
+        living = store.load(parent)
+        start = time.perf_counter()
+        with progress_bar(recording.name) as progress:
+            if localize:
+                result = run_localization(recording, living, config, realtime=realtime, progress=progress)
+            else:
+                session = run_session(recording, living, config, progress=progress)
+                result = session.slam
+        elapsed_s = time.perf_counter() - start
+        _write(recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force)
+        if localize or result.interrupted:
+            return
+        if session.living is living:  # it was not found in the map
+            raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
+        stamps = recording.frames.stamp_s
+        store.commit(
+            session.living,
+            Provenance(
+                kind=RevisionKind.SESSION,
+                recording=recording.name,
+                source=recording.source,
+                command=command_line(),
+                config=to_toml(config),
+                seed=config.slam.seed,
+                stamp_from_s=float(stamps[0]),
+                stamp_to_s=float(stamps[-1]),
+                wall_s=elapsed_s,
+            ),
+            session.changes,
+            session.evidence,
+            parent=parent,
+        )
+
+
+def _write(
+    recording: Recording,
+    result: SlamResult,
+    config: Config,
+    out: Path,
+    elapsed_s: float,
+    *,
+    realtime: bool,
+    as_json: bool,
+    force: bool,
+) -> None:
+    from evermap.runfolder import RunInfo, write_run
+    from evermap.viz.change_words import explanations
+
+    info = RunInfo(
+        command=command_line(),
+        seeds={"slam": config.slam.seed},
+        processing_s=None if realtime else elapsed_s,
+        total_s=elapsed_s,
+    )
+    summary = write_run(out, recording, result, config, info=info, force=force)
+    for remark in summary["warnings"]:
+        warn(remark)
+    show_run(summary, out, as_json=as_json, findings=explanations(result))
+    if result.interrupted:
+        raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}; the map stays as it was")
