@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats as law
-from simulated_stays import as_seen, histories, two_looks_a_day
+from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
-from evermap.maps.learning import class_survival, learned_lives
+from evermap.maps.learning import NEWEST, class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
 from evermap.sim.classes import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
@@ -134,3 +135,41 @@ def test_forecasts_of_the_next_session_beat_the_general_purpose_prior_and_are_ca
         rows = (p >= low) & (p <= high)
         error = np.sqrt(np.mean(p[rows] * (1.0 - p[rows])) / rows.sum())
         assert abs(np.mean(y[rows]) - np.mean(p[rows])) < 3.0 * error + 0.01
+
+
+def test_places_differ_only_where_they_do() -> None:
+    """Half of the things stand where they are moved six times as often; the class knows only the average."""
+    rng = np.random.default_rng(5)
+    slow, fast = (ObjectClass("thing", count=15, stay=Duration(days), p_vanish=0.0) for days in (6.0, 1.0))
+    true = histories((slow, fast), END_S, rng, 0.0)
+    corner = np.array([[5.0, 5.0], [25.0, 5.0]])
+    by_place = np.repeat(corner, 15, axis=0)
+    stays = as_seen([TrueStay(s.thing, 0, s.site, s.start_s, s.end_s) for s in true], LOOKS_S, by_place)
+    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    here, there, elsewhere = (lives.of(0, np.array(place)).stay for place in (*corner, (95.0, 5.0)))
+    next_day = [float(np.exp(life.log_conditional_survival(DAY_S, 2.0 * DAY_S))) for life in (here, elsewhere, there)]
+    truth = np.exp([-1.0 / 6.0, -1.0])
+    error, error_of_class = np.abs(np.array(next_day)[[0, 2]] - truth), np.abs(next_day[1] - truth)
+    assert (error < 0.5 * error_of_class).all()
+    assert next_day[2] < next_day[1] < next_day[0]
+
+    # the same things, placed by lot: chunks are what their class is
+    by_lot = corner[rng.integers(0, 2, 30)]
+    alike = as_seen(histories((slow, slow), END_S, rng, 0.0), LOOKS_S, by_lot)
+    lives = learned_lives(replace(alike, class_id=0 * alike.class_id), Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    medians = [float(lives.of(0, place).stay.quantile(0.5)) for place in (*corner, np.array([95.0, 5.0]))]
+    assert max(medians) / min(medians) < 1.25
+
+
+def test_learning_does_not_depend_on_how_long_ago_a_class_was_first_seen() -> None:
+    """A class with more stays than are learned from: the newest count, whatever became of them."""
+    classes = (ObjectClass("swing", "hinge", count=8, stay=Duration(2.0)),)
+    looks_s = two_looks_a_day(180)
+    stays = as_seen(histories(classes, 180 * DAY_S, np.random.default_rng(6), 0.0), looks_s)
+    assert len(stays) > 1.5 * NEWEST
+    lives = learned_lives(stays, Lives(looks_s=looks_s[:-1]), looks_s[-1])
+    assert lives.of(0, np.zeros(2)).n_stays == NEWEST
+    mean, lower, upper = class_survival(stays, lives, 0, [2.0 * DAY_S])
+    assert lower < np.exp(-1.0) < upper
+    assert upper - lower < 0.15
+    assert np.exp(lives.of(0, np.zeros(2)).stay.log_survival(2.0 * DAY_S)) == pytest.approx(mean[0], rel=1e-2)
