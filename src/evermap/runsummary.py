@@ -109,6 +109,8 @@ def change_dict(change: MapChange) -> dict[str, Any]:
         "displacement_m": [_number(metres) for metres in change.displacement_m],
         "rotation_rad": _number(change.rotation_rad),
         "probability": _number(change.probability),
+        "hits": change.n_hits,
+        "misses": change.n_misses,
     }
 
 

@@ -79,6 +79,8 @@ def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
         if not move.swapped:
             axes.plot(*move.before_m.T, ls="", zorder=7, **mark)
         for start, end in zip(move.before_m, move.after_m, strict=True):
+            if np.array_equal(start, end):
+                continue
             arrow = FancyArrowPatch(
                 (start[0], start[1]),
                 (end[0], end[1]),
@@ -111,6 +113,8 @@ def _places(
         after = np.array([place[identity] for identity in ids])
         if change.kind is ChangeKind.SWAPPED:
             before = after[::-1]
+        elif not np.all(np.isfinite(change.displacement_m)):  # it was nowhere before
+            before = after
         else:
             before = se2.move_together(after, -np.array(change.displacement_m), -change.rotation_rad)
             place |= zip(ids, before, strict=True)

@@ -46,6 +46,13 @@ def what(change: MapChange) -> str:
     """The change without its time."""
     if change.kind is ChangeKind.SWAPPED:
         return f"{_group(change)} exchanged their identities"
+    if change.kind is ChangeKind.VANISHED:
+        return f"{_group(change)} vanished"
+    if change.kind is ChangeKind.APPEARED:
+        return f"{_group(change)} appeared"
+    if change.kind is ChangeKind.RETURNED:
+        far = math.hypot(*change.displacement_m)
+        return f"{_group(change)} returned" + (f", {far:.2f} m from where it was" if far > 0.0 else "")
     moved = f"moved by ({_signed(change.displacement_m[0])}, {_signed(change.displacement_m[1])}) m"
     if change.kind is ChangeKind.ROTATED:
         return f"{_group(change)} turned by {_signed(math.degrees(change.rotation_rad), 1)}° and {moved}"
@@ -68,6 +75,8 @@ def _when(change: MapChange, start_s: float) -> str:
     if math.isnan(change.stamp_from_s):
         return "before the session"
     early, late = change.stamp_from_s - start_s, change.stamp_to_s - start_s
+    if early < 0.0:
+        return f"since the last session, noticed {late:.0f} s after the start" if late >= 0.0 else "before the session"
     if round(early) == round(late):
         return f"{late:.0f} s after the start"
     return f"between {early:.0f} s and {late:.0f} s after the start"
