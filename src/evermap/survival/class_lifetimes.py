@@ -39,7 +39,7 @@ SHAPE_SPREAD = 0.5
 _LEVELS = np.linspace(math.log(3600.0), math.log(3650.0 * 86400.0), 12)
 _SPREADS = np.array([0.5, 1.0, 2.0, 4.0])
 """Between classes: means of log mean durations (an hour to ten years), and standard deviations about them."""
-_EDGES_S = np.concatenate([[0.0], np.geomspace(600.0, 1e9, 42)])
+_EDGES_S = np.concatenate([[0.0], np.geomspace(1800.0, 1e9, 23)])
 """Curves have constant hazards between these ages."""
 _INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 """Gauss-Legendre: where between two looks something arrived, as shares of the gap."""
