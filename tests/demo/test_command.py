@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -15,17 +16,32 @@ import evermap.demo
 from evermap.cli.main import app
 
 
+def outcome(what: str, *, holds: bool) -> dict[str, Any]:
+    return {"what": what, "value": 0.5, "least": 0.98, "most": None, "holds": holds}
+
+
 def fake_summary() -> dict[str, Any]:
-    errors = {"pose_rmse_m": 0.1234}
-    changes = {"moved": 5, "vanished": 2, "landmarks_mapped_then": 70}
-    session = {
-        "day": 4,
-        "changes": changes,
-        "changed": errors,
-        "unchanged": errors,
-        "from_scratch": {"pose_rmse_m": None},
+    week = {
+        "pose_rmse_m": 0.1234,
+        "precision": 0.75,
+        "recall": 0.5,
+        "existence_brier": 0.125,
+        "forecast_skill_over_as_is": None,
     }
-    return {"demo": {"sessions": [session]}, "warnings": []}
+    worse = {"weeks": [{**week, "precision": 1.0}, week], "sessions": [{"places": 60}, {"places": 77}]}
+    return {
+        "demo": {
+            "methods": {"static": {"label": "static SLAM", **worse}},
+            "expected": {"recall": outcome("recall of the map", holds=False)},
+        },
+        "timing": {
+            "demo": {
+                "session_cpu_s": {"static": [0.9, 0.25, 0.1]},
+                "expected": {"flat_cost": outcome("cost of a session", holds=True)},
+            }
+        },
+        "warnings": [],
+    }
 
 
 @pytest.fixture
@@ -42,15 +58,18 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return seen
 
 
-def test_prints_one_line_a_day(called, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["demo", "--out", str(tmp_path / "out"), "--seed", "9"])
+def test_prints_the_last_week_of_every_method(called, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = CliRunner().invoke(app, ["demo", "--out", str(out), "--seed", "9", "--days", "3", "--processes", "64"])
     assert result.exit_code == 0, result.stderr
     assert called["seed"] == 9
-    assert called["out"] == tmp_path / "out"
-    day = next(line for line in result.stdout.splitlines() if line.strip().startswith("4 "))
-    assert day.split("  ")[-1].strip() == "7 of 70"
-    assert day.count("12.3 cm") == 2
-    assert "–" in day
+    assert called["out"] == out
+    assert called["scenario"] == evermap.demo.Scenario(days=3)
+    assert called["processes"] == os.cpu_count()
+    line = next(line for line in result.stdout.splitlines() if "static SLAM" in line)
+    assert line.split()[-9:] == ["12.3", "cm", "0.750", "0.500", "0.125", "–", "77", "250", "ms"]
+    assert "recall of the map" in result.stdout
+    assert "cost of a session" not in result.stdout
     assert result.stderr == ""
 
 

@@ -1,4 +1,4 @@
-"""What a static map costs in a building where things come and go: `evermap demo`."""
+"""Four weeks in a building where things come and go, lived through with every method: `evermap demo`."""
 
 from __future__ import annotations
 

@@ -1,130 +1,202 @@
-"""What the study says, session by session, as plain values with stable keys: section `demo` of `summary.json`."""
+"""What the study says, as plain values with stable keys: section `demo` of `summary.json`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from evermap.demo.study import SERIES, Study, Visit
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap.demo.lifetimes import LearnedLife
+from evermap.demo.methods import METHODS
+from evermap.demo.scores import Counts, alignment_of, map_counts, pose_counts
+from evermap.demo.study import Study
+from evermap.metrics.existence import NEAR_M
+from evermap.types import FloatArray, Trajectory
 
-MOVED_M = 0.05
-"""Farther from its old place than this, a landmark has moved."""
+WEEK_DAYS = 7
+POSE_RATIO_BOUND, EXISTENCE_BOUND, COST_BOUND = 1.15, 0.98, 1.2
+"""What is expected of evermap: pose RMSE over the oracle's, precision and recall, cost of last week over first."""
+LIFETIME_BOUND = 0.9
+"""Share of the true quartiles of lifetimes that lie within the learned 95 % intervals: they hang together."""
 
-ALIGNMENT = "each session's path by an SE(2) alignment of its own, for evaluation only; landmarks by the same"
+COUNTED = (
+    f"poses in the map's frame, tied to the truth once, by the path of the first session; a claim (p_exists >= 0.5) is"
+    f" right within {NEAR_M} m; Brier scores over 'the landmark stands where it stood last' of every landmark that was"
+    " ever detected; nothing is left out"
+)
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
-    """How the world of one session differs from the one that was mapped.
+class Line:
+    """One method over all sessions.
 
     Attributes:
-        stayed, moved, vanished, appeared: ids of landmarks; `vanished` were there at first and are not any more.
-        displacement_m: how far each of `moved` is from its first place.
+        counts: one a session.
+        pose_truth_map: (3,) alignment by the first session.
     """
 
-    stayed: IntArray
-    moved: IntArray
-    displacement_m: FloatArray
-    vanished: IntArray
-    appeared: IntArray
+    counts: tuple[Counts, ...]
+    pose_truth_map: FloatArray
 
 
-def drift(then: Landmarks, now: Landmarks) -> Drift:
-    """Compare two true states of a building."""
-    ids, old, new = np.intersect1d(then.landmark_id, now.landmark_id, return_indices=True)
-    gap_m = np.linalg.norm(now.position_m[new] - then.position_m[old], axis=1)
-    return Drift(
-        stayed=ids[gap_m <= MOVED_M],
-        moved=ids[gap_m > MOVED_M],
-        displacement_m=gap_m[gap_m > MOVED_M],
-        vanished=np.setdiff1d(then.landmark_id, ids),
-        appeared=np.setdiff1d(now.landmark_id, ids),
-    )
+def lines_of(study: Study) -> dict[str, Line]:
+    """Every method compared with the truth, by name."""
+    paths = [session.truth for session in study.building.sessions]
+    lines = {}
+    for name, visits in study.visits.items():
+        pose = alignment_of(visits[0].path, _known(paths[0]))
+        counts = tuple(
+            pose_counts(visit.path, _known(paths[k]), pose) + map_counts(visit.snapshot, study.truth, k, pose)
+            for k, visit in enumerate(visits)
+        )
+        lines[name] = Line(counts, pose)
+    return lines
 
 
-def drifts(study: Study) -> tuple[Drift, ...]:
-    """One a session, against the truth of the first session, in the changing building."""
-    truths = [session.true_landmarks for session in study.changed.sessions]
-    assert truths[0] is not None
-    return tuple(drift(truths[0], truth) for truth in truths if truth is not None)
+def _known(path: Trajectory | None) -> Trajectory:
+    assert path is not None  # the simulation knows
+    return path
 
 
-def demo_dict(study: Study, seed: int) -> dict[str, Any]:
-    """All numbers. Shares are of the detections that had a prediction; None where there is nothing to divide by."""
-    sessions = [
-        {
-            "session": k + 1,
-            "day": study.changed.truths[k].day + 1,
-            "start_s": study.changed.truths[k].start_s,
-            "changes": _changes(study, k, now),
-            **{name: _errors(study.visits[name][k]) for name in SERIES},
-        }
-        for k, now in enumerate(drifts(study))
-    ]
+def week_of(study: Study) -> FloatArray:
+    """(S,) week of every session, from 0."""
+    return np.array([truth.day // WEEK_DAYS for truth in study.building.truths])
+
+
+def ratios(counts: Counts) -> dict[str, float | None]:
+    """Scores of summed counts; None where there is nothing to divide by."""
+    forecast, share = counts.forecast.brier, _over(counts.n_come_true, counts.forecast.n_statements)
+    return {
+        "pose_rmse_m": _root(_over(counts.pose_error2_m2, counts.n_poses)),
+        "pose_rmse_own_alignment_m": _root(_over(counts.own_error2_m2, counts.n_poses)),
+        "precision": counts.existence.precision,
+        "recall": counts.existence.recall,
+        "existence_brier": counts.existence.brier,
+        "forecast_brier": forecast,
+        "forecast_skill_over_as_is": _skill(forecast, counts.as_is.brier),
+        "forecast_skill_over_base_rate": _skill(forecast, None if share is None else share * (1.0 - share)),
+    }
+
+
+def demo_dict(study: Study, lines: dict[str, Line], lives: Sequence[LearnedLife], seed: int) -> dict[str, Any]:
+    """All numbers that are the same for the same seed."""
     return {
         "scenario": study.scenario.as_dict(),
         "seed": seed,
-        "alignment": ALIGNMENT,
-        "moved_threshold_m": MOVED_M,
-        "sessions": sessions,
-        "true_events": len(study.changed.events),
+        "counted": COUNTED,
+        "sessions": _sessions(study),
+        "methods": {name: _method(study, name, line) for name, line in lines.items()},
+        "lifetimes": {life.name: _life(life) for life in lives},
+        "true_events": len(study.building.events),
+        "expected": expected(study, lines, lives),
     }
 
 
-def _errors(visit: Visit) -> dict[str, float | None]:
-    """How far off one session was."""
-    poses, landmarks = visit.evaluation.poses, visit.evaluation.landmarks
-    numbers: dict[str, float | None] = dict.fromkeys(
-        ("pose_rmse_m", "pose_p10_m", "pose_p90_m", "heading_rmse_deg", "landmark_rmse_m", "landmark_median_m")
+def expected(study: Study, lines: dict[str, Line], lives: Sequence[LearnedLife]) -> dict[str, dict[str, Any]]:
+    """What was expected of the demonstration before it was run, and what came out."""
+    week = week_of(study)
+    first, last, whole = (
+        {name: ratios(_sum(line.counts, rows)) for name, line in lines.items()}
+        for rows in (week == 0, week == week[-1], week >= 0)
     )
-    if poses is not None:
-        low, high = np.percentile(poses.position_error_m, [10, 90])
-        numbers |= {
-            "pose_rmse_m": poses.rmse_m,
-            "pose_p10_m": float(low),
-            "pose_p90_m": float(high),
-            "heading_rmse_deg": poses.heading_rmse_deg,
-        }
-    if landmarks is not None and np.any(landmarks.scored):
-        numbers["landmark_rmse_m"] = landmarks.rmse_m
-        numbers["landmark_median_m"] = float(np.median(landmarks.error_m[landmarks.scored]))
-    numbers["outlier_share"] = visit.evaluation.nis.outlier_share
-    return numbers
-
-
-def _changes(study: Study, k: int, now: Drift) -> dict[str, float | int | None]:
-    """What has changed since the map was made, and what the estimator made of it in session `k`.
-
-    A moved landmark is 'believed' if most of its detections were, else 'rejected'; not every one was seen.
-    """
-    innovations = study.visits["changed"][k].result.innovations
-    rejected = innovations.p_inlier < 0.5
-    of_moved = np.isin(innovations.landmark_id, now.moved)
-    of_stayed = np.isin(innovations.landmark_id, now.stayed)
-    seen = np.isin(now.moved, innovations.landmark_id)
-    far = now.displacement_m[seen]
-    doubt = np.array([np.mean(rejected[innovations.landmark_id == name]) for name in now.moved[seen]])
+    growth = _over(last["static"]["pose_rmse_m"], first["static"]["pose_rmse_m"])
+    ratio = _over(last["evermap"]["pose_rmse_m"], last["oracle"]["pose_rmse_m"])
+    covers = [covered for life in lives for covered in life.covers]
+    precision, recall = whole["evermap"]["precision"], whole["evermap"]["recall"]
     return {
-        "landmarks_mapped_then": len(now.stayed) + len(now.moved) + len(now.vanished),
-        "moved": len(now.moved),
-        "vanished": len(now.vanished),
-        "appeared": len(now.appeared),
-        "moved_believed": int(np.count_nonzero(doubt < 0.5)),
-        "moved_rejected": int(np.count_nonzero(doubt >= 0.5)),
-        "believed_displacement_m": _median(far[doubt < 0.5]),
-        "rejected_displacement_m": _median(far[doubt >= 0.5]),
-        "moved_detection_share": _share(of_moved),
-        "moved_rejected_share": _share(rejected[of_moved]),
-        "stayed_rejected_share": _share(rejected[of_stayed]),
+        "static_error_grows": _outcome("pose RMSE of static SLAM, last week over first", growth, least=1.0),
+        "as_good_as_told": _outcome("pose RMSE of evermap over the oracle's, last week", ratio, most=POSE_RATIO_BOUND),
+        "precision": _outcome("precision of evermap's map, all sessions", precision, least=EXISTENCE_BOUND),
+        "recall": _outcome("recall of evermap's map, all sessions", recall, least=EXISTENCE_BOUND),
+        "lifetimes": _outcome(
+            "share of the true quartiles of lifetimes within the learned intervals",
+            _over(sum(covers), len(covers)),
+            least=LIFETIME_BOUND,
+        ),
     }
 
 
-def _share(which: BoolArray) -> float | None:
-    return float(np.mean(which)) if len(which) else None
+def cost(study: Study) -> dict[str, Any]:
+    """What sessions cost; times differ from run to run, so they are kept apart."""
+    week = week_of(study)
+    cpu_s = {name: np.array([visit.cpu_s for visit in visits]) for name, visits in study.visits.items()}
+    first, last = (float(np.median(cpu_s["evermap"][week == which])) for which in (0, week[-1]))
+    return {
+        "session_cpu_s": {name: times.tolist() for name, times in cpu_s.items()},
+        "expected": {
+            "flat_cost": _outcome("median time of a session of evermap, last week over first", last / first,
+                                  most=COST_BOUND)
+        },
+    }  # fmt: skip
 
 
-def _median(values: FloatArray) -> float | None:
-    return float(np.median(values)) if len(values) else None
+def _outcome(
+    what: str, value: float | None, *, least: float | None = None, most: float | None = None
+) -> dict[str, Any]:
+    holds = value is not None and (least is None or value >= least) and (most is None or value <= most)
+    return {"what": what, "value": value, "least": least, "most": most, "holds": holds}
+
+
+def _life(life: LearnedLife) -> dict[str, Any]:
+    """What was learned of a class, at the ages of the figure."""
+    return {
+        "stays": life.n_stays,
+        "ended": life.n_ended,
+        "age_days": life.age_days.tolist(),
+        "true_survival": life.truth.tolist(),
+        "survival": life.mean.tolist(),
+        "low": life.low.tolist(),
+        "high": life.high.tolist(),
+        "quartiles_covered": list(life.covers),
+    }
+
+
+def _sessions(study: Study) -> list[dict[str, Any]]:
+    """The world, session by session."""
+    truth = study.truth
+    as_first = np.all(truth.position_m == truth.position_m[0], axis=2)
+    return [
+        {
+            "session": k + 1,
+            "day": known.day + 1,
+            "start_s": known.start_s,
+            "landmarks": int(truth.there[k].sum()),
+            "changed": int(truth.changed[k].sum()),
+            "where_first_mapped": int(as_first[k].sum()),
+        }
+        for k, known in enumerate(study.building.truths)
+    ]
+
+
+def _method(study: Study, name: str, line: Line) -> dict[str, Any]:
+    week = week_of(study)
+    labels = {method.name: (method.label, method.says) for method in METHODS}
+    label, says = labels[name]
+    sizes = [{"landmarks": len(v.snapshot.landmarks), "places": len(v.snapshot.place_id), "sites": v.snapshot.n_sites}
+             for v in study.visits[name]]  # fmt: skip
+    return {
+        "label": label,
+        "says": says,
+        "sessions": [ratios(counts) | size for counts, size in zip(line.counts, sizes, strict=True)],
+        "weeks": [ratios(_sum(line.counts, week == which)) for which in np.unique(week)],
+        "whole": ratios(_sum(line.counts, week >= 0)),
+    }
+
+
+def _sum(counts: tuple[Counts, ...], rows: Any) -> Counts:
+    return sum((counts[k] for k in np.flatnonzero(rows)), start=Counts())
+
+
+def _over(value: float | None, by: float | None) -> float | None:
+    return value / by if value is not None and by else None
+
+
+def _root(square: float | None) -> float | None:
+    return None if square is None else float(np.sqrt(square))
+
+
+def _skill(brier: float | None, reference: float | None) -> float | None:
+    """1 for a perfect forecast, 0 for one no better than the reference."""
+    return 1.0 - brier / reference if brier is not None and reference else None

@@ -9,12 +9,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from evermap.demo.methods import method_named
 from evermap.demo.scenario import Scenario
 from evermap.demo.study import Progress, run_study
 from evermap.runfolder import SUMMARY, RunFolder, RunInfo, check_replaceable, summary_text, write_run
 from evermap.sim import ChangeEvent
 
 TRUE_EVENTS = "true_events.jsonl"
+MAP = "map.evermap"
 
 
 def run_demo(
@@ -27,49 +29,55 @@ def run_demo(
     command: str = "",
     force: bool = False,
 ) -> dict[str, Any]:
-    """Map a changing building once, live with the map, and show what that costs. Returns `summary.json`'s content.
+    """Live in a changing building for four weeks, with every method. Returns `summary.json`'s content.
 
-    The folder is that of the last session's run (see `runfolder.write_run`), with a section `demo` in the summary,
-    the story at the top of the report, `figures/demo.png` and the simulator's `true_events.jsonl`.
+    The folder is that of evermap's last session (see `runfolder.write_run`), with a section `demo` in the summary, the
+    story at the top of the report, its figures, the map with all its revisions and the simulator's true events.
 
     Args:
         out: folder to write.
         seed: of the simulation; same seed, same numbers.
         progress: told seconds of recordings done and in all.
-        scenario: how much is simulated; default: 6 patrols of 165 s on 6 days.
-        processes: runs at a time; above 1 the calling script needs its `__main__` guard.
+        scenario: how much is simulated; default: 56 patrols of 110 s on 28 days.
+        processes: methods at a time; above 1 the calling script needs its `__main__` guard.
         command: what was typed, for the summary.
         force: replace `out` whatever it holds.
 
     Raises:
         ConfigError: `out` must not be replaced, or the scenario is out of range.
     """
-    from evermap.demo.figure import draw_demo
-    from evermap.demo.numbers import demo_dict
-    from evermap.demo.story import demo_section
+    from evermap.demo.hero import draw_hero
+    from evermap.demo.lifetime_figure import draw_lifetimes
+    from evermap.demo.lifetimes import learned_lives
+    from evermap.demo.numbers import cost, demo_dict, lines_of
+    from evermap.demo.score_figure import draw_scores
+    from evermap.demo.story import demo_sections
     from evermap.viz.style import save_png, save_svg
 
     check_replaceable(out, force=force)
     scenario = scenario or Scenario()
-    config = scenario.estimator()
+    config = method_named("evermap").config()
     start = time.perf_counter()
-    study = run_study(scenario, seed, config, processes=processes, progress=progress)
-    numbers = demo_dict(study, seed)
-    hero = draw_demo(study)
-    last = study.visits["changed"][-1]
-    info = RunInfo(
-        command=command, seeds={"simulation": seed, "slam": config.slam.seed}, total_s=time.perf_counter() - start
-    )
     with RunFolder(out, force=force) as folder:
+        study = run_study(scenario, seed, store=folder.path(MAP), processes=processes, progress=progress)
+        lines, lives = lines_of(study), learned_lives(study)
+        numbers, costs = demo_dict(study, lines, lives, seed), cost(study)
+        figures = (draw_hero(study, lines), draw_scores(study, lines), draw_lifetimes(lives))
+        info = RunInfo(
+            command=command, seeds={"simulation": seed, "slam": config.slam.seed}, total_s=time.perf_counter() - start
+        )
         # the run in a folder of its own first: what is added must not be half there either
         run = folder.path("run")
-        summary = write_run(run, last.recording, last.result, config, info=info, sections=[demo_section(numbers, hero)])
+        sections = demo_sections(numbers, costs, figures)
+        summary = write_run(run, study.building.sessions[-1], study.result, config, info=info, sections=sections)
         for item in run.iterdir():
             item.rename(folder.path(item.name))
         run.rmdir()
-        save_png(hero.figure, folder.path("figures/demo.png"))
-        save_svg(hero.figure, folder.path("figures/demo.svg"))
-        folder.path(TRUE_EVENTS).write_text(_events_text(study.changed.events), encoding="utf-8")
+        for figure in figures:
+            save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
+            save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
+        folder.path(TRUE_EVENTS).write_text(_events_text(study.building.events), encoding="utf-8")
+        summary["timing"] |= {"demo": costs}
         summary |= {"demo": numbers, "outputs": folder.files()}
         folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     return summary

@@ -2,105 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
 from evermap.viz.report import ReportSection
 from evermap.viz.style import NamedFigure
 
-NOT_YET = (
-    "evermap does nothing about it yet: it takes a map as true for ever, and neither notices that a landmark has moved,"
-    " vanished or come back, nor mends the map. That is the work ahead, and these numbers are what it has to beat."
+_COLUMNS = (
+    ("pose_rmse_m", "position error"),
+    ("precision", "precision"),
+    ("recall", "recall"),
+    ("existence_brier", "Brier, existence"),
+    ("forecast_skill_over_as_is", "forecast skill"),
 )
 
 
-def demo_section(numbers: Mapping[str, Any], figure: NamedFigure) -> ReportSection:
-    """The story with its table and figure; `numbers` are those of `demo_dict`."""
-    sessions = numbers["sessions"]
-    last = sessions[-1]
+def demo_sections(
+    numbers: Mapping[str, Any], cost: Mapping[str, Any], figures: Sequence[NamedFigure]
+) -> tuple[ReportSection, ...]:
+    """The story; `numbers` are those of `demo_dict`, `cost` of `cost`; figures: hero, scores, lifetimes."""
+    hero, scores, lifetimes = figures
     html = (
-        f"<p>A robot maps a simulated building on day 1 and then patrols it once a day, believing that map."
-        f" {_what_happened(last)}</p>"
-        f"<p>{_what_it_costs(sessions)}</p>"
-        f"<p>{_why(sessions)}</p>"
-        f'<p class="note"><strong>Not yet done.</strong> {escape(NOT_YET)}</p>'
-        f"{_table(sessions)}"
-        "<p>Position error: RMSE in centimetres after an alignment of each path of its own (evaluation only; the"
-        " estimator never sees the truth). <em>Nothing changes</em>: the same building, robot, patrols and noise"
-        " with all changes switched off. <em>No map kept</em>: the changing building, mapped from scratch every day."
-        " Rejected: detections whose landmark moved, or stayed where it was, that were judged to be outliers. True"
-        " changes are in <code>true_events.jsonl</code>; everything below this section is about the last day in"
-        " the changing building.</p>"
+        f"<p>A robot patrols a simulated building for {numbers['scenario']['days']} days,"
+        f" {numbers['scenario']['sessions_per_day']} times a day. {_what_happened(numbers)} The same recordings go,"
+        " session after session, into one map for each of these methods; they are one engine with parts switched"
+        f" off:</p>{_who(numbers)}"
     )
-    return ReportSection("What a map that never changes costs", html, (figure,))
-
-
-def _what_happened(session: Mapping[str, Any]) -> str:
-    changes = session["changes"]
-    return (
-        f"By day {session['day']}, {changes['moved']} of its {changes['landmarks_mapped_then']} landmarks have moved,"
-        f" {changes['vanished']} have vanished and {changes['appeared']} new ones stand about."
-    )
-
-
-def _what_it_costs(sessions: list[Mapping[str, Any]]) -> str:
-    """Only what these very numbers say; another seed may tell another story."""
-    first, later = sessions[0], sessions[1:]
-    changed = [s["changed"]["pose_rmse_m"] for s in later if s["changed"]["pose_rmse_m"] is not None]
-    unchanged = [s["unchanged"]["pose_rmse_m"] for s in later if s["unchanged"]["pose_rmse_m"] is not None]
-    if not changed or not unchanged or first["changed"]["pose_rmse_m"] is None:
-        return "There is too little truth to say what that costs."
-    mine, other = sum(changed) / len(changed), sum(unchanged) / len(unchanged)
     text = (
-        f"On the day the map is made the position error is {100 * first['changed']['pose_rmse_m']:.1f} cm. On the later"
-        f" days it is {100 * mine:.1f} cm on average, up to {100 * max(changed):.1f} cm, where things"
-        f" change, and {100 * other:.1f} cm where nothing does"
+        f"<p>In the last week:</p>{_table(numbers, cost)}"
+        f"<p>Counted are {escape(numbers['counted'])}. Forecast skill is 1 for what was always right, 0 for no better"
+        " than 'all stays as it truly is', and negative for worse. A map that is wrong about now is wrong about"
+        " tomorrow.</p>"
+        f"<p>What was expected before it was run:</p>{_expected(numbers, cost)}"
+        "<p>All true changes are in <code>true_events.jsonl</code>, evermap's map with a revision a session in"
+        " <code>map.evermap</code> (<code>evermap map log</code> reads it). Everything below is about evermap's last"
+        " session.</p>"
     )
-    ratio = mine / other
-    return text + (f": {ratio:.1f} times as much." if ratio >= 1.1 else ": in this run the changes hardly hurt.")
+    return (
+        ReportSection("Four weeks in one map", html, (hero,)),
+        ReportSection("How right, how sure, how large, how dear", text, (scores, lifetimes)),
+    )
 
 
-def _why(sessions: list[Mapping[str, Any]]) -> str:
-    """What became of the moved landmarks: the robust kernel is all that stands between the old map and the robot."""
-    day, changes = sessions[-1]["day"], sessions[-1]["changes"]
-    believed, rejected = changes["moved_believed"], changes["moved_rejected"]
-    text = f"Of the moved landmarks that were seen on day {day}, "
-    if rejected:
-        text += (
-            f"{rejected} (by {changes['rejected_displacement_m']:.1f} m, median) are too far from their old place to be"
-            " believed: the robust kernel rejects their detections, and the robot has to do without them."
-        )
-    if believed:
-        text += (" " if rejected else "") + (
-            f"{believed} (by {changes['believed_displacement_m']:.1f} m) are {'still ' if rejected else ''}near enough"
-            " to pass for a mistake of the map: the estimate compromises, and is drawn off with them."
-        )
-    if not (believed or rejected):
-        return ""
-    return f"{text} And it starts from zero every day: it judges detections, but learns nothing about the map."
+def _what_happened(numbers: Mapping[str, Any]) -> str:
+    sessions = numbers["sessions"]
+    first, last = sessions[0], sessions[-1]
+    return (
+        f"Doors open and close, things are moved, taken away and brought back: {numbers['true_events']} changes. Of the"
+        f" {first['landmarks']} landmarks that stood there in the first session, {last['where_first_mapped']} stand in"
+        " the same place in the last."
+    )
 
 
-def _table(sessions: list[Mapping[str, Any]]) -> str:
+def _who(numbers: Mapping[str, Any]) -> str:
     from evermap.viz.tables import table
 
-    head = ("day", "moved", "vanished", "new", "error, things change", "error, nothing changes", "error, no map kept",
-            "rejected, moved", "rejected, stayed")  # fmt: skip
+    rows = [(escape(m["label"]), escape(m["says"])) for m in numbers["methods"].values()]
+    return table(("method", "what it does about change"), rows)
+
+
+def _table(numbers: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
+    from evermap.viz.tables import table
+
+    head = ("method", *(title for _, title in _COLUMNS), "places", "time a session")
     rows = [
-        (
-            str(s["day"]),
-            *(str(s["changes"][name]) for name in ("moved", "vanished", "appeared")),
-            *(_centimetres(s[name]["pose_rmse_m"]) for name in ("changed", "unchanged", "from_scratch")),
-            *(_percent(s["changes"][f"{name}_rejected_share"]) for name in ("moved", "stayed")),
-        )
-        for s in sessions
+        (escape(method["label"]), *cells_of(method), f"{median_ms(cost['session_cpu_s'][name]):.0f} ms")
+        for name, method in numbers["methods"].items()
     ]
     return table(head, rows, numbers=tuple(range(1, len(head))))
 
 
-def _centimetres(value: float | None) -> str:
-    return "–" if value is None else f"{100 * value:.1f} cm"
+def cells_of(method: Mapping[str, Any]) -> tuple[str, ...]:
+    """A method's last week as text: error, precision, recall, Brier score, forecast skill, places."""
+    week = method["weeks"][-1]
+    error = week["pose_rmse_m"]
+    scores = [week[name] for name, _ in _COLUMNS[1:]]
+    return (
+        "–" if error is None else f"{100 * error:.1f} cm",
+        *("–" if score is None else f"{score:.3f}" for score in scores),
+        str(method["sessions"][-1]["places"]),
+    )
 
 
-def _percent(value: float | None) -> str:
-    return "–" if value is None else f"{value:.0%}"
+def median_ms(cpu_s: Sequence[float]) -> float:
+    """Median time of a session [ms]."""
+    from statistics import median
+
+    return 1e3 * median(cpu_s)
+
+
+def _expected(numbers: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
+    from evermap.viz.tables import table
+
+    outcomes = [*numbers["expected"].values(), *cost["expected"].values()]
+    return table(("what", "expected", "here", ""), [_row(outcome) for outcome in outcomes], numbers=(1, 2))
+
+
+def _row(outcome: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    bound = f"at least {outcome['least']:g}" if outcome["least"] is not None else f"at most {outcome['most']:g}"
+    value = "–" if outcome["value"] is None else f"{outcome['value']:.3f}"
+    return escape(outcome["what"]), bound, value, "holds" if outcome["holds"] else "<strong>falls short</strong>"

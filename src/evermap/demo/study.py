@@ -1,140 +1,227 @@
-"""The experiment: map a building once, live with that map for days, and compare with two ways that do not age.
-
-Three series over the same patrols:
-
-* `changed`: the map of the first session is believed in all later ones, while the building changes;
-* `unchanged`: the same, in a building where nothing changes: same robot, same drive, same noise;
-* `from_scratch`: the changing building again, mapped anew in every session: no memory, so nothing to be wrong about.
-"""
+"""The experiment: the same recordings through every method, session after session into one map each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from evermap.demo.methods import METHODS, Method
 from evermap.demo.scenario import Scenario
+from evermap.demo.scores import Snapshot
+from evermap.demo.truth import Truth, truth_of
 from evermap.sim import BuildingSimulation
-from evermap.types import Landmarks, Recording, SlamResult
+from evermap.types import IntArray, MapChange, Recording, SlamResult, Trajectory
 
 if TYPE_CHECKING:
-    from evermap.config import Config
-    from evermap.metrics.summary import Evaluation
+    from evermap.config import Config, LivingConfig
+    from evermap.maps.living import LivingMap
+    from evermap.pipeline import Session
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-SERIES = ("changed", "unchanged", "from_scratch")
 Progress = Callable[[float, float], None]
 """Called with seconds of recordings that are done, and seconds in all."""
 
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One session, estimated and compared with the truth."""
+    """One session of one method.
 
-    recording: Recording
-    result: SlamResult
-    evaluation: Evaluation
+    Attributes:
+        path: where the robot was, in the frame of the method's map.
+        snapshot: what the map said afterwards.
+        changes: what it says has changed.
+        cpu_s: time of the processor.
+    """
+
+    path: Trajectory
+    snapshot: Snapshot
+    changes: tuple[MapChange, ...]
+    cpu_s: float
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """Both buildings and what was estimated in them: by series, one visit a session."""
+    """All that was simulated and estimated.
+
+    Attributes:
+        scenario, building, truth: the world.
+        visits: by name of the method, one a session.
+        living: evermap's map in the end.
+        result: evermap's last session.
+    """
 
     scenario: Scenario
-    changed: BuildingSimulation
-    unchanged: BuildingSimulation
+    building: BuildingSimulation
+    truth: Truth
     visits: dict[str, tuple[Visit, ...]]
+    living: LivingMap
+    result: SlamResult
 
 
 @dataclass(frozen=True, slots=True)
-class _Job:
-    """One run of the estimator: which series and session, and with which map."""
+class _Day:
+    """A day's sessions of one method: what a worker is asked to do.
 
-    series: str
-    session: int
-    recording: Recording
-    prior_map: Landmarks | None = None
+    Attributes:
+        method: which.
+        recordings: the day's, without truth.
+        changed: for each, landmarks that changed since the session before; only who is told looks at it.
+        until_s: for each, when the next session begins; nan where there is none.
+        living: the map of the evening before, None on the first day.
+        store: file that gets a revision a session, None for none.
+    """
+
+    method: Method
+    recordings: tuple[Recording, ...]
+    changed: tuple[IntArray, ...]
+    until_s: tuple[float, ...]
+    living: LivingMap | None
+    store: Path | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Evening:
+    """What a worker answers: the day's visits, the map, and the last session."""
+
+    visits: tuple[Visit, ...]
+    living: LivingMap
+    result: SlamResult
 
 
 def run_study(
-    scenario: Scenario, seed: int, config: Config, *, processes: int = 1, progress: Progress | None = None
+    scenario: Scenario,
+    seed: int,
+    *,
+    methods: Sequence[Method] = METHODS,
+    store: Path | None = None,
+    processes: int = 1,
+    progress: Progress | None = None,
 ) -> Study:
-    """Simulate, estimate, compare.
+    """Simulate, and estimate in every way.
 
     Args:
         scenario: how much.
         seed: of the simulation.
-        config: of the estimator.
-        processes: how many runs at a time; above 1 a script that calls this needs its `__main__` guard.
-        progress: told after every run.
+        methods: what is compared; evermap must be among them.
+        store: file that gets evermap's map, a revision a session.
+        processes: how many methods at a time; above 1 a script that calls this needs its `__main__` guard.
+        progress: told after every day of every method.
 
     Raises:
         KeyboardInterrupt: nothing is kept of a comparison that is not finished.
     """
-    changed, unchanged = scenario.simulate(seed)
-    buildings = {"changed": changed, "unchanged": unchanged}
-    last = range(1, scenario.sessions)
-    results: dict[tuple[str, int], SlamResult] = {}
-    total_s = scenario.patrol_s * (3 * scenario.sessions - 1)
+    building = scenario.simulate(seed)
+    truth = truth_of(building)
+    visits: dict[str, list[Visit]] = {method.name: [] for method in methods}
+    evening: dict[str, _Evening] = {}
+    total_s = scenario.patrol_s * scenario.sessions * len(methods)
+    done_s = 0.0
 
-    def run_all(jobs: list[_Job], executor: Executor | None) -> None:
-        for job, result in _run(jobs, config, executor):
-            results[job.series, job.session] = result
-            if progress is not None:
-                progress(len(results) * scenario.patrol_s, total_s)
+    def next_day(method: Method) -> _Day:
+        first = len(visits[method.name])
+        rows = range(first, first + scenario.sessions_per_day)
+        return _Day(
+            method=method,
+            # the estimator sees no truth
+            recordings=tuple(replace(building.sessions[k], truth=None, true_landmarks=None) for k in rows),
+            changed=tuple(np.flatnonzero(truth.changed[k]) for k in rows),
+            until_s=tuple(building.truths[k + 1].start_s if k + 1 < len(truth) else np.nan for k in rows),
+            living=evening[method.name].living if first else None,
+            store=store if method.name == "evermap" else None,
+        )
 
-    with _workers(processes) as executor:
-        run_all([_Job(name, 0, world.sessions[0]) for name, world in buildings.items()], executor)
-        jobs = [_Job("from_scratch", k, changed.sessions[k]) for k in last]
-        jobs += [
-            _Job(name, k, world.sessions[k], results[name, 0].landmarks)
-            for k in last
-            for name, world in buildings.items()
-        ]
-        run_all(jobs, executor)
-    results["from_scratch", 0] = results["changed", 0]  # the first session has no memory in any case
-    buildings["from_scratch"] = changed
-    visits = {
-        name: tuple(_visit(recording, results[name, k]) for k, recording in enumerate(buildings[name].sessions))
-        for name in SERIES
-    }
-    return Study(scenario, changed, unchanged, visits)
-
-
-def _visit(recording: Recording, result: SlamResult) -> Visit:
-    from evermap.metrics.summary import compare_with_truth
-
-    return Visit(recording, result, compare_with_truth(recording, result))
-
-
-def _run(jobs: list[_Job], config: Config, executor: Executor | None) -> Iterator[tuple[_Job, SlamResult]]:
-    """Jobs with their results, in the order in which they finish."""
-    blind = [replace(job, recording=replace(job.recording, truth=None, true_landmarks=None)) for job in jobs]
-    if executor is None:
-        for job in blind:
-            yield job, _estimate(job, config)
-        return
-    pending: dict[Future[SlamResult], _Job] = {executor.submit(_estimate, job, config): job for job in blind}
-    for done in as_completed(pending):
-        yield pending[done], done.result()
+    with _workers(processes) as submit:
+        running = {submit(next_day(method)): method for method in methods}
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                method, answer = running.pop(future), future.result()
+                evening[method.name] = answer
+                visits[method.name] += answer.visits
+                done_s += scenario.patrol_s * scenario.sessions_per_day
+                if progress is not None:
+                    progress(done_s, total_s)
+                if len(visits[method.name]) < scenario.sessions:
+                    running[submit(next_day(method))] = method
+    return Study(
+        scenario=scenario,
+        building=building,
+        truth=truth,
+        visits={name: tuple(series) for name, series in visits.items()},
+        living=evening["evermap"].living,
+        result=evening["evermap"].result,
+    )
 
 
-def _estimate(job: _Job, config: Config) -> SlamResult:
-    from evermap.pipeline import run_slam
+def _live_through(day: _Day) -> _Evening:
+    """A day of one method; the same in a worker and here."""
+    from evermap.pipeline import run_session, warm_up
 
-    result = run_slam(job.recording, config, prior_map=job.prior_map)
-    if result.interrupted:
-        raise KeyboardInterrupt
-    return result
+    warm_up()  # compiling is no part of the first session
+    config, living, visits = day.method.config(), day.living, []
+    for recording, changed, until_s in zip(day.recordings, day.changed, day.until_s, strict=True):
+        if day.method.is_told and living is not None:
+            living = living.without(changed)
+        start_s = time.process_time()
+        session = run_session(recording, living, config)
+        cpu_s = time.process_time() - start_s
+        if session.slam.interrupted:
+            raise KeyboardInterrupt
+        living = session.living
+        if day.store is not None:
+            _keep(day.store, recording, session, config, cpu_s)
+        visits.append(
+            Visit(session.slam.trajectory, snapshot_of(living, config.living, until_s), session.changes, cpu_s)
+        )
+    assert living is not None
+    return _Evening(tuple(visits), living, session.slam)
+
+
+def snapshot_of(living: LivingMap, config: LivingConfig, until_s: float) -> Snapshot:
+    """What a map says now and expects at `until_s`, nan for no forecast."""
+    from evermap.lifelong.believe import predicted
+
+    site = np.searchsorted(living.sites.site_id, living.places.site_id)
+    later = living.sites.p_here if np.isnan(until_s) else predicted(living, config, until_s)
+    return Snapshot(
+        landmarks=living.landmarks(),
+        place_id=living.places.landmark_id,
+        place_m=living.places.position_m,
+        p_now=living.sites.p_here[site],
+        p_next=later[site],
+        n_sites=len(living.sites),
+    )
+
+
+def _keep(where: Path, recording: Recording, session: Session, config: Config, wall_s: float) -> None:
+    """One more revision of the map's file."""
+    from evermap.config import to_toml
+    from evermap.maps.store import Provenance, open_store
+
+    store = open_store(where, create=True)
+    stamps = recording.frames.stamp_s
+    provenance = Provenance(
+        recording=recording.name,
+        source=recording.source,
+        config=to_toml(config),
+        stamp_from_s=float(stamps[0]),
+        stamp_to_s=float(stamps[-1]),
+        wall_s=wall_s,
+    )
+    store.commit(session.living, provenance, session.changes, session.evidence, parent=store.head())
 
 
 @contextmanager
-def _workers(processes: int) -> Iterator[Executor | None]:
-    """Processes to run in, or None for this one. An interrupt drops what waits and lets what runs end."""
+def _workers(processes: int) -> Iterator[Callable[[_Day], Future[_Evening]]]:
+    """Who lives through days: processes, or this one. An interrupt drops what waits and lets what runs end."""
     if processes <= 1:
-        yield None
+        yield _at_once
         return
     import multiprocessing
     import os
@@ -145,7 +232,7 @@ def _workers(processes: int) -> Iterator[Executor | None]:
     context = multiprocessing.get_context("spawn")  # a fork would copy locks of threads that it does not copy
     with ProcessPoolExecutor(processes, mp_context=context, initializer=_ignore_interrupts) as executor:
         try:
-            yield executor
+            yield lambda day: executor.submit(_live_through, day)
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
@@ -155,6 +242,12 @@ def _workers(processes: int) -> Iterator[Executor | None]:
                     del os.environ[name]
                 else:
                     os.environ[name] = value
+
+
+def _at_once(day: _Day) -> Future[_Evening]:
+    done: Future[_Evening] = Future()
+    done.set_result(_live_through(day))
+    return done
 
 
 def _ignore_interrupts() -> None:
