@@ -12,7 +12,7 @@ from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.kernels import NOISE_NAMES
-from evermap.slam.noise import START
+from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Problem, independent
 from evermap.slam.streaming import Outcome, PriorMap, StreamingSlam
 from evermap.types import (
@@ -239,11 +239,18 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
 
 def parameters(outcome: Outcome, prior: CalibrationPrior) -> tuple[ParameterEstimate, ...]:
     """Calibration states and noise levels with their uncertainty and what was believed before."""
-    states = [
+    return described(outcome.estimate.states, outcome.states_covariance, outcome.noise, prior)
+
+
+def described(
+    states: FloatArray, covariance: FloatArray, fit: NoiseFit, prior: CalibrationPrior
+) -> tuple[ParameterEstimate, ...]:
+    """Calibration states (9,) with their covariance (9, 9), and noise levels, as records."""
+    estimates = [
         ParameterEstimate(
             name=spec.name,
-            value=float(outcome.estimate.states[k]),
-            sigma=float(np.sqrt(outcome.states_covariance[k, k])) if prior.free[k] else 0.0,
+            value=float(states[k]),
+            sigma=float(np.sqrt(covariance[k, k])) if prior.free[k] else 0.0,
             prior_mean=float(prior.mean[k]),
             prior_sigma=float(prior.sigma[k]) if prior.free[k] else 0.0,
             unit=spec.unit,
@@ -253,9 +260,9 @@ def parameters(outcome: Outcome, prior: CalibrationPrior) -> tuple[ParameterEsti
         for k, spec in enumerate(SPECS)
     ]
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
-    levels = np.concatenate([outcome.noise.noise.detection, outcome.noise.noise.odometry])
+    levels = np.concatenate([fit.noise.detection, fit.noise.odometry])
     started = np.concatenate([START.detection, START.odometry])
-    relative = np.concatenate([outcome.noise.detection_relative, outcome.noise.odometry_relative])
+    relative = np.concatenate([fit.detection_relative, fit.odometry_relative])
     meanings = (
         "noise of a range",
         "noise of a bearing",
@@ -270,7 +277,7 @@ def parameters(outcome: Outcome, prior: CalibrationPrior) -> tuple[ParameterEsti
         ParameterEstimate(name, float(level), float(level * r), float(s), float("nan"), unit, meaning=meaning)
         for name, level, r, s, unit, meaning in zip(names, levels, relative, started, units, meanings, strict=True)
     ]
-    return (*states, *noise)
+    return (*estimates, *noise)
 
 
 def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:

@@ -20,8 +20,8 @@ from evermap.slam.kernels import (
     odometry_covariance,
     sandwich,
 )
-from evermap.slam.problem import Estimate, Noise, Problem
-from evermap.types import FloatArray, IntArray
+from evermap.slam.problem import Drive, Estimate, Noise, Problem
+from evermap.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,15 +41,23 @@ class Motion:
     @classmethod
     def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
         """From pose `row - 1` to pose `row`."""
-        drive, stamp = problem.drive, problem.stamp_s
+        return cls.over(
+            problem.drive, problem.stamp_s[row - 1], problem.stamp_s[row], states, problem.prior.free, noise
+        )
+
+    @classmethod
+    def over(
+        cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
+    ) -> Motion:
+        """Between two instants, with (9,) calibration states of which some are `free`."""
         increment, by_states = np.zeros(3), np.zeros((3, 4))
         kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
         integrate_odometry(
             drive.stamp_s,
             drive.velocity,
             drive.unknown,
-            stamp[row - 1],
-            stamp[row],
+            start_s,
+            stop_s,
             states,
             increment,
             by_states,
@@ -57,7 +65,7 @@ class Motion:
             covariance,
         )
         odometry_covariance(kinds, covariance, noise.odometry**2, covariance)
-        return cls(increment, by_states * problem.prior.free[5:], covariance)
+        return cls(increment, by_states * free[5:], covariance)
 
 
 class IncrementalSolver(Protocol):

@@ -1,0 +1,307 @@
+"""Where the robot is in a map that is not changed by it: pose and calibration, frame after frame, at a fixed cost.
+
+An error-state extended Kalman filter of the newest pose and the calibration states. What a frame costs depends on what
+is in view, not on the size of the map: of its places only those used last are considered (see `schmidt`), and only the
+neighbourhood is expected. Where the robot starts is not known; the same search finds it again when it was carried away.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap import se2
+from evermap.sensing.visibility import (
+    RANGE_MARGIN_M,
+    WORTH_A_MISS,
+    detection_probability,
+)
+from evermap.slam.border import drive_on
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.kernels import AT_PLACES
+from evermap.slam.known_places import KnownPlaces, Neighbourhood
+from evermap.slam.local_track import LEAST_BELIEF, LocalTrack, Placed
+from evermap.slam.problem import Drive, Noise
+from evermap.slam.schmidt import choose_places, update_considering
+from evermap.slam.solver import Motion
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
+
+MOST_CONSIDERED = 256
+"""Places whose errors are kept correlated with the pose's: those used last. Of a frame no more are used."""
+NEIGHBOURS = 8
+"""Places, the nearest, through which a new one is correlated with the pose where the map's errors are joint."""
+EXPECTING_SIGMA_M = 0.5
+"""No landmark is expected while the robot's position is less certain than this, along either axis."""
+HARDLY_EXPECTED = 0.01
+DOUBT = 1.0
+MOST_DOUBT = 6.0
+"""Nats by which a place is believed less for every frame in which its landmark was found elsewhere (and more again for
+every other one), and in all: one that has moved must not mislead where there are few others to contradict it."""
+REMEMBERED = 8
+"""Different landmarks, compared last, by which the filter judges whether it is lost."""
+LEAST_REMEMBERED = 3
+MEMORY_S = 20.0
+
+
+class Sightings(NamedTuple):
+    """Detections of one frame: (M,) landmark_id, (M, 2) range [m] and bearing [rad], (M, 2) sigmas, nan where none."""
+
+    landmark_id: IntArray
+    reading: FloatArray
+    sigma_given: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """What one frame said.
+
+    Attributes:
+        pose: (3,) in the map's frame; nan while it is not known.
+        covariance: (3, 3) in the robot's frame.
+        place: (M,) row of the place that each detection was compared with, `UNKNOWN` where the map lacks it.
+        nis: (M,) squared Mahalanobis distance of the innovation; nan where nothing was compared.
+        p_inlier: (M,) probability that the detection is of that place; below 1/2 it was gated. nan likewise.
+        expected: (E,) rows of places that are in view.
+        p_detect: (E,) probability of a detection, did the landmark stand there.
+        missed: (E,) True where the most probable place of a landmark is well in view and the landmark was not detected.
+        lost: the pose is kept by odometry alone, or not known at all, while it is searched for.
+    """
+
+    pose: FloatArray
+    covariance: FloatArray
+    place: IntArray
+    nis: FloatArray
+    p_inlier: FloatArray
+    expected: IntArray
+    p_detect: FloatArray
+    missed: BoolArray
+    lost: bool
+
+
+class Localizer:
+    """Feed frames in order with `step`.
+
+    Args:
+        places: the map.
+        sensor: limits, mounting and detection probability.
+        prior: of the calibration states.
+        noise: standard deviations of detections and odometry; they are not estimated.
+        start: (3,) pose and (3, 3) covariance at the first frame, where these are known.
+    """
+
+    def __init__(
+        self,
+        places: KnownPlaces,
+        sensor: Sensor,
+        prior: CalibrationPrior,
+        noise: Noise,
+        *,
+        start: tuple[FloatArray, FloatArray] | None = None,
+    ) -> None:
+        self.places = places
+        self._sensor, self._prior, self._noise = sensor, prior, noise
+        self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
+        self._log_p = np.log(np.maximum(places.p_here, LEAST_BELIEF))
+        self._believed = self._log_p.copy()
+        self._near = Neighbourhood(places.position_m, sensor.range_max_m + 3.0 * RANGE_MARGIN_M)
+        self._most_probable = np.zeros(len(places), dtype=np.bool_)
+        self._most_probable[places.most_probable()] = True
+        self._stamp_s: float | None = None
+        self._pose = np.full(3, np.nan)
+        self._states = prior.mean.copy()
+        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
+        self._covariance[3:, 3:] = np.diag((prior.sigma * prior.free) ** 2)
+        self._considered: IntArray = np.zeros(0, dtype=np.int64)
+        self._used_at: IntArray = np.zeros(0, dtype=np.int64)
+        self._slot = np.full(len(places), -1, dtype=np.int64)
+        self._frame = 0
+        self._agreed: dict[int, tuple[float, bool]] = {}
+        self._track: LocalTrack | None = LocalTrack(self._mount)
+        if start is not None:
+            self._place_at(Placed(*start, np.zeros(0, dtype=np.int64), np.zeros((3, 0))))
+
+    @property
+    def states(self) -> FloatArray:
+        """(9,) calibration states."""
+        return self._states.copy()
+
+    @property
+    def states_covariance(self) -> FloatArray:
+        """(9, 9) of them."""
+        return self._covariance[3:AT_PLACES, 3:AT_PLACES].copy()
+
+    @property
+    def considered(self) -> IntArray:
+        """(K,) rows of the places whose errors are kept correlated with the pose's."""
+        return self._considered.copy()
+
+    def step(self, stamp_s: float, drive: Drive, seen: Sightings) -> Located:
+        """Process a frame: predict, place if need be, compare, update, expect.
+
+        Args:
+            stamp_s: of the frame, on the clock of `drive`, not before the last one.
+            drive: odometry since the last frame at least; nothing that is later than the frame by more than the delay
+                is looked at.
+            seen: its detections; those of unknown identity, or of landmarks that the map lacks, are not used.
+        """
+        self._frame += 1
+        if self._stamp_s is not None:
+            self._drive(Motion.over(drive, self._stamp_s, stamp_s, self._states, self._prior.free, self._noise))
+        self._stamp_s = stamp_s
+        first, last = self.places.rows_of(seen.landmark_id)
+        usable = (last > first) & np.all(np.isfinite(seen.reading), axis=1) & (seen.landmark_id != UNKNOWN)
+        used = np.flatnonzero(usable)[:MOST_CONSIDERED]
+        if self._track is not None:
+            self._track.see(stamp_s, seen.landmark_id[used], seen.reading[used], self._states)
+            self._search(stamp_s)
+        place = np.full(len(usable), UNKNOWN, dtype=np.int64)
+        nis, p_inlier = np.full((2, len(usable)), np.nan)
+        if self._is_placed and len(used):
+            place[used], nis[used], p_inlier[used] = self._update(first[used], last[used], seen, used)
+            self._judge(stamp_s, seen.landmark_id[used], p_inlier[used] > 0.5)
+        return Located(
+            self._pose.copy(),
+            self._covariance[:3, :3].copy(),
+            place,
+            nis,
+            p_inlier,
+            *self._expect(seen.landmark_id),
+            self._track is not None,
+        )
+
+    @property
+    def _is_placed(self) -> bool:
+        return bool(np.isfinite(self._pose[0]))
+
+    def _drive(self, motion: Motion) -> None:
+        if self._track is not None:
+            self._track.drive(motion.increment)
+        if self._is_placed:
+            drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
+
+    def _search(self, stamp_s: float) -> None:
+        """Lay the drive since the robot got lost over the map, and go there if that explains much more than staying."""
+        assert self._track is not None
+        placed = self._track.placed(stamp_s, self.places)
+        if placed is None:
+            return
+        if self._is_placed and 2.0 * self._track.agreement(self._pose, self.places) >= self._track.agreement(
+            placed.pose, self.places
+        ):
+            # a pose that is chosen to fit always fits somewhat better: it is the world that differs from the map
+            self._track = None
+            self._agreed.clear()
+            return
+        self._place_at(placed)
+
+    def _place_at(self, placed: Placed) -> None:
+        """Begin anew at a pose; what is known of the calibration stays."""
+        states = self.states_covariance
+        self._slot[self._considered] = -1
+        self._considered = self._used_at = np.zeros(0, dtype=np.int64)
+        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
+        for row in placed.rows.tolist():
+            self._add(row)
+        follows = placed.by_places @ self._covariance[AT_PLACES:, AT_PLACES:]
+        self._covariance[:3, AT_PLACES:], self._covariance[AT_PLACES:, :3] = follows, follows.T
+        self._covariance[:3, :3] = placed.covariance + follows @ placed.by_places.T
+        self._covariance[3:AT_PLACES, 3:AT_PLACES] = states
+        self._pose = np.array(placed.pose, dtype=np.float64)
+        self._believed[:] = self._log_p
+        self._track = None
+        self._agreed.clear()
+
+    def _update(
+        self, first: IntArray, last: IntArray, seen: Sightings, used: IntArray
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Place, innovation and weight of the detections `used`."""
+        places, reading = self.places, np.ascontiguousarray(seen.reading[used])
+        sigma = self._noise.of_detections(seen.sigma_given[used])
+        row = np.empty(len(used), dtype=np.int64)
+        choose_places(
+            self._pose, self._states, self._covariance, places.position_m, places.covariance_m2,
+            self._believed, self._slot, first, last, reading, sigma, self._mount, self._prior.free, row,
+        )  # fmt: skip
+        self._consider(np.unique(row))
+        nis, weight = np.empty((2, len(used)))
+        log_odds = self._noise.outlier_log_odds + self._believed[row]
+        update_considering(
+            self._pose, self._states, self._covariance, places.position_m[self._considered], self._slot[row], reading,
+            sigma, log_odds, self._mount, self._prior.free, nis, weight,
+        )  # fmt: skip
+        more = self._believed[row] + np.where(weight > 0.5, DOUBT, -DOUBT)
+        self._believed[row] = np.clip(more, self._log_p[row] - MOST_DOUBT, self._log_p[row])
+        return row, nis, weight
+
+    def _consider(self, rows: IntArray) -> None:
+        """Have different places (k,) in the covariance, instead of those that were used longest ago."""
+        new = rows[self._slot[rows] < 0]
+        self._used_at[self._slot[rows[self._slot[rows] >= 0]]] = self._frame
+        spare = MOST_CONSIDERED - len(self._considered)
+        if len(new) > spare:
+            self._forget(np.sort(np.argsort(self._used_at, kind="stable")[: len(new) - spare]))
+        for row in new.tolist():
+            self._add(row)
+
+    def _forget(self, slots: IntArray) -> None:
+        kept = np.setdiff1d(np.arange(len(self._considered)), slots)
+        self._slot[self._considered[slots]] = -1
+        self._considered, self._used_at = self._considered[kept], self._used_at[kept]
+        self._slot[self._considered] = np.arange(len(kept))
+        columns = np.concatenate([np.arange(AT_PLACES), _columns(kept)])
+        self._covariance = np.ascontiguousarray(self._covariance[np.ix_(columns, columns)])
+
+    def _add(self, row: int) -> None:
+        """One more place. Its error is known to be like its neighbours', as far as the map says that."""
+        size, others = len(self._covariance), self._considered
+        grown = np.zeros((size + 2, size + 2))
+        grown[:size, :size] = self._covariance
+        grown[size:, size:] = self.places.covariance_m2[row]
+        joint = self.places.joint_m2
+        if joint is not None and len(others):
+            own = np.array([2 * row, 2 * row + 1])
+            grown[AT_PLACES:size, size:] = joint[np.ix_(_columns(others, 0), own)]
+            away = ((self.places.position_m[others] - self.places.position_m[row]) ** 2).sum(axis=1)
+            near = np.argsort(away, kind="stable")[:NEIGHBOURS]
+            slots, rows = AT_PLACES + _columns(near, 0), _columns(others[near], 0)
+            by = np.linalg.solve(joint[np.ix_(rows, rows)], joint[np.ix_(rows, own)])
+            grown[:AT_PLACES, size:] = self._covariance[:AT_PLACES, slots] @ by
+            grown[size:, :size] = grown[:size, size:].T
+        self._covariance = grown
+        self._slot[row] = len(others)
+        self._considered = np.append(others, row)
+        self._used_at = np.append(self._used_at, self._frame)
+
+    def _judge(self, stamp_s: float, landmark_id: IntArray, agrees: BoolArray) -> None:
+        """Lost where most of the landmarks compared last were not where they should have been."""
+        for name, good in zip(landmark_id.tolist(), agrees.tolist(), strict=True):
+            self._agreed.pop(name, None)
+            self._agreed[name] = (stamp_s, good)
+        while len(self._agreed) > max(REMEMBERED, len(landmark_id)):
+            self._agreed.pop(next(iter(self._agreed)))
+        fresh = [good for seen_s, good in self._agreed.values() if seen_s >= stamp_s - MEMORY_S]
+        lost = len(fresh) >= LEAST_REMEMBERED and 2 * sum(fresh) < len(fresh)
+        if lost and self._track is None:
+            self._track = LocalTrack(self._mount)
+        elif not lost:
+            self._track = None
+
+    def _expect(self, seen_id: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
+        """Rows of places in view, P(detect) of each, and which are missed."""
+        sigma = math.sqrt(max(self._covariance[0, 0], self._covariance[1, 1]))
+        if not self._is_placed or self._track is not None or sigma > EXPECTING_SIGMA_M:
+            return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.bool_)
+        rows = self._near(se2.compose(self._pose, self._mount)[:2])
+        p = detection_probability(self._pose[None], self.places.position_m[rows], self._sensor)[0]
+        rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
+        well = self._most_probable[rows] & (p >= WORTH_A_MISS * self._sensor.p_detect)
+        return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
+
+
+def _columns(slots: IntArray, start: int = AT_PLACES) -> IntArray:
+    """Columns of x and y of places, behind `start`."""
+    columns: IntArray = start + (2 * slots[:, None] + np.arange(2)).ravel()
+    return columns

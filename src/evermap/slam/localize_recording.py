@@ -1,0 +1,226 @@
+"""A recording driven through a map that is not changed: the frames in order, and what comes out as plain arrays."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from evermap import se2
+from evermap.errors import DataError
+from evermap.slam.bridge import dead_reckoned
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.known_places import KnownPlaces
+from evermap.slam.localize import Localizer, Located, Sightings
+from evermap.slam.noise import START, NoiseFit
+from evermap.slam.problem import Drive, Noise
+from evermap.slam.session import described
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    FloatArray,
+    Innovations,
+    IntArray,
+    Landmarks,
+    Misses,
+    Recording,
+    SlamResult,
+    Trajectory,
+)
+
+
+def localize(
+    recording: Recording,
+    landmarks: Landmarks,
+    prior: CalibrationPrior,
+    noise: Noise,
+    *,
+    joint_m2: FloatArray | None = None,
+    realtime: bool = False,
+    progress: Callable[[float, float], None] | None = None,
+) -> SlamResult:
+    """Causal poses of one recording in a map that is not changed, from an unknown start.
+
+    Args:
+        recording: what a reader returned; its truth is not looked at.
+        landmarks: the map. Here, other than elsewhere, a landmark may have several rows: one a site where it may stand,
+            with `p_exists` the probability of each.
+        prior: of the calibration states.
+        noise: standard deviations; they are not estimated.
+        joint_m2: (2 L, 2 L) covariance of all rows together, x and y by turns; None takes `covariance_m2`, and the rows
+            to be independent.
+        realtime: process at the recording's pace.
+        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+
+    Returns:
+        Poses from the first frame on at which the robot knew where it was, `trajectory` the same as `online`; the map
+        with one row a landmark, its most probable one, and the hits and misses of this recording.
+
+    Raises:
+        DataError: there is no odometry, or the robot's place in the map could not be found.
+    """
+    odometry, stamps = recording.odometry, recording.frames.stamp_s
+    if len(odometry) == 0:
+        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+    start_s = float(odometry.stamp_s[0])
+    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
+    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
+    places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists)
+    localizer = Localizer(places, recording.sensor, prior, noise)
+    frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
+    run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
+    placed = run.placed
+    if not placed.any():
+        raise DataError(
+            f"{recording.name}: cannot localise in the map: too few of its landmarks were seen standing to each other "
+            "as it says",
+            hint="check that it is the map of this place",
+        )
+    pose = np.array([one.pose for one in run.located])[placed]
+    pose[:, 2] = se2.wrap(pose[:, 2])
+    spread = np.array([one.covariance for one in run.located])[placed]
+    trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
+    reported = CalibrationPrior.from_settings(calibrated=False, fix={}).mean
+    reckoned, spread = dead_reckoned(trajectory.stamp_s - start_s, drive, reported, START)
+    misses = run.misses(places)
+    fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
+    return SlamResult(
+        trajectory=trajectory,
+        online=trajectory,
+        landmarks=_with_counts(landmarks, recording, run, places, misses),
+        parameters=described(localizer.states, localizer.states_covariance, fit, prior),
+        innovations=run.innovations(recording),
+        misses=misses,
+        step_s=run.step_s[placed],
+        dead_reckoning=replace(trajectory, pose_world_robot=se2.compose(pose[0], reckoned), covariance=spread),
+        warnings=tuple(_warnings(recording, run, places)),
+        interrupted=run.interrupted,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What the frames said.
+
+    Attributes:
+        frame: (F,) rows of `Recording.frames` that were processed.
+        first: (F,) row of the first detection of each.
+        located: one a frame.
+        step_s: (F,) seconds that each took.
+        interrupted: True where the recording goes on.
+    """
+
+    frame: IntArray
+    first: IntArray
+    located: list[Located]
+    step_s: FloatArray
+    interrupted: bool
+
+    @property
+    def placed(self) -> BoolArray:
+        """(F,) frames with a pose."""
+        return np.array([bool(np.isfinite(one.pose[0])) for one in self.located], dtype=np.bool_)
+
+    def all(self, name: str) -> Any:
+        """One column of all frames, one row a detection."""
+        return np.concatenate([getattr(one, name) for one in self.located])
+
+    @property
+    def detection(self) -> IntArray:
+        """Rows of `Recording.detections` in these frames."""
+        rows = [first + np.arange(len(one.place)) for first, one in zip(self.first, self.located, strict=True)]
+        return np.concatenate(rows).astype(np.int64)
+
+    def innovations(self, recording: Recording) -> Innovations:
+        """Of every detection that was compared with the map."""
+        told = self.all("place") != UNKNOWN
+        rows = self.detection[told]
+        return Innovations(
+            stamp_s=recording.frames.stamp_s[recording.detections.frame[rows]],
+            detection=rows,
+            landmark_id=recording.detections.landmark_id[rows],
+            nis=self.all("nis")[told],
+            p_inlier=self.all("p_inlier")[told],
+        )
+
+    def misses(self, places: KnownPlaces) -> Misses:
+        """Landmarks that were well in view and not detected."""
+        missed = self.all("missed")
+        count = [int(one.missed.sum()) for one in self.located]
+        return Misses(
+            frame=np.repeat(self.frame, count),
+            landmark_id=places.landmark_id[self.all("expected")[missed]],
+            p_detect=self.all("p_detect")[missed],
+        )
+
+
+def _feed(
+    localizer: Localizer,
+    recording: Recording,
+    frame: IntArray,
+    drive: Drive,
+    *,
+    realtime: bool,
+    progress: Callable[[float, float], None] | None,
+) -> _Run:
+    """Frame after frame through the filter."""
+    seen, stamps = recording.detections, recording.frames.stamp_s
+    first, last = np.searchsorted(seen.frame, frame), np.searchsorted(seen.frame, frame, side="right")
+    located: list[Located] = []
+    step_s: list[float] = []
+    began = time.perf_counter()
+    try:
+        for row, low, high in zip(frame.tolist(), first, last, strict=True):
+            passed_s = float(stamps[row] - stamps[frame[0]])
+            if realtime:
+                time.sleep(max(0.0, passed_s - (time.perf_counter() - began)))
+            start = time.perf_counter()
+            sightings = Sightings(
+                seen.landmark_id[low:high],
+                np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
+                np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
+            )
+            located.append(localizer.step(stamps[row] - recording.odometry.stamp_s[0], drive, sightings))
+            step_s.append(time.perf_counter() - start)
+            if progress is not None:
+                progress(passed_s, float(stamps[frame[-1]] - stamps[frame[0]]))
+    except KeyboardInterrupt:
+        if not step_s:
+            raise
+    done = len(step_s)
+    return _Run(frame[:done], first[:done], located[:done], np.array(step_s), done < len(frame))
+
+
+def _with_counts(
+    landmarks: Landmarks, recording: Recording, run: _Run, places: KnownPlaces, misses: Misses
+) -> Landmarks:
+    """One row a landmark, with the hits and misses of this recording."""
+    rows = np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()]
+    columns: dict[str, Any] = {item.name: getattr(landmarks, item.name) for item in fields(landmarks)}
+    best = replace(landmarks, **{k: column[rows] for k, column in columns.items() if isinstance(column, np.ndarray)})
+    names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
+    n_hits, n_misses = (
+        np.bincount(np.searchsorted(names, seen), minlength=len(names)).astype(np.int64)
+        for seen in (recording.detections.landmark_id[hit], misses.landmark_id)
+    )
+    return replace(best, n_hits=n_hits, n_misses=n_misses, frame="prior_map")
+
+
+def _warnings(recording: Recording, run: _Run, places: KnownPlaces) -> list[str]:
+    names = recording.detections.landmark_id[run.detection]
+    anonymous = int((names == UNKNOWN).sum())
+    strange = int((~np.isin(names, places.landmark_id)).sum()) - anonymous
+    at = int(np.argmax(run.placed))
+    blind = float(np.ptp(recording.frames.stamp_s[run.frame[: at + 1]]))
+    searching = int(sum(one.lost for one in run.located[at:]))
+    said = {
+        f"{anonymous} detections without identity not used": anonymous,
+        f"{strange} detections of landmarks that the map lacks not used": strange,
+        f"the robot's place in the map was found after {blind:.1f} s; there are no poses before": at,
+        f"in {searching} frames the map did not fit, and the robot's place was searched for": searching,
+    }
+    return [text for text, count in said.items() if count]
