@@ -60,7 +60,7 @@ NEW_CLIQUE_P = 0.9
 """Belief in a body that nobody knew, before its sightings are counted."""
 
 
-def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig) -> Extended:
+def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
     """Enter what a session found.
 
     Args:
@@ -68,6 +68,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         p_site: (S,) belief in its sites, at the beginning of the session.
         found: the session's landmarks.
         config: how far landmarks of one body may be apart.
+        drift_m: by which places may have been off when the session was solved.
     """
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
@@ -88,6 +89,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         seen,
         found.position_m[order],
         of_places(found.covariance_m2, order),
+        drift_m,
     )
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))

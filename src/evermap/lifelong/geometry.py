@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.lifelong.overlaying import drifted
 from evermap.types import FloatArray, IntArray
 
 
@@ -17,6 +16,7 @@ def with_session(
     seen: IntArray,
     session_m: FloatArray,
     session_covariance_m2: FloatArray,
+    drift_m: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Positions and joint covariance of the old places, then of the new ones.
 
@@ -28,6 +28,7 @@ def with_session(
         seen: (K,) rows of those that the session saw.
         session_m: (K + N, 2) posterior of these, then of N new ones.
         session_covariance_m2: (2 (K + N), 2 (K + N)) joint posterior.
+        drift_m: as in `drifted`, when the session was solved.
 
     Returns:
         (P + N, 2) and (2 (P + N), 2 (P + N)).
@@ -36,7 +37,7 @@ def with_session(
     s = _coordinates(seen)
     k = len(s)
     u = np.setdiff1d(np.arange(2 * count), s)
-    before = drifted(covariance_m2[np.ix_(s, s)])
+    before = drifted(covariance_m2[np.ix_(s, s)], drift_m)
     gain = np.linalg.solve(before, covariance_m2[np.ix_(s, u)]).T if k else np.zeros((len(u), 0))
     mean = np.zeros(2 * (count + new))
     mean[s] = session_m[: len(seen)].ravel()
@@ -65,6 +66,11 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     motion[0::2, 2], motion[1::2, 2] = -middle[:, 1], middle[:, 0]
     onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
     return np.asarray(onto @ covariance_m2 @ onto.T)
+
+
+def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
+    """Joint covariance (2 K, 2 K) of places of which each may be off by `drift_m` since the map was made."""
+    return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
 def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:

@@ -10,8 +10,6 @@ from evermap.maps.living import LivingMap
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.types import FloatArray, IntArray
 
-DRIFT_M = 0.01
-"""Standard deviation by which a landmark is not quite where it was, from session to session."""
 SMALLEST_P = 1e-6
 
 
@@ -24,14 +22,14 @@ class Laid:
         pose_map_session: (3,) motion from the session's frame to the map's.
         place: (K,) row of the map's places, `ELSEWHERE` where a landmark stands at none of its own, or is new.
         probability: (K,) of that.
-        misfit: factor on variances that the session wanted.
+        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
     """
 
     landmark_id: IntArray
     pose_map_session: FloatArray
     place: IntArray
     probability: FloatArray
-    misfit: float
+    drift_m: float
 
 
 def laid_over(
@@ -76,7 +74,7 @@ def laid_over(
         Sighted(position_m[seen], covariance_m2[np.ix_(inner, inner)], clique.ravel().astype(np.int64)),
         Known(
             position_m=places.position_m[used],
-            covariance_m2=drifted(living.covariance_m2[np.ix_(corner, corner)]),
+            covariance_m2=living.covariance_m2[np.ix_(corner, corner)],
             landmark=landmark[used],
             site=site.ravel().astype(np.int64),
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
@@ -90,9 +88,4 @@ def laid_over(
     place[seen] = np.where(found.place >= 0, used[found.place], ELSEWHERE)
     probability = np.ones(len(landmark_id))
     probability[seen] = found.probability
-    return Laid(landmark_id, found.pose_map_session, place, probability, found.misfit)
-
-
-def drifted(covariance_m2: FloatArray) -> FloatArray:
-    """Joint covariance (2 K, 2 K) of places, a session later."""
-    return np.asarray(covariance_m2 + DRIFT_M**2 * np.eye(len(covariance_m2)))
+    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m)

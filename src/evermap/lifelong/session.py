@@ -11,8 +11,8 @@ from evermap.errors import DataError
 from evermap.lifelong import believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
-from evermap.lifelong.geometry import anchored, of_places
-from evermap.lifelong.overlaying import Laid, drifted, laid_over
+from evermap.lifelong.geometry import anchored, drifted, of_places
+from evermap.lifelong.overlaying import Laid, laid_over
 from evermap.maps.learning import learned_lives
 from evermap.maps.living import Evidence, LivingMap
 from evermap.slam import session as of_slam
@@ -108,7 +108,7 @@ def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior,
         where.pose_map_session,
         np.searchsorted(alone.prepared.landmark_id, where.landmark_id[stand]),
         living.places.position_m[places],
-        where.misfit * drifted(of_places(living.covariance_m2, places)),
+        drifted(of_places(living.covariance_m2, places), where.drift_m),
         robust=robust,
     )
     return replace(alone, outcome=outcome)
@@ -116,7 +116,7 @@ def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior,
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
     """The map with the places and sites that the session found."""
-    own = own_landmarks(visit.outcome)
+    own = own_landmarks(visit.outcome, of_unknown_size=False)  # the first session says how long a metre is
     detection, landmark = _inliers(visit)
     stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
     count = len(visit.prepared.landmark_id)
@@ -136,7 +136,7 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Vi
     if where is None:
         covariance = anchored(own.position_m[seen], covariance)
     found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, first[row], last[row])
-    return extended(living, p_site, found, config)
+    return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
 def looks(entry: Extended, visit: Visit) -> Looks:

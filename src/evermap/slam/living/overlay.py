@@ -32,10 +32,10 @@ TURN_M = 0.35
 LOG_P_SPLIT = math.log(1e-3)
 """Log probability that landmarks which were taken for one body are not."""
 SMALLEST_ROOM_M2 = 50.0
-MISFIT_DOF = 20.0
-"""Degrees of freedom that speak for covariances that are true, before the misfit of the session is heard."""
-LARGEST_MISFIT = 9.0
-ROUNDS = 3
+DRIFTS_M = (0.01, 0.02, 0.04, 0.08)
+"""Standard deviations by which landmarks may not quite be where they were, though nobody moved them: another robot with
+errors of its own, warmth, a sensor that sees another corner. Each is half as probable as the one before, a session."""
+LOG_P_COARSER = math.log(0.5)
 MOST_FLIPS = 400
 
 
@@ -82,15 +82,13 @@ class Overlay:
         pose_map_session: (3,) the rigid motion.
         place: (L,) row of the place at which each landmark stands, `ELSEWHERE` where it stands at none.
         probability: (L,) of that, given what is decided of the others.
-        n_agree: landmarks that stand at places of the map.
-        misfit: factor on variances that the session wants, at least 1.
+        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
     """
 
     pose_map_session: FloatArray
     place: IntArray
     probability: FloatArray
-    n_agree: int
-    misfit: float
+    drift_m: float
 
 
 def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay | None:
@@ -117,16 +115,24 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
     options = _Options(sighted, known, motion)
     if search == "none":
         chosen = options.likeliest_sites()
+    elif search == "gate":
+        chosen = options.gated(options.agreeing())
     else:
-        chosen = options.agreeing()
-        if search == "joint":
-            for _ in range(ROUNDS):
-                chosen = options.climb(chosen)
-                if not options.hear_misfit(chosen):
-                    break
-        else:
-            chosen = options.gated(chosen)
+        chosen = _joint(options)
     return options.concluded(chosen, split=search == "joint")
+
+
+def _joint(options: _Options) -> IntArray:
+    """The most probable assignment, and with it how well sessions agree at all."""
+    best, highest, drift_m = options.agreeing(), -math.inf, DRIFTS_M[0]
+    for k, options.drift_m in enumerate(DRIFTS_M):
+        chosen = options.climb(best)
+        score = options.log_probability(chosen) + k * LOG_P_COARSER
+        if score <= highest:
+            break
+        best, highest, drift_m = chosen, score, options.drift_m
+    options.drift_m = drift_m
+    return best
 
 
 class _Options:
@@ -144,7 +150,7 @@ class _Options:
         freedom *= FREE_MOTION
         self._session = turn @ sighted.covariance_m2 @ turn.T
         self._freedom = freedom @ freedom.T
-        self._misfit = 1.0
+        self.drift_m = DRIFTS_M[0]
         spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
         self._log_room = -math.log(max(float(np.prod(spread)), SMALLEST_ROOM_M2))
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
@@ -198,22 +204,19 @@ class _Options:
         table = self._scores(chosen)
         return np.array([max(scores, key=lambda o: scores[o]) for scores in table], dtype=np.int64)
 
-    def hear_misfit(self, chosen: IntArray) -> bool:
-        """Widen the covariances as the session wants; False where they are as they were."""
-        rows = self._chosen_rows(chosen)
-        if len(rows) < 3:
-            return False
-        error, inverse = self._whitened(rows)
-        pull = inverse @ error
-        blocks = inverse.reshape(len(rows), 2, len(rows), 2)[np.arange(len(rows)), :, np.arange(len(rows)), :]
-        mine = pull.reshape(-1, 2)
-        squared = np.einsum("ka,kab,kb->k", mine, np.linalg.inv(blocks), mine)  # leave-one-out, chi-square of two
-        robust = min(squared.sum(), len(rows) * float(np.median(squared)) / math.log(4.0) * 2.0)
-        wanted = (MISFIT_DOF + robust * self._misfit) / (MISFIT_DOF + 2.0 * len(rows))
-        misfit = min(max(wanted, 1.0), LARGEST_MISFIT)
-        changed = bool(abs(misfit / self._misfit - 1.0) > 0.05)
-        self._misfit = misfit
-        return changed
+    def log_probability(self, chosen: IntArray) -> float:
+        """Of an assignment with all that was seen, up to a constant that all assignments share."""
+        error, inverse, rows = self._field(chosen)
+        sign_log = np.linalg.slogdet(inverse)[1] if len(rows) else 0.0
+        total = 0.5 * float(sign_log) - 0.5 * float(error @ inverse @ error) - len(rows) * math.log(2.0 * math.pi)
+        for clique, sites in enumerate(self.sites):
+            site = int(chosen[clique])
+            if site != ELSEWHERE:
+                total += float(self.known.log_p_site[site])
+            elif sites:
+                total += float(self.known.log_p_elsewhere[clique])
+                total += max(self._log_elsewhere(self._rows[other]) for other in sites)
+        return total
 
     def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
         """The assignment, landmark by landmark, with bodies taken apart whose members disagree."""
@@ -237,7 +240,7 @@ class _Options:
         motion = self.motion
         if len(rows) >= 2:
             motion, _ = consensus(self.sighted.position_m[matched], self.known.position_m[rows], landmark=matched)
-        return Overlay(motion, place, probability, int((place >= 0).sum()), self._misfit)
+        return Overlay(motion, place, probability, self.drift_m)
 
     def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
         """Members that stand where they stood, while the body as a whole does not."""
@@ -352,8 +355,10 @@ class _Options:
         """Between the differences of two sets of places."""
         la, lb = _coordinates(self.known.landmark[a]), _coordinates(self.known.landmark[b])
         pa, pb = _coordinates(a), _coordinates(b)
-        noise = self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)]
-        both: FloatArray = self._misfit * noise + self._freedom[np.ix_(la, lb)]
+        both: FloatArray = (
+            self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)] + self._freedom[np.ix_(la, lb)]
+        )
+        both[pa[:, None] == pb[None, :]] += self.drift_m**2
         return both
 
 

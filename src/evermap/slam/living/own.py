@@ -20,7 +20,7 @@ class OwnLandmarks:
     Attributes:
         row: (K,) rows of the problem's landmarks: those that were seen often enough to be believed.
         position_m: (K, 2) in the frame of the first pose.
-        covariance_m2: (2 K, 2 K), what is not known of the scale included.
+        covariance_m2: (2 K, 2 K).
     """
 
     row: IntArray
@@ -34,12 +34,21 @@ def believable(landmark_row: IntArray, inlier: FloatArray, known: BoolArray) -> 
     return np.flatnonzero(known & (sightings >= SIGHTINGS))
 
 
-def own_landmarks(outcome: Outcome) -> OwnLandmarks:
-    """What a session that was solved without a map says of its landmarks."""
+def own_landmarks(outcome: Outcome, *, of_unknown_size: bool = True) -> OwnLandmarks:
+    """What a session says of its landmarks.
+
+    Args:
+        outcome: of the session.
+        of_unknown_size: with what is not known of the scale, as one needs to compare it with a map. The metre of a map is
+            that of its first session: where later ones could change it, the shrinking that noise does to every graph
+            would shrink it a little each time.
+    """
     estimate = outcome.graph_estimate
     row = believable(outcome.problem.landmark_row, outcome.inlier, estimate.known)
     at = (2 * row[:, None] + np.arange(2)).ravel()
     position = estimate.landmark[row] * outcome.scale
-    longer = position.ravel() * outcome.log_scale_sigma  # a longer world moves all landmarks away from the origin
-    covariance = outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2 + np.outer(longer, longer)
+    covariance = outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2
+    if of_unknown_size:
+        longer = position.ravel() * outcome.log_scale_sigma  # a longer world moves all landmarks away from the origin
+        covariance = covariance + np.outer(longer, longer)
     return OwnLandmarks(row, position, covariance)
