@@ -10,7 +10,8 @@ import pytest
 from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
-from evermap.maps.learning import NEWEST, class_survival, learned_lives
+from evermap.maps.history import NEWEST
+from evermap.maps.learning import class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
 from evermap.sim.classes import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
