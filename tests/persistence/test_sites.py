@@ -14,11 +14,24 @@ from scipy.special import betaln
 from evermap.errors import InputError
 from evermap.persistence import joint, single
 from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
+from evermap.sensing.sightlines import Lines
 from evermap.survival import Exponential, GeneralPurpose, Weibull
 from evermap.types import FloatArray
 
 SURE = 1e15
 """Pseudo counts of a rate that is known: no look changes it."""
+
+
+def certain(rate: FloatArray) -> Lines:
+    """Free lines of sight, along which this rate is known."""
+    return Lines(np.ones(len(rate)), SURE * rate, SURE * (1.0 - rate), 0.03)
+
+
+def free(hits: FloatArray, misses: FloatArray) -> Lines:
+    """Free lines of sight of these counts."""
+    return Lines(np.ones(len(hits)), hits, misses, 0.03)
+
+
 GENERAL = GeneralPurpose(1e-7, 1e-2)
 
 
@@ -118,7 +131,7 @@ def test_equals_the_sum_over_all_paths(p_hop: float, use_misses: bool) -> None:
                     ratios[t, k + 1] *= (1 - rate[k]) / (1 - p_false)
     rng.shuffle(rows)  # type: ignore[arg-type]
     found = follow_sites(
-        p_here, np.zeros(3, np.int64), known, looks(rows), SURE * rate, SURE * (1 - rate),
+        p_here, np.zeros(3, np.int64), known, looks(rows), certain(rate),
         start_s=0.0, until_s=95.0, p_false=p_false, p_occluded=0.0, use_misses=use_misses,
     )  # fmt: skip
 
@@ -146,7 +159,7 @@ def test_one_site_and_no_return_is_the_persistence_filter(prior: Any) -> None:
     state, posterior = single.run(single.init(n, prior), clique, stamp - since[clique], hit, 1 - rate, p_false)
     found = follow_sites(
         np.ones(n), np.arange(n), alone(prior, since),
-        SiteLooks(stamp, clique, clique, np.arange(m), hit), SURE * rate, SURE * (1 - rate),
+        SiteLooks(stamp, clique, clique, np.arange(m), hit), certain(rate),
         start_s=since, until_s=6e3, p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
     order = np.lexsort((stamp, clique))
@@ -167,7 +180,7 @@ def test_many_landmarks_on_one_site_are_the_joint_clique_filter() -> None:
         state = joint.jcf(state, t, hit, p_miss, p_false, expected, member)
         rows += [(t, int(member[k]), int(member[k]), int(k), bool(hit[k])) for k in np.flatnonzero(expected)]
     found = follow_sites(
-        np.ones(3), np.arange(3), alone(prior, np.zeros(3)), looks(rows), SURE * (1 - p_miss), SURE * p_miss,
+        np.ones(3), np.arange(3), alone(prior, np.zeros(3)), looks(rows), certain(1 - p_miss),
         start_s=0.0, until_s=39.0, p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
     np.testing.assert_allclose(found.p_here, single.predict(state, 39.0), rtol=1e-12)
@@ -193,7 +206,7 @@ def test_constant_hazard_and_hops_are_the_chain_of_modes() -> None:
     found = follow_sites(
         np.full(k, 1 / k), np.zeros(k, np.int64), known,
         SiteLooks(stamp[at], np.zeros(t * k, np.int64), site, np.arange(t * k), hit.ravel()),
-        SURE * rate.ravel(), SURE * (1 - rate.ravel()),
+        certain(rate.ravel()),
         start_s=stamp[0], until_s=stamp[-1], p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
     np.testing.assert_allclose(found.p_here, np.exp(modes.log_filtered[-1]), rtol=1e-10)
@@ -214,7 +227,7 @@ def test_a_long_gap_is_that_of_a_continuous_chain() -> None:
     rate -= np.diag(rate.sum(axis=1))
     for gap in (30.0, 300.0, 2400.0):
         found = follow_sites(
-            np.array([0.9, 0.0]), np.zeros(2, np.int64), known, looks([]), np.ones(0), np.ones(0),
+            np.array([0.9, 0.0]), np.zeros(2, np.int64), known, looks([]), certain(np.ones(0)),
             start_s=0.0, until_s=gap, p_false=0.1,
         )  # fmt: skip
         exact = np.array([0.1, 0.9, 0.0]) @ expm(rate * gap)
@@ -228,7 +241,7 @@ def one(rows: list[tuple[float, int, int, int, bool]], p_here: float = 0.9, **ch
     known = alone(Exponential(1e-30), np.zeros(1))
     given_ = {"start_s": 0.0, "until_s": 1e3, "p_false": 0.01, "p_occluded": 0.0} | changed
     return follow_sites(
-        np.array([p_here]), np.zeros(1, np.int64), known, looks(rows), np.array([4.0]), np.array([1.0]), **given_
+        np.array([p_here]), np.zeros(1, np.int64), known, looks(rows), free(np.array([4.0]), np.array([1.0])), **given_
     )
 
 
@@ -262,7 +275,7 @@ def test_one_frame_says_no_more_against_a_clique_than_that_it_was_occluded() -> 
     known = alone(Exponential(1e-30), np.zeros(1))
     rows = looks([(1.0, 0, 0, key, False) for key in range(50)])
     found = follow_sites(
-        np.array([0.9]), np.zeros(1, np.int64), known, rows, np.full(50, 40.0), np.full(50, 1.0),
+        np.array([0.9]), np.zeros(1, np.int64), known, rows, free(np.full(50, 40.0), np.full(50, 1.0)),
         start_s=0.0, until_s=1.0, p_false=0.01, p_occluded=0.05,
     )  # fmt: skip
     assert found.trace.log_odds[0] == pytest.approx(np.log(0.05), rel=1e-6)
@@ -275,7 +288,7 @@ def test_misses_along_a_hidden_line_of_sight_say_little() -> None:
     def after(alpha: float, beta: float, n: int) -> float:
         rows = looks([(float(t), 0, 0, 0, False) for t in range(n)])
         found = follow_sites(
-            np.array([0.9]), np.zeros(1, np.int64), known, rows, np.array([alpha]), np.array([beta]),
+            np.array([0.9]), np.zeros(1, np.int64), known, rows, free(np.array([alpha]), np.array([beta])),
             start_s=0.0, until_s=1e3, p_false=0.01,
         )  # fmt: skip
         return float(found.p_here[0])
@@ -286,13 +299,13 @@ def test_misses_along_a_hidden_line_of_sight_say_little() -> None:
 
 def test_a_clique_that_is_held_is_never_away() -> None:
     rows = looks([(float(t), 0, t % 3, t % 3, False) for t in range(90)])
-    counts = np.full(3, 50.0), np.full(3, 1.0)
+    lines = free(np.full(3, 50.0), np.full(3, 1.0))
     known, sites = dynamics(p_hop=np.zeros(1)), np.zeros(3, np.int64)
-    free = follow_sites(np.array([0.5, 0.1, 0.0]), sites, known, rows, *counts, start_s=0.0, until_s=90.0, p_false=0.01)
-    assert free.p_here.sum() < 0.1
+    loose = follow_sites(np.array([0.5, 0.1, 0.0]), sites, known, rows, lines, start_s=0.0, until_s=90.0, p_false=0.01)
+    assert loose.p_here.sum() < 0.1
     for p_here in (np.array([0.5, 0.1, 0.0]), np.zeros(3)):
         firm = follow_sites(
-            p_here, sites, known, rows, *counts, start_s=-500.0, until_s=90.0, p_false=0.01, held=np.array([True])
+            p_here, sites, known, rows, lines, start_s=-500.0, until_s=90.0, p_false=0.01, held=np.array([True])
         )
         assert firm.p_here.sum() == pytest.approx(1.0, abs=1e-12)
         np.testing.assert_allclose(firm.trace.p_exists, 1.0, atol=1e-12)
@@ -301,8 +314,8 @@ def test_a_clique_that_is_held_is_never_away() -> None:
 def test_it_is_followed_from_one_site_to_another() -> None:
     rows = [(float(t), 0, k, k, k == (0 if t < 50 else 2)) for t in range(100) for k in range(3)]
     found = follow_sites(
-        np.array([0.9, 0.0, 0.0]), np.zeros(3, np.int64), dynamics(), looks(rows), np.full(3, 16.0), np.full(3, 4.0),
-        start_s=0.0, until_s=100.0, p_false=0.01,
+        np.array([0.9, 0.0, 0.0]), np.zeros(3, np.int64), dynamics(), looks(rows),
+        free(np.full(3, 16.0), np.full(3, 4.0)), start_s=0.0, until_s=100.0, p_false=0.01,
     )  # fmt: skip
     assert found.p_here[2] > 0.99
     assert found.p_stayed[2] < 1e-6
@@ -333,8 +346,7 @@ def _worlds(draw: st.DrawFn) -> dict[str, Any]:
         "looks": SiteLooks(
             np.round(rng.uniform(0.0, 20.0, n)), clique_of_site[site], site, rng.integers(0, k, n), rng.random(n) < 0.5
         ),
-        "alpha": rng.uniform(0.1, 30.0, k),
-        "beta": rng.uniform(0.1, 30.0, k),
+        "lines": Lines(rng.choice([0.0, 0.5, 1.0, rng.random()], k), *rng.uniform(0.5, 30.0, (2, k)), 0.03),
         "start_s": -draw(st.sampled_from([0.0, 1.0, 1e4])),
         "until_s": 20.0 + draw(st.sampled_from([0.0, 1e3])),
         "p_false": 0.01,
@@ -416,7 +428,7 @@ def test_beliefs_drawn_from_the_model_are_calibrated() -> None:
     clique = np.repeat(np.arange(n), 6)
     found = follow_sites(
         np.full(n, 0.8), np.arange(n), known, SiteLooks(np.tile(stamps, n), clique, clique, clique, hit.ravel()),
-        np.full(n, 2.0), np.full(n, 1.0), start_s=0.0, until_s=stamps[-1], p_false=0.02,
+        free(np.full(n, 2.0), np.full(n, 1.0)), start_s=0.0, until_s=stamps[-1], p_false=0.02,
     )  # fmt: skip
     for p, fact in (
         (found.p_before, truth[:, 0]),
@@ -436,7 +448,7 @@ def test_nothing_to_follow() -> None:
     none = np.zeros(0, dtype=np.int64)
     known = SiteDynamics((), np.zeros(0), (), np.zeros(0), np.zeros(0), np.zeros(0))
     found = follow_sites(
-        np.zeros(0), none, known, looks([]), np.zeros(0), np.zeros(0), start_s=0.0, until_s=1.0, p_false=0.1
+        np.zeros(0), none, known, looks([]), free(np.zeros(0), np.zeros(0)), start_s=0.0, until_s=1.0, p_false=0.1
     )
     assert len(found.p_here) == len(found.weight) == len(found.trace.clique) == 0
 
@@ -448,7 +460,9 @@ def test_nothing_to_follow() -> None:
         ({"start_s": 11.0}, "stamp_s.*before"),
         ({"p_false": 0.0}, "p_false"),
         ({"p_occluded": 1.0}, "p_occluded"),
-        ({"alpha": np.array([0.0])}, "alpha.*row 0"),
+        ({"lines": free(np.zeros(1), np.ones(1))}, "hits.*row 0"),
+        ({"lines": Lines(np.full(1, 1.5), np.ones(1), np.ones(1), 0.1)}, "p_free.*row 0"),
+        ({"lines": Lines(np.ones(1), np.ones(1), np.ones(1), 1.0)}, "p_blocked"),
         ({"p_here": np.array([0.5, 0.6, 0.0])}, "p_here.*clique 0"),
         ({"clique_of_site": np.array([0, 0, 1])}, "clique_of_site.*does not exist"),
         ({"looks": looks([(10.0, 0, 3, 0, True)])}, "site.*does not exist"),
@@ -461,7 +475,7 @@ def test_nothing_to_follow() -> None:
 def test_what_cannot_be_is_refused(change: dict[str, Any], words: str) -> None:
     world = {
         "p_here": np.array([0.5, 0.1, 0.0]), "clique_of_site": np.zeros(3, np.int64), "dynamics": dynamics(),
-        "looks": looks([(10.0, 0, 0, 0, True)]), "alpha": np.ones(1), "beta": np.ones(1), "start_s": 0.0,
+        "looks": looks([(10.0, 0, 0, 0, True)]), "lines": free(np.ones(1), np.ones(1)), "start_s": 0.0,
         "until_s": 10.0, "p_false": 0.01,
     }  # fmt: skip
     follow_sites(**world)  # type: ignore[arg-type]

@@ -13,7 +13,7 @@ from scipy.stats import binom
 from evermap import se2
 from evermap.errors import InputError
 from evermap.sensing import sightlines
-from evermap.sensing.sightlines import MOST_LOOKS, SightLines, nominal_counts
+from evermap.sensing.sightlines import MOST_LOOKS, SightLines, nominal_lines
 from evermap.sensing.visibility import detection_probability
 from evermap.sim.config import BuildingConfig
 from evermap.sim.world import simulate_building
@@ -67,11 +67,13 @@ def test_laws_of_the_table(seed: int, before: int, after: int) -> None:
 
     if n:
         p = rng.uniform(0.2, 0.9, n)
-        alpha, beta = whole.prior_counts(keys, p)
-        assert (np.isfinite(alpha) & np.isfinite(beta) & (alpha > 0.0) & (beta > 0.0)).all()
+        found = whole.lines(keys, p)
+        assert ((found.p_free > 0.0) & (found.p_free < 1.0) & (found.hits > 0.0) & (found.misses > 0.0)).all()
+        assert ((found.p_detect > 0.0) & (found.p_detect < 1.0)).all()
         order = rng.permutation(n)
-        for there, mixed in zip((alpha, beta), whole.prior_counts(keys[order], p[order]), strict=True):
-            np.testing.assert_allclose(mixed, there[order])
+        mixed = whole.lines(keys[order], p[order])
+        for there, again in zip(found[:3], mixed[:3], strict=True):
+            np.testing.assert_allclose(again, there[order])
 
 
 def test_old_looks_fade() -> None:
@@ -81,13 +83,12 @@ def test_old_looks_fade() -> None:
     for hit, n in ((True, 5000), (False, 1000)):
         for _ in range(n):
             table = table.learned(key, np.array([hit]), np.ones(1))
-    alpha, beta = table.prior_counts(key, np.array([0.8]))
     assert table.looks[0] <= MOST_LOOKS
-    assert alpha[0] / (alpha[0] + beta[0]) < 0.05
+    assert table.lines(key, np.array([0.8])).p_detect[0] < 0.05
 
 
 @pytest.mark.parametrize(("hits", "looks"), [(0, 0), (1, 1), (0, 3), (2, 5), (30, 40)])
-def test_counts_have_mean_and_variance_of_the_mixture(hits: int, looks: int) -> None:
+def test_a_line_is_known_as_integration_over_both_kinds_has_it(hits: int, looks: int) -> None:
     """One line, by integration over both kinds' distributions, with the shares and rates that it is given."""
     table = SightLines.empty()
     key = table.rows(np.zeros((1, 2)), np.array([[3.0, 0.0]]))
@@ -100,19 +101,20 @@ def test_counts_have_mean_and_variance_of_the_mixture(hits: int, looks: int) -> 
         for share, rate in ((kinds.p_free[3], kinds.free[3]), (1 - kinds.p_free[3], kinds.blocked))
     ]
 
-    def moment(k: int) -> float:
-        """Of the rate, unnormalised; by quantiles, since a density may be infinite at 0."""
-        return sum(
-            w * quad(lambda u, d=d: d.ppf(u) ** k * binom.pmf(hits, looks, d.ppf(u)), 0.0, 1.0, limit=400)[0]
-            for w, d in parts
+    def moment(k: int) -> FloatArray:
+        """Of the rate, unnormalised, by kind; by quantiles, since a density may be infinite at 0."""
+        return np.array(
+            [
+                w * quad(lambda u, d=d: d.ppf(u) ** k * binom.pmf(hits, looks, d.ppf(u)), 0.0, 1.0, limit=400)[0]
+                for w, d in parts
+            ]
         )
 
-    nought, mean, square = moment(0), moment(1), moment(2)
-    mean, square = mean / nought, square / nought
-    alpha, beta = table.prior_counts(key, np.array([0.8]))
-    found = beta_distribution(alpha[0], beta[0])
-    assert found.mean() == pytest.approx(mean, rel=1e-5)
-    assert found.var() == pytest.approx(square - mean**2, rel=1e-4)
+    weight, rate = moment(0), moment(1)
+    line = table.lines(key, np.array([0.8]))
+    assert line.p_free[0] == pytest.approx(weight[0] / weight.sum(), rel=1e-5)
+    assert line.hits[0] / (line.hits[0] + line.misses[0]) == pytest.approx(rate[0] / weight[0], rel=1e-5)
+    assert line.hits[0] + line.misses[0] == pytest.approx(looks + s)
 
 
 def test_both_kinds_are_found() -> None:
@@ -132,13 +134,14 @@ def test_both_kinds_are_found() -> None:
     assert kinds.free[5] == pytest.approx(0.7, abs=0.04)
     assert kinds.blocked == pytest.approx(0.05, abs=0.02)
     # and a line of the same length that was never looked along is expected to be as they are
-    alpha, beta = table.prior_counts(SightLines.empty().rows(np.zeros((1, 2)), np.array([[0.0, 5.2]])), np.array([0.9]))
-    assert alpha[0] / (alpha[0] + beta[0]) == pytest.approx(0.3 * 0.7 + 0.7 * 0.05, abs=0.03)
+    line = table.lines(SightLines.empty().rows(np.zeros((1, 2)), np.array([[0.0, 5.2]])), np.array([0.9]))
+    assert line.p_detect[0] == pytest.approx(0.3 * 0.7 + 0.7 * 0.05, abs=0.03)
 
 
-def test_nominal_counts_do_not_learn() -> None:
-    alpha, beta = nominal_counts(np.array([0.7, 0.2]))
-    np.testing.assert_allclose((alpha + 100) / (alpha + beta + 1000), [0.7, 0.2], rtol=1e-4)
+def test_nominal_lines_do_not_learn() -> None:
+    lines = nominal_lines(np.array([0.7, 0.2]))
+    np.testing.assert_array_equal(lines.p_free, 1.0)
+    np.testing.assert_allclose((lines.hits + 100) / (lines.hits + lines.misses + 1000), [0.7, 0.2], rtol=1e-4)
 
 
 def looks_of(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray, IntArray]:
@@ -170,8 +173,7 @@ def test_sessions_to_come_are_predicted_better_than_by_the_field_of_view() -> No
     for session, recording in enumerate(simulation.sessions):
         sensor, landmark, nominal, hit, _ = looks_of(recording)
         key = table.rows(sensor, landmark)
-        alpha, beta = table.prior_counts(key, nominal)
-        p = alpha / (alpha + beta)
+        p = table.lines(key, nominal).p_detect
         log_score = [np.where(hit, np.log(q), np.log1p(-q)).mean() for q in (nominal, np.full(len(hit), hit.mean()), p)]
         score.append((log_score[0], log_score[1], log_score[2]))
         if session >= 2:

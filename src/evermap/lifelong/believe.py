@@ -11,7 +11,7 @@ from evermap.config import LivingConfig
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
-from evermap.sensing.sightlines import SightLines
+from evermap.sensing.sightlines import Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.named import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
@@ -101,7 +101,7 @@ def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatA
     none = np.zeros(0, dtype=np.int64)
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
     return _followed(
-        living, living.sites.p_here, nothing, np.zeros((2, 0)), config, living.stamp_s, until_s, 0.01
+        living, living.sites.p_here, nothing, nominal_lines(np.zeros(0)), config, living.stamp_s, until_s, 0.01
     ).p_here
 
 
@@ -159,15 +159,12 @@ def believed(
         start_s: beginning of the session.
         until_s: its end.
     """
-    known = SightLines.empty()
+    lines = nominal_lines(looks.p_nominal)
     if config.learn_sight:
         stood = surely_there(looks.rows)
-        lines, hit = looks.sight_key[looks.rows.key[stood]], looks.rows.hit[stood]
-        known = living.sightlines.learned(lines, hit, np.ones(len(hit)))
-    alpha, beta = known.prior_counts(looks.sight_key, looks.p_nominal)
-    return _followed(
-        living, p_start, looks.rows, np.stack([alpha, beta]), config, start_s, until_s, p_false_of(sensor, living)
-    )
+        key, hit = looks.sight_key[looks.rows.key[stood]], looks.rows.hit[stood]
+        lines = living.sightlines.learned(key, hit, np.ones(len(hit))).lines(looks.sight_key, looks.p_nominal)
+    return _followed(living, p_start, looks.rows, lines, config, start_s, until_s, p_false_of(sensor, living))
 
 
 def surely_there(rows: SiteLooks) -> BoolArray:
@@ -206,7 +203,7 @@ def _followed(
     living: LivingMap,
     p_start: FloatArray,
     rows: SiteLooks,
-    counts: FloatArray,
+    lines: Lines,
     config: LivingConfig,
     start_s: float,
     until_s: float,
@@ -218,8 +215,7 @@ def _followed(
         row,
         dynamics_of(living, config),
         rows,
-        counts[0],
-        counts[1],
+        lines,
         start_s=start_s,
         until_s=until_s,
         p_false=p_false,

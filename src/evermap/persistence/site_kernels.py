@@ -25,11 +25,14 @@ def _log_add(a: Any, b: Any) -> Any:
 @kernel
 def frame_evidence(
     first: IntArray,
+    clique: IntArray,
     slot: IntArray,
     seat: IntArray,
     hit: BoolArray,
+    p_free: FloatArray,
     hits: FloatArray,
     misses: FloatArray,
+    p_blocked: float,
     p_false: float,
     p_occluded: float,
     use_misses: bool,
@@ -40,18 +43,22 @@ def frame_evidence(
 ) -> None:
     """What frames say for each seat against 'away', the lines of sight being learned on the way.
 
-    Given that the clique has been at a site all the time, its detections along one line of sight are exchangeable
-    (Beta-Bernoulli): their probabilities multiply, each given those before. (Of one that comes while it is watched,
-    the looks before count too: a little too cautious then.) Somebody may stand before the whole clique in a frame
-    (MATH.md section 3); what is seen of it then is false, and teaches nothing.
+    All is given that the clique has been at a site all the time. (Of one that comes while it is watched, the looks
+    before count too: a little too cautious then.) Whether the lines of sight to it are free changes as seldom as what
+    is known of each by itself allows, for one wall hides a clique from many cells. Detections along a free line are
+    exchangeable (Beta-Bernoulli): their probabilities multiply, each given those before. And somebody may stand before
+    the whole clique in a frame (MATH.md section 3); what is seen of it then is false, and teaches nothing.
 
     Args:
         first: (F + 1,) rows of frame f are `first[f]` to `first[f + 1]`, those of a seat next to each other.
+        clique: (F,) frames of a clique are next to each other.
         slot: (N,) rows of `hits` and `misses`: one for each pair of seat and line of sight.
         seat: (N,) number of the seat within its clique.
         hit: (N,) detected.
-        hits: pseudo counts of detections, updated in place.
+        p_free: of every slot, that its line of sight is free.
+        hits: pseudo counts of detections along it if it is, updated in place.
         misses: of misses.
+        p_blocked: probability of a detection if it is not.
         p_false: of a detection of nothing.
         p_occluded: that somebody stands before the whole clique, in a frame.
         use_misses: False has only hits speak.
@@ -60,37 +67,58 @@ def frame_evidence(
         n_misses: (F, W) filled in.
         expected: (F, W) filled in: mean number of detections.
     """
+    width = log_ratio.shape[1]
+    free, likely = np.empty(width), np.empty(width)  # of each seat: after the last frame, and by its lines alone
     for f in range(first.size - 1):
         log_ratio[f], n_hits[f], n_misses[f], expected[f] = 0.0, 0, 0, 0.0
+        if f == 0 or clique[f] != clique[f - 1]:
+            likely[:] = -1.0
         low = first[f]
         while low < first[f + 1]:
             k = seat[low]
-            high, total = low, 0.0
+            high, p_line = low, 0.0
             while high < first[f + 1] and seat[high] == k:
-                a, b = hits[slot[high]], misses[slot[high]]
+                p_line += p_free[slot[high]]
+                high += 1
+            p_line /= high - low
+            if likely[k] < 0.0:
+                free[k] = p_line
+            elif p_line >= likely[k]:
+                opened = (p_line - likely[k]) / (1.0 - likely[k]) if likely[k] < 1.0 else 0.0
+                free[k] += (1.0 - free[k]) * opened
+            else:
+                free[k] *= p_line / likely[k]
+            likely[k] = p_line
+
+            seen, hidden = 0.0, 0.0
+            for row in range(low, high):
+                a, b = hits[slot[row]], misses[slot[row]]
                 p = max(a / (a + b), p_false)  # what is there is no harder to detect than what is not
-                expected[f, k] += p
-                if hit[high]:
+                q = max(p_blocked, p_false)
+                expected[f, k] += free[k] * p + (1.0 - free[k]) * q
+                if hit[row]:
                     n_hits[f, k] += 1
-                    hits[slot[high]] += 1.0
-                    total += np.log(p / p_false)
+                    hits[slot[row]] += 1.0
+                    seen += np.log(p / p_false)
+                    hidden += np.log(q / p_false)
                 else:
                     n_misses[f, k] += 1
                     if use_misses:
-                        misses[slot[high]] += 1.0
-                        total += np.log(min(b / (a + b), 1.0 - p_false) / (1.0 - p_false))
-                high += 1
-            if p_occluded > 0.0:
-                seen = np.log1p(-p_occluded) + total
-                log_ratio[f, k] = _log_add(seen, np.log(p_occluded))
-                occluded = p_occluded * np.exp(-log_ratio[f, k])
-                for row in range(low, high):  # looks that were none
-                    if hit[row]:
-                        hits[slot[row]] -= occluded
-                    elif use_misses:
-                        misses[slot[row]] -= occluded
-            else:
-                log_ratio[f, k] = total
+                        misses[slot[row]] += 1.0
+                        seen += np.log(min(b / (a + b), 1.0 - p_false) / (1.0 - p_false))
+                        hidden += np.log((1.0 - q) / (1.0 - p_false))
+            seen += np.log(free[k] * (1.0 - p_occluded))
+            veiled = np.log(free[k] * p_occluded)
+            hidden += np.log(1.0 - free[k])
+            total = _log_add(_log_add(seen, veiled), hidden)
+            log_ratio[f, k] = total
+            free[k] = min(np.exp(_log_add(seen, veiled) - total), 1.0)
+            nothing = 1.0 - min(np.exp(seen - total), 1.0)
+            for row in range(low, high):  # looks that were none
+                if hit[row]:
+                    hits[slot[row]] -= nothing
+                elif use_misses:
+                    misses[slot[row]] -= nothing
             low = high
 
 

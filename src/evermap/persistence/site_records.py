@@ -9,6 +9,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.persistence import checks
+from evermap.sensing.sightlines import Lines
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -21,7 +22,7 @@ class SiteLooks:
         stamp_s: of the frame; rows of one clique and stamp are one frame.
         clique: row of the clique, 0 to C - 1.
         site: row of the site the place belongs to, 0 to S - 1.
-        key: row of the pseudo counts of its line of sight.
+        key: row of its line of sight, 0 to K - 1.
         hit: whether it was detected.
     """
 
@@ -107,8 +108,7 @@ def check_sites(
     clique_of_site: IntArray,
     dynamics: SiteDynamics,
     looks: SiteLooks,
-    alpha: FloatArray,
-    beta: FloatArray,
+    lines: Lines,
     start_s: FloatArray,
     until_s: float,
     p_false: float,
@@ -121,7 +121,8 @@ def check_sites(
         "since_s": (dynamics.since_s, n_sites), "return_share": (dynamics.return_share, n_sites),
         "absence": (dynamics.absence, n_cliques), "away_since_s": (dynamics.away_since_s, n_cliques),
         "p_hop": (dynamics.p_hop, n_cliques), "clique": (looks.clique, n_looks), "site": (looks.site, n_looks),
-        "key": (looks.key, n_looks), "hit": (looks.hit, n_looks), "beta": (beta, len(alpha)),
+        "key": (looks.key, n_looks), "hit": (looks.hit, n_looks), "misses": (lines.misses, len(lines.hits)),
+        "p_free": (lines.p_free, len(lines.hits)),
     }  # fmt: skip
     for field, (column, n) in lengths.items():
         shape = (len(column),) if isinstance(column, tuple) else np.shape(column)
@@ -130,8 +131,13 @@ def check_sites(
     checks.check_rows(clique_of_site, n_cliques, twice=True, field="clique_of_site")
     checks.check_rows(looks.clique, n_cliques, twice=True, field="clique")
     checks.check_rows(looks.site, n_sites, twice=True, field="site")
-    checks.check_rows(looks.key, len(alpha), twice=True, field="key")
-    for field, values in (("p_here", p_here), ("p_hop", dynamics.p_hop), ("return_share", dynamics.return_share)):
+    checks.check_rows(looks.key, len(lines.hits), twice=True, field="key")
+    for field, values in (
+        ("p_here", p_here),
+        ("p_hop", dynamics.p_hop),
+        ("return_share", dynamics.return_share),
+        ("p_free", lines.p_free),
+    ):
         checks.check_probability(np.asarray(values, dtype=np.float64), field)
     for field, summed in (("p_here", p_here), ("return_share", dynamics.return_share)):
         total = np.bincount(clique_of_site, summed, minlength=n_cliques)
@@ -150,9 +156,11 @@ def check_sites(
         raise InputError(f"{until_s} s lies before the last look", field="until_s")
     if not 0.0 < p_false < 1.0:
         raise InputError(f"{p_false} is no probability between 0 and 1", field="p_false")
+    if not 0.0 <= lines.p_blocked < 1.0:
+        raise InputError(f"{lines.p_blocked} is no probability below 1", field="p_blocked")
     if not 0.0 <= p_occluded < 1.0:
         raise InputError(f"{p_occluded} is no probability below 1", field="p_occluded")
-    for field, counts in (("alpha", alpha), ("beta", beta)):
+    for field, counts in (("hits", lines.hits), ("misses", lines.misses)):
         good = np.isfinite(counts) & (np.asarray(counts) > 0.0)
         if not good.all():
             row = int(np.argmin(good))

@@ -5,9 +5,9 @@ survival of its lifetime; who leaves stands at another known site at once with `
 returns as its absence ends. With one site and no return this is Rosen's persistence filter, with several landmarks on
 the clique Bateman's joint clique filter, with a constant hazard and `p_hop = 1` Nielsen's chain of modes.
 
-Misses are weighed by what is known of the line of sight (`sensing.sightlines`) and by what the same session says of it,
-so that false negatives are explained instead of suppressed: a site that is hidden from where the robot looks, or that
-somebody stands before, is not one that was left.
+Misses are weighed by what is known of the lines of sight (`sensing.sightlines`) and by what the same session says of
+them, so that false negatives are explained instead of suppressed: a site that is hidden from where the robot looks, or
+that somebody stands before, is not one that was left.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from evermap.persistence import checks
 from evermap.persistence.site_chains import Chains, distinct, odds, transitions
 from evermap.persistence.site_records import SiteBeliefs, SiteDynamics, SiteLooks, SiteTrace, check_sites
+from evermap.sensing.sightlines import Lines
 from evermap.types import BoolArray, FloatArray, IntArray
 
 __all__ = ["SiteBeliefs", "SiteDynamics", "SiteLooks", "SiteTrace", "follow_sites"]
@@ -30,8 +31,7 @@ def follow_sites(
     clique_of_site: IntArray,
     dynamics: SiteDynamics,
     looks: SiteLooks,
-    alpha: FloatArray,
-    beta: FloatArray,
+    lines: Lines,
     *,
     start_s: FloatArray | float,
     until_s: float,
@@ -47,8 +47,7 @@ def follow_sites(
         clique_of_site: (S,) row of the clique of each site; a clique may have none.
         dynamics: how sites are left and returned to.
         looks: what was looked at.
-        alpha: (K,) pseudo counts of hits along each line of sight, before the session.
-        beta: (K,) of misses.
+        lines: what is known of K lines of sight before the session.
         start_s: when `p_here` held, for all or (C,) of each clique; none of its looks is earlier.
         until_s: end of the session; no look is later.
         p_false: probability of a detection at a place where nothing of the clique is.
@@ -64,7 +63,7 @@ def follow_sites(
     n_cliques, n_sites = len(dynamics.p_hop), len(p_here)
     start = checks.as_rows(start_s, n_cliques, "start_s")
     pinned = np.zeros(n_cliques, dtype=np.bool_) if held is None else np.asarray(held, dtype=np.bool_)
-    check_sites(p_here, clique_of_site, dynamics, looks, alpha, beta, start, until_s, p_false, p_occluded)
+    check_sites(p_here, clique_of_site, dynamics, looks, lines, start, until_s, p_false, p_occluded)
     chains = Chains.of(clique_of_site, n_cliques)
     old = chains.start(np.asarray(p_here, dtype=np.float64), pinned)
     route, moves = chains.routes(dynamics.p_hop, dynamics.return_share, pinned)
@@ -88,18 +87,21 @@ def follow_sites(
     width = int(np.max(np.diff(chains.first), initial=1))
     shape = len(frame_clique), width
     seat = chains.row_of_site[looks.site[order]] - chains.first[clique]
-    pair, slot = np.unique(looks.site[order] * max(len(alpha), 1) + looks.key[order], return_inverse=True)
-    key = pair % max(len(alpha), 1)
-    hits, misses = np.asarray(alpha, dtype=np.float64)[key], np.asarray(beta, dtype=np.float64)[key]
+    pair, slot = np.unique(looks.site[order] * max(len(lines.hits), 1) + looks.key[order], return_inverse=True)
+    key = pair % max(len(lines.hits), 1)
+    p_free, hits, misses = (np.asarray(column, dtype=np.float64)[key] for column in lines[:3])
     log_ratio, expected = np.zeros(shape), np.zeros(shape)
     n_hits, n_misses = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     kernels.frame_evidence(
         row_first,
+        frame_clique,
         slot.ravel(),
         seat,
         np.asarray(looks.hit, dtype=np.bool_)[order],
+        p_free,
         hits,
         misses,
+        float(lines.p_blocked),
         float(p_false),
         float(p_occluded),
         use_misses,

@@ -36,6 +36,26 @@ _SENSOR_CELLS = 1 << 20
 _REACH = 1 << 10
 
 
+class Lines(NamedTuple):
+    """What is known of N lines of sight.
+
+    Attributes:
+        p_free: (N,) probability that they are free.
+        hits, misses: (N,) parameters of the Beta distribution of the detection probability along them if they are.
+        p_blocked: detection probability along them if they are not.
+    """
+
+    p_free: FloatArray
+    hits: FloatArray
+    misses: FloatArray
+    p_blocked: float
+
+    @property
+    def p_detect(self) -> FloatArray:
+        """(N,) mean detection probability."""
+        return self.p_free * self.hits / (self.hits + self.misses) + (1.0 - self.p_free) * self.p_blocked
+
+
 class _Kinds(NamedTuple):
     """The two kinds of lines.
 
@@ -92,13 +112,11 @@ class SightLines:
         dx, dy = (away.astype(np.int64) + _REACH).T
         return np.asarray(((x * _SENSOR_CELLS + y) * (2 * _REACH) + dx) * (2 * _REACH) + dy, dtype=np.int64)
 
-    def prior_counts(self, keys: IntArray, p_detect: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Beta distributions of the detection probability along lines of sight: pseudo counts (N,) of hits and misses.
-
-        That of a line which may be free or blocked is the Beta distribution of the same mean and variance.
+    def lines(self, keys: IntArray, p_detect: FloatArray) -> Lines:
+        """What is known of lines of sight.
 
         Args:
-            keys: (N,) lines of sight.
+            keys: (N,) which.
             p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along free
                 lines that is started from, and by how much it is less at the field's edge.
         """
@@ -107,13 +125,8 @@ class SightLines:
         kinds, length, (hits, looks) = self._kinds(middle), _length(keys), self._counts(keys)
         free, blocked = np.clip(kinds.free[length] * nominal / middle, *RATES), np.full(len(length), kinds.blocked)
         p_free = _p_free(hits, looks, kinds.p_free[length], free, blocked)
-        share = np.stack([p_free, 1.0 - p_free])
-        mean = (hits + STRENGTH * np.stack([free, blocked])) / (looks + STRENGTH)
-        spread = mean * (1.0 - mean) / (looks + STRENGTH + 1.0)
-        both = (share * mean).sum(axis=0)
-        variance = (share * (spread + (mean - both) ** 2)).sum(axis=0)
-        count = both * (1.0 - both) / variance - 1.0  # positive: no distribution on [0, 1] of this mean is wider
-        return count * both, count * (1.0 - both)
+        misses = np.maximum(looks - hits, 0.0)
+        return Lines(p_free, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), kinds.blocked)
 
     def learned(self, keys: IntArray, hit: BoolArray, weight: FloatArray) -> SightLines:
         """The table after looks at what was there with some probability.
@@ -159,10 +172,10 @@ class SightLines:
         return kinds
 
 
-def nominal_counts(p_detect: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pseudo counts of one who takes the sensor's nominal field of view for the truth, whatever is looked at."""
+def nominal_lines(p_detect: FloatArray) -> Lines:
+    """For who takes the sensor's nominal field of view (N,) for the truth, whatever is looked at."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
-    return KNOWN * nominal, KNOWN * (1.0 - nominal)
+    return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), BLOCKED)
 
 
 def _p_free(
