@@ -23,6 +23,7 @@ class Experiment(StrEnum):
     NIELSEN2024 = "nielsen2024"
     BATEMAN2020 = "bateman2020"
     LIFETIMES = "lifetimes"
+    LIFELONG = "lifelong"
 
 
 DATA = {
@@ -31,8 +32,11 @@ DATA = {
     Experiment.PRESENCE: Path("../shared/data/presence"),
     Experiment.NIELSEN2024: Path("../shared/data/mrclam"),
     Experiment.LIFETIMES: Path("../shared/data/presence"),
+    Experiment.LIFELONG: Path("../shared/data/mrclam"),
 }
 """Where the data of each experiment are looked for; bateman2020 has none."""
+COUNTED = (Experiment.PRESENCE, Experiment.LIFELONG)
+"""Experiments whose progress is not counted in seconds of recordings."""
 
 
 def reproduce(
@@ -57,8 +61,8 @@ def reproduce(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="nielsen2024: only this part (simulation, recordings, during, search); repeatable. Rows of an older "
-            "run of other parts, data sets and methods in --out stay.",
+            help="Only this part, repeatable; nielsen2024: simulation, recordings, during, search; lifelong: five, "
+            "fifty, ablation-recorded, ablation-simulated. Rows of an older run of other parts in --out stay.",
             show_default=False,
         ),
     ] = None,
@@ -69,7 +73,8 @@ def reproduce(
         list[str] | None, typer.Option(help="nielsen2024: only this method; repeatable.", show_default=False)
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="nielsen2024: one robot and three displacements, minutes instead of hours.")
+        bool,
+        typer.Option("--quick", help="nielsen2024, lifelong: a little of everything, minutes instead of hours."),
     ] = False,
     jobs: Annotated[
         int | None, typer.Option(help="nielsen2024: runs at a time; 1 for timings that mean something.", min=1)
@@ -77,8 +82,9 @@ def reproduce(
     runs: Annotated[
         int | None,
         typer.Option(
-            help="bateman2020: simulated for every world and sensor. lifetimes: months of patrols that are simulated.",
-            show_default="100; lifetimes 10",
+            help="bateman2020: simulated for every world and sensor. lifetimes: months of patrols that are simulated. "
+            "lifelong: scripts of changes.",
+            show_default="100; lifetimes 10; lifelong 5",
         ),
     ] = None,
     world: Annotated[
@@ -108,6 +114,7 @@ def reproduce(
     a room and at a door. nielsen2024: landmarks that moved, by all methods, in simulation and in the UTIAS recordings.
     bateman2020: landmarks on rigid bodies seen in space, by filters of single landmarks and of whole bodies. lifetimes:
     how long things stay, learned from tracks, from months of patrols and from looks at rooms, against the truth.
+    lifelong: sessions of the UTIAS robots into one map, while landmarks move, leave and come back between them.
     Runs follow one another on one core, so that the timings mean something.
 
     \b
@@ -117,6 +124,7 @@ def reproduce(
       evermap reproduce presence --out out/presence
       evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
       evermap reproduce lifetimes --runs 3
+      evermap reproduce lifelong --part five
       evermap reproduce bateman2020 --runs 20 --world nominal --world occlusion --filters jcf+suppression,oracle
     """
     _one_core()
@@ -139,7 +147,7 @@ def reproduce(
     _refuse_options(experiment, given)
     target = out or Path("evermap-out") / experiment.value
     check_replaceable(target, force=force)
-    with progress_bar(experiment.value, speed=experiment is not Experiment.PRESENCE) as progress:
+    with progress_bar(experiment.value, speed=experiment not in COUNTED) as progress:
         if experiment is Experiment.MRCLAM:
             from evermap.experiments import mrclam
 
@@ -181,6 +189,14 @@ def reproduce(
             rooms = _reference(experiment, data, lifetimes.ROOMS, "nothing is said about rooms")
             table = lifetimes.reproduce(target, simulated, data=rooms, progress=progress, force=force)
             as_text = lifetimes.as_markdown
+        elif experiment is Experiment.LIFELONG:
+            from evermap.experiments import lifelong
+
+            base = lifelong.QUICK if quick else lifelong.Settings()
+            these: dict[str, Any] = {"parts": part and tuple(part), "seed": seed, "seeds": runs}
+            lives = replace(base, **{name: value for name, value in these.items() if value is not None})
+            table = lifelong.reproduce(data or DATA[experiment], target, lives, progress=progress, force=force)
+            as_text = lifelong.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -210,6 +226,7 @@ def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
         Experiment.NIELSEN2024: {"--data", "--seed", "--part", "--dataset", "--method", "--quick", "--jobs"},
         Experiment.BATEMAN2020: {"--seed", "--runs", "--world", "--filters"},
         Experiment.LIFETIMES: {"--data", "--seed", "--runs"},
+        Experiment.LIFELONG: {"--data", "--seed", "--part", "--quick", "--runs"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))

@@ -182,7 +182,7 @@ def inputs_of(job: Job, recording: Recording, reference: Reference) -> tuple[Rec
     if not job.during:
         return recording, shifted(truth, job.shifts), truth
     after = shifted(truth, job.shifts)
-    poses = _poses_at(reference.trajectory, recording.frames.stamp_s)
+    poses = poses_at(reference.trajectory, recording.frames.stamp_s)
     changed = edited(recording, poses, truth, after, half_time_s(recording), reference.range_law)
     return changed, truth, after
 
@@ -248,7 +248,7 @@ def warm_up(jobs: Sequence[Job], data: Path) -> None:
         run_slam(first_frames(recording, 60), job.config(), prior_map=survey_of(recording))
 
 
-def _poses_at(trajectory: Trajectory, stamp_s: FloatArray) -> FloatArray:
+def poses_at(trajectory: Trajectory, stamp_s: FloatArray) -> FloatArray:
     """(F, 3) poses at the frames; those before the first and after the last are held."""
     inside = np.clip(stamp_s, trajectory.stamp_s[0], trajectory.stamp_s[-1])
     return interpolate(trajectory, inside)[0]

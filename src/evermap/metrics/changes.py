@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,6 +55,56 @@ def compare_changes(found: Sequence[MapChange], true: Sequence[MapChange]) -> Ch
         rotation_error_rad=np.array([abs(float(wrap(f.rotation_rad - t.rotation_rad))) for f, t in pairs]),
         time_error_s=np.array([abs(time_of_change(f) - time_of_change(t)) for f, t in pairs]),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeCounts:
+    """Changes by landmark and kind, of one session or sums of many.
+
+    Attributes:
+        n_found, n_true: landmarks that are said to have changed, and that did.
+        n_right: landmarks of both, with the same kind of change.
+    """
+
+    n_found: int = 0
+    n_true: int = 0
+    n_right: int = 0
+
+    def __add__(self, other: ChangeCounts) -> ChangeCounts:
+        return ChangeCounts(self.n_found + other.n_found, self.n_true + other.n_true, self.n_right + other.n_right)
+
+    @property
+    def precision(self) -> float | None:
+        """Share of the found that are right; None where nothing was found."""
+        return self.n_right / self.n_found if self.n_found else None
+
+    @property
+    def recall(self) -> float | None:
+        """Share of the true that were found; None where nothing changed."""
+        return self.n_right / self.n_true if self.n_true else None
+
+
+def count_changes(
+    found: Sequence[MapChange], true: Sequence[MapChange], kind: ChangeKind | None = None
+) -> ChangeCounts:
+    """Counts by landmark and kind; groups do not matter, and what turned has moved.
+
+    Args:
+        found: what is said to have changed.
+        true: what did.
+        kind: only changes of this kind; None for all, with the kind as part of what must be right.
+    """
+    claimed, changed = (
+        {(identity, what) for identity, what in _by_landmark(changes) if kind in (None, what)}
+        for changes in (found, true)
+    )
+    return ChangeCounts(len(claimed), len(changed), len(claimed & changed))
+
+
+def _by_landmark(changes: Sequence[MapChange]) -> Iterator[tuple[int, ChangeKind]]:
+    for change in changes:
+        kind = ChangeKind.MOVED if change.kind is ChangeKind.ROTATED else change.kind
+        yield from ((identity, kind) for identity in change.landmark_ids)
 
 
 def rank_of_truth(result: SlamResult, true: Sequence[MapChange]) -> int | None:

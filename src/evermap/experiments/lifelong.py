@@ -1,0 +1,212 @@
+"""Sessions of real robots into one map, while landmarks move, leave and come back between them; MATH.md section 5.
+
+Three questions: what five robots' sessions do to a map, by method; whether error, size and cost stay the same over a
+long life; and what each part of the engine contributes, on the recordings and in a simulated building.
+Each part can be run alone: what an older run left of the others stays in the tables.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from evermap import __version__
+from evermap.errors import ConfigError
+from evermap.experiments.lifelong_runs import ABLATIONS, CONTENDERS, SIMULATED, WHOLE, Contender, live
+from evermap.experiments.lifelong_scores import NOTHING
+from evermap.experiments.lifelong_table import as_markdown, verdicts
+from evermap.experiments.lifelong_world import DATASET, World, recorded_world, simulated_world
+from evermap.experiments.mrclam import find_dataset, machine
+
+Progress = Callable[[float, float], None]
+"""Called with what is done and the total, in sessions."""
+Row = dict[str, Any]
+
+SCHEMA_VERSION = "1"
+EXPERIMENT = "lifelong"
+PARTS = ("five", "fifty", "ablation-recorded", "ablation-simulated")
+SCORING = (
+    "poses at 2 Hz and landmarks in the frame of the map, tied to the truth once, by the landmarks of the first "
+    "session's map; landmarks that are there and that the map believes in (p >= 0.5), however far off; a claim is "
+    "right within 0.25 m; Brier score of 'the landmark stands where it stood last' for all that were ever detected; "
+    "changes by landmark and kind; nothing is left out"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What is run; the defaults are everything.
+
+    Attributes:
+        parts: of `PARTS`.
+        seeds: scripts of changes for the five sessions, and for the ablation on recordings.
+        short, long: sessions of a short and of a long life.
+        long_contenders: names of those who live long.
+        buildings, days: simulated buildings of the ablation, and how long they are visited, twice a day.
+        seed: of everything random; scripts and buildings count up from it.
+    """
+
+    parts: tuple[str, ...] = PARTS
+    seeds: int = 5
+    short: int = 5
+    long: int = 50
+    long_contenders: tuple[str, ...] = (CONTENDERS[0].name, WHOLE.name, CONTENDERS[-1].name)
+    buildings: int = 4
+    days: int = 10
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        unknown = [part for part in self.parts if part not in PARTS]
+        if unknown:
+            raise ConfigError(f"no part {unknown[0]}", field="part", hint=" | ".join(PARTS))
+        for name, least in (("seeds", 1), ("short", 2), ("long", 5), ("buildings", 1), ("days", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
+
+
+QUICK = Settings(seeds=1, long=10, buildings=1, days=3)
+"""Minutes: one script, one building, a tenth of everything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One contender in one world."""
+
+    part: str
+    seed: int
+    contender: Contender
+    sessions: int
+
+
+def reproduce(
+    data: str | Path,
+    out: str | Path,
+    settings: Settings | None = None,
+    *,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> dict[str, Any]:
+    """Run what is asked for, and write `summary.json`, `table.md` and the figures of all that is known by then.
+
+    Args:
+        data: folder with the MRCLAM recordings.
+        out: folder; rows of an older run of parts that were not asked for are kept, all else is replaced. Untouched if
+            this run fails.
+        settings: everything where None.
+        progress: told after every session.
+        force: replace `out` whatever it holds.
+
+    Returns:
+        `rows` (a dictionary a session), `expected`, `settings`, `machine`; plain JSON values.
+
+    Raises:
+        InputError: a recording is missing or malformed.
+        ConfigError: `out` must not be replaced.
+    """
+    from evermap.runfolder import RunFolder
+    from evermap.viz.style import save_all
+
+    settings = settings or Settings()
+    if any("simulated" not in part for part in settings.parts):
+        find_dataset(Path(data), DATASET)
+    kept = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts]
+    with RunFolder(out, force=force) as folder:
+        wall, cpu = time.perf_counter(), time.process_time()
+        rows = [*kept, *_run_all(settings, Path(data), progress)]
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        rows.sort(key=lambda row: PARTS.index(row["part"]))
+        table: dict[str, Any] = {
+            "schema_version": SCHEMA_VERSION,
+            "evermap": __version__,
+            "experiment": EXPERIMENT,
+            "scoring": SCORING,
+            "settings": json.loads(json.dumps(asdict(settings))),
+            "machine": machine(cpu / wall),
+            "processing_s": wall,
+            "expected": verdicts(rows),
+            "rows": rows,
+        }
+        save_all(_figures(rows), folder.path)
+        folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
+        table["outputs"] = sorted([*folder.files(), "summary.json"])
+        text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        folder.path("summary.json").write_text(text, encoding="utf-8")
+    return table
+
+
+def jobs(settings: Settings) -> list[Job]:
+    """Who lives in which world, in the order in which they are run: worlds change as rarely as possible."""
+    scripts = range(settings.seed, settings.seed + settings.seeds)
+    buildings = range(settings.seed, settings.seed + settings.buildings)
+    planned = {
+        "five": [Job("five", seed, who, settings.short) for seed in scripts for who in CONTENDERS],
+        "fifty": [
+            Job("fifty", settings.seed, who, settings.long)
+            for who in CONTENDERS
+            if who.name in settings.long_contenders
+        ],
+        "ablation-recorded": [
+            Job("ablation-recorded", seed, who, settings.short) for seed in scripts for who in ABLATIONS
+        ],
+        "ablation-simulated": [
+            Job("ablation-simulated", seed, who, 2 * settings.days) for seed in buildings for who in ABLATIONS
+        ],
+    }
+    return [job for part in PARTS if part in settings.parts for job in planned[part]]
+
+
+def _run_all(settings: Settings, data: Path, progress: Progress | None) -> Iterator[Row]:
+    from evermap.pipeline import warm_up
+
+    warm_up()  # compiling is no part of the first session
+    planned = jobs(settings)
+    total, done = sum(job.sessions for job in planned), 0
+    made: tuple[tuple[bool, int, int], World] | None = None
+    for job in planned:
+        is_simulated = "simulated" in job.part
+        key = is_simulated, job.sessions, job.seed
+        if made is None or made[0] != key:
+            made = None  # one at a time in memory
+            made = key, _world(job, data)
+        for row in live(made[1], job.contender, SIMULATED if is_simulated else ()):
+            done += 1
+            if progress is not None:
+                progress(done, total)
+            yield {"part": job.part, "seed": job.seed, "contender": job.contender.name, **row}
+
+
+def _world(job: Job, data: Path) -> World:
+    if "simulated" in job.part:
+        return simulated_world(job.sessions // 2, job.seed)
+    return recorded_world(data, job.sessions, job.seed)
+
+
+def _figures(rows: list[Row]) -> dict[str, Any]:
+    from evermap.experiments.lifelong_figures import draw_errors, draw_flat
+
+    few, many = ([row for row in rows if row["part"] == part] for part in ("five", "fifty"))
+    figures = {}
+    if few:
+        figures["five"] = draw_errors(few)
+    if many:
+        figures["fifty"] = draw_errors(many)
+        figures["flat"] = draw_flat(many)
+    return figures
+
+
+def _earlier(out: Path) -> list[Row]:
+    """Rows that an older run left; none where there is none of this schema."""
+    try:
+        table = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    if table.get("experiment") != EXPERIMENT or table.get("schema_version") != SCHEMA_VERSION:
+        return []
+    return [row for row in table["rows"] if NOTHING.keys() <= row.keys()]
+
+
+__all__ = ["PARTS", "QUICK", "Settings", "as_markdown", "reproduce"]
