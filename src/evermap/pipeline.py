@@ -52,11 +52,10 @@ def run_slam(
     """
     from threadpoolctl import threadpool_limits
 
-    from evermap.config import Config
     from evermap.slam.association.identify import identified
     from evermap.slam.session import prepare
 
-    config = config or Config()
+    config = _or_default(config)
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     prior, noise = _beliefs(recording, config)
     if config.slam.unknown_ids:
@@ -76,12 +75,15 @@ class Session:
 
     Attributes:
         living: the map after it; the very map that was given where the session could not be found in it.
+        recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
+            that name detections and frames are rows of it.
         slam: trajectory, landmarks and all else, in the map's frame.
         changes: what appeared, vanished, moved, was exchanged or returned since the session before.
         evidence: what was seen of every clique, frame by frame.
     """
 
     living: LivingMap
+    recording: Recording
     slam: SlamResult
     changes: tuple[MapChange, ...]
     evidence: Evidence
@@ -106,33 +108,69 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
+    config = _or_default(config)
+    living = _or_begun(living, recording)
+    return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
+
+
+@dataclass(frozen=True, slots=True)
+class Alone:
+    """A session solved by itself, in a frame of its own, before a map is asked.
+
+    Attributes:
+        visit: the recording as it is used, and what the estimator made of it.
+        slam: the estimator, for what it knew at the time.
+        prior: of the calibration states.
+        step_s: seconds a frame.
+        interrupted: True where it was stopped before its end.
+    """
+
+    visit: Visit
+    slam: StreamingSlam
+    prior: CalibrationPrior
+    step_s: FloatArray
+    interrupted: bool
+
+
+def solve_alone(recording: Recording, living: LivingMap, config: Config, *, progress: Progress | None = None) -> Alone:
+    """The first half of `run_session`: poses and landmarks of a session as one Gaussian.
+
+    It is the same for all maps that agree on classes and deleted landmarks, whatever else they believe.
+    """
     from threadpoolctl import threadpool_limits
 
-    from evermap.config import Config
-    from evermap.lifelong import believe
-    from evermap.lifelong import session as lifelong
-    from evermap.maps.living import LivingMap
+    from evermap.lifelong.session import Visit, admitted
+    from evermap.slam.cleaning import clean
     from evermap.slam.session import prepare
 
-    config = config or Config()
-    living = LivingMap(clock=recording.clock) if living is None else living
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
-    recording, living = lifelong.admitted(recording, living)
+    recording, _ = admitted(clean(recording), living)
     prior, noise = _beliefs(recording, config)
     prepared = prepare(recording)
     warm_up()
     with threadpool_limits(limits=1, user_api="blas"):
-        # the session by itself: poses and landmarks as one Gaussian, in a frame of its own
         slam = _estimator(prepared, prior, noise, recording, config.model_copy(update={"slam": _alone(config)}))
         step_s, interrupted = _feed(slam, prepared, realtime=False, progress=progress)
-        visit = lifelong.Visit(recording, prepared, slam.finish())
+        return Alone(Visit(recording, prepared, slam.finish()), slam, prior, step_s, interrupted)
+
+
+def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
+    """The second half of `run_session`: what a session that was solved alone makes of a map."""
+    from threadpoolctl import threadpool_limits
+
+    from evermap.lifelong import believe
+    from evermap.lifelong import session as lifelong
+
+    visit, slam = alone.visit, alone.slam
+    _, living = lifelong.admitted(visit.recording, living)
+    with threadpool_limits(limits=1, user_api="blas"):
         # over the map as it is believed to be by now, and solved again with the map as its prior
         expected = believe.predicted(living, config.living, visit.start_s)
         where = lifelong.laid(living, expected, visit, config.living)
         if where is None and len(living.places):
-            return _lost(visit, slam, prior, step_s, living, interrupted=interrupted)
+            return _lost(visit, slam, alone.prior, alone.step_s, living, interrupted=alone.interrupted)
         if where is not None:
-            visit = lifelong.refit(living, where, visit, prior, robust=config.slam.robust)
+            visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
         # what was found goes into the map, then hits and misses into beliefs, and those into decisions
         entry = lifelong.entered(living, expected, where, visit, config.living)
         looks = lifelong.looks(entry, visit)
@@ -141,8 +179,22 @@ def run_session(
         after = lifelong.learned(after, now, looks, config.living)
         frame = "first_pose" if where is None else "prior_map"
         landmarks = replace(after.landmarks(p_least=0.5), frame=frame)
-        result = _result(visit, slam, prior, step_s, frame, landmarks=landmarks, interrupted=interrupted)
-    return Session(after, replace(result, changes=changes), changes, now.evidence)
+        result = _result(
+            visit, slam, alone.prior, alone.step_s, frame, landmarks=landmarks, interrupted=alone.interrupted
+        )
+    return Session(after, visit.recording, replace(result, changes=changes), changes, now.evidence)
+
+
+def _or_default(config: Config | None) -> Config:
+    from evermap.config import Config
+
+    return config or Config()
+
+
+def _or_begun(living: LivingMap | None, recording: Recording) -> LivingMap:
+    from evermap.maps.living import LivingMap
+
+    return LivingMap(clock=recording.clock) if living is None else living
 
 
 def run_localization(
@@ -165,13 +217,12 @@ def run_localization(
     Raises:
         DataError: the map is empty, or the robot's place in it could not be found.
     """
-    from evermap.config import Config
     from evermap.errors import DataError
     from evermap.lifelong.believe import predicted
     from evermap.lifelong.session import admitted
     from evermap.slam.localize_recording import localize
 
-    config = config or Config()
+    config = _or_default(config)
     if not len(living.places):
         raise DataError("the map is empty", field="--map", hint="evermap slam RECORDING --map FILE, without --localize")
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
@@ -374,4 +425,4 @@ def _lost(
     landmarks = session.landmarks(visit.prepared, visit.outcome, visit.recording, "first_pose")
     result = _result(visit, slam, prior, step_s, "first_pose", landmarks=landmarks, interrupted=interrupted)
     warning = "cannot localise in the map: too few of its landmarks were seen standing to each other as it says"
-    return Session(living, replace(result, warnings=(*result.warnings, warning)), (), Evidence.empty())
+    return Session(living, visit.recording, replace(result, warnings=(*result.warnings, warning)), (), Evidence.empty())

@@ -45,7 +45,7 @@ def run_in_map(
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
                 session = run_session(recording, living, config, progress=progress)
-                result = session.slam
+                result, recording = session.slam, session.recording
         elapsed_s = time.perf_counter() - start
         _write(recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force)
         if localize or result.interrupted:

@@ -17,6 +17,15 @@ SAME_PLACE_M = 0.3
 """Cliques that stand this close to where another stood have taken its place."""
 
 
+SURELY_AWAY = 0.02
+FORGOTTEN_P = 0.05
+"""Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
+MOST_AWAY = 20
+"""Cliques that are away are remembered up to this number, and as many again as stand somewhere."""
+MOST_STAYS = 5000
+"""Newest stays that lifetimes are learned from: a year of a large building."""
+
+
 @dataclass(frozen=True, slots=True)
 class Standing:
     """Where cliques stand: their ids, and the row of the site of each, -1 where it is away."""
@@ -91,17 +100,56 @@ def with_stays(before: LivingMap, after: LivingMap, looks: Looks, start_s: float
 
 
 def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
-    """The map without the least probable sites of cliques that have too many; places go with their sites."""
-    sites = living.sites
+    """The map without what it need not remember: its cost is that of what stands there, whatever its age.
+
+    Left out are the least probable sites of cliques that have more than `most_sites`, and cliques that are away for
+    good: those that return with little probability, or, where too many are away, that went first. Their stays are kept
+    to learn from.
+    """
+    sites, members = living.sites, living.members
     order = np.lexsort((-sites.seen_s, -sites.p_here, sites.clique_id))
-    first = np.searchsorted(sites.clique_id[order], sites.clique_id[order])
-    kept = np.sort(order[np.arange(len(order)) - first < most_sites])
-    if len(kept) == len(sites):
-        return living
-    sites = sites[kept]
-    rows = np.flatnonzero(np.isin(living.places.site_id, sites.site_id))
-    places = living.places[rows]
-    return replace(living, sites=sites, places=places, covariance_m2=of_places(living.covariance_m2, rows))
+    rank = np.arange(len(order)) - np.searchsorted(sites.clique_id[order], sites.clique_id[order])
+    kept = np.zeros(len(sites), dtype=np.bool_)
+    kept[order[rank < most_sites]] = True
+    gone = _gone_for_good(living)
+    kept &= ~np.isin(sites.clique_id, gone)
+    stays = living.stays
+    if len(stays) > MOST_STAYS:
+        stays = stays[np.sort(np.argsort(stays.last_s, kind="stable")[-MOST_STAYS:])]
+    if kept.all():
+        return replace(living, stays=stays)
+    rows = np.flatnonzero(np.isin(living.places.site_id, sites.site_id[kept]))
+    return replace(
+        living,
+        members=members[~np.isin(members.clique_id, gone)],
+        sites=sites[kept],
+        places=living.places[rows],
+        covariance_m2=of_places(living.covariance_m2, rows),
+        stays=stays,
+    )
+
+
+def _gone_for_good(living: LivingMap) -> IntArray:
+    """Ids of cliques that are away and need not be remembered."""
+    sites = living.sites
+    cliques, row = clique_rows(sites)
+    p_here, seen = np.zeros(len(cliques)), np.full(len(cliques), -np.inf)
+    np.add.at(p_here, row, sites.p_here)
+    np.maximum.at(seen, row, sites.seen_s)
+    operated = living.members.pinned | living.members.deleted
+    away = np.flatnonzero((p_here < SURELY_AWAY) & ~np.isin(cliques, living.members.clique_id[operated]))
+    kinds, middle = _class_of(living, cliques[away]), site_middles(living)
+    newest = {int(row[s]): s for s in np.argsort(sites.seen_s, kind="stable")}
+    p_return = np.zeros(len(away))
+    for k, clique in enumerate(away):
+        absence = living.lives.of(int(kinds[k]), middle[newest[int(clique)]]).absence
+        still_away = float(np.exp(absence.log_survival(max(living.stamp_s - seen[clique], 0.0))))
+        p_return[k] = 1.0 - absence.p_never_leaves / still_away if still_away > 0.0 else 0.0
+    hopeless = away[p_return < FORGOTTEN_P]
+    waiting = away[p_return >= FORGOTTEN_P]
+    most = MOST_AWAY + len(cliques) - len(away)
+    too_many = waiting[np.argsort(seen[waiting], kind="stable")][: max(len(waiting) - most, 0)]
+    return np.asarray(cliques[np.concatenate([hopeless, too_many])])
 
 
 def changes_between(before: LivingMap, after: LivingMap, looks: Looks) -> tuple[MapChange, ...]:

@@ -39,9 +39,9 @@ def own_landmarks(outcome: Outcome, *, of_unknown_size: bool = True) -> OwnLandm
 
     Args:
         outcome: of the session.
-        of_unknown_size: with what is not known of the scale, as one needs to compare it with a map. The metre of a map is
-            that of its first session: where later ones could change it, the shrinking that noise does to every graph
-            would shrink it a little each time.
+        of_unknown_size: with what is not known of the scale, as one needs to compare it with a map. The metre of a map
+            is that of its first session: where later ones could change it, the shrinking that noise does to every
+            graph would shrink it a little each time.
     """
     estimate = outcome.graph_estimate
     row = believable(outcome.problem.landmark_row, outcome.inlier, estimate.known)
