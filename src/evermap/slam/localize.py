@@ -135,8 +135,9 @@ class Localizer:
 
     @property
     def considered(self) -> IntArray:
-        """(K,) rows of the places whose errors are kept correlated with the pose's."""
-        return self._considered.copy()
+        """Rows of the places whose errors are kept correlated with the pose's."""
+        considered: IntArray = self._considered[self._considered != UNKNOWN]
+        return considered
 
     def step(self, stamp_s: float, drive: Drive, seen: Sightings) -> Located:
         """Process a frame: predict, place if need be, compare, update, expect.
@@ -200,14 +201,15 @@ class Localizer:
     def _place_at(self, placed: Placed) -> None:
         """Begin anew at a pose; what is known of the calibration stays."""
         states = self.states_covariance
-        self._slot[self._considered] = -1
+        self._slot[:] = -1
         self._considered = self._used_at = np.zeros(0, dtype=np.int64)
         self._covariance = np.zeros((AT_PLACES, AT_PLACES))
-        for row in placed.rows.tolist():
-            self._add(row)
-        follows = placed.by_places @ self._covariance[AT_PLACES:, AT_PLACES:]
+        self._consider(placed.rows)
+        by_places = np.zeros((3, 2 * len(self._considered)))
+        by_places[:, _columns(self._slot[placed.rows])] = placed.by_places
+        follows = by_places @ self._covariance[AT_PLACES:, AT_PLACES:]
         self._covariance[:3, AT_PLACES:], self._covariance[AT_PLACES:, :3] = follows, follows.T
-        self._covariance[:3, :3] = placed.covariance + follows @ placed.by_places.T
+        self._covariance[:3, :3] = placed.covariance + follows @ by_places.T
         self._covariance[3:AT_PLACES, 3:AT_PLACES] = states
         self._pose = np.array(placed.pose, dtype=np.float64)
         self._believed[:] = self._log_p
@@ -240,40 +242,37 @@ class Localizer:
         """Have different places (k,) in the covariance, instead of those that were used longest ago."""
         new = rows[self._slot[rows] < 0]
         self._used_at[self._slot[rows[self._slot[rows] >= 0]]] = self._frame
-        spare = MOST_CONSIDERED - len(self._considered)
-        if len(new) > spare:
-            self._forget(np.sort(np.argsort(self._used_at, kind="stable")[: len(new) - spare]))
-        for row in new.tolist():
-            self._add(row)
+        free = np.flatnonzero(self._considered == UNKNOWN)
+        room = len(self._considered)
+        if len(new) > len(free) and room < MOST_CONSIDERED:
+            more = min(max(room, len(new)), MOST_CONSIDERED - room)
+            self._considered = np.append(self._considered, np.full(more, UNKNOWN))
+            self._used_at = np.append(self._used_at, np.full(more, -1))
+            self._covariance = np.pad(self._covariance, (0, 2 * more))
+        longest_ago = np.argsort(self._used_at, kind="stable")[: len(new)]  # those that are free first
+        for slot in longest_ago[self._considered[longest_ago] != UNKNOWN].tolist():
+            self._slot[self._considered[slot]] = -1
+            self._considered[slot] = UNKNOWN
+        for row, slot in zip(new.tolist(), np.sort(longest_ago).tolist(), strict=True):
+            self._put(row, slot)
 
-    def _forget(self, slots: IntArray) -> None:
-        kept = np.setdiff1d(np.arange(len(self._considered)), slots)
-        self._slot[self._considered[slots]] = -1
-        self._considered, self._used_at = self._considered[kept], self._used_at[kept]
-        self._slot[self._considered] = np.arange(len(kept))
-        columns = np.concatenate([np.arange(AT_PLACES), _columns(kept)])
-        self._covariance = np.ascontiguousarray(self._covariance[np.ix_(columns, columns)])
-
-    def _add(self, row: int) -> None:
+    def _put(self, row: int, slot: int) -> None:
         """One more place. Its error is known to be like its neighbours', as far as the map says that."""
-        size, others = len(self._covariance), self._considered
-        grown = np.zeros((size + 2, size + 2))
-        grown[:size, :size] = self._covariance
-        grown[size:, size:] = self.places.covariance_m2[row]
-        joint = self.places.joint_m2
-        if joint is not None and len(others):
-            own = np.array([2 * row, 2 * row + 1])
-            grown[AT_PLACES:size, size:] = joint[np.ix_(_columns(others, 0), own)]
-            away = ((self.places.position_m[others] - self.places.position_m[row]) ** 2).sum(axis=1)
+        at = slice(AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 2)
+        covariance, places, joint = self._covariance, self.places, self.places.joint_m2
+        covariance[:, at] = 0.0
+        taken = np.flatnonzero(self._considered != UNKNOWN)
+        if joint is not None and len(taken):
+            others, own = self._considered[taken], _columns(np.array([row]))
+            covariance[AT_PLACES + _columns(taken), at] = joint[np.ix_(_columns(others), own)]
+            away = ((places.position_m[others] - places.position_m[row]) ** 2).sum(axis=1)
             near = np.argsort(away, kind="stable")[:NEIGHBOURS]
-            slots, rows = AT_PLACES + _columns(near, 0), _columns(others[near], 0)
+            rows = _columns(others[near])
             by = np.linalg.solve(joint[np.ix_(rows, rows)], joint[np.ix_(rows, own)])
-            grown[:AT_PLACES, size:] = self._covariance[:AT_PLACES, slots] @ by
-            grown[size:, :size] = grown[:size, size:].T
-        self._covariance = grown
-        self._slot[row] = len(others)
-        self._considered = np.append(others, row)
-        self._used_at = np.append(self._used_at, self._frame)
+            covariance[:AT_PLACES, at] = covariance[:AT_PLACES, AT_PLACES + _columns(taken[near])] @ by
+        covariance[at] = covariance[:, at].T
+        covariance[at, at] = places.covariance_m2[row]
+        self._slot[row], self._considered[slot], self._used_at[slot] = slot, row, self._frame
 
     def _judge(self, stamp_s: float, landmark_id: IntArray, agrees: BoolArray) -> None:
         """Lost where most of the landmarks compared last were not where they should have been."""
@@ -301,7 +300,7 @@ class Localizer:
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
 
 
-def _columns(slots: IntArray, start: int = AT_PLACES) -> IntArray:
-    """Columns of x and y of places, behind `start`."""
-    columns: IntArray = start + (2 * slots[:, None] + np.arange(2)).ravel()
+def _columns(rows: IntArray) -> IntArray:
+    """Columns of x and y of places."""
+    columns: IntArray = (2 * rows[:, None] + np.arange(2)).ravel()
     return columns

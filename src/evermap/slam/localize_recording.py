@@ -201,7 +201,8 @@ def _with_counts(
     """One row a landmark, with the hits and misses of this recording."""
     rows = np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()]
     columns: dict[str, Any] = {item.name: getattr(landmarks, item.name) for item in fields(landmarks)}
-    best = replace(landmarks, **{k: column[rows] for k, column in columns.items() if isinstance(column, np.ndarray)})
+    columns = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    best = replace(landmarks, **columns)
     names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
     n_hits, n_misses = (
         np.bincount(np.searchsorted(names, seen), minlength=len(names)).astype(np.int64)

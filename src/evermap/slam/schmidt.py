@@ -231,13 +231,11 @@ def _spread(
             if by != 0.0:
                 for k in range(len(covariance)):
                     gain[row, k] += by * covariance[at, k]
+    spread[:] = np.ascontiguousarray(gain[:, :8]) @ np.ascontiguousarray(jacobian[:, :8].T)
     for row in range(len(jacobian)):
         for other in range(row + 1):
-            total = 0.0
-            for a in range(8):
-                total += gain[row, a] * jacobian[other, a]
-            for a in range(8, 10):
-                total += gain[row, column[other // 2, a]] * jacobian[other, a]
+            x, y = column[other // 2, 8], column[other // 2, 9]
+            total = spread[row, other] + gain[row, x] * jacobian[other, 8] + gain[row, y] * jacobian[other, 9]
             spread[row, other] = spread[other, row] = total
 
 
@@ -323,7 +321,7 @@ def _solve(root: FloatArray, right: FloatArray, out: FloatArray) -> None:
 @kernel
 def _learn(covariance: FloatArray, gain: FloatArray, root: FloatArray) -> None:
     """Schmidt's update, in place: the state's rows and columns lose what the frame told; the places' keep theirs."""
-    n, size = len(root), len(covariance)
+    n = len(root)
     white = np.zeros((n, AT_PLACES))  # L^-1 H P, of the state alone
     for i in range(n):
         for b in range(AT_PLACES):
@@ -341,12 +339,10 @@ def _learn(covariance: FloatArray, gain: FloatArray, root: FloatArray) -> None:
             by = root[i, k]
             for b in range(AT_PLACES):
                 white[k, b] -= by * white[i, b]
+    told = np.ascontiguousarray(white.T) @ gain
     for a in range(AT_PLACES):
-        for row in range(n):
-            by = white[row, a]
-            for k in range(a, size):
-                covariance[a, k] -= by * gain[row, k]
-        for k in range(a, size):
+        for k in range(a, len(covariance)):
+            covariance[a, k] -= told[a, k]
             covariance[k, a] = covariance[a, k]
 
 
