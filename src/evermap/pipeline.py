@@ -74,7 +74,8 @@ class Session:
     """What a session made of a map.
 
     Attributes:
-        living: the map after it; the very map that was given where the session could not be found in it.
+        living: the map after it.
+        found: False where the session could not be found in the map, which then stays as it was.
         recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
             that name detections and frames are rows of it.
         slam: trajectory, landmarks and all else, in the map's frame.
@@ -83,6 +84,7 @@ class Session:
     """
 
     living: LivingMap
+    found: bool
     recording: Recording
     slam: SlamResult
     changes: tuple[MapChange, ...]
@@ -182,7 +184,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         result = _result(
             visit, slam, alone.prior, alone.step_s, frame, landmarks=landmarks, interrupted=alone.interrupted
         )
-    return Session(after, visit.recording, replace(result, changes=changes), changes, now.evidence)
+    return Session(after, True, visit.recording, replace(result, changes=changes), changes, now.evidence)
 
 
 def _or_default(config: Config | None) -> Config:
@@ -425,4 +427,5 @@ def _lost(
     landmarks = session.landmarks(visit.prepared, visit.outcome, visit.recording, "first_pose")
     result = _result(visit, slam, prior, step_s, "first_pose", landmarks=landmarks, interrupted=interrupted)
     warning = "cannot localise in the map: too few of its landmarks were seen standing to each other as it says"
-    return Session(living, visit.recording, replace(result, warnings=(*result.warnings, warning)), (), Evidence.empty())
+    result = replace(result, warnings=(*result.warnings, warning))
+    return Session(living, False, visit.recording, result, (), Evidence.empty())

@@ -50,7 +50,7 @@ def run_in_map(
         _write(recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force)
         if localize or result.interrupted:
             return
-        if session.living is living:  # it was not found in the map
+        if not session.found:
             raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
         stamps = recording.frames.stamp_s
         store.commit(
