@@ -184,7 +184,7 @@ def test_evidence_by_clique_by_landmark_and_by_time(store: MapStore) -> None:
     assert len(store.evidence()) == len(early) + len(late)
     middle = float(early.stamp_s[10])
     assert len(store.evidence(clique_id=0, since_s=middle)) == 30
-    assert len(store.evidence(landmark_id=landmark, revision=1)) == 40
+    assert len(store.evidence(landmark_id=landmark, revisions=[1])) == 40
     store.revert(1)  # what a session saw that was taken back says nothing any more
     assert_same(store.evidence(landmark_id=landmark).stamp_s, early[early.clique_id == 0].stamp_s)
     assert len(store.evidence(landmark_id=-5)) == 0

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 from evermap import __version__
 from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival, track
+from evermap.cli import map as living_map
 from evermap.cli.terminal import fail, say
 from evermap.errors import EvermapError
 
@@ -82,6 +83,7 @@ app.command("slam")(slam.slam)
 app.command("persist")(persist.persist)
 app.command("track")(track.track)
 app.command("convert")(convert.convert)
+app.add_typer(living_map.app)
 app.add_typer(survival.app)
 app.command("simulate")(simulate.simulate)
 app.command("reproduce")(reproduce.reproduce)

@@ -59,6 +59,36 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     Console().print(table)
 
 
+def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Sequence[int] = ()) -> None:
+    """A table with a head: framed on a terminal, aligned text when piped.
+
+    Args:
+        title: above it.
+        head: names of the columns.
+        rows: cells.
+        numbers: columns to align right.
+    """
+    if not sys.stdout.isatty():
+        lines = [list(head), *rows]
+        widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+        typer.echo(title)
+        for line in lines:
+            cells = (
+                c.rjust(w) if k in numbers else c.ljust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))
+            )
+            typer.echo("  " + "  ".join(cells).rstrip())
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for k, name in enumerate(head):
+        table.add_column(name, justify="right" if k in numbers else "left", no_wrap=k in numbers)
+    for line in rows:
+        table.add_row(*line)
+    Console().print(table)
+
+
 def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
     """Compile the kernels (of the pipeline if not told which), or load them; says so where that takes a while."""
     if compile_kernels is None:

@@ -14,7 +14,7 @@ from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
 from evermap.io.atomic import write_atomic
 from evermap.io.quantities import STAMP_S, X_M, Y_M, Quantity
-from evermap.io.table import Table, parquet_bytes, parse_csv, parse_parquet
+from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
 
 MAP_SCHEMA_VERSION = 1
@@ -131,6 +131,14 @@ def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
     """
     metadata = {"evermap": json.dumps(about_map(landmarks))}
     return write_atomic(path, parquet_bytes(map_columns(landmarks), metadata))
+
+
+def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
+    """Writes a map as CSV with the same columns. Returns the path.
+
+    `read_landmarks` gives back equal numbers; frame and clock, for which CSV has no place, are not kept.
+    """
+    return write_atomic(path, csv_text(map_columns(landmarks)))
 
 
 def map_columns(landmarks: Landmarks) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol, Self
@@ -151,9 +151,16 @@ class MapStore(Protocol):
         clique_id: int | None = None,
         landmark_id: int | None = None,
         since_s: float = -np.inf,
-        revision: int | None = None,
+        revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """What was seen over all sessions in `lineage(revision)`, by time; of one clique or of a landmark's cliques."""
+        """What sessions saw, by time; of one clique, or of the cliques that a landmark belonged to.
+
+        Args:
+            clique_id: the clique; None for all.
+            landmark_id: the landmark; None for all.
+            since_s: leave out what is older.
+            revisions: whose sessions; None for those of `lineage()`.
+        """
         ...
 
     def close(self) -> None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Self
 
@@ -148,23 +148,23 @@ class SqlStore:
         clique_id: int | None = None,
         landmark_id: int | None = None,
         since_s: float = -np.inf,
-        revision: int | None = None,
+        revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """What was seen."""
+        """What sessions saw."""
         table = schema.evidence
         with self._reading() as connection:
-            numbers = self._lineage(connection, revision)
+            numbers = self._lineage(connection, None) if revisions is None else revisions
             wanted = select(table).where(table.c.last_s >= since_s).order_by(table.c.revision, table.c.first_s)
+            wanted = wanted.where(table.c.revision.in_(list(numbers)))
             if clique_id is not None:
                 wanted = wanted.where(table.c.clique_id == clique_id)
             cliques = None if landmark_id is None else _cliques_of(connection, landmark_id, numbers)
             kept = [Evidence.empty()]
             for row in connection.execute(wanted).mappings():
                 mine = cliques is None or cliques.get(row["revision"]) == row["clique_id"]
-                if mine and row["revision"] in numbers:
+                if mine:
                     kept.append(looks_from_bytes(row["clique_id"], row["looks"]))
-        columns = [np.concatenate([getattr(part, item) for part in kept]) for item in Evidence.__dataclass_fields__]
-        found = Evidence(*columns)
+        found = Evidence(*(np.concatenate([getattr(part, item.name) for part in kept]) for item in fields(Evidence)))
         found = found[found.stamp_s >= since_s]
         return found[np.argsort(found.stamp_s, kind="stable")]
 

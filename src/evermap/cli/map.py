@@ -1,0 +1,311 @@
+"""`evermap map`: the history of a living map: what changed, why, and back."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evermap.cli.map_edits import delete, pin, revert, undelete, unpin
+from evermap.cli.picture import check_picture, write_picture
+from evermap.cli.terminal import print_json, print_rows, say
+from evermap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from evermap.maps.living import LivingMap
+    from evermap.maps.why import Answer
+    from evermap.types import FloatArray
+
+app = typer.Typer(
+    name="map",
+    help="Living maps: their revisions, what changed and why, and the operator's word.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+for command in (revert, pin, unpin, delete, undelete):
+    app.command()(command)
+
+_File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
+_AtRevision = Annotated[
+    int | None, typer.Option("--revision", metavar="N", help="Look at this one.", show_default="newest")
+]
+_AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
+
+
+@app.command("log")
+def log(file: _File, as_json: _AsJson = False) -> None:
+    """List the revisions: every session, edit and revert, with what it changed.
+
+    \b
+    Example:
+      evermap map log site.evermap
+    """
+    from evermap.cli.map_content import revision_dict, revision_row
+    from evermap.maps.store import open_store
+
+    with open_store(file) as store:
+        revisions = store.log()
+        clock = store.load().clock
+    if as_json:
+        print_json(
+            {"map": file, "head": len(revisions), "clock": clock.value, "revisions": [*map(revision_dict, revisions)]}
+        )
+        return
+    head = ("revision", "written (UTC)", "kind", "of", "starts", "landmarks", "changes", "took")
+    print_rows(file, head, [revision_row(item, clock) for item in revisions], numbers=(0, 7))
+
+
+@app.command("show")
+def show(
+    file: _File,
+    revision: _AtRevision = None,
+    ahead: Annotated[str, typer.Option(help="How far to look ahead, as 12h or 3d.")] = "1d",
+    everything: Annotated[bool, typer.Option("--all", help="List what is believed gone, too.")] = False,
+    figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map.", show_default="none")] = None,
+    as_json: _AsJson = False,
+) -> None:
+    """List the landmarks: whether they exist, where, since when, and whether they will be there tomorrow.
+
+    \b
+    Example:
+      evermap map show site.evermap --ahead 3d --figure map.png
+    """
+    from evermap.cli.map_content import landmark_dicts, landmark_row
+    from evermap.maps.stamps import stamp_text
+    from evermap.maps.store import open_store
+    from evermap.survival.durations import parse_duration_s
+
+    ahead_s = parse_duration_s(ahead)
+    if figure is not None:
+        check_picture(figure, "--figure")
+    with open_store(file) as store:
+        number = store.head() if revision is None else revision
+        living = store.load(number)
+    content = landmark_dicts(living, _p_ahead(living, ahead_s))
+    if figure is not None:
+        from evermap.viz.living_map_figure import plot_living_map
+
+        write_picture(figure, plot_living_map(**_picture(living), title=f"{Path(file).name}, revision {number}"))
+    if as_json:
+        about = {"map": file, "revision": number, "stamp_s": _finite(living.stamp_s), "clock": living.clock.value}
+        print_json({**about, "ahead_s": ahead_s, "landmarks": content})
+        return
+    listed = [
+        item for item in content if everything or item["pinned"] or (item["p_exists"] >= 0.5 and not item["deleted"])
+    ]
+    head = ("landmark", "class", "P(exists)", f"in {ahead}", "place [m]", "+-", "since", "last seen", "sites", "")
+    title = f"{file}, revision {number}, seen until {stamp_text(living.stamp_s, living.clock)}"
+    print_rows(title, head, [landmark_row(item, living.clock) for item in listed], numbers=(0, 2, 3, 5, 8))
+    if len(listed) < len(content):
+        say(f"{len(content) - len(listed)} more are believed gone or deleted; --all lists them")
+
+
+@app.command("diff")
+def diff(
+    file: _File,
+    a: Annotated[int, typer.Argument(metavar="A", help="The earlier revision; 0 is the empty map.")],
+    b: Annotated[int | None, typer.Argument(metavar="B", help="The later one.", show_default="newest")] = None,
+    as_json: _AsJson = False,
+) -> None:
+    """What appeared, vanished, moved, swapped places and returned between two revisions, and what operators did.
+
+    \b
+    Example:
+      evermap map diff site.evermap 3 7
+    """
+    from evermap.cli.map_content import change_content, change_line
+    from evermap.maps.diff import diff as between
+    from evermap.maps.diff import edits
+    from evermap.maps.store import open_store
+
+    with open_store(file) as store:
+        later = store.head() if b is None else b
+        old, new = store.load(a), store.load(later)
+    changes, edited = between(old, new), edits(old, new)
+    if as_json:
+        listed = [{"landmark": name, "what": word} for name, word in edited]
+        print_json({"map": file, "a": a, "b": later, "changes": [*map(change_content, changes)], "edits": listed})
+        return
+    for change in changes:
+        typer.echo(change_line(change, new.clock))
+    for name, word in edited:
+        typer.echo(f"landmark {name} {word} by an operator")
+    if not changes and not edited:
+        say(f"no difference between revisions {a} and {later}")
+
+
+@app.command("export")
+def export(
+    file: _File,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="What to write: .parquet, .geojson or .csv.")],
+    revision: _AtRevision = None,
+    p_least: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="Leave out what exists with a smaller probability.")
+    ] = 0.5,
+    as_json: _AsJson = False,
+) -> None:
+    """Write the landmarks that exist as a table, for other tools and for `evermap slam --prior-map`.
+
+    \b
+    Example:
+      evermap map export site.evermap --out map.geojson
+    """
+    from evermap.maps.store import open_store
+
+    write = _writer(out)
+    with open_store(file) as store:
+        number = store.head() if revision is None else revision
+        landmarks = store.load(number).landmarks(p_least=p_least)
+    write(landmarks, out)
+    if as_json:
+        print_json({"map": file, "revision": number, "out": str(out), "landmarks": len(landmarks)})
+        return
+    say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}")
+
+
+@app.command("why")
+def why(
+    file: _File,
+    landmark: Annotated[int, typer.Argument(metavar="LANDMARK", help="Its id.")],
+    revision: _AtRevision = None,
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw its belief over time.", show_default="none")
+    ] = None,
+    as_json: _AsJson = False,
+) -> None:
+    """Why a landmark is believed to be there, or gone: what was seen of it, and how much each of that says.
+
+    \b
+    Example:
+      evermap map why site.evermap 17 --figure why.png
+    """
+    from evermap.cli.map_content import answer_dict
+    from evermap.maps.store import open_store
+    from evermap.maps.why import why as of_landmark
+
+    if figure is not None:
+        check_picture(figure, "--figure")
+    with open_store(file) as store:
+        answer = of_landmark(store, landmark, revision)
+    if figure is not None:
+        _draw_why(figure, answer)
+    if as_json:
+        print_json({"map": file, **answer_dict(answer)})
+        return
+    _print_why(answer)
+
+
+def _p_ahead(living: LivingMap, ahead_s: float) -> FloatArray:
+    """(L,) probability that each landmark stands at one of its sites a while after the map was last seen."""
+    import numpy as np
+
+    from evermap.config import LivingConfig
+    from evermap.lifelong.believe import predicted
+
+    if not (np.isfinite(living.stamp_s) and len(living.sites)):
+        return np.full(len(living.members), np.nan)
+    from dataclasses import replace
+
+    later = replace(living.sites, p_here=predicted(living, LivingConfig(), living.stamp_s + ahead_s))
+    return replace(living, sites=later).p_exists()
+
+
+def _writer(out: Path) -> Any:
+    """What writes such a file.
+
+    Raises:
+        ConfigError: no map is written to such a file.
+    """
+    from evermap.io import write_map_geojson, write_map_parquet
+    from evermap.io.landmarks import write_map_csv
+
+    writers = {
+        ".parquet": write_map_parquet,
+        ".geojson": write_map_geojson,
+        ".json": write_map_geojson,
+        ".csv": write_map_csv,
+    }
+    with suppress(KeyError):
+        return writers[out.suffix.lower()]
+    raise ConfigError(
+        f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson or .csv"
+    )
+
+
+def _print_why(answer: Answer) -> None:
+    from evermap.cli.map_content import change_line
+    from evermap.maps.stamps import stamp_text
+    from evermap.maps.why import probability_text
+
+    typer.echo(answer.headline)
+    for reason in answer.reasons:
+        typer.echo(f"  - {reason}")
+    for revision, change in answer.changes:
+        typer.echo(f"  revision {revision}: {change_line(change, answer.clock)}")
+    if answer.visits:
+        head = ("revision", "session", "looks from", "to", "frames", "hits", "misses", "expected", "nats", "P(exists)")
+        rows = [
+            [
+                str(visit.revision),
+                visit.recording or "-",
+                stamp_text(visit.from_s, answer.clock),
+                stamp_text(visit.to_s, answer.clock),
+                str(visit.n_looks),
+                str(visit.n_hits),
+                str(visit.n_misses),
+                f"{visit.expected:.1f}",
+                f"{visit.log_odds:+.1f}",
+                probability_text(visit.p_exists),
+            ]
+            for visit in answer.visits
+        ]
+        print_rows("what the sessions saw", head, rows, numbers=(0, 4, 5, 6, 7, 8, 9))
+
+
+def _draw_why(path: Path, answer: Answer) -> None:
+    import numpy as np
+
+    from evermap.viz.why_figure import plot_why
+
+    seen, stays = answer.evidence, answer.stays
+    session = np.repeat([v.revision for v in answer.visits], [v.n_looks for v in answer.visits])
+    names = {site: f"site {k + 1}" for k, site in enumerate(dict.fromkeys(stays.site_id.tolist()))}
+    columns = zip(stays.site_id.tolist(), stays.elsewhere_s, stays.first_s, stays.last_s, stays.gone_s, strict=True)
+    drawn = plot_why(
+        seen.stamp_s,
+        seen.p_exists,
+        seen.n_hits,
+        seen.n_misses,
+        seen.log_odds,
+        session=session.astype(np.int64),
+        stays=[(names[site], *map(float, stamps)) for site, *stamps in columns],  # type: ignore[misc]
+        now_s=answer.stamp_s,
+        title=answer.headline,
+        clock=answer.clock,
+    )
+    write_picture(path, drawn)
+
+
+def _picture(living: LivingMap) -> dict[str, Any]:
+    """What the figure of a map needs."""
+    members, site = living.members, living.site_of()
+    place = living.place_row(members.landmark_id, site)
+    return {
+        "landmark_id": members.landmark_id,
+        "place": place,
+        "p_exists": living.p_exists(),
+        "class_id": members.class_id,
+        "class_names": living.class_names,
+        "pinned": members.pinned,
+        "deleted": members.deleted,
+        "position_m": living.places.position_m,
+        "place_landmark": living.places.landmark_id,
+    }
+
+
+def _finite(value: float) -> float | None:
+    from evermap.cli.map_content import number
+
+    return number(value)

@@ -1,0 +1,206 @@
+"""What `evermap map` prints of revisions, landmarks and changes, for machines and for people."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from evermap.maps.stamps import between_text, stamp_text
+from evermap.types import UNKNOWN, Clock, FloatArray, MapChange
+
+if TYPE_CHECKING:
+    from evermap.maps.living import LivingMap
+    from evermap.maps.store import Revision
+    from evermap.maps.why import Answer
+
+
+def number(value: float | None) -> float | None:
+    """Of JSON: null for nan and infinity."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def revision_dict(item: Revision) -> dict[str, Any]:
+    """One line of the history."""
+    origin = item.provenance
+    return {
+        "revision": item.number,
+        "parent": item.parent,
+        "restores": item.restores,
+        "kind": origin.kind.value,
+        "created_at": item.created_at,
+        "recording": origin.recording,
+        "source": origin.source,
+        "command": origin.command,
+        "config": origin.config,
+        "seed": origin.seed,
+        "evermap_version": item.evermap_version,
+        "stamp_from_s": number(origin.stamp_from_s),
+        "stamp_to_s": number(origin.stamp_to_s),
+        "wall_s": number(origin.wall_s),
+        "note": origin.note,
+        "landmarks": item.n_landmarks,
+        "existing": item.n_existing,
+        "changes": {kind.value: count for kind, count in item.n_changes.items()},
+    }
+
+
+def revision_row(item: Revision, clock: Clock) -> list[str]:
+    """The same in words."""
+    origin = item.provenance
+    changes = ", ".join(f"{count} {kind.value}" for kind, count in item.n_changes.items())
+    return [
+        str(item.number),
+        item.created_at.replace("T", " ").removesuffix("+00:00"),
+        origin.kind.value,
+        origin.note or origin.recording or "-",
+        stamp_text(origin.stamp_from_s, clock),
+        f"{item.n_existing} of {item.n_landmarks}",
+        changes or "-",
+        f"{origin.wall_s:.1f} s" if math.isfinite(origin.wall_s) else "-",
+    ]
+
+
+def change_content(change: MapChange) -> dict[str, Any]:
+    """A change with what speaks for it."""
+    return {
+        "landmarks": [int(name) for name in change.landmark_ids],
+        "kind": change.kind.value,
+        "stamp_from_s": number(change.stamp_from_s),
+        "stamp_to_s": number(change.stamp_to_s),
+        "displacement_m": [number(part) for part in change.displacement_m],
+        "rotation_rad": number(change.rotation_rad),
+        "probability": number(change.probability),
+        "hits": change.n_hits,
+        "misses": change.n_misses,
+    }
+
+
+def change_line(change: MapChange, clock: Clock) -> str:
+    """'landmark 5 moved by (+0.50, 0.00) m between 10:02:00 and 10:20:00, probability 97 % (12 hits, 40 misses)'."""
+    from evermap.viz.change_words import probability, what
+
+    when = between_text(change.stamp_from_s, change.stamp_to_s, clock)
+    return f"{what(change)} {when}, {probability(change.probability)} ({change.n_hits} hits, {change.n_misses} misses)"
+
+
+def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any]]:
+    """Every landmark at its most probable place.
+
+    Args:
+        living: the map.
+        p_ahead: (L,) probability that each stands there at the time that was asked for.
+    """
+    import numpy as np
+
+    members, site = living.members, living.site_of()
+    place = living.place_row(members.landmark_id, site)
+    p_exists = living.p_exists()
+    at = np.searchsorted(living.sites.site_id, site)
+    content = []
+    for row in range(len(members)):
+        placed = place[row] >= 0
+        k = 2 * int(place[row])
+        content.append(
+            {
+                "landmark": int(members.landmark_id[row]),
+                "class": class_name(living, int(members.class_id[row])),
+                "clique": int(members.clique_id[row]),
+                "p_exists": float(p_exists[row]),
+                "p_ahead": number(float(p_ahead[row])),
+                "x_m": float(living.places.position_m[place[row], 0]) if placed else None,
+                "y_m": float(living.places.position_m[place[row], 1]) if placed else None,
+                "sigma_m": float(np.sqrt(np.trace(living.covariance_m2[k : k + 2, k : k + 2]) / 2)) if placed else None,
+                "since_s": number(float(living.sites.since_s[at[row]])) if placed else None,
+                "seen_s": number(float(living.sites.seen_s[at[row]])) if placed else None,
+                "sites": int(np.sum(living.sites.clique_id == members.clique_id[row])),
+                "hits": int(living.places.n_hits[place[row]]) if placed else 0,
+                "misses": int(living.places.n_misses[place[row]]) if placed else 0,
+                "pinned": bool(members.pinned[row]),
+                "deleted": bool(members.deleted[row]),
+            }
+        )
+    return content
+
+
+def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
+    """The same in words."""
+    from evermap.maps.why import probability_text
+
+    placed = content["x_m"] is not None
+    flags = " ".join(word for word in ("pinned", "deleted") if content[word])
+    ahead = content["p_ahead"]
+    return [
+        str(content["landmark"]),
+        content["class"] or "-",
+        probability_text(content["p_exists"]),
+        "-" if ahead is None else probability_text(ahead),
+        f"({content['x_m']:.2f}, {content['y_m']:.2f})" if placed else "-",
+        f"{100 * content['sigma_m']:.1f} cm" if placed else "-",
+        stamp_text(_or_nan(content["since_s"]), clock),
+        stamp_text(_or_nan(content["seen_s"]), clock),
+        str(content["sites"]),
+        flags,
+    ]
+
+
+def answer_dict(answer: Answer) -> dict[str, Any]:
+    """Everything behind a 'why', with every look."""
+    seen, stays = answer.evidence, answer.stays
+    return {
+        "landmark": answer.landmark_id,
+        "class": answer.class_name,
+        "clique": answer.clique_id,
+        "companions": list(answer.companions),
+        "p_exists": answer.p_exists,
+        "stamp_s": number(answer.stamp_s),
+        "pinned": answer.pinned,
+        "deleted": answer.deleted,
+        "headline": answer.headline,
+        "reasons": list(answer.reasons),
+        "sessions": [
+            {
+                "revision": visit.revision,
+                "recording": visit.recording,
+                "stamp_from_s": visit.from_s,
+                "stamp_to_s": visit.to_s,
+                "looks": visit.n_looks,
+                "hits": visit.n_hits,
+                "misses": visit.n_misses,
+                "expected_hits": number(visit.expected),
+                "log_odds": number(visit.log_odds),
+                "p_exists": number(visit.p_exists),
+            }
+            for visit in answer.visits
+        ],
+        "stays": [
+            {
+                "site": int(stays.site_id[k]),
+                **{
+                    name: number(float(getattr(stays, name)[k]))
+                    for name in ("elsewhere_s", "first_s", "last_s", "gone_s")
+                },
+            }
+            for k in range(len(stays))
+        ],
+        "changes": [{"revision": revision, **change_content(change)} for revision, change in answer.changes],
+        "edits": [{"revision": revision, "at": when, "what": word} for revision, when, word in answer.edits],
+        "looks": {
+            "stamp_s": seen.stamp_s.tolist(),
+            "hits": seen.n_hits.tolist(),
+            "misses": seen.n_misses.tolist(),
+            "expected_hits": [number(value) for value in seen.expected.tolist()],
+            "log_odds": [number(value) for value in seen.log_odds.tolist()],
+            "p_exists": [number(value) for value in seen.p_exists.tolist()],
+        },
+    }
+
+
+def class_name(living: LivingMap, class_id: int) -> str:
+    """'' for a class that is not known, its number for one without a name."""
+    if class_id == UNKNOWN:
+        return ""
+    return living.class_names[class_id] if class_id < len(living.class_names) else str(class_id)
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

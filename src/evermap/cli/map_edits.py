@@ -1,0 +1,117 @@
+"""`evermap map revert | pin | unpin | delete | undelete`: an operator's word, as revisions that can be reverted."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from evermap.cli.terminal import command_line, print_json, say
+from evermap.errors import InputError
+
+_File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
+_AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
+_Ids = Annotated[list[int], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks.")]
+_Note = Annotated[str, typer.Option(help="A word for the log.")]
+
+
+def revert(
+    file: _File,
+    revision: Annotated[int, typer.Argument(metavar="N", help="Whose content to bring back; 0 is the empty map.")],
+    note: _Note = "",
+    as_json: _AsJson = False,
+) -> None:
+    """Go back to an older revision, by a new one with its content: nothing is lost, and a revert can be reverted.
+
+    \b
+    Example:
+      evermap map revert site.evermap 6 --note "the lidar was dirty"
+    """
+    from evermap.maps.store import Provenance, open_store
+
+    with open_store(file) as store:
+        before = store.head()
+        now = store.revert(revision, Provenance(command=command_line(), note=note))
+    if as_json:
+        print_json({"map": file, "revision": now, "restores": revision, "parent": before})
+        return
+    say(f"revision {now} has the content of revision {revision}; back again with: evermap map revert {file} {before}")
+
+
+def pin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+    """Never remove these landmarks, whatever is missed.
+
+    \b
+    Example:
+      evermap map pin site.evermap 3 4
+    """
+    _edit(file, landmarks, "pinned", note, as_json, pinned=True)
+
+
+def unpin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+    """Let the evidence decide about these landmarks again.
+
+    \b
+    Example:
+      evermap map unpin site.evermap 3
+    """
+    _edit(file, landmarks, "unpinned", note, as_json, pinned=False)
+
+
+def delete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+    """Do not use these landmarks any more; their detections are ignored until that is taken back.
+
+    \b
+    Example:
+      evermap map delete site.evermap 17 --note "a reflection"
+    """
+    _edit(file, landmarks, "deleted", note, as_json, deleted=True)
+
+
+def undelete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+    """Use these landmarks again.
+
+    \b
+    Example:
+      evermap map undelete site.evermap 17
+    """
+    _edit(file, landmarks, "undeleted", note, as_json, deleted=False)
+
+
+def _edit(
+    file: str,
+    landmarks: list[int],
+    word: str,
+    note: str,
+    as_json: bool,
+    *,
+    pinned: bool | None = None,
+    deleted: bool | None = None,
+) -> None:
+    """An operator's word as a revision; none where nothing would change."""
+    from evermap.maps.diff import edits
+    from evermap.maps.store import Provenance, RevisionKind, open_store
+
+    with open_store(file) as store:
+        parent = store.head()
+        before = after = store.load(parent)
+        for name in landmarks:
+            try:
+                after = after.edited(name, pinned=pinned, deleted=deleted)
+            except KeyError:
+                problem = f"no landmark {name} in revision {parent}"
+                raise InputError(problem, path=file, hint=f"evermap map show {file} --all") from None
+        changed = [name for name, _ in edits(before, after)]
+        number = parent
+        if changed:
+            listed = ", ".join(map(str, changed))
+            said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
+            number = store.commit(
+                after, Provenance(kind=RevisionKind.EDIT, command=command_line(), note=said), parent=parent
+            )
+    if as_json:
+        print_json({"map": file, "revision": number, "parent": parent, word: changed})
+    elif changed:
+        say(f"revision {number}: {said}; back with: evermap map revert {file} {parent}")
+    else:
+        say(f"nothing to do: already {word}")

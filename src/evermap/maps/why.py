@@ -1,0 +1,244 @@
+"""Why a landmark is believed to be there, or gone: what was seen of it, when, and how much each of that says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.maps.diff import EXISTS, edits
+from evermap.maps.living import Evidence, LivingMap, Stays
+from evermap.maps.stamps import stamp_text
+from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
+from evermap.survival.durations import duration_text
+from evermap.types import Clock, MapChange
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """What one session saw of a landmark's clique.
+
+    Attributes:
+        revision, recording: which session.
+        from_s, to_s: first and last look.
+        n_looks: frames in which a place of it was looked at.
+        n_hits, n_misses, expected: detections, misses, and the hits that were to be expected had it stood there.
+        log_odds: what the looks said for 'it stands there' [nats].
+        p_exists: after the last of them.
+    """
+
+    revision: int
+    recording: str
+    from_s: float
+    to_s: float
+    n_looks: int
+    n_hits: int
+    n_misses: int
+    expected: float
+    log_odds: float
+    p_exists: float
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """All that a map knows of why it believes what it believes of one landmark.
+
+    Attributes:
+        landmark_id, class_name: which; '' where the class is not known.
+        clique_id, companions: the body it belongs to, and the other landmarks on that.
+        clock, stamp_s: of all stamps, and until when the map has seen anything.
+        p_exists: now.
+        pinned, deleted: what an operator said.
+        visits: by time.
+        stays: of its clique, as the map has them now.
+        changes: that were told of it: revision and change.
+        edits: of operators: revision, when, and what.
+        evidence: every look at it.
+        headline: the answer in a line.
+        reasons: what that rests on, a sentence each.
+    """
+
+    landmark_id: int
+    class_name: str
+    clique_id: int
+    companions: tuple[int, ...]
+    clock: Clock
+    stamp_s: float
+    p_exists: float
+    pinned: bool
+    deleted: bool
+    visits: tuple[Visit, ...]
+    stays: Stays
+    changes: tuple[tuple[int, MapChange], ...]
+    edits: tuple[tuple[int, str, str], ...]
+    evidence: Evidence
+    headline: str
+    reasons: tuple[str, ...]
+
+
+def why(store: MapStore, landmark_id: int, revision: int | None = None) -> Answer:
+    """The answer for a landmark, in the newest revision or in another.
+
+    Raises:
+        InputError: the map does not know the landmark, or there is no such revision.
+    """
+    living = store.load(revision)
+    found = np.flatnonzero(living.members.landmark_id == landmark_id)
+    if not len(found):
+        raise InputError(_unknown(living, landmark_id), path=store.where, hint=f"evermap map show {store.where}")
+    row = int(found[0])
+    clique = int(living.members.clique_id[row])
+    on_it = living.members.landmark_id[living.members.clique_id == clique]
+    line = store.lineage(revision)
+    log = {item.number: item for item in store.log()}
+    parts = [(number, store.evidence(landmark_id=landmark_id, revisions=[number])) for number in line]
+    evidence = Evidence.empty()
+    for _, part in parts:
+        evidence = evidence.joined(part)
+    visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
+    changes = tuple((n, c) for n in line for c in store.changes(n) if landmark_id in c.landmark_ids)
+    class_id = int(living.members.class_id[row])
+    answer = Answer(
+        landmark_id=landmark_id,
+        class_name=living.class_names[class_id] if 0 <= class_id < len(living.class_names) else "",
+        clique_id=clique,
+        companions=tuple(int(name) for name in on_it if name != landmark_id),
+        clock=living.clock,
+        stamp_s=living.stamp_s,
+        p_exists=float(living.p_exists()[row]),
+        pinned=bool(living.members.pinned[row]),
+        deleted=bool(living.members.deleted[row]),
+        visits=visits,
+        stays=living.stays[living.stays.clique_id == clique],
+        changes=changes,
+        edits=_edits(store, [log[number] for number in line], landmark_id),
+        evidence=evidence,
+        headline="",
+        reasons=(),
+    )
+    return _with_words(answer, living)
+
+
+def _visit(revision: Revision, seen: Evidence) -> Visit:
+    return Visit(
+        revision=revision.number,
+        recording=revision.provenance.recording,
+        from_s=float(seen.stamp_s[0]),
+        to_s=float(seen.stamp_s[-1]),
+        n_looks=len(seen),
+        n_hits=int(seen.n_hits.sum()),
+        n_misses=int(seen.n_misses.sum()),
+        expected=float(seen.expected.sum()),
+        log_odds=float(seen.log_odds.sum()),
+        p_exists=float(seen.p_exists[-1]),
+    )
+
+
+def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tuple[int, str, str], ...]:
+    """What operators said of a landmark: revision, when, what."""
+    return tuple(
+        (item.number, item.created_at, word)
+        for item in line
+        if item.provenance.kind is RevisionKind.EDIT
+        for name, word in edits(store.load(item.parent), store.load(item.number))
+        if name == landmark_id
+    )
+
+
+def _with_words(answer: Answer, living: LivingMap) -> Answer:
+    """The same with its headline and reasons."""
+    kind = f" ({answer.class_name})" if answer.class_name else ""
+    what = f"landmark {answer.landmark_id}{kind}"
+    belief = f"P(exists) = {probability_text(answer.p_exists)}"
+    if answer.deleted:
+        headline = f"{what} is not used: an operator deleted it; by what was seen, {belief}"
+    elif answer.p_exists >= EXISTS:
+        headline = f"{what} is believed to be there: {belief}"
+    else:
+        headline = f"{what} is believed gone: {belief}"
+    reasons = [f"an operator {word} it in revision {number} ({when})" for number, when, word in answer.edits]
+    reasons += _on_sightings(answer, living)
+    if answer.companions:
+        others = ", ".join(str(name) for name in answer.companions)
+        word = "landmarks" if len(answer.companions) > 1 else "landmark"
+        reasons.append(f"it shares a body with {word} {others}: hits and misses of all of them count")
+    if answer.pinned:
+        reasons.append("it is pinned: it is never taken out of the map")
+    return replace(answer, headline=headline, reasons=tuple(reasons))
+
+
+def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
+    """When it was seen last, and what the looks since then and the passing of time say."""
+    seen, clock = answer.evidence, answer.clock
+    if not len(seen):
+        return ["no session looked at it, as far as this map remembers"]
+    hits = np.flatnonzero(seen.n_hits > 0)
+    if not len(hits):
+        return [f"it was never detected where it is expected, in {_looks(seen)}"]
+    last = int(hits[-1])
+    last_s, p_then = float(seen.stamp_s[last]), float(seen.p_exists[last])
+    reasons = [f"it was last detected {_when(last_s, clock)}; P(exists) was {probability_text(p_then)} then"]
+    after = seen[np.arange(len(seen)) > last]
+    said = float(after.log_odds.sum())
+    if len(after):
+        reasons.append(
+            f"since then it was looked for in {_looks(after)}: {int(after.n_misses.sum())} misses and no detection, "
+            f"where {after.expected.sum():.1f} detections were expected had it stood there; that is {abs(said):.1f} "
+            f"nats {'against' if said < 0 else 'for'} it"
+        )
+    reasons += _on_time(answer, living, last_s, _logit(p_then) + said)
+    return reasons
+
+
+def _on_time(answer: Answer, living: LivingMap, last_s: float, logit: float) -> list[str]:
+    """What time did to the belief since the last sighting, and what is known of how long its like stay."""
+    waited_s = living.stamp_s - last_s
+    if not (np.isfinite(waited_s) and waited_s > 0.0):
+        return []
+    row = int(np.flatnonzero(living.members.landmark_id == answer.landmark_id)[0])
+    place = living.place_row(living.members.landmark_id[row : row + 1], living.site_of()[row : row + 1])
+    if place[0] < 0:
+        return []
+    life = living.lives.of(int(living.members.class_id[row]), living.places.position_m[place[0]])
+    at = answer.stays[answer.stays.last_s <= last_s]
+    age_s = max(last_s - float(at.first_s[-1]), 0.0) if len(at) else 0.0
+    stay = float(np.exp(life.stay.log_conditional_survival(age_s, age_s + waited_s)))
+    known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned of its kind yet"
+    like = f"of its kind, {stay:.0%} of those that have stood for {duration_text(age_s)}"
+    reasons = [f"{like} stand for another {duration_text(waited_s)} ({known})"]
+    drift = _logit(answer.p_exists) - logit
+    if abs(drift) > 0.5:
+        way = "less" if drift < 0.0 else "more"
+        reasons.append(f"time, and the other places where it may stand, make it {abs(drift):.1f} nats {way} probable")
+    return reasons
+
+
+def _looks(seen: Evidence) -> str:
+    return f"{len(seen)} frame{'s' if len(seen) != 1 else ''}"
+
+
+def _when(stamp_s: float, clock: Clock) -> str:
+    text = stamp_text(stamp_s, clock)
+    return f"on {text}" if text.startswith(("day", "1", "2")) and " " in text else f"at {text}"
+
+
+def probability_text(p: float) -> str:
+    """'0.97', and more digits near 0 and 1, where they matter; never certain."""
+    if 0.01 <= p <= 0.99:
+        return f"{p:.2f}"
+    low = min(p, 1.0 - p)
+    return ("< 0.0001" if p < 0.5 else "> 0.9999") if low < 1e-4 else f"{p:.4f}"
+
+
+def _logit(p: float) -> float:
+    p = float(np.clip(p, 1e-12, 1.0 - 1e-12))
+    return float(np.log(p) - np.log1p(-p))
+
+
+def _unknown(living: LivingMap, landmark_id: int) -> str:
+    names = living.members.landmark_id
+    if not len(names):
+        return f"no landmark {landmark_id}: the map is empty"
+    near = sorted(names[np.argsort(np.abs(names - landmark_id), kind="stable")[:3]].tolist())
+    return f"no landmark {landmark_id}; the nearest ids are {', '.join(map(str, near))}"

@@ -1,0 +1,156 @@
+"""A landmark's belief over the sessions of a map, with what was seen of it, where it stood, and who intervened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.types import Clock, FloatArray, IntArray
+from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, house_style, new_figure, settle
+from evermap.viz.time_axis import TimeAxis
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def plot_why(
+    stamp_s: FloatArray,
+    p_exists: FloatArray,
+    n_hits: IntArray,
+    n_misses: IntArray,
+    log_odds: FloatArray,
+    *,
+    session: IntArray,
+    stays: Sequence[tuple[str, float, float, float, float]],
+    now_s: float,
+    title: str,
+    clock: Clock = Clock.RECORDING,
+) -> Figure:
+    """Three rows over one axis of time: belief, evidence of every session, stays.
+
+    Args:
+        stamp_s: (N,) of the looks, never decreasing.
+        p_exists: (N,) after each.
+        n_hits: (N,) detections.
+        n_misses: (N,) expected detections that did not come.
+        log_odds: (N,) what each said for 'it stands there' [nats].
+        session: (N,) number of the session of each look.
+        stays: name of the site, last look before, first and last sighting, first look after, as in `maps.Stays`.
+        now_s: end of the axis.
+        title: above the axes.
+        clock: of the stamps.
+
+    Raises:
+        InputError: nothing was looked at and it never stood anywhere.
+    """
+    edges = [value for stay in stays for value in stay[1:] if np.isfinite(value)]
+    known = np.concatenate([stamp_s, edges, [now_s] if np.isfinite(now_s) else []])
+    if not len(known):
+        raise InputError("nothing to draw: no session looked at it")
+    first, last = float(known.min()), float(known.max())
+    margin = 0.02 * max(last - first, 1.0)
+    axis = TimeAxis.over(first, last + margin, clock)
+    sites = list(dict.fromkeys(name for name, *_ in stays))
+    with house_style():
+        figure = new_figure(7.2, 3.9 + 0.22 * len(sites))
+        rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.2, 1.4, 0.5 + 0.35 * max(len(sites), 1)])
+        _draw_belief(rows[0], axis, stamp_s, p_exists, session, now_s)
+        _draw_evidence(rows[1], axis, stamp_s, n_hits, n_misses, log_odds, session)
+        _draw_stays(rows[2], axis, stays, sites, last)
+        rows[0].set_title(title)
+        rows[2].set_xlim(axis.coordinates(first - margin), axis.coordinates(last + margin))
+        axis.label(rows[2])
+        known_labels = {
+            label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        figure.legend(known_labels.values(), known_labels.keys(), loc="outside lower center", ncols=3)
+        settle(figure)
+    return figure
+
+
+def _draw_belief(
+    axes: Axes, axis: TimeAxis, stamp_s: FloatArray, p_exists: FloatArray, session: IntArray, now_s: float
+) -> None:
+    """A line within every session, a thin one between sessions, where nobody looked."""
+    for k, rows in enumerate(_sessions(session)):
+        label = "P(exists)" if k == 0 else None
+        axes.plot(axis.coordinates(stamp_s[rows]), p_exists[rows], color=ESTIMATE, lw=1.8, zorder=4, label=label)
+    if len(stamp_s):
+        axes.plot(axis.coordinates(stamp_s), p_exists, color=ESTIMATE, lw=0.7, alpha=0.6, zorder=3)
+        axes.plot(axis.coordinates(stamp_s[-1:]), p_exists[-1:], "o", color=ESTIMATE, ms=4.0, zorder=5)
+    axes.axhline(0.5, color=MUTED, lw=0.8, ls=(0, (3, 2)), zorder=2)
+    if np.isfinite(now_s):
+        axes.axvline(axis.coordinates(now_s), color=INK, lw=0.9, ls=(0, (4, 2)), zorder=2, label="now")
+    axes.set(ylim=(-0.05, 1.05), yticks=(0.0, 0.5, 1.0), ylabel="P(exists) [1]")
+
+
+def _draw_evidence(
+    axes: Axes,
+    axis: TimeAxis,
+    stamp_s: FloatArray,
+    n_hits: IntArray,
+    n_misses: IntArray,
+    log_odds: FloatArray,
+    session: IntArray,
+) -> None:
+    """What every session said, upwards for and downwards against, with its hits and misses written to it."""
+    for rows in _sessions(session):
+        said = float(log_odds[rows].sum())
+        at = axis.coordinates(stamp_s[rows].mean())
+        axes.vlines(at, 0.0, said, color=LANDMARK if said >= 0.0 else ALERT, lw=3.0, zorder=3)
+    for colour, label in ((LANDMARK, "a session speaks for it"), (ALERT, "a session speaks against it")):
+        axes.plot([], [], "-", color=colour, lw=3.0, label=label)
+    groups = _sessions(session)
+    if len(groups) <= 12:
+        for rows in groups:
+            said = float(log_odds[rows].sum())
+            axes.annotate(
+                f"+{int(n_hits[rows].sum())} −{int(n_misses[rows].sum())}",
+                (axis.coordinates(stamp_s[rows].mean()), said),
+                xytext=(0, 3 if said >= 0.0 else -3),
+                textcoords="offset points",
+                ha="center",
+                va="bottom" if said >= 0.0 else "top",
+                fontsize=7.5,
+                color=MUTED,
+            )
+    axes.axhline(0.0, color=MUTED, lw=0.7, zorder=2)
+    axes.set_yscale("symlog", linthresh=10.0)
+    axes.margins(y=0.25)
+    axes.set_ylabel("evidence [nats]")
+
+
+def _draw_stays(
+    axes: Axes,
+    axis: TimeAxis,
+    stays: Sequence[tuple[str, float, float, float, float]],
+    sites: Sequence[str],
+    last_s: float,
+) -> None:
+    """A bar from the first to the last sighting; thin lines for when it may have come and gone; an arrow goes on."""
+    for k, (name, elsewhere, first, until, gone) in enumerate(stays):
+        y = sites.index(name)
+        label = "" if k else "seen at the site"
+        axes.hlines(y, axis.coordinates(first), axis.coordinates(until), color=LANDMARK, lw=6.0, zorder=3, label=label)
+        if np.isfinite(elsewhere):
+            axes.hlines(y, axis.coordinates(elsewhere), axis.coordinates(first), color=MUTED, lw=1.0, zorder=2)
+        if np.isfinite(gone):
+            axes.hlines(y, axis.coordinates(until), axis.coordinates(gone), color=MUTED, lw=1.0, zorder=2)
+            axes.plot(axis.coordinates(gone), y, "x", color=ALERT, ms=5.0, mew=1.4, zorder=4)
+        else:
+            axes.hlines(y, axis.coordinates(until), axis.coordinates(last_s), color=LANDMARK, lw=1.0, zorder=2)
+            axes.plot(axis.coordinates(last_s), y, ">", color=LANDMARK, ms=4.0, zorder=4)
+    if any(np.isfinite(stay[4]) for stay in stays):
+        axes.plot([], [], "x", color=ALERT, ms=5.0, mew=1.4, label="found gone")
+    axes.set(ylim=(len(sites) - 0.4 if sites else 1.0, -0.6), yticks=range(len(sites)))
+    axes.set_yticklabels(sites)
+    axes.grid(visible=False, axis="y")
+
+
+def _sessions(session: IntArray) -> list[Any]:
+    """Rows of each session, in order."""
+    return [np.flatnonzero(session == number) for number in dict.fromkeys(session.tolist())]
