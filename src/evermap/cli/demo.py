@@ -13,7 +13,7 @@ import typer
 
 from evermap.cli.terminal import Progress, command_line, print_json, print_table, progress_bar, say, warn
 
-PATIENCE_S = 8.0
+PATIENCE_S = 12.0
 """The first day takes a few seconds, unless its kernels have to be compiled."""
 
 _HEAD = ("error", "precision", "recall", "Brier", "forecast", "places", "time")

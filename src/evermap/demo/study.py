@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -67,28 +67,28 @@ class Study:
 
 @dataclass(frozen=True, slots=True)
 class _Day:
-    """A day's sessions of one method: what a worker is asked to do.
+    """A day's sessions of some methods: what a worker is asked to do.
 
     Attributes:
-        method: which.
         recordings: the day's, without truth.
         changed: for each, landmarks that changed since the session before; only who is told looks at it.
         until_s: for each, when the next session begins; nan where there is none.
-        living: the map of the evening before, None on the first day.
-        store: file that gets a revision a session, None for none.
+        methods: which.
+        living: the map of each on the evening before, None on the first day.
+        store: file that gets evermap's map, a revision a session; None for none.
     """
 
-    method: Method
     recordings: tuple[Recording, ...]
     changed: tuple[IntArray, ...]
     until_s: tuple[float, ...]
-    living: LivingMap | None
+    methods: tuple[Method, ...]
+    living: tuple[LivingMap | None, ...]
     store: Path | None
 
 
 @dataclass(frozen=True, slots=True)
 class _Evening:
-    """What a worker answers: the day's visits, the map, and the last session."""
+    """What a worker answers for one method: the day's visits, the map, and the last session."""
 
     visits: tuple[Visit, ...]
     living: LivingMap
@@ -96,59 +96,55 @@ class _Evening:
 
 
 def run_study(
-    scenario: Scenario,
-    seed: int,
-    *,
-    methods: Sequence[Method] = METHODS,
-    store: Path | None = None,
-    processes: int = 1,
-    progress: Progress | None = None,
+    scenario: Scenario, seed: int, *, store: Path | None = None, processes: int = 1, progress: Progress | None = None
 ) -> Study:
     """Simulate, and estimate in every way.
 
     Args:
         scenario: how much.
         seed: of the simulation.
-        methods: what is compared; evermap must be among them.
         store: file that gets evermap's map, a revision a session.
-        processes: how many methods at a time; above 1 a script that calls this needs its `__main__` guard.
-        progress: told after every day of every method.
+        processes: between how many the methods are divided; above 1 a script that calls this needs its `__main__`
+            guard.
+        progress: told after every day of some methods.
 
     Raises:
         KeyboardInterrupt: nothing is kept of a comparison that is not finished.
     """
     building = scenario.simulate(seed)
     truth = truth_of(building)
-    visits: dict[str, list[Visit]] = {method.name: [] for method in methods}
+    visits: dict[str, list[Visit]] = {method.name: [] for method in METHODS}
     evening: dict[str, _Evening] = {}
-    total_s = scenario.patrol_s * scenario.sessions * len(methods)
+    total_s = scenario.patrol_s * scenario.sessions * len(METHODS)
     done_s = 0.0
 
-    def next_day(method: Method) -> _Day:
-        first = len(visits[method.name])
+    def next_day(methods: tuple[Method, ...]) -> _Day:
+        first = len(visits[methods[0].name])
         rows = range(first, first + scenario.sessions_per_day)
         return _Day(
-            method=method,
             # the estimator sees no truth
             recordings=tuple(replace(building.sessions[k], truth=None, true_landmarks=None) for k in rows),
             changed=tuple(np.flatnonzero(truth.changed[k]) for k in rows),
             until_s=tuple(building.truths[k + 1].start_s if k + 1 < len(truth) else np.nan for k in rows),
-            living=evening[method.name].living if first else None,
-            store=store if method.name == "evermap" else None,
+            methods=methods,
+            living=tuple(evening[method.name].living if first else None for method in methods),
+            store=store,
         )
 
-    with _workers(processes) as submit:
-        running = {submit(next_day(method)): method for method in methods}
+    parts = min(processes, len(METHODS))
+    with _workers(parts) as submit:
+        running = {submit(next_day(METHODS[part::parts])): METHODS[part::parts] for part in range(parts)}
         while running:
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                method, answer = running.pop(future), future.result()
-                evening[method.name] = answer
-                visits[method.name] += answer.visits
-                done_s += scenario.patrol_s * scenario.sessions_per_day
+                methods = running.pop(future)
+                for method, answer in zip(methods, future.result(), strict=True):
+                    evening[method.name] = answer
+                    visits[method.name] += answer.visits
+                done_s += scenario.patrol_s * scenario.sessions_per_day * len(methods)
                 if progress is not None:
                     progress(done_s, total_s)
-                if len(visits[method.name]) < scenario.sessions:
-                    running[submit(next_day(method))] = method
+                if len(visits[methods[0].name]) < scenario.sessions:
+                    running[submit(next_day(methods))] = methods
     return Study(
         scenario=scenario,
         building=building,
@@ -159,28 +155,33 @@ def run_study(
     )
 
 
-def _live_through(day: _Day) -> _Evening:
-    """A day of one method; the same in a worker and here."""
-    from evermap.pipeline import run_session, warm_up
+def _live_through(day: _Day) -> tuple[_Evening, ...]:
+    """A day of some methods; the same in a worker and here."""
+    from evermap.maps.living import LivingMap
+    from evermap.pipeline import bring_in, solve_alone, warm_up
 
     warm_up()  # compiling is no part of the first session
-    config, living, visits = day.method.config(), day.living, []
+    config = [method.config() for method in day.methods]
+    living = [LivingMap() if one is None else one for one in day.living]
+    visits: list[list[Visit]] = [[] for _ in day.methods]
+    results: dict[int, SlamResult] = {}
     for recording, changed, until_s in zip(day.recordings, day.changed, day.until_s, strict=True):
-        if day.method.is_told and living is not None:
-            living = living.without(changed)
-        start_s = time.process_time()
-        session = run_session(recording, living, config)
-        cpu_s = time.process_time() - start_s
-        if session.slam.interrupted:
+        begin_s = time.process_time()
+        alone = solve_alone(recording, living[0], config[0])  # the same for all: they differ in what they do with it
+        alone_s = time.process_time() - begin_s
+        if alone.interrupted:
             raise KeyboardInterrupt
-        living = session.living
-        if day.store is not None:
-            _keep(day.store, recording, session, config, cpu_s)
-        visits.append(
-            Visit(session.slam.trajectory, snapshot_of(living, config.living, until_s), session.changes, cpu_s)
-        )
-    assert living is not None
-    return _Evening(tuple(visits), living, session.slam)
+        for row, method in enumerate(day.methods):
+            before = living[row].without(changed) if method.is_told else living[row]
+            begin_s = time.process_time()
+            session = bring_in(alone, before, config[row])
+            cpu_s = alone_s + time.process_time() - begin_s
+            living[row], results[row] = session.living, session.slam
+            said = snapshot_of(session.living, config[row].living, until_s)
+            visits[row].append(Visit(session.slam.trajectory, said, session.changes, cpu_s))
+            if day.store is not None and method.name == "evermap":
+                _keep(day.store, recording, session, config[row], cpu_s)
+    return tuple(_Evening(tuple(visits[row]), living[row], results[row]) for row in range(len(day.methods)))
 
 
 def snapshot_of(living: LivingMap, config: LivingConfig, until_s: float) -> Snapshot:
@@ -218,7 +219,7 @@ def _keep(where: Path, recording: Recording, session: Session, config: Config, w
 
 
 @contextmanager
-def _workers(processes: int) -> Iterator[Callable[[_Day], Future[_Evening]]]:
+def _workers(processes: int) -> Iterator[Callable[[_Day], Future[tuple[_Evening, ...]]]]:
     """Who lives through days: processes, or this one. An interrupt drops what waits and lets what runs end."""
     if processes <= 1:
         yield _at_once
@@ -244,8 +245,8 @@ def _workers(processes: int) -> Iterator[Callable[[_Day], Future[_Evening]]]:
                     os.environ[name] = value
 
 
-def _at_once(day: _Day) -> Future[_Evening]:
-    done: Future[_Evening] = Future()
+def _at_once(day: _Day) -> Future[tuple[_Evening, ...]]:
+    done: Future[tuple[_Evening, ...]] = Future()
     done.set_result(_live_through(day))
     return done
 
