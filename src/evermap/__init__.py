@@ -20,7 +20,9 @@ if TYPE_CHECKING:
     from evermap.config import Config, load_config
     from evermap.errors import EvermapError
     from evermap.io import read_recording, write_native
-    from evermap.pipeline import run_slam
+    from evermap.maps.living import LivingMap
+    from evermap.maps.store import open_store
+    from evermap.pipeline import Session, run_localization, run_session, run_slam
     from evermap.presence.config import PersistConfig
     from evermap.presence.run import run_persist
     from evermap.presence.table import read_looks
@@ -31,7 +33,9 @@ _HOME = {
     "evermap.config": ("Config", "load_config"),
     "evermap.errors": ("EvermapError",),
     "evermap.io": ("read_recording", "write_native"),
-    "evermap.pipeline": ("run_slam",),
+    "evermap.maps.living": ("LivingMap",),
+    "evermap.maps.store": ("open_store",),
+    "evermap.pipeline": ("Session", "run_localization", "run_session", "run_slam"),
     "evermap.presence.config": ("PersistConfig",),
     "evermap.presence.run": ("run_persist",),
     "evermap.presence.table": ("read_looks",),
@@ -55,17 +59,22 @@ __all__ = [
     "EvermapError",
     "Frames",
     "Landmarks",
+    "LivingMap",
     "Odometry",
     "PersistConfig",
     "Recording",
     "Sensor",
+    "Session",
     "SlamResult",
     "Trajectory",
     "__version__",
     "load_config",
+    "open_store",
     "read_looks",
     "read_recording",
+    "run_localization",
     "run_persist",
+    "run_session",
     "run_slam",
     "write_native",
     "write_run",
