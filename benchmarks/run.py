@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, npmle, persistence, selectors, tracking
+from benchmarks import cliques, localize, npmle, persistence, selectors, tracking
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -35,10 +35,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **cliques.METRICS,
     **npmle.METRICS,
     **tracking.METRICS,
+    **localize.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "localize")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -54,6 +55,7 @@ def run(
     n_lifetimes: int = npmle.N_LIFETIMES,
     n_frames: int = tracking.N_FRAMES,
     n_stored: int = tracking.N_STORED,
+    n_steps: int = localize.N_FRAMES,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -64,6 +66,7 @@ def run(
         n_features, seconds, n_cliques: the same for the persistence filter, and for the filters of cliques.
         n_lifetimes: censored samples of each kind.
         n_frames, n_stored: length of a scene for trackers, and objects in the working set.
+        n_steps: frames of a drive in a known map.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -96,6 +99,9 @@ def run(
         measured |= ratios
     if only in (None, "tracking"):
         ratios, shown["tracking"] = tracking.run(n_frames, n_stored)
+        measured |= ratios
+    if only in (None, "localize"):
+        ratios, shown["localize"] = localize.run(n_steps)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -180,6 +186,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", npmle.as_text(shown["npmle"])]
     if "tracking" in shown:
         lines += ["", tracking.as_markdown(shown["tracking"])]
+    if "localize" in shown:
+        lines += ["", localize.as_markdown(shown["localize"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

@@ -181,6 +181,19 @@ def test_the_working_set_and_the_tree_of_the_race_find_the_same(run: ModuleType)
         assert len(near) > 1
 
 
+def test_both_who_race_in_a_known_map_find_the_way(run: ModuleType) -> None:
+    """As near to each other as to the truth, and the map has what it says in view."""
+    race = run.localize
+    drives = race.draw(race.RACE, 60)
+    for world in (drives, *(race.draw(size, 60) for size in race.SIZES)):
+        expected = race.P_DETECT * race.IN_VIEW
+        assert np.mean([len(seen.landmark_id) for seen in world.sightings]) == pytest.approx(expected, rel=0.05)
+    ours, theirs = (contender(drives).pose[race.WARM_UP :] for contender in (race.by_evermap, race.by_gtsam))
+    truth = drives.pose[race.WARM_UP :]
+    for one, other in ((ours, truth), (theirs, truth), (ours, theirs)):
+        assert np.abs(se2.log(se2.between(one, other))).max() < 0.05
+
+
 def test_learning_cliques_of_the_race_are_all_looked_at_and_learned_from(run: ModuleType) -> None:
     """Nobody saves time by leaving something out, and the memory is that of all arrays."""
     scene = run.cliques.world(40)
@@ -280,6 +293,7 @@ def test_a_small_run_writes_compares_and_reports(
         n_lifetimes=300,
         n_frames=12,
         n_stored=2000,
+        n_steps=25,
     )
     assert measured["regressions"] == []
     assert [row["metric"] for row in measured["metrics"]] == list(run.METRICS)

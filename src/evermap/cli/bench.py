@@ -21,7 +21,8 @@ def bench(
         bool, typer.Option("--update-baseline", help="Make these measurements the new baseline.")
     ] = False,
     only: Annotated[
-        str | None, typer.Option(help="Measure one part: slam, persistence, selectors, cliques, npmle or tracking.")
+        str | None,
+        typer.Option(help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking or localize."),
     ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
