@@ -109,13 +109,20 @@ class History:
     def shares(self, event: BoolArray, chance: BoolArray) -> FloatArray:
         """(C + 1,) probability of an event for each class, and for one never seen; classes lean on their average."""
         chances, events = (self.counts(self.recent & rows) for rows in (chance, event & chance))
-        average = (events[-1] + 0.5 * STRENGTH) / (chances[-1] + STRENGTH)
+        # classes differ: every one counts for one event at most, however often it was seen
+        weight = 1.0 / (chances[:-1] + STRENGTH)
+        average = (0.5 + events[:-1] @ weight) / (1.0 + chances[:-1] @ weight)
         of_classes = (events[:-1] + STRENGTH * average) / (chances[:-1] + STRENGTH)
         return np.append(of_classes, average)
 
     def counts(self, rows: BoolArray) -> IntArray:
         """(C + 1,) how many of some rows (K,) are of each class, and of all together."""
         return np.append(np.bincount(self.kind[rows], minlength=len(self.class_ids)), rows.sum())
+
+    @property
+    def gap_s(self) -> float:
+        """Between two looks, as a rule; a day as long as there was one look."""
+        return float(np.median(np.diff(self.looks_s))) if len(self.looks_s) > 1 else 86_400.0
 
     def sightings(self, back_by_stay: FloatArray, back_rate: FloatArray) -> Sightings:
         """Of the recent stays, with what may have been missed between the looks at them."""

@@ -112,10 +112,13 @@ def _learned(history: History) -> _Learned:
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
     here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
-    back_rate = (1.0 - p_hop) * here_again * np.array([absence.rate(row) for row in range(n_classes + 1)])
-    back = history.kind[history.recent]
-    log_likelihood = stay_log_likelihood(history.sightings(back_by_hop[back], back_rate[back]))
-    log_likelihood = _by_class(log_likelihood, back, n_classes)
+    # of those that a look missed: who is back before nobody can miss, and counts as one who never left
+    gap_s = history.gap_s
+    back = [-absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s for row in range(n_classes + 1)]
+    back_rate = (1.0 - p_hop) * here_again * np.array(back)
+    kind = history.kind[history.recent]
+    log_likelihood = stay_log_likelihood(history.sightings(back_by_hop[kind], back_rate[kind]))
+    log_likelihood = _by_class(log_likelihood, kind, n_classes)
     p_known = history.shares(history.to_known, history.had_choice)
     counts = (history.counts(mask) for mask in (history.recent, history.recent & ended))
     return _Learned(stay_posterior(log_likelihood), absence, p_hop, p_known, *counts)

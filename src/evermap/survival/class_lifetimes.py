@@ -85,11 +85,6 @@ class ClassPosterior:
         )
         return survival @ weight, lower, upper
 
-    def rate(self, row: int) -> float:
-        """Posterior mean rate in 1/s at which they end at first, were the hazard constant."""
-        share = self.second if self.improper else np.ones(len(self.second))
-        return float(np.sum(self.weight[row] / self.mean_s[:, None] * share))
-
 
 def stay_posterior(log_likelihood: FloatArray) -> ClassPosterior:
     """Of stays, from the (C, M, A) log likelihoods of C classes on `LOG_MEAN` and `LOG_SHAPE`."""
