@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.lifelong.geometry import of_places, with_session
-from evermap.maps.grouping import group
+from evermap.lifelong.geometry import blocks, of_places, with_session
+from evermap.maps.grouping import Fate, group, regrouped
 from evermap.maps.living import LivingMap, Members, Places, Sites
+from evermap.maps.relabel import relabelled
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -70,10 +71,13 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         config: how far landmarks of one body may be apart.
         drift_m: by which places may have been off when the session was solved.
     """
+    living, moved_to = _regrouped(replace(living, sites=replace(living.sites, p_here=p_site)), found, config, drift_m)
+    p_site = living.sites.p_here
+    if len(moved_to):
+        found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
     site_of = _standing_at(living, found, clique)
-    members, clique, cliques_ever = _parted(living, members, clique, found, site_of, cliques_ever)
 
     new = np.flatnonzero(found.place < 0)
     fresh = np.unique(clique[new][[int(c) not in site_of for c in clique[new]]])  # cliques that get a new site
@@ -154,22 +158,38 @@ def _join_neighbours(clique: IntArray, new: IntArray, members: Members, found: F
             clique[clique == name] = near[min(near)]
 
 
-def _parted(
-    living: LivingMap, members: Members, clique: IntArray, found: Found, site_of: dict[int, int], cliques_ever: int
-) -> tuple[Members, IntArray, int]:
-    """Members of a body that stands at a site, but that don't: they are a body of their own."""
-    clique, renamed = clique.copy(), members.clique_id.copy()
-    for name in np.unique(clique[found.place < 0]):
-        if int(name) not in site_of:
-            continue
-        gone = np.flatnonzero((clique == name) & (found.place < 0))
-        had = living.place_row(found.landmark_id[gone], np.full(len(gone), site_of[int(name)])) >= 0
-        if not had.any():
-            continue
-        clique[gone[had]] = cliques_ever
-        renamed[np.searchsorted(members.landmark_id, found.landmark_id[gone[had]])] = cliques_ever
-        cliques_ever += 1
-    return replace(members, clique_id=renamed), clique, cliques_ever
+def _regrouped(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> tuple[LivingMap, IntArray]:
+    """The map with bodies taken apart whose members went apart, and put together that moved as one."""
+    nowhere = np.arange(len(living.places))
+    if not config.cliques or not len(living.members):
+        return living, nowhere
+    members, places = living.members, living.places
+    stood = living.place_row(members.landmark_id, living.site_of())
+    _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
+    known = stood[member] >= 0
+    member, row = member[known], row[known]
+    fate = np.full(len(members), Fate.UNSEEN, dtype=np.int64)
+    fate[member] = np.where(found.place[row] == stood[member], Fate.STAYED, Fate.MOVED)
+    if not (fate == Fate.MOVED).any():
+        return living, nowhere
+    before = places.position_m[np.maximum(stood, 0)]
+    after, spread = before.copy(), np.zeros((len(members), 2, 2))
+    after[member] = found.position_m[row]
+    spread[member] = blocks(found.covariance_m2)[row] + blocks(living.covariance_m2)[stood[member]]
+    spread += drift_m**2 * np.eye(2)
+    clique_id = regrouped(
+        members.clique_id,
+        members.class_id,
+        fate,
+        before,
+        after,
+        spread,
+        reach_m=config.clique_reach_m,
+        next_id=living.n_cliques_ever,
+    )
+    if np.array_equal(clique_id, members.clique_id):
+        return living, nowhere
+    return relabelled(living, clique_id)
 
 
 def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:

@@ -73,6 +73,13 @@ def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
+def blocks(covariance_m2: FloatArray) -> FloatArray:
+    """(P, 2, 2) covariance of every place by itself, of the joint one (2 P, 2 P)."""
+    count = len(covariance_m2) // 2
+    rows = np.arange(count)
+    return np.asarray(covariance_m2.reshape(count, 2, count, 2)[rows, :, rows, :])
+
+
 def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
     """(2 K, 2 K) joint covariance of some places, in their order."""
     at = _coordinates(rows)
