@@ -121,12 +121,13 @@ def test_equals_the_sum_over_all_paths(p_hop: float, use_misses: bool) -> None:
     rate, p_false = np.array([0.8, 0.3, 0.6]), 0.05
     hit = rng.random((4, 3, 2)) < 0.5
     rows = [(stamps[t], 0, k, k, bool(hit[t, k, i])) for t in range(4) for k in range(3) for i in range(2)]
-    ratios = np.ones((4, 4))
+    ratios, ratios_of_hits = np.ones((2, 4, 4))
     for t in range(4):
         for k in range(3):
             for i in range(2):
                 if hit[t, k, i]:
                     ratios[t, k + 1] *= rate[k] / p_false
+                    ratios_of_hits[t, k + 1] *= rate[k] / p_false
                 elif use_misses:
                     ratios[t, k + 1] *= (1 - rate[k]) / (1 - p_false)
     rng.shuffle(rows)  # type: ignore[arg-type]
@@ -135,7 +136,8 @@ def test_equals_the_sum_over_all_paths(p_hop: float, use_misses: bool) -> None:
         start_s=0.0, until_s=95.0, p_false=p_false, p_occluded=0.0, use_misses=use_misses,
     )  # fmt: skip
 
-    filtered, smoothed, evidence = sum_over_paths(p_here, known, stamps, ratios)
+    filtered, _, evidence = sum_over_paths(p_here, known, stamps, ratios)
+    _, smoothed, _ = sum_over_paths(p_here, known, stamps, ratios_of_hits)
     np.testing.assert_allclose(found.p_here, filtered[-1, 1:], rtol=1e-11)
     np.testing.assert_allclose(found.trace.p_exists, filtered[:, 1:].sum(axis=1), rtol=1e-11)
     np.testing.assert_allclose(found.p_before, p_here, rtol=1e-12)
@@ -210,7 +212,6 @@ def test_constant_hazard_and_hops_are_the_chain_of_modes() -> None:
         start_s=stamp[0], until_s=stamp[-1], p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
     np.testing.assert_allclose(found.p_here, np.exp(modes.log_filtered[-1]), rtol=1e-10)
-    np.testing.assert_allclose(found.weight, np.exp(modes.log_smoothed).ravel(), rtol=1e-10)
 
 
 def test_a_long_gap_is_that_of_a_continuous_chain() -> None:
@@ -319,7 +320,7 @@ def test_it_is_followed_from_one_site_to_another() -> None:
     )  # fmt: skip
     assert found.p_here[2] > 0.99
     assert found.p_stayed[2] < 1e-6
-    row = SiteLooks(*(np.array(column) for column in zip(*rows, strict=True)))
+    row = looks(rows)
     np.testing.assert_allclose(found.weight[(row.site == 0) & (row.stamp_s < 47)], 1.0, atol=1e-3)
     np.testing.assert_allclose(found.weight[(row.site == 2) & (row.stamp_s > 53)], 1.0, atol=1e-3)
     np.testing.assert_allclose(found.weight[row.site == 1], 0.0, atol=1e-3)
@@ -434,7 +435,6 @@ def test_beliefs_drawn_from_the_model_are_calibrated() -> None:
         (found.p_before, truth[:, 0]),
         (found.p_here, truth[:, -1]),
         (found.trace.p_exists.reshape(n, 6)[:, 2], truth[:, 2]),
-        (found.weight.reshape(n, 6)[:, 1], truth[:, 1]),
     ):
         bins = np.digitize(p, [0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
         for b in np.unique(bins):

@@ -36,6 +36,11 @@ class Chains:
         row_of_site[order] = np.arange(len(order)) + clique_of_site[order] + 1  # one 'away' for each clique up to it
         return cls(first, np.repeat(np.arange(n_cliques), count), row_of_site)
 
+    @property
+    def width(self) -> int:
+        """W: most seats of a clique."""
+        return int(np.max(np.diff(self.first), initial=1))
+
     def by_row(self, of_site: Any, of_clique: Any) -> Any:
         """(R,) a column by seat."""
         column = np.empty(len(self.clique), dtype=np.asarray(of_site).dtype)
@@ -58,7 +63,7 @@ class Chains:
     def routes(self, p_hop: FloatArray, return_share: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
         """(R, W) where one that leaves a seat goes, by seat of its clique, and (R,) the sum: the rest stays."""
         share = self.by_row(return_share, 0.0)
-        width = int(np.max(np.diff(self.first), initial=1))
+        width = self.width
         seat = np.arange(len(self.clique)) - self.first[self.clique]
         to = self.first[self.clique][:, None] + np.arange(width)
         known = to < self.first[1:][self.clique][:, None]
@@ -114,7 +119,7 @@ def transitions(
 
     Without meaning at the first frame of a clique.
     """
-    width = int(np.max(np.diff(chains.first), initial=1))
+    width = chains.width
     row = chains.first[frame_clique][:, None] + np.arange(width)
     frame, seat = np.nonzero(row < chains.first[1:][frame_clique][:, None])
     row = row[frame, seat]

@@ -182,7 +182,7 @@ def _rest(odds: Any, moves: Any) -> Any:
 
 
 @kernel
-def smooth(
+def forward(
     seat: IntArray,
     first_frame: IntArray,
     log_route: FloatArray,
@@ -191,11 +191,10 @@ def smooth(
     log_here: FloatArray,
     log_ratio: FloatArray,
     filtered: FloatArray,
-    smoothed: FloatArray,
     log_odds: FloatArray,
     log_evidence: FloatArray,
 ) -> None:
-    """Forward and backward over the frames of every clique, the first of which lie where its beliefs are known.
+    """Beliefs after each frame of every clique, the first of which lies where they are known.
 
     Args:
         seat: (C + 1,) rows of the seats of each clique.
@@ -206,13 +205,10 @@ def smooth(
         log_here: (R, 2) log probabilities at the first frame, before it: old and new.
         log_ratio: (F, W) what each frame says for the seats, against 'away'.
         filtered: (F, 2, W) filled in: log probabilities after each frame.
-        smoothed: (F, 2, W) filled in: log probabilities given all frames.
         log_odds: (F,) filled in: what each frame says for 'at one of its sites' against 'away'.
         log_evidence: (C,) filled in: log probability of all frames over that if it were away.
     """
-    width = log_ratio.shape[1]
-    flow = np.empty(width)
-    ahead = np.empty((2, width))
+    flow = np.empty(log_ratio.shape[1])
     for c in range(seat.size - 1):
         low, n = seat[c], seat[c + 1] - seat[c]
         log_evidence[c] = 0.0
@@ -243,6 +239,36 @@ def smooth(
             log_odds[f] = seen - sites if sites > -np.inf else 0.0
             log_evidence[c] += total
             now[:, :n] -= total
+
+
+@kernel
+def backward(
+    seat: IntArray,
+    first_frame: IntArray,
+    log_route: FloatArray,
+    log_rest: FloatArray,
+    log_leave: FloatArray,
+    log_ratio: FloatArray,
+    filtered: FloatArray,
+    smoothed: FloatArray,
+) -> None:
+    """Beliefs at each frame given all of them, from those of `forward`.
+
+    Args:
+        seat: as above, like all down to `filtered`.
+        first_frame: see there.
+        log_route: see there.
+        log_rest: see there.
+        log_leave: see there.
+        log_ratio: see there.
+        filtered: what `forward` filled in.
+        smoothed: (F, 2, W) filled in: log probabilities.
+    """
+    width = log_ratio.shape[1]
+    flow = np.empty(width)
+    ahead = np.empty((2, width))
+    for c in range(seat.size - 1):
+        low, n = seat[c], seat[c + 1] - seat[c]
         ahead[:] = 0.0
         for f in range(first_frame[c + 1] - 1, first_frame[c] - 1, -1):
             smoothed[f] = -np.inf

@@ -89,7 +89,8 @@ class SiteBeliefs:
         p_stayed: (S,) part of it: that it has stood there since before the start.
         p_before: (S,) before the clique's first look; at the end where there was none.
         since_s: (S,) mean begin of the stay there, given that it stands there at the end.
-        weight: (N,) probability that the clique stood at the looks' sites then, given all looks of the session.
+        weight: (N,) probability that the clique stood at the looks' sites then, given all hits of the session. Misses
+            are left out: whether they are due to the line of sight or to the clique is what is learned from them.
         log_evidence: (C,) log probability of all looks at a clique, less that of the same looks if it were away.
         trace: what every frame said.
     """
