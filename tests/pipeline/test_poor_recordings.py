@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from judged import arrays_of, judge, judged, recording_of, surveyed
-from recordings import with_detections, with_ids, without_odometry_between
+from recordings import building, with_detections, with_ids, without_odometry_between
 
 from evermap.errors import DataError
 from evermap.pipeline import run_slam
@@ -108,3 +108,14 @@ def test_silent_odometry_alone_is_survived_and_admitted():
     recording = recording_of(0, faults=0.0)
     run = judge(without_odometry_between(recording, 10.0, 30.0), np.zeros(0))
     assert run.pose_nees.max() < 25.0
+
+
+def test_a_robot_whose_odometry_fails_while_it_turns_is_not_lost_for_words():
+    """With 30 s of silence the last poses hang on the first by little more than nothing; covariances stay ones."""
+    recording = building(0, patrol_s=90.0, rate_hz=2.0).sessions[0]
+    result = run_slam(without_odometry_between(recording, 30.0, 60.0))
+    for covariance in (result.trajectory.covariance, result.online.covariance, result.landmarks.covariance_m2):
+        assert np.linalg.eigvalsh(covariance)[:, 0].min() > 0.0
+    passed = result.online.stamp_s - recording.odometry.stamp_s[0]
+    size = np.sqrt(np.einsum("nii->ni", result.online.covariance)[:, :2].sum(axis=1))
+    assert size[passed > 60.0].min() > size[passed < 30.0].max()

@@ -386,7 +386,12 @@ class Smoother:
     def newest(self, estimate: Estimate) -> FloatArray:
         """(3 + 2 K + 9,) squared: joint covariance of the last pose, the known landmarks and the states."""
         information, _ = eliminate_chain(self.normal(estimate))
-        return inverse_of(information)
+        try:
+            root = np.linalg.inv(np.linalg.cholesky(0.5 * (information + information.T)))
+        except np.linalg.LinAlgError:
+            raise NumericalError("the session hangs together too loosely for a covariance") from None
+        # a square has no negative eigenvalue, however loosely the last pose hangs on the others
+        return root.T @ root
 
     def _prior_information(self, known: BoolArray) -> FloatArray:
         """The prior of the known landmarks, worked out anew only when others are known."""
