@@ -17,7 +17,7 @@ from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, In
 
 FASTEST = 100.0
 """No robot drives [m/s] or turns [rad/s] faster."""
-HARDEST = 100.0
+HARDEST = 20.0
 """No robot speeds up and slows down again by more than this, [m/s^2] or [rad/s^2]: that is a spike of an encoder."""
 SHARPEST = 2.0
 """But by so much [m/s or rad/s] it may at any rate: some robots log what they were told, not what they did."""
