@@ -89,15 +89,18 @@ def sum_over_paths(
             leaving[0] = 1 - q - leaving.sum()
         return (staying if after == before else 0.0) + (leaving[after[0]] if after[1] else 0.0)
 
+    steps = [
+        {(a, b): step(a, b, t0, t1) for a in states for b in states}
+        for t0, t1 in zip(stamps[:-1], stamps[1:], strict=True)
+    ]
+    start = {(seat, new): 0.0 if new else np.append(1 - p_here.sum(), p_here)[seat] for seat, new in states}
+
     def weigh(count: int) -> FloatArray:
         total = np.zeros((count, n + 1))
-        start = np.append(1 - p_here.sum(), p_here)
         for path in itertools.product(states, repeat=count):
-            if path[0][1]:
-                continue
-            p = start[path[0][0]] * ratios[0, path[0][0]]
+            p = start[path[0]] * ratios[0, path[0][0]]
             for k in range(1, count):
-                p *= step(path[k - 1], path[k], stamps[k - 1], stamps[k]) * ratios[k, path[k][0]]
+                p *= steps[k - 1][path[k - 1], path[k]] * ratios[k, path[k][0]]
             for k in range(count):
                 total[k, path[k][0]] += p
         return total
@@ -240,10 +243,9 @@ def test_a_long_gap_is_that_of_a_continuous_chain() -> None:
 def one(rows: list[tuple[float, int, int, int, bool]], p_here: float = 0.9, **changed: Any) -> SiteBeliefs:
     """One clique with one site, without end, looked at along one line of sight of 4 hits in 5 looks."""
     known = alone(Exponential(1e-30), np.zeros(1))
-    given_ = {"start_s": 0.0, "until_s": 1e3, "p_false": 0.01, "p_occluded": 0.0} | changed
-    return follow_sites(
-        np.array([p_here]), np.zeros(1, np.int64), known, looks(rows), free(np.array([4.0]), np.array([1.0])), **given_
-    )
+    line = free(np.array([4.0]), np.array([1.0]))
+    given_ = {"lines": line, "start_s": 0.0, "until_s": 1e3, "p_false": 0.01, "p_occluded": 0.0} | changed
+    return follow_sites(np.array([p_here]), np.zeros(1, np.int64), known, looks(rows), **given_)
 
 
 def test_looks_along_a_line_of_sight_weigh_as_exchangeable_ones() -> None:
@@ -270,6 +272,34 @@ def test_occlusion_is_near_the_sum_over_who_was_occluded(pattern: str) -> None:
     exact = np.log(total) - np.where(hit, np.log(p_false), np.log1p(-p_false)).sum()
     assert found.log_evidence[0] == pytest.approx(np.log(0.9 * np.exp(exact) + 0.1), abs=0.12 * len(pattern))
     assert found.trace.log_odds.sum() == pytest.approx(exact, abs=0.12 * len(pattern))
+
+
+@pytest.mark.parametrize("pattern", ["000000", "011000", "110001"])
+def test_free_and_blocked_lines_are_the_sum_over_both_at_every_frame(pattern: str) -> None:
+    """Whether a line is free follows from whether the last one was as surely as what is known of each allows."""
+    rng = np.random.default_rng(len(pattern))
+    hit = np.array([c == "1" for c in pattern])
+    p_free, rate = rng.random(len(hit)), rng.uniform(0.4, 0.9, len(hit))
+    p_free[2] = p_free[1]
+    p_blocked, p_false, p_occluded = 0.04, 0.01, 0.1
+    lines = Lines(p_free, SURE * rate, SURE * (1 - rate), p_blocked)
+    found = one([(float(t), 0, 0, t, bool(h)) for t, h in enumerate(hit)], lines=lines, p_occluded=p_occluded)
+
+    gone = np.where(hit, p_false, 1 - p_false)
+    seen = (1 - p_occluded) * np.where(hit, rate, 1 - rate) + p_occluded * gone
+    likelihood = np.column_stack([np.where(hit, p_blocked, 1 - p_blocked), seen]) / gone[:, None]
+    total = 0.0
+    for path in itertools.product([0, 1], repeat=len(hit)):
+        p = 1.0
+        for t, state in enumerate(path):
+            if t == 0:
+                opens = p_free[0]
+            else:  # the two have the largest correlation that their probabilities allow
+                both = min(p_free[t], p_free[t - 1])
+                opens = both / p_free[t - 1] if path[t - 1] else (p_free[t] - both) / (1 - p_free[t - 1])
+            p *= (opens if state else 1 - opens) * likelihood[t, state]
+        total += p
+    assert found.log_evidence[0] == pytest.approx(np.log(0.9 * total + 0.1), rel=1e-9)
 
 
 def test_one_frame_says_no_more_against_a_clique_than_that_it_was_occluded() -> None:
