@@ -184,6 +184,8 @@ def _between(
     mine = b.stays[b.stays.clique_id == clique]
     left, come = _newest(mine, old_site), _newest(mine, new_site)
     from_s, to_s = [], []
+    if kind is ChangeKind.VANISHED and len(mine):  # from wherever it stood last
+        left = _newest(mine, int(mine.site_id[np.argmax(mine.first_s)]))
     if kind in (ChangeKind.VANISHED, ChangeKind.MOVED, ChangeKind.ROTATED) and left is not None:
         from_s.append(left[2])
         to_s.append(left[3])
@@ -195,7 +197,9 @@ def _between(
         from_s += [float(earlier.max())] if len(earlier) else []
     start = max(from_s, default=a.stamp_s)
     end = min([*to_s, b.stamp_s])
-    return (float(min(start, end)) if np.isfinite(start) else np.nan), float(end)
+    if start > end:  # it stood elsewhere in between: from when it left to when it came
+        start, end = min(from_s, default=np.nan), max(to_s, default=end)
+    return (float(start) if np.isfinite(start) else np.nan), float(end)
 
 
 def _newest(stays: Stays, site_id: int) -> tuple[float, float, float, float] | None:

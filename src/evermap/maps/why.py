@@ -150,7 +150,7 @@ def _with_words(answer: Answer, living: LivingMap) -> Answer:
     """The same with its headline and reasons."""
     kind = f" ({answer.class_name})" if answer.class_name else ""
     what = f"landmark {answer.landmark_id}{kind}"
-    belief = f"P(exists) = {probability_text(answer.p_exists)}"
+    belief = f"P(exists) {_belief(answer.p_exists)}"
     if answer.deleted:
         headline = f"{what} is not used: an operator deleted it; by what was seen, {belief}"
     elif answer.p_exists >= EXISTS:
@@ -178,40 +178,42 @@ def _on_sightings(answer: Answer, living: LivingMap) -> list[str]:
         return [f"it was never detected where it is expected, in {_looks(seen)}"]
     last = int(hits[-1])
     last_s, p_then = float(seen.stamp_s[last]), float(seen.p_exists[last])
-    reasons = [f"it was last detected {_when(last_s, clock)}; P(exists) was {probability_text(p_then)} then"]
+    reasons = [f"it was last detected {_when(last_s, clock)}; then P(exists) {_belief(p_then)}"]
     after = seen[np.arange(len(seen)) > last]
-    said = float(after.log_odds.sum())
+    newest = answer.visits[-1]
+    if newest.n_hits and (answer.p_exists >= EXISTS or not len(after)):
+        reasons.append(
+            f"in its newest session it was detected {newest.n_hits} times, where {newest.expected:.1f} detections were "
+            f"expected; {newest.n_misses} misses fit the range, the field of view and what blocks it"
+        )
+        if answer.p_exists >= EXISTS:
+            return reasons
     if len(after):
+        said = float(after.log_odds.sum())
         reasons.append(
             f"since then it was looked for in {_looks(after)}: {int(after.n_misses.sum())} misses and no detection, "
             f"where {after.expected.sum():.1f} detections were expected had it stood there; that is {abs(said):.1f} "
             f"nats {'against' if said < 0 else 'for'} it"
         )
-    reasons += _on_time(answer, living, last_s, _logit(p_then) + said)
-    return reasons
+    else:
+        reasons.append("nobody has looked for it since; time has made it improbable")
+    return [*reasons, *_on_time(answer, living, last_s)]
 
 
-def _on_time(answer: Answer, living: LivingMap, last_s: float, logit: float) -> list[str]:
-    """What time did to the belief since the last sighting, and what is known of how long its like stay."""
+def _on_time(answer: Answer, living: LivingMap, last_s: float) -> list[str]:
+    """How long its like stay."""
+    row = np.flatnonzero(living.members.landmark_id == answer.landmark_id)
+    place = living.place_row(living.members.landmark_id[row], living.site_of()[row])
     waited_s = living.stamp_s - last_s
-    if not (np.isfinite(waited_s) and waited_s > 0.0):
+    if place[0] < 0 or not (np.isfinite(waited_s) and waited_s > 0.0):
         return []
-    row = int(np.flatnonzero(living.members.landmark_id == answer.landmark_id)[0])
-    place = living.place_row(living.members.landmark_id[row : row + 1], living.site_of()[row : row + 1])
-    if place[0] < 0:
-        return []
-    life = living.lives.of(int(living.members.class_id[row]), living.places.position_m[place[0]])
-    at = answer.stays[answer.stays.last_s <= last_s]
-    age_s = max(last_s - float(at.first_s[-1]), 0.0) if len(at) else 0.0
+    life = living.lives.of(int(living.members.class_id[row[0]]), living.places.position_m[place[0]])
+    at = answer.stays[answer.stays.first_s <= last_s]
+    age_s = last_s - float(at.first_s[-1]) if len(at) else 0.0
     stay = float(np.exp(life.stay.log_conditional_survival(age_s, age_s + waited_s)))
     known = f"learned from {life.n_stays} stays" if life.n_stays else "nothing was learned of its kind yet"
     like = f"of its kind, {stay:.0%} of those that have stood for {duration_text(age_s)}"
-    reasons = [f"{like} stand for another {duration_text(waited_s)} ({known})"]
-    drift = _logit(answer.p_exists) - logit
-    if abs(drift) > 0.5:
-        way = "less" if drift < 0.0 else "more"
-        reasons.append(f"time, and the other places where it may stand, make it {abs(drift):.1f} nats {way} probable")
-    return reasons
+    return [f"{like} stand for another {duration_text(waited_s)} ({known})"]
 
 
 def _looks(seen: Evidence) -> str:
@@ -223,17 +225,18 @@ def _when(stamp_s: float, clock: Clock) -> str:
     return f"on {text}" if text.startswith(("day", "1", "2")) and " " in text else f"at {text}"
 
 
+def _belief(p: float) -> str:
+    """'= 0.97' or '> 0.9999'."""
+    text = probability_text(p)
+    return text if text[0] in "<>" else f"= {text}"
+
+
 def probability_text(p: float) -> str:
     """'0.97', and more digits near 0 and 1, where they matter; never certain."""
     if 0.01 <= p <= 0.99:
         return f"{p:.2f}"
     low = min(p, 1.0 - p)
-    return ("< 0.0001" if p < 0.5 else "> 0.9999") if low < 1e-4 else f"{p:.4f}"
-
-
-def _logit(p: float) -> float:
-    p = float(np.clip(p, 1e-12, 1.0 - 1e-12))
-    return float(np.log(p) - np.log1p(-p))
+    return ("< 0.0001" if p < 0.5 else "> 0.9999") if low < 5e-5 else f"{p:.4f}"
 
 
 def _unknown(living: LivingMap, landmark_id: int) -> str:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = (LANDMARK, ESTIMATE, ODOMETRY, GROUP, ONLINE)
+_MARKERS = ("o", "s", "^", "D")
 _MAX_LABELS = 60
 
 
@@ -82,7 +83,9 @@ def plot_living_map(
             mine = (class_id[shown] == name) & there
             if mine.any():
                 alpha = np.clip(p_exists[shown][mine], 0.25, 1.0)
-                axes.scatter(at[mine, 0], at[mine, 1], s=34, color=colour, alpha=alpha, lw=0, zorder=4, label=label)
+                x, y = at[mine].T
+                shape = _MARKERS[k // len(_COLOURS) % len(_MARKERS)]
+                axes.scatter(x, y, s=34, color=colour, marker=shape, alpha=alpha, lw=0, zorder=4, label=label)
         if not there.all():
             axes.plot(*at[~there].T, "x", color=ALERT, ms=5, mew=1.1, zorder=3, label="believed gone")
         if pinned[shown].any():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,12 @@ from evermap.viz.time_axis import TimeAxis
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+_WORDS = 10.0
+"""Room for words beyond the bars, as a factor on a logarithmic axis."""
+_MAX_WORDS = 6
+"""More sessions than this have no room for words."""
 
 
 def plot_why(
@@ -57,7 +64,7 @@ def plot_why(
     sites = list(dict.fromkeys(name for name, *_ in stays))
     with house_style():
         figure = new_figure(7.2, 3.9 + 0.22 * len(sites))
-        rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.2, 1.4, 0.5 + 0.35 * max(len(sites), 1)])
+        rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.6, 0.5 + 0.35 * max(len(sites), 1)])
         _draw_belief(rows[0], axis, stamp_s, p_exists, session, now_s)
         _draw_evidence(rows[1], axis, stamp_s, n_hits, n_misses, log_odds, session)
         _draw_stays(rows[2], axis, stays, sites, last)
@@ -105,23 +112,34 @@ def _draw_evidence(
     for colour, label in ((LANDMARK, "a session speaks for it"), (ALERT, "a session speaks against it")):
         axes.plot([], [], "-", color=colour, lw=3.0, label=label)
     groups = _sessions(session)
-    if len(groups) <= 12:
-        for rows in groups:
+    if len(groups) <= _MAX_WORDS:
+        for k, rows in enumerate(groups):
             said = float(log_odds[rows].sum())
             axes.annotate(
-                f"+{int(n_hits[rows].sum())} −{int(n_misses[rows].sum())}",
+                f"{int(n_hits[rows].sum())} hits, {int(n_misses[rows].sum())} misses",
                 (axis.coordinates(stamp_s[rows].mean()), said),
                 xytext=(0, 3 if said >= 0.0 else -3),
                 textcoords="offset points",
-                ha="center",
+                ha="left" if k == 0 else "right" if k == len(groups) - 1 else "center",
                 va="bottom" if said >= 0.0 else "top",
-                fontsize=7.5,
+                fontsize=8,
                 color=MUTED,
             )
     axes.axhline(0.0, color=MUTED, lw=0.7, zorder=2)
+    said_all = [float(log_odds[rows].sum()) for rows in groups]
+    high, low = _decade(max([*said_all, 1.0])), 0.0 - _decade(-min([*said_all, 0.0]))
     axes.set_yscale("symlog", linthresh=10.0)
-    axes.margins(y=0.25)
+    ticks = sorted({low, 0.0, high})
+    axes.set_yticks(ticks)
+    axes.set_yticklabels([f"{value:,.0f}" for value in ticks])
+    axes.minorticks_off()
+    axes.set_ylim(_WORDS * low if low else -3.0, _WORDS * high)
     axes.set_ylabel("evidence [nats]")
+
+
+def _decade(nats: float) -> float:
+    """The power of ten from 10 on that holds so much; 0 for nothing."""
+    return 0.0 if nats <= 0.0 else max(10.0, 10.0 ** math.ceil(math.log10(nats)))
 
 
 def _draw_stays(
@@ -136,6 +154,7 @@ def _draw_stays(
         y = sites.index(name)
         label = "" if k else "seen at the site"
         axes.hlines(y, axis.coordinates(first), axis.coordinates(until), color=LANDMARK, lw=6.0, zorder=3, label=label)
+        axes.plot(axis.coordinates(np.array([first, until])), [y, y], "s", color=LANDMARK, ms=6.0, mew=0.0, zorder=3)
         if np.isfinite(elsewhere):
             axes.hlines(y, axis.coordinates(elsewhere), axis.coordinates(first), color=MUTED, lw=1.0, zorder=2)
         if np.isfinite(gone):

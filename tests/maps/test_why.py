@@ -1,0 +1,164 @@
+"""The answer to 'why is this gone?', of a map whose history was written by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evermap.errors import InputError
+from evermap.maps.lives import EVERYWHERE, Life, Lives
+from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
+from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.why import probability_text, why
+from evermap.survival import Exponential
+from evermap.types import ChangeKind, Clock, MapChange
+
+HOUR_S = 3600.0
+LIFE_S = 10 * HOUR_S
+
+
+def the_map(
+    stamp_s: float, p: tuple[float, float], stays: list[tuple[int, int, float, float, float, float]]
+) -> LivingMap:
+    """Landmarks 5 and 6 on body 1 at site 1, landmark 9 on body 2 at site 2; beliefs by body."""
+    rows = np.array(stays, dtype=np.float64).reshape(-1, 6)
+    life = Life(stay=Exponential(1 / LIFE_S), n_stays=12, n_ended=3)
+    return LivingMap(
+        stamp_s=stamp_s,
+        members=Members(
+            np.array([5, 6, 9]), np.array([0, 0, -1]), np.array([1, 1, 2]), np.zeros(3, bool), np.zeros(3, bool)
+        ),
+        sites=Sites(np.array([1, 2]), np.array([1, 2]), np.array(p), np.zeros(2), np.full(2, stamp_s)),
+        places=Places(
+            np.array([1, 1, 2]), np.array([5, 6, 9]), np.array([[0.0, 0], [1, 0], [5, 5]]), *np.ones((2, 3), int)
+        ),
+        stays=Stays(
+            rows[:, 0].astype(int), rows[:, 1].astype(int), np.zeros(len(rows), int), np.zeros((len(rows), 2)),
+            *rows[:, 2:].T.copy(),
+        ),
+        covariance_m2=1e-4 * np.eye(6),
+        lives=Lives(np.array([0]), np.array([[EVERYWHERE, EVERYWHERE]]), (life,)),
+        class_names=("pallet",),
+        clock=Clock.RECORDING,
+        n_cliques_ever=3,
+        n_sites_ever=3,
+    )  # fmt: skip
+
+
+def seen(clique: int, rows: list[tuple[float, int, int, float, float, float]]) -> Evidence:
+    """Stamp, hits, misses, expected, log odds, P(exists)."""
+    stamp, hits, misses, expected, said, p = (np.array(column) for column in zip(*rows, strict=True))
+    return Evidence(np.full(len(rows), clique), stamp.astype(float), hits, misses, expected, said, p)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> MapStore:
+    """Body 1 stands for two sessions, and is missed in the third; body 2 is always seen."""
+    first = seen(1, [(100.0, 2, 0, 1.8, 9.0, 0.99), (160.0, 1, 1, 1.8, 4.0, 0.999)])
+    second = seen(1, [(HOUR_S, 2, 0, 1.8, 9.0, 0.9999)])
+    other = seen(2, [(HOUR_S, 1, 0, 0.9, 4.0, 0.95)])
+    third = seen(1, [(5 * HOUR_S, 0, 2, 1.75, -3.0, 0.6), (5 * HOUR_S + 60.0, 0, 1, 0.5, -4.5, 0.02)])
+    gone = MapChange((5, 6), ChangeKind.VANISHED, HOUR_S, 5 * HOUR_S, (np.nan, np.nan), 0.0, 0.98, 0, 3)
+    store = open_store(tmp_path / "m.evermap", create=True)
+    stay, other_stay = (1, 1, -np.inf, 100.0, HOUR_S, np.inf), (2, 2, -np.inf, HOUR_S, HOUR_S, np.inf)
+    store.commit(the_map(160.0, (0.999, 0.5), [stay]), Provenance(recording="monday"), (), first, parent=0)
+    store.commit(
+        the_map(HOUR_S, (0.9999, 0.95), [stay, other_stay]),
+        Provenance(recording="tuesday"),
+        (),
+        second.joined(other),
+        parent=1,
+    )
+    ended = (*stay[:-1], 5 * HOUR_S)
+    last = the_map(6 * HOUR_S, (0.02, 0.9), [ended, other_stay])
+    store.commit(last, Provenance(recording="friday"), (gone,), third, parent=2)
+    return store
+
+
+def test_why_it_is_gone(store: MapStore) -> None:
+    answer = why(store, 5)
+    assert answer.headline == "landmark 5 (pallet) is believed gone: P(exists) = 0.02"
+    assert answer.companions == (6,)
+    assert [(v.revision, v.recording, v.n_looks, v.n_hits, v.n_misses) for v in answer.visits] == [
+        (1, "monday", 2, 3, 1),
+        (2, "tuesday", 1, 2, 0),
+        (3, "friday", 2, 0, 3),
+    ]
+    np.testing.assert_allclose([v.log_odds for v in answer.visits], [13.0, 9.0, -7.5], rtol=1e-6)
+    np.testing.assert_allclose([v.expected for v in answer.visits], [3.6, 1.8, 2.25], rtol=1e-6)
+    np.testing.assert_allclose([v.p_exists for v in answer.visits], [0.999, 0.9999, 0.02], rtol=1e-6)
+    ((revision, change),) = answer.changes
+    assert (revision, change.kind) == (3, ChangeKind.VANISHED)
+    text = " / ".join(answer.reasons)
+    assert "last detected at 01:00:00; then P(exists) = 0.9999" in text
+    # 1.75 + 0.5 expected, -3.0 - 4.5 nats
+    assert "looked for in 2 frames: 3 misses and no detection, where 2.2 detections were expected" in text
+    assert "that is 7.5 nats against it" in text
+    # of an exponential law with a mean of 10 h, exp(-5 h / 10 h) stay for another 5 h
+    assert (
+        f"{np.exp(-0.5):.0%} of those that have stood for 58.3 min stand for another 5 h (learned from 12 stays)"
+        in text
+    )
+    assert "shares a body with landmark 6" in text
+
+
+def test_why_it_is_there(store: MapStore) -> None:
+    before = why(store, 6, revision=2)
+    assert before.headline == "landmark 6 (pallet) is believed to be there: P(exists) = 0.9999"
+    assert [v.revision for v in before.visits] == [1, 2]
+    assert before.changes == ()
+    assert "in its newest session it was detected 2 times, where 1.8 detections were expected" in " ".join(
+        before.reasons
+    )
+    other = why(store, 9)
+    assert other.headline == "landmark 9 is believed to be there: P(exists) = 0.90"
+    assert other.companions == ()
+
+
+def test_an_operators_word_is_part_of_the_answer(store: MapStore) -> None:
+    living = store.load()
+    edit = Provenance(kind=RevisionKind.EDIT)
+    store.commit(living.edited(5, pinned=True), edit, parent=3)
+    store.commit(living.edited(5, deleted=True), edit, parent=4)
+    answer = why(store, 5)
+    assert answer.headline.startswith("landmark 5 (pallet) is not used: an operator deleted it; by what was seen, P(")
+    assert [(revision, word) for revision, _, word in answer.edits] == [(4, "pinned"), (5, "deleted"), (5, "unpinned")]
+    assert "an operator deleted it in revision 5" in " ".join(answer.reasons)
+    assert why(store, 6).edits == ()
+    store.revert(3)  # what was taken back explains nothing
+    assert why(store, 5).edits == ()
+
+
+def test_a_session_that_was_taken_back_explains_nothing(store: MapStore) -> None:
+    store.revert(2)
+    answer = why(store, 5)
+    assert [v.revision for v in answer.visits] == [1, 2]
+    assert answer.changes == ()
+
+
+def test_time_alone_can_make_it_gone(store: MapStore) -> None:
+    faded = replace(store.load(2), stamp_s=60 * HOUR_S)
+    faded = replace(faded, sites=replace(faded.sites, p_here=np.array([0.2, 0.9])))
+    store.revert(2)
+    store.commit(faded, Provenance(), parent=4)
+    text = " ".join(why(store, 5).reasons)
+    assert "nobody has looked for it since; time has made it improbable" in text
+    assert f"{np.exp(-5.9):.0%} of those" in text
+
+
+def test_a_landmark_nobody_knows(store: MapStore) -> None:
+    with pytest.raises(InputError, match=r"no landmark 7; the nearest ids are 5, 6, 9 \(try: evermap map show"):
+        why(store, 7)
+    with pytest.raises(InputError, match="no landmark 7: the map is empty"):
+        why(store, 7, revision=0)
+
+
+@pytest.mark.parametrize(
+    ("p", "text"),
+    [(0.5, "0.50"), (0.99, "0.99"), (0.999, "0.9990"), (1.0, "> 0.9999"), (0.0, "< 0.0001"), (0.002, "0.0020")],
+)
+def test_probabilities_are_never_certain(p: float, text: str) -> None:
+    assert probability_text(p) == text
