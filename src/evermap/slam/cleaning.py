@@ -40,7 +40,7 @@ def clean(recording: Recording) -> Recording:
 
         * stamps that are none or stand alone: their rows are left out;
         * late rows: sorted in; rows with equal stamps: the last odometry is kept, frames are united;
-        * clocks that were set back, and clocks of one sensor that were set forward, by more than a second: taken back,
+        * clocks that were set back, by more than 1 s, and clocks of one sensor set forward, by more than 2 s: taken back,
           to within a few periods of the sensor;
         * odometry that is no number, beyond `FASTEST`, or a spike: left out, the row before holds on;
         * readings that are no number, not positive, or beyond the sensor's reach: left out;
