@@ -89,10 +89,7 @@ def sum_over_paths(
             leaving[0] = 1 - q - leaving.sum()
         return (staying if after == before else 0.0) + (leaving[after[0]] if after[1] else 0.0)
 
-    steps = [
-        {(a, b): step(a, b, t0, t1) for a in states for b in states}
-        for t0, t1 in zip(stamps[:-1], stamps[1:], strict=True)
-    ]
+    steps = [{(a, b): step(a, b, t0, t1) for a in states for b in states} for t0, t1 in itertools.pairwise(stamps)]
     start = {(seat, new): 0.0 if new else np.append(1 - p_here.sum(), p_here)[seat] for seat, new in states}
 
     def weigh(count: int) -> FloatArray:
