@@ -147,7 +147,7 @@ def building() -> BuildingSimulation:
 
 
 def test_what_is_hidden_is_not_gone_and_what_is_gone_is_not_hidden(building: BuildingSimulation) -> None:
-    """Measured for this seed: Brier score .0010, precision 1.00, recall .998; by the nominal field .127, .99 and .76."""
+    """Measured: Brier score .0010, precision 1.00, recall .998; by the nominal field of view .127, .99 and .76."""
     learned, table = follow(building, lambda table, key, nominal: table.lines(key, nominal))
     brier, precision, recall = learned.of()
     assert brier < 0.005
