@@ -164,11 +164,10 @@ def made_map(places: list[tuple[int, int, float, float, float]]) -> LivingMap:
 
 
 def made_session(living: LivingMap, path: np.ndarray, changes: tuple[MapChange, ...] = (), placed: bool = True) -> Any:
-    frame = "prior_map" if placed else "first_pose"
-    trajectory = Trajectory(np.arange(20.0), path, np.zeros((20, 3, 3)), frame=frame)
-    return SimpleNamespace(
-        living=living, changes=changes, slam=SimpleNamespace(trajectory=trajectory, step_s=np.full(20, 0.002))
+    slam = SimpleNamespace(
+        trajectory=Trajectory(np.arange(20.0), path, np.zeros((20, 3, 3))), step_s=np.full(20, 0.002)
     )
+    return SimpleNamespace(living=living, found=placed, changes=changes, slam=slam)
 
 
 def found(kind: ChangeKind, landmark: int) -> MapChange:
@@ -221,7 +220,6 @@ def test_the_frame_is_that_of_the_first_map_and_creeping_away_is_wrong() -> None
     lost = session_scores(made_session(living, creeping, placed=False), world, 1, pose, 0.5)
     assert not lost["placed"]
     assert lost["pose_rmse_m"] is None
-    assert session_scores(made_session(living, creeping, placed=False), world, 0, pose, 0.5)["placed"]
     nothing = Landmarks.at([], np.zeros((0, 2)))
     assert landmark_rmse_m(nothing, world.landmarks(0), pose) is None
 
@@ -245,24 +243,22 @@ def test_who_is_told_forgets_what_changed_and_nobody_sees_the_truth(
     survey = survey_of(world.recordings[0])
     given: list[Any] = []
 
-    def run(recording: Any, living: LivingMap | None, config: Any) -> Any:
-        given.append((recording, living, config))
+    def bring_in(alone: Any, living: LivingMap, config: Any) -> Any:
+        given.append((alone, living, config))
         if len(given) == 3:
             raise NumericalError("no finite optimum")
-        whole = made_map([(k, int(i), *at, 1.0) for k, (i, at) in enumerate(zip(*_rows(survey), strict=True))])  # type: ignore[misc]
-        result = SimpleNamespace(
-            trajectory=replace(world.recordings[len(given) - 1].truth, frame="prior_map"),
-            step_s=np.ones(3),
-            interrupted=False,
-        )
-        return SimpleNamespace(living=whole, slam=result, changes=())
+        whole = made_map([(k, int(i), *at, 1.0) for k, (i, at) in enumerate(zip(*_rows(survey), strict=True))])
+        path = world.recordings[len(given) - 1].truth
+        result = SimpleNamespace(trajectory=path, step_s=np.ones(3), interrupted=False)
+        return SimpleNamespace(living=whole, found=True, slam=result, changes=())
 
-    monkeypatch.setattr("evermap.pipeline.run_session", run)
-    rows = list(live(world, CONTENDERS[-1]))
+    monkeypatch.setattr("evermap.pipeline.solve_alone", lambda recording, living, config: recording)
+    monkeypatch.setattr("evermap.pipeline.bring_in", bring_in)
+    rows = list(live(world, [CONTENDERS[-1]]))
     assert [row["failure"] for row in rows] == [None, None, "no finite optimum", None]
     assert [row["session"] for row in rows] == [0, 1, 2, 3]
     assert all(recording.truth is None and recording.true_landmarks is None for recording, _, _ in given)
-    assert given[0][1] is None
+    assert len(given[0][1].members) == 0
     for k in (1, 2):
         left = np.setdiff1d(survey.landmark_id, world.changed(k))
         np.testing.assert_array_equal(given[k][1].members.landmark_id, left)
@@ -270,6 +266,21 @@ def test_who_is_told_forgets_what_changed_and_nobody_sees_the_truth(
     left = np.setdiff1d(left, world.changed(3))
     np.testing.assert_array_equal(given[3][1].members.landmark_id, left)
     assert rows[1]["pose_rmse_m"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_sessions_are_solved_once_for_all_who_agree_how(made_up_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = recorded_world(made_up_data, 2, 0)
+    solved: list[str] = []
+
+    def fail(*_: Any) -> Any:
+        raise NumericalError("enough")
+
+    monkeypatch.setattr("evermap.pipeline.solve_alone", lambda _, __, config: solved.append(config.slam.sensor_model))
+    monkeypatch.setattr("evermap.pipeline.bring_in", fail)
+    rows = list(live(world, ABLATIONS))
+    assert len(rows) == 2 * len(ABLATIONS)
+    assert {row["contender"] for row in rows} == {contender.name for contender in ABLATIONS}
+    assert solved == ["calibrated", "plain"] * 2
 
 
 def _rows(survey: Landmarks) -> tuple[list[int], list[list[float]]]:

@@ -19,7 +19,7 @@ from evermap.errors import ConfigError
 from evermap.experiments.lifelong_runs import ABLATIONS, CONTENDERS, SIMULATED, WHOLE, Contender, live
 from evermap.experiments.lifelong_scores import NOTHING
 from evermap.experiments.lifelong_table import as_markdown, verdicts
-from evermap.experiments.lifelong_world import DATASET, World, recorded_world, simulated_world
+from evermap.experiments.lifelong_world import DATASET, recorded_world, simulated_world
 from evermap.experiments.mrclam import find_dataset, machine
 
 Progress = Callable[[float, float], None]
@@ -28,7 +28,8 @@ Row = dict[str, Any]
 
 SCHEMA_VERSION = "1"
 EXPERIMENT = "lifelong"
-PARTS = ("five", "fifty", "ablation-recorded", "ablation-simulated")
+SIMULATED_PART = "ablation-simulated"
+PARTS = ("five", "fifty", "ablation-recorded", SIMULATED_PART)
 SCORING = (
     "poses at 2 Hz and landmarks in the frame of the map, tied to the truth once, by the landmarks of the first "
     "session's map; landmarks that are there and that the map believes in (p >= 0.5), however far off; a claim is "
@@ -74,12 +75,17 @@ QUICK = Settings(seeds=1, long=10, buildings=1, days=3)
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One contender in one world."""
+    """Who lives in one world."""
 
     part: str
     seed: int
-    contender: Contender
+    contenders: tuple[Contender, ...]
     sessions: int
+
+    @property
+    def is_simulated(self) -> bool:
+        """In the building of the demonstration."""
+        return self.part == SIMULATED_PART
 
 
 def reproduce(
@@ -111,7 +117,7 @@ def reproduce(
     from evermap.viz.style import save_all
 
     settings = settings or Settings()
-    if any("simulated" not in part for part in settings.parts):
+    if set(settings.parts) != {SIMULATED_PART}:
         find_dataset(Path(data), DATASET)
     kept = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts]
     with RunFolder(out, force=force) as folder:
@@ -139,22 +145,15 @@ def reproduce(
 
 
 def jobs(settings: Settings) -> list[Job]:
-    """Who lives in which world, in the order in which they are run: worlds change as rarely as possible."""
+    """All that the settings ask for."""
     scripts = range(settings.seed, settings.seed + settings.seeds)
     buildings = range(settings.seed, settings.seed + settings.buildings)
+    long_lived = tuple(who for who in CONTENDERS if who.name in settings.long_contenders)
     planned = {
-        "five": [Job("five", seed, who, settings.short) for seed in scripts for who in CONTENDERS],
-        "fifty": [
-            Job("fifty", settings.seed, who, settings.long)
-            for who in CONTENDERS
-            if who.name in settings.long_contenders
-        ],
-        "ablation-recorded": [
-            Job("ablation-recorded", seed, who, settings.short) for seed in scripts for who in ABLATIONS
-        ],
-        "ablation-simulated": [
-            Job("ablation-simulated", seed, who, 2 * settings.days) for seed in buildings for who in ABLATIONS
-        ],
+        "five": [Job("five", seed, CONTENDERS, settings.short) for seed in scripts],
+        "fifty": [Job("fifty", settings.seed, long_lived, settings.long)],
+        "ablation-recorded": [Job("ablation-recorded", seed, ABLATIONS, settings.short) for seed in scripts],
+        SIMULATED_PART: [Job(SIMULATED_PART, seed, ABLATIONS, 2 * settings.days) for seed in buildings],
     }
     return [job for part in PARTS if part in settings.parts for job in planned[part]]
 
@@ -164,25 +163,17 @@ def _run_all(settings: Settings, data: Path, progress: Progress | None) -> Itera
 
     warm_up()  # compiling is no part of the first session
     planned = jobs(settings)
-    total, done = sum(job.sessions for job in planned), 0
-    made: tuple[tuple[bool, int, int], World] | None = None
+    total, done = sum(job.sessions * len(job.contenders) for job in planned), 0
     for job in planned:
-        is_simulated = "simulated" in job.part
-        key = is_simulated, job.sessions, job.seed
-        if made is None or made[0] != key:
-            made = None  # one at a time in memory
-            made = key, _world(job, data)
-        for row in live(made[1], job.contender, SIMULATED if is_simulated else ()):
+        if job.is_simulated:
+            world = simulated_world(job.sessions // 2, job.seed)
+        else:
+            world = recorded_world(data, job.sessions, job.seed)
+        for row in live(world, job.contenders, SIMULATED if job.is_simulated else ()):
             done += 1
             if progress is not None:
                 progress(done, total)
-            yield {"part": job.part, "seed": job.seed, "contender": job.contender.name, **row}
-
-
-def _world(job: Job, data: Path) -> World:
-    if "simulated" in job.part:
-        return simulated_world(job.sessions // 2, job.seed)
-    return recorded_world(data, job.sessions, job.seed)
+            yield {"part": job.part, "seed": job.seed, **row}
 
 
 def _figures(rows: list[Row]) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,8 @@ from evermap.experiments.lifelong_world import World
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.living import LivingMap
+    from evermap.pipeline import Alone
+    from evermap.types import FloatArray, Recording
 
 P_CLAIMED = 0.5
 """A map claims what it believes in at least this much."""
@@ -66,45 +68,74 @@ SIMULATED = ("slam.calibration.fix={range_slope = 0.0}",)
 """Settings for simulated worlds: without a length standard no estimator can tell the size of a building."""
 
 
-def live(
-    world: World,
-    contender: Contender,
-    overrides: tuple[str, ...] = (),
-) -> Iterator[Row]:
-    """Session after session into one map; a row of plain JSON values each.
+@dataclass
+class _Life:
+    """One contender's map so far; its frame in that of the truth is known from the first session on."""
 
-    A session that fails leaves the map as it was, and a row with its `failure`.
+    contender: Contender
+    config: Config
+    living: LivingMap
+    pose_truth_map: FloatArray | None = None
+
+
+def live(world: World, contenders: Sequence[Contender], overrides: tuple[str, ...] = ()) -> Iterator[Row]:
+    """Session after session into one map each; a row of plain JSON values for every session and contender.
+
+    Sessions are solved alone once for all who agree on how, and brought into each map. One that fails leaves a map as
+    it was, and a row with its `failure`. The time of a session is that of both halves.
 
     Args:
         world: sessions and their truth; the estimator sees no truth.
-        contender: who.
+        contenders: who.
         overrides: settings of the world.
 
     Raises:
-        DataError: nothing comes out of the first session.
         KeyboardInterrupt: a session was interrupted.
     """
-    from evermap.pipeline import run_session
+    from evermap.maps.living import LivingMap
 
-    config = contender.config(overrides)
-    living: LivingMap | None = None
-    pose_truth_map = None
+    lives = [_Life(who, who.config(overrides), LivingMap(clock=world.recordings[0].clock)) for who in contenders]
     for number, recording in enumerate(world.recordings):
-        if contender.is_told and living is not None:
-            living = living.without(world.changed(number))
+        halves = _Halves(replace(recording, truth=None, true_landmarks=None))
+        for life in lives:
+            scores = _session(life, halves, world, number)
+            yield {"contender": life.contender.name, "session": number, **scores}
+
+
+def _session(life: _Life, halves: _Halves, world: World, number: int) -> Row:
+    from evermap.pipeline import bring_in
+
+    if life.contender.is_told and number:
+        life.living = life.living.without(world.changed(number))
+    try:
+        alone, alone_s = halves.alone(life)
         began = time.process_time()
-        try:
-            session = run_session(replace(recording, truth=None, true_landmarks=None), living, config)
-        except (DataError, NumericalError) as error:
-            if living is None:
-                raise
-            yield {"session": number, **NOTHING, "failure": error.one_line()}
-            continue
-        cpu_s = time.process_time() - began
-        if session.slam.interrupted:
-            raise KeyboardInterrupt
-        living = session.living
-        if pose_truth_map is None:
-            pose_truth_map = alignment_of(living, world)
-        row = session_scores(session, world, number, pose_truth_map, P_CLAIMED)
-        yield {"session": number, **row, "cpu_s": cpu_s}
+        session = bring_in(alone, life.living, life.config)
+        cpu_s = alone_s + time.process_time() - began
+    except (DataError, NumericalError) as error:
+        return {**NOTHING, "failure": error.one_line()}
+    if session.slam.interrupted:
+        raise KeyboardInterrupt
+    life.living = session.living
+    if life.pose_truth_map is None:
+        life.pose_truth_map = alignment_of(life.living, world)
+    return {**session_scores(session, world, number, life.pose_truth_map, P_CLAIMED), "cpu_s": cpu_s}
+
+
+class _Halves:
+    """A session solved alone, once for every way to do so."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._known: dict[str, tuple[Alone, float]] = {}
+
+    def alone(self, life: _Life) -> tuple[Alone, float]:
+        """The session, and processor time that it took [s]."""
+        from evermap.pipeline import solve_alone
+
+        key = life.config.slam.model_dump_json()
+        if key not in self._known:
+            began = time.process_time()
+            alone = solve_alone(self._recording, life.living, life.config)
+            self._known[key] = alone, time.process_time() - began
+        return self._known[key]

@@ -62,7 +62,7 @@ def session_scores(session: Session, world: World, number: int, pose_truth_map: 
         p_least: a landmark is claimed from this probability on.
     """
     living, slam = session.living, session.slam
-    placed = number == 0 or slam.trajectory.frame == "prior_map"
+    placed = session.found
     return {
         **NOTHING,
         "placed": placed,
