@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -89,3 +89,39 @@ def laid_over(
     probability = np.ones(len(landmark_id))
     probability[seen] = found.probability
     return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m)
+
+
+def with_glimpsed(living: LivingMap, p_site: FloatArray, where: Laid, landmark_id: IntArray) -> Laid:
+    """Landmarks that were seen too rarely to say where they are, laid where their cliques stand.
+
+    Whether their sightings fit there is seen when the session is solved with the map.
+
+    Args:
+        living: the map.
+        p_site: (S,) belief in its sites.
+        where: where all others lie.
+        landmark_id: (K,) those.
+    """
+    members, places, sites = living.members, living.places, living.sites
+    names = np.intersect1d(landmark_id, members.landmark_id)
+    clique = members.clique_id[np.searchsorted(members.landmark_id, names)]
+    expected = replace(living, sites=replace(sites, p_here=p_site)).site_of()
+    site = expected[np.searchsorted(members.landmark_id, names)]
+    laid = where.place >= 0
+    stands = dict(
+        zip(
+            members.clique_id[np.searchsorted(members.landmark_id, where.landmark_id[laid])].tolist(),
+            places.site_id[where.place[laid]].tolist(),
+            strict=True,
+        )
+    )
+    site = np.array([stands.get(int(c), int(s)) for c, s in zip(clique, site, strict=True)], dtype=np.int64)
+    place = living.place_row(names, site)
+    names, place = names[place >= 0], place[place >= 0]
+    order = np.argsort(np.concatenate([where.landmark_id, names]), kind="stable")
+    return replace(
+        where,
+        landmark_id=np.concatenate([where.landmark_id, names])[order],
+        place=np.concatenate([where.place, place])[order],
+        probability=np.concatenate([where.probability, np.ones(len(names))])[order],
+    )

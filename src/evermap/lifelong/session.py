@@ -12,7 +12,7 @@ from evermap.lifelong import believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import anchored, drifted, of_places
-from evermap.lifelong.overlaying import Laid, laid_over
+from evermap.lifelong.overlaying import Laid, laid_over, with_glimpsed
 from evermap.maps.learning import learned_lives
 from evermap.maps.living import Evidence, LivingMap
 from evermap.slam import session as of_slam
@@ -95,7 +95,11 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
     """Where the session lies in the map; None where it shows nothing that stands as in the map."""
     own = own_landmarks(alone.outcome)
     names = alone.prepared.landmark_id[own.row]
-    return laid_over(living, p_site, names, own.position_m, own.covariance_m2, config.search)
+    where = laid_over(living, p_site, names, own.position_m, own.covariance_m2, config.search)
+    if where is None:
+        return None
+    glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
+    return with_glimpsed(living, p_site, where, glimpsed)
 
 
 def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool) -> Visit:
@@ -116,7 +120,12 @@ def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior,
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
     """The map with the places and sites that the session found."""
-    own = own_landmarks(visit.outcome, of_unknown_size=False)  # the first session says how long a metre is
+    in_place = None if where is None else where.landmark_id[where.place >= 0]
+    own = own_landmarks(
+        visit.outcome,
+        None if in_place is None else np.searchsorted(visit.prepared.landmark_id, in_place),
+        of_unknown_size=False,  # the first session says how long a metre is
+    )
     detection, landmark = _inliers(visit)
     stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
     count = len(visit.prepared.landmark_id)

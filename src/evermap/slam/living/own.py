@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.slam.streaming import Outcome
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import FloatArray, IntArray
 
 SIGHTINGS = 1.5
 """Inliers that a landmark needs to be believed: one sighting may carry a wrong identity."""
+SIGHTINGS_IN_PLACE = 0.5
+"""The same, of one that stands where the map has it: a wrong identity is hardly ever the right one there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,23 +30,21 @@ class OwnLandmarks:
     covariance_m2: FloatArray
 
 
-def believable(landmark_row: IntArray, inlier: FloatArray, known: BoolArray) -> IntArray:
-    """(K,) rows of landmarks that have a position, and enough sightings that fit it."""
-    sightings = np.bincount(landmark_row[: len(inlier)], inlier, minlength=len(known))
-    return np.flatnonzero(known & (sightings >= SIGHTINGS))
-
-
-def own_landmarks(outcome: Outcome, *, of_unknown_size: bool = True) -> OwnLandmarks:
+def own_landmarks(outcome: Outcome, in_place: IntArray | None = None, *, of_unknown_size: bool = True) -> OwnLandmarks:
     """What a session says of its landmarks.
 
     Args:
         outcome: of the session.
+        in_place: rows of landmarks that were laid at places of the map.
         of_unknown_size: with what is not known of the scale, as one needs to compare it with a map. The metre of a map
             is that of its first session: where later ones could change it, the shrinking that noise does to every
             graph would shrink it a little each time.
     """
     estimate = outcome.graph_estimate
-    row = believable(outcome.problem.landmark_row, outcome.inlier, estimate.known)
+    landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
+    least = np.full(len(estimate.known), SIGHTINGS)
+    least[[] if in_place is None else in_place] = SIGHTINGS_IN_PLACE
+    row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
     at = (2 * row[:, None] + np.arange(2)).ravel()
     position = estimate.landmark[row] * outcome.scale
     covariance = outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2
