@@ -135,32 +135,38 @@ def renew(
 ) -> None:
     """Beliefs over a long gap, in which a clique may leave and return many times: the renewal equation in M steps.
 
-    Who comes in one of the steps does so in its middle, and stays until its end.
+    Who comes in one of the steps does so in its middle; who leaves again in the same one comes somewhere in the next.
 
     Args:
         seat: (C + 1,) rows of the seats of each clique.
         route: (R, W) where one that leaves a seat goes; what is missing to 1 stays.
         moves: (R,) sum of that.
         death_old: (R, M) odds of leaving, in each step, of who has been there since before.
-        death_new: (R, M) odds of leaving in the step, of who came that many steps ago, and one.
+        death_new: (R, M) odds of leaving of who came: in what was left of the step then, and in each one after it.
         old: (R,) probabilities, updated in place.
         new: (R,) filled in: of who came in the meantime.
         began: (R,) filled in: when that was on average, in steps; the middle of the gap where nobody came.
     """
     steps = death_old.shape[1]
     come = np.zeros((old.size, steps))
+    again = np.zeros(old.size)
     for c in range(seat.size - 1):
         low, high = seat[c], seat[c + 1]
         for m in range(steps):
             for s in range(low, high):
-                leaving = old[s] * _share(death_old[s, m])
+                leaving = again[s] + old[s] * _share(death_old[s, m])
                 old[s] *= _rest(death_old[s, m], moves[s])
                 for j in range(m):
-                    odds = death_new[s, m - 1 - j]
-                    leaving += come[s, j] * _share(odds)
-                    come[s, j] *= _rest(odds, moves[s])
+                    leaving += come[s, j] * _share(death_new[s, m - j])
+                    come[s, j] *= _rest(death_new[s, m - j], moves[s])
                 for t in range(high - low):
                     come[low + t, m] += leaving * route[s, t]
+            for s in range(low, high):
+                again[s] = come[s, m] * _share(death_new[s, 0])
+                come[s, m] *= _rest(death_new[s, 0], moves[s])
+        for s in range(low, high):
+            for t in range(high - low):
+                come[low + t, steps - 1] += again[s] * route[s, t]
         for s in range(low, high):
             new[s], began[s] = 0.0, 0.0
             for m in range(steps):

@@ -80,8 +80,8 @@ def follow_sites(
     step_s = ((first_s - start) / STEPS)[chains.clique]
     old, new, came = chains.start(p_here, pinned), np.zeros(len(since)), np.zeros(len(since))
     edges = age[:, None] + np.arange(STEPS + 1) * step_s[:, None]
-    middles = (np.arange(STEPS + 1) + 0.5) * step_s[:, None]
-    death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, middles))
+    since_middle = np.maximum(np.arange(STEPS + 1) - 0.5, 0.0) * step_s[:, None]
+    death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, since_middle))
     kernels.renew(chains.first, route, moves, death_old, death_new, old, new, came)
     came = start[chains.clique] + came * step_s
     log_rest, log_leave = transitions(chains, priors, prior, since, came, moves, frames.clique, frames.stamp_s)
