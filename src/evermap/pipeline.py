@@ -172,7 +172,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         if where is None and len(living.places):
             return _lost(visit, slam, alone.prior, alone.step_s, living, interrupted=alone.interrupted)
         if where is not None:
-            visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
+            living, visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
         # what was found goes into the map, then hits and misses into beliefs, and those into decisions
         entry = lifelong.entered(living, expected, where, visit, config.living)
         looks = lifelong.looks(entry, visit)

@@ -5,8 +5,11 @@ The poses of the session were marginalised, so nothing of it remains but this: t
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from evermap.maps.living import LivingMap
 from evermap.types import FloatArray, IntArray
 
 
@@ -71,6 +74,18 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
 def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     """Joint covariance (2 K, 2 K) of places of which each may be off by `drift_m` since the map was made."""
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
+
+
+def resized(living: LivingMap, factor: float, log_size_variance: float) -> LivingMap:
+    """The map longer by a factor, about its middle; how well its metre is known goes with it."""
+    position = living.places.position_m
+    middle = position.mean(axis=0)
+    return replace(
+        living,
+        places=replace(living.places, position_m=middle + factor * (position - middle)),
+        covariance_m2=factor**2 * living.covariance_m2,
+        log_size_variance=log_size_variance,
+    )
 
 
 def blocks(covariance_m2: FloatArray) -> FloatArray:

@@ -11,14 +11,16 @@ from evermap.errors import DataError
 from evermap.lifelong import believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
-from evermap.lifelong.geometry import anchored, drifted, of_places
+from evermap.lifelong.geometry import anchored, drifted, of_places, resized
 from evermap.lifelong.overlaying import Laid, laid_over, with_glimpsed
 from evermap.maps.learning import learned_lives
 from evermap.maps.living import Evidence, LivingMap
 from evermap.slam import session as of_slam
+from evermap.slam.align import rigid
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.living.own import own_landmarks
+from evermap.slam.living.own import of_unknown_size, own_landmarks
 from evermap.slam.living.refit import refitted
+from evermap.slam.living.size import log_ratio, settled
 from evermap.slam.session import Prepared
 from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording
@@ -95,37 +97,59 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
     """Where the session lies in the map; None where it shows nothing that stands as in the map."""
     own = own_landmarks(alone.outcome)
     names = alone.prepared.landmark_id[own.row]
-    where = laid_over(living, p_site, names, own.position_m, own.covariance_m2, config.search)
+    log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
+    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config.search)
     if where is None:
         return None
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, p_site, where, glimpsed)
 
 
-def refit(living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool) -> Visit:
-    """The session solved again, its landmarks held by the map's places at which they stand."""
+def refit(
+    living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool
+) -> tuple[LivingMap, Visit]:
+    """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized."""
+    outcome = alone.outcome
     stand = np.flatnonzero(where.place >= 0)
     places = where.place[stand]
+    row = np.searchsorted(alone.prepared.landmark_id, where.landmark_id[stand])
+    size = outcome.scale
+    if outcome.log_scale_sigma > 0.0:
+        own = own_landmarks(outcome)
+        _, mine, theirs = np.intersect1d(own.row, row, return_indices=True)
+        covariance = drifted(of_places(living.covariance_m2, places[theirs]), where.drift_m)
+        shown = log_ratio(
+            own.position_m[mine],
+            of_places(own.covariance_m2, mine),
+            living.places.position_m[places[theirs]],
+            covariance,
+        )
+        found = settled(*shown, (0.0, outcome.log_scale_sigma), living.log_size_variance)
+        living = resized(living, found.map_factor, found.variance)
+        size *= found.session_factor
+    position = living.places.position_m[places]
+    motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
     outcome = refitted(
-        alone.outcome,
+        outcome,
         prior,
-        where.pose_map_session,
-        np.searchsorted(alone.prepared.landmark_id, where.landmark_id[stand]),
-        living.places.position_m[places],
+        motion,
+        size,
+        row,
+        position,
         drifted(of_places(living.covariance_m2, places), where.drift_m),
         robust=robust,
     )
-    return replace(alone, outcome=outcome)
+    return living, replace(alone, outcome=outcome)
 
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
     """The map with the places and sites that the session found."""
-    in_place = None if where is None else where.landmark_id[where.place >= 0]
-    own = own_landmarks(
-        visit.outcome,
-        None if in_place is None else np.searchsorted(visit.prepared.landmark_id, in_place),
-        of_unknown_size=False,  # the first session says how long a metre is
-    )
+    in_place = None
+    if where is None:
+        living = replace(living, log_size_variance=visit.outcome.log_scale_sigma**2)
+    else:
+        in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
+    own = own_landmarks(visit.outcome, in_place)
     detection, landmark = _inliers(visit)
     stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
     count = len(visit.prepared.landmark_id)

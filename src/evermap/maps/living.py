@@ -187,7 +187,8 @@ class LivingMap:
     Attributes:
         stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
         members, sites, places, stays: see there.
-        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns.
+        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known.
+        log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where to where the sensor sees.
         class_names: names of the classes.
@@ -201,6 +202,7 @@ class LivingMap:
     places: Places = field(default_factory=Places.empty)
     stays: Stays = field(default_factory=Stays.empty)
     covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    log_size_variance: float = 0.0
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     class_names: tuple[str, ...] = ()

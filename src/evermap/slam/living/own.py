@@ -22,7 +22,7 @@ class OwnLandmarks:
     Attributes:
         row: (K,) rows of the problem's landmarks: those that were seen often enough to be believed.
         position_m: (K, 2) in the frame of the first pose.
-        covariance_m2: (2 K, 2 K).
+        covariance_m2: (2 K, 2 K), as if its size were known.
     """
 
     row: IntArray
@@ -30,15 +30,12 @@ class OwnLandmarks:
     covariance_m2: FloatArray
 
 
-def own_landmarks(outcome: Outcome, in_place: IntArray | None = None, *, of_unknown_size: bool = True) -> OwnLandmarks:
-    """What a session says of its landmarks.
+def own_landmarks(outcome: Outcome, in_place: IntArray | None = None) -> OwnLandmarks:
+    """What a session says of its landmarks, in its own metres: those of the map where it was solved with one.
 
     Args:
         outcome: of the session.
         in_place: rows of landmarks that were laid at places of the map.
-        of_unknown_size: with what is not known of the scale, as one needs to compare it with a map. The metre of a map
-            is that of its first session: where later ones could change it, the shrinking that noise does to every
-            graph would shrink it a little each time.
     """
     estimate = outcome.graph_estimate
     landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
@@ -47,8 +44,10 @@ def own_landmarks(outcome: Outcome, in_place: IntArray | None = None, *, of_unkn
     row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
     at = (2 * row[:, None] + np.arange(2)).ravel()
     position = estimate.landmark[row] * outcome.scale
-    covariance = outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2
-    if of_unknown_size:
-        longer = position.ravel() * outcome.log_scale_sigma  # a longer world moves all landmarks away from the origin
-        covariance = covariance + np.outer(longer, longer)
-    return OwnLandmarks(row, position, covariance)
+    return OwnLandmarks(row, position, outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2)
+
+
+def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
+    """(2 K, 2 K) covariance with a size that is known to `log_sigma`: a longer world moves all away from the origin."""
+    longer = own.position_m.ravel() * log_sigma
+    return np.asarray(own.covariance_m2 + np.outer(longer, longer))

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap import se2
 from evermap.slam.arrow import Smoother
-from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate
 from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome
 from evermap.types import FloatArray, IntArray
@@ -20,6 +20,7 @@ def refitted(
     outcome: Outcome,
     prior: CalibrationPrior,
     pose_map_session: FloatArray,
+    size: float,
     row: IntArray,
     mean_m: FloatArray,
     covariance_m2: FloatArray,
@@ -30,8 +31,9 @@ def refitted(
 
     Args:
         outcome: of the session alone.
-        prior: of the calibration states; the map tells the scale, so none is held.
+        prior: of the calibration states.
         pose_map_session: (3,) where the session's frame is in the map.
+        size: metres of the map for one of the session's graph.
         row: (K,) landmarks of the problem that stand at places of the map.
         mean_m: (K, 2) positions of these places.
         covariance_m2: (2 K, 2 K) joint covariance of them.
@@ -45,10 +47,16 @@ def refitted(
     at = (2 * row[:, None] + np.arange(2)).ravel()
     mean[row] = mean_m
     information[np.ix_(at, at)] = np.linalg.inv(covariance_m2)
-    own = outcome.estimate
-    landmark = se2.transform(pose_map_session, own.landmark)
+    own = outcome.graph_estimate
+    stretch = np.array([size, size, 1.0])
+    landmark = se2.transform(pose_map_session, own.landmark * size)
     landmark[row] = mean_m
-    start = Estimate(se2.compose(pose_map_session, own.pose), landmark, own.states)
+    states, prior = own.states.copy(), prior.without_scale()
+    if not prior.free[SLOPE]:  # held, in the map's metres
+        states[SLOPE] = (1.0 + prior.mean[SLOPE]) / size - 1.0
+        states[FORWARD] *= size
+        prior = replace(prior, mean=np.where(np.arange(N_STATES) == SLOPE, states[SLOPE], prior.mean))
+    start = Estimate(se2.compose(pose_map_session, own.pose * stretch), landmark, states)
     problem = replace(
         outcome.problem,
         prior=prior,

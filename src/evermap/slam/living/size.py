@@ -1,0 +1,90 @@
+"""How long the map's metre is: every session knows it a little, by the priors of its range slope and wheel size.
+
+A graph whose scale is free shrinks: smaller worlds have smaller residuals. So the scale is held inside every graph and
+settled outside, where it is a one-dimensional Gaussian: with `e` the log of the map's metre over the true one and `g`
+that of the true metre over the session's, how much longer the map is than the session shows `g + e`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap import se2
+from evermap.slam.align import rigid
+from evermap.types import FloatArray
+
+ITERATIONS = 5
+WALK = 0.002
+"""Standard deviation by which the log of a map's metre wanders in a session, as its landmarks are replaced."""
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """What a session and a map say of the size of the world, together.
+
+    Attributes:
+        map_factor: by which the map should be longer.
+        session_factor: metres of that map for one of the session's own.
+        variance: of the log of the map's metre, after the session.
+    """
+
+    map_factor: float
+    session_factor: float
+    variance: float
+
+
+def settled(log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float) -> Size:
+    """Both sizes after they were compared.
+
+    Args:
+        log_ratio: of the map's size over that of the session, as its landmarks show it.
+        ratio_variance: of it.
+        session: log of the true metre over the session's, by its own priors, and the standard deviation of that.
+        map_variance: of the log of the map's metre over the true one.
+    """
+    own, sigma = session
+    before = map_variance + WALK**2
+    innovation = log_ratio - own
+    total = sigma**2 + before + ratio_variance
+    gain = before / total
+    return Size(
+        map_factor=float(np.exp(-gain * innovation)),
+        session_factor=float(np.exp(own + sigma**2 / total * innovation)),
+        variance=before * (1.0 - gain),
+    )
+
+
+def log_ratio(
+    session_m: FloatArray, session_m2: FloatArray, map_m: FloatArray, map_m2: FloatArray
+) -> tuple[float, float]:
+    """Log of the map's size over the session's, and its variance: a similarity by generalised least squares.
+
+    Args:
+        session_m: (K, 2) landmarks in the session's frame and metres.
+        session_m2: (2 K, 2 K) their covariance, the scale held.
+        map_m: (K, 2) the same in the map.
+        map_m2: (2 K, 2 K) covariance of these.
+    """
+    size = float(
+        np.sqrt(((map_m - map_m.mean(0)) ** 2).sum() / max(((session_m - session_m.mean(0)) ** 2).sum(), 1e-12))
+    )
+    motion, log_size, variance = np.zeros(3), np.log(size), np.inf
+    motion = rigid(size * session_m, map_m)
+    for _ in range(ITERATIONS):
+        factor = np.exp(log_size)
+        turned = se2.transform(np.array([0.0, 0.0, motion[2]]), session_m) * factor
+        turn = factor * np.kron(np.eye(len(session_m)), se2.rotation(motion[2]))
+        columns = np.zeros((2 * len(session_m), 4))
+        columns[0::2, 0] = columns[1::2, 1] = 1.0
+        columns[0::2, 2], columns[1::2, 2] = -turned[:, 1], turned[:, 0]
+        columns[:, 3] = turned.ravel()
+        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, columns)
+        information = columns.T @ weighed
+        step = np.linalg.solve(information, weighed.T @ (map_m - turned - motion[:2]).ravel())
+        motion, log_size = motion + step[:3], log_size + step[3]
+        variance = float(np.linalg.inv(information)[3, 3])
+        if np.abs(step).max() < 1e-9:
+            break
+    return float(log_size), variance
