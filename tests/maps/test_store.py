@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from random_maps import assert_same, random_changes, random_evidence, random_map
 
 from evermap.errors import ConfigError, InputError
 from evermap.maps.living import LivingMap
-from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, open_store
+from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, content, open_store
 from evermap.types import ChangeKind
 
 SESSION = Provenance(
@@ -229,6 +231,40 @@ def test_the_cost_of_a_revision_does_not_grow_with_the_history(tmp_path: Path) -
     grown = np.diff(sizes)
     # the last chunk of every column is rewritten each time, until it is full: that is the bound
     assert grown[60:].sum() < 1.5 * grown[:30].sum()
+
+
+def rewritten(living: LivingMap, change: Callable[[dict[str, Any]], None]) -> LivingMap:
+    """A map as it is read when its manifest was another."""
+    name, chunks = content.pack(living)
+    manifest = json.loads(chunks[name].raw)
+    change(manifest)
+    other = content.text_chunk(json.dumps(manifest))
+    stored = {key: chunk.stored() for key, chunk in {**chunks, other.name: other}.items()}
+    return content.unpack(other.name, lambda names: {key: stored[key] for key in names})
+
+
+def test_what_an_older_evermap_did_not_write_has_its_default() -> None:
+    living = random_map(2)
+    read = rewritten(replace(living, log_size_variance=0.5), lambda m: m["values"].pop("log_size_variance"))
+    assert_same(read, living)
+    read = rewritten(living, lambda m: m["columns"].pop("lives.looks_s"))
+    assert_same(read, living)
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda m: m["columns"].pop("members.pinned"), "columns of different lengths in 'members'"),
+        (
+            lambda m: m["values"].update(colour="red"),
+            "it holds 'colour', which this evermap does not know",
+        ),
+        (lambda m: m.update(format=2), "columns of format 2, this evermap reads 1"),
+    ],
+)
+def test_what_this_evermap_does_not_know_is_not_dropped(change: Callable[[dict[str, Any]], None], line: str) -> None:
+    with pytest.raises(content.DamagedError, match=line):
+        rewritten(random_map(2), change)
 
 
 @pytest.mark.parametrize("address", ["postgresql://host/db", "mysql+driver://x"])

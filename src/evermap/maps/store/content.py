@@ -57,7 +57,7 @@ class Chunk:
     def stored(self) -> bytes:
         """Compressed, all first bytes of the values in front, then all second ones: neighbours are alike in them."""
         planes = np.frombuffer(self.raw, np.uint8).reshape(-1, np.dtype(self.dtype).itemsize).T
-        return zlib.compress(planes.tobytes(), level=6)
+        return zlib.compress(planes.tobytes(), level=1)  # covariances are most of a map, and more levels gain 3 %
 
     @classmethod
     def of_stored(cls, name: bytes, dtype: str, stored: bytes) -> Chunk:
@@ -113,11 +113,14 @@ def unpack(name: bytes, fetch: Fetch) -> LivingMap:
         DamagedError: a chunk is missing or is not what was written.
     """
     manifest = _manifest(name, fetch)
-    arrays = _arrays(manifest["columns"], fetch)
-    try:
-        living: LivingMap = _build(LivingMap(), "", arrays, manifest["values"])
-    except KeyError as error:
-        raise DamagedError(f"it lacks {error}") from None
+    parts = {**manifest["values"], **_arrays(manifest["columns"], fetch)}
+    living: LivingMap = _build(LivingMap(), "", parts)
+    if parts:
+        raise DamagedError(f"it holds '{min(parts)}', which this evermap does not know; a newer one wrote it")
+    for table in ("members", "sites", "places", "stays"):
+        rows = getattr(living, table)
+        if len({len(getattr(rows, item.name)) for item in fields(rows)}) > 1:
+            raise DamagedError(f"columns of different lengths in '{table}'")
     return living
 
 
@@ -142,20 +145,26 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
             values[name] = part
 
 
-def _build(like: Any, prefix: str, arrays: Mapping[str, NDArray[Any]], values: Mapping[str, Any]) -> Any:
-    """A dataclass of the type of `like`; KeyError for what is missing."""
+def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
+    """A dataclass of the type of `default`, of parts that are taken out.
+
+    What an older evermap did not write is as in `default`. A new column of a table has no such default: that needs
+    another `FORMAT`, and who reads the old one.
+    """
     content: dict[str, Any] = {}
-    for item in fields(like):
-        name, part = prefix + item.name, getattr(like, item.name)
-        if name == _LIFE:
-            content[item.name] = tuple(_life_from_dict(life) for life in json.loads(arrays[name].tobytes()))
+    for item in fields(default):
+        name, part = prefix + item.name, getattr(default, item.name)
+        if is_dataclass(part):
+            content[item.name] = _build(part, name + ".", parts)
+        elif name not in parts:
+            content[item.name] = part
+        elif name == _LIFE:
+            content[item.name] = tuple(_life_from_dict(life) for life in json.loads(parts.pop(name).tobytes()))
         elif isinstance(part, np.ndarray):
-            content[item.name] = arrays[name]
-        elif is_dataclass(part):
-            content[item.name] = _build(part, name + ".", arrays, values)
+            content[item.name] = parts.pop(name)
         else:
-            content[item.name] = type(part)(values[name])
-    return type(like)(**content)
+            content[item.name] = type(part)(parts.pop(name))
+    return type(default)(**content)
 
 
 def _flat(column: str, array: NDArray[Any]) -> NDArray[Any]:
