@@ -41,8 +41,8 @@ RULES = {
     "demo": "errors types se2 config survival maps lifelong sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types survival tracking io viz runsummary runfolder",
-    "cli": "errors types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder presence objects "
-    "server experiments demo",
+    "cli": "errors types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder presence "
+    "objects server experiments demo",
 }
 
 # loaded by the functions that need them, never by starting up
