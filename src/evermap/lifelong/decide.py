@@ -15,8 +15,8 @@ EXISTS = 0.5
 """A clique is said to stand at a site that is more probable than this, and to be away where that is more probable."""
 SAME_PLACE_M = 0.3
 """Cliques that stand this close to where another stood have taken its place."""
-
-
+NEAR_M = 3.0
+"""Who looks at something sees what else stands this close to it."""
 SURELY_AWAY = 0.02
 FORGOTTEN_P = 0.05
 """Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
@@ -73,7 +73,9 @@ def with_stays(before: LivingMap, after: LivingMap, looks: Looks, start_s: float
             continue
         elsewhere_s = _looked_before(before, middle[site]) if site >= 0 else -np.inf
         if row is not None:
-            at = int(np.searchsorted(after.sites.site_id, after.stays.site_id[row]))
+            at = _row(after, int(after.stays.site_id[row]))
+            if at >= 0:  # who left during the session may have been seen in it
+                last[row] = max(last[row], after.sites.seen_s[at])
             gone[row] = _first_miss(looks, at, float(last[row]), start_s)
             elsewhere_s = float(last[row])
         if site >= 0:
@@ -263,10 +265,15 @@ def _when(living: LivingMap, clique: int, site: int) -> tuple[float, float]:
 
 
 def _looked_before(before: LivingMap, middle: FloatArray) -> float:
-    """The last look at a spot before this session, if the map knows something near it."""
-    at = before.places.position_m
-    near = len(at) and bool(np.any(np.all(np.abs(at - middle) < 3.0, axis=1)))
-    return before.stamp_s if near else -np.inf
+    """The last look at a spot before this session: something near it was seen, or missed; -inf where there was none."""
+
+    def near(at: FloatArray) -> BoolArray:
+        return np.asarray(np.all(np.abs(at - middle) < NEAR_M, axis=1))
+
+    seen = before.places.site_id[near(before.places.position_m)]
+    seen_s = before.sites.seen_s[np.isin(before.sites.site_id, seen)]
+    missed_s = before.stays.gone_s[near(before.stays.position_m) & np.isfinite(before.stays.gone_s)]
+    return float(np.concatenate([seen_s, missed_s]).max(initial=-np.inf))
 
 
 def _first_miss(looks: Looks, site: int, last_s: float, start_s: float) -> float:
