@@ -110,6 +110,14 @@ def test_changes_read_back(store: MapStore) -> None:
     for mine, theirs in zip(store.changes(1), changes, strict=True):
         assert_same(mine, theirs)
     assert store.changes() == ()
+    store.commit(living, SESSION, changes[::-1], parent=2)
+    moved, appeared = changes
+    for name, wanted in ((moved.landmark_ids[1], moved), (appeared.landmark_ids[0], appeared)):
+        (first, one), (second, other) = store.changes_of(name)
+        assert (first, second) == (1, 3)
+        assert_same(one, wanted)
+        assert_same(other, wanted)
+    assert store.changes_of(-5) == ()
 
 
 def test_a_writer_that_comes_late_is_refused(store: MapStore) -> None:

@@ -15,7 +15,6 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
-    from evermap.maps.why import Answer
     from evermap.types import FloatArray
 
 app = typer.Typer(
@@ -182,6 +181,7 @@ def why(
       evermap map why site.evermap 17 --figure why.png
     """
     from evermap.cli.map_content import answer_dict
+    from evermap.cli.map_why import draw_why, print_why
     from evermap.maps.store import open_store
     from evermap.maps.why import why as of_landmark
 
@@ -190,11 +190,11 @@ def why(
     with open_store(file) as store:
         answer = of_landmark(store, landmark, revision)
     if figure is not None:
-        _draw_why(figure, answer)
+        draw_why(figure, answer)
     if as_json:
         print_json({"map": file, **answer_dict(answer)})
         return
-    _print_why(answer)
+    print_why(answer)
 
 
 def _p_ahead(living: LivingMap, ahead_s: float) -> FloatArray:
@@ -232,60 +232,6 @@ def _writer(out: Path) -> Any:
     raise ConfigError(
         f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson or .csv"
     )
-
-
-def _print_why(answer: Answer) -> None:
-    from evermap.cli.map_content import change_line
-    from evermap.maps.stamps import stamp_text
-    from evermap.maps.why import probability_text
-
-    typer.echo(answer.headline)
-    for reason in answer.reasons:
-        typer.echo(f"  - {reason}")
-    for revision, change in answer.changes:
-        typer.echo(f"  revision {revision}: {change_line(change, answer.clock)}")
-    if answer.visits:
-        head = ("revision", "session", "looks from", "to", "frames", "hits", "misses", "expected", "nats", "P(exists)")
-        rows = [
-            [
-                str(visit.revision),
-                visit.recording or "-",
-                stamp_text(visit.from_s, answer.clock),
-                stamp_text(visit.to_s, answer.clock),
-                str(visit.n_looks),
-                str(visit.n_hits),
-                str(visit.n_misses),
-                f"{visit.expected:.1f}",
-                f"{visit.log_odds:+.1f}",
-                probability_text(visit.p_exists),
-            ]
-            for visit in answer.visits
-        ]
-        print_rows("what the sessions saw", head, rows, numbers=(0, 4, 5, 6, 7, 8, 9))
-
-
-def _draw_why(path: Path, answer: Answer) -> None:
-    import numpy as np
-
-    from evermap.viz.why_figure import plot_why
-
-    seen, stays = answer.evidence, answer.stays
-    session = np.repeat([v.revision for v in answer.visits], [v.n_looks for v in answer.visits])
-    names = {site: f"site {k + 1}" for k, site in enumerate(dict.fromkeys(stays.site_id.tolist()))}
-    columns = zip(stays.site_id.tolist(), stays.elsewhere_s, stays.first_s, stays.last_s, stays.gone_s, strict=True)
-    drawn = plot_why(
-        seen.stamp_s,
-        seen.p_exists,
-        seen.n_hits,
-        seen.n_misses,
-        seen.log_odds,
-        session=session.astype(np.int64),
-        stays=[(names[site], *map(float, stamps)) for site, *stamps in columns],  # type: ignore[misc]
-        now_s=answer.stamp_s,
-        title=answer.headline,
-        clock=answer.clock,
-    )
-    write_picture(path, drawn)
 
 
 def _picture(living: LivingMap) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def why(store: MapStore, landmark_id: int, revision: int | None = None) -> Answe
     for _, part in parts:
         evidence = evidence.joined(part)
     visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
-    changes = tuple((n, c) for n in line for c in store.changes(n) if landmark_id in c.landmark_ids)
+    changes = tuple((number, change) for number, change in store.changes_of(landmark_id) if number in line)
     class_id = int(living.members.class_id[row])
     answer = Answer(
         landmark_id=landmark_id,

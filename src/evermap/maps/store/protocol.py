@@ -145,6 +145,10 @@ class MapStore(Protocol):
         """What was committed as the changes of one revision."""
         ...
 
+    def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
+        """All changes that a landmark had a part in, each with the revision that told it, in order."""
+        ...
+
     def evidence(
         self,
         *,

@@ -3,29 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import Connection, Engine, bindparam, func, insert, inspect, select
+from sqlalchemy import Connection, Engine, and_, exists, func, insert, inspect, select
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from evermap import __version__
 from evermap.errors import InputError
 from evermap.maps.living import Evidence, LivingMap
-from evermap.maps.store import content, schema
+from evermap.maps.store import content, queries, schema
 from evermap.maps.store.content import DamagedError
-from evermap.maps.store.history import change_from_row, change_to_row, lineage, revision_from_row
+from evermap.maps.store.history import change_to_row, lineage, revision_from_row
 from evermap.maps.store.looks import looks_from_bytes, looks_to_bytes
 from evermap.maps.store.migrations import migrate
 from evermap.maps.store.protocol import Provenance, Revision, RevisionKind, StaleRevisionError
 from evermap.types import MapChange
-
-_AT_ONCE = 500
-"""Names in one question to the database."""
 
 
 class SqlStore:
@@ -73,13 +70,13 @@ class SqlStore:
     def head(self) -> int:
         """The newest revision."""
         with self._reading() as connection:
-            return _head(connection)
+            return queries.head(connection)
 
     def log(self) -> tuple[Revision, ...]:
         """All revisions."""
         with self._reading() as connection:
             rows = connection.execute(select(schema.revision).order_by(schema.revision.c.number)).mappings().all()
-            stored = _fetched(connection, {row["config"] for row in rows})
+            stored = queries.fetched(connection, {row["config"] for row in rows})
             configs = {name: content.read_text(name, data) for name, data in stored.items()}
             counts: dict[int, dict[str, int]] = {}
             by = schema.change.c.revision, schema.change.c.kind
@@ -100,8 +97,8 @@ class SqlStore:
             number = self._known(connection, revision)
             if number == 0:
                 return LivingMap()
-            name = _content(connection, number)
-            return content.unpack(name, lambda names: _fetched(connection, names))
+            name = queries.content_of(connection, number)
+            return content.unpack(name, lambda names: queries.fetched(connection, names))
 
     def commit(
         self,
@@ -134,13 +131,19 @@ class SqlStore:
         """Changes of one revision."""
         with self._reading() as connection:
             number = self._known(connection, revision)
-            whole, named = schema.change, schema.change_landmark
-            groups: dict[int, list[int]] = {}
-            listed = select(named).where(named.c.revision == number).order_by(named.c.position, named.c.rank)
-            for row in connection.execute(listed):
-                groups.setdefault(row.position, []).append(row.landmark_id)
-            rows = connection.execute(select(whole).where(whole.c.revision == number).order_by(whole.c.position))
-            return tuple(change_from_row(dict(row), groups.get(row["position"], [])) for row in rows.mappings())
+            found = queries.changes_where(connection, schema.change.c.revision == number)
+        return tuple(change for _, change in found)
+
+    def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
+        """Changes of a landmark."""
+        change, named = schema.change, schema.change_landmark.alias()
+        mine = and_(
+            named.c.revision == change.c.revision,
+            named.c.position == change.c.position,
+            named.c.landmark_id == landmark_id,
+        )
+        with self._reading() as connection:
+            return tuple(queries.changes_where(connection, exists().where(mine)))
 
     def evidence(
         self,
@@ -158,7 +161,7 @@ class SqlStore:
             wanted = wanted.where(table.c.revision.in_(list(numbers)))
             if clique_id is not None:
                 wanted = wanted.where(table.c.clique_id == clique_id)
-            cliques = None if landmark_id is None else _cliques_of(connection, landmark_id, numbers)
+            cliques = None if landmark_id is None else queries.cliques_of(connection, landmark_id, numbers)
             kept = [Evidence.empty()]
             for row in connection.execute(wanted).mappings():
                 mine = cliques is None or cliques.get(row["revision"]) == row["clique_id"]
@@ -211,10 +214,10 @@ class SqlStore:
         ]
         evidence_rows = [] if evidence is None else list(_evidence_rows(number, evidence))
         with self._writing() as connection:
-            head = _head(connection)
+            head = queries.head(connection)
             if head != parent:
                 raise self._stale(parent, head)
-            new = chunks.keys() - _present(connection, chunks)
+            new = chunks.keys() - queries.present(connection, chunks)
             rows: list[dict[str, Any]] = [{"name": key, "data": chunks[key].stored()} for key in sorted(new)]
             for table, content_rows in (
                 (schema.chunk, rows),
@@ -254,7 +257,7 @@ class SqlStore:
 
     def _known(self, connection: Connection, revision: int | None) -> int:
         """The number of a revision that exists."""
-        head = _head(connection)
+        head = queries.head(connection)
         number = head if revision is None else revision
         if not 0 <= number <= head:
             there = f"it has {head} of them" if head else "it has none yet"
@@ -308,54 +311,6 @@ def _in_words(message: str, where: str) -> InputError:
     return InputError(f"damaged or not reachable: {message}", path=where, hint="a copy of the file")
 
 
-def _head(connection: Connection) -> int:
-    return int(connection.execute(select(func.coalesce(func.max(schema.revision.c.number), 0))).scalar_one())
-
-
-def _content(connection: Connection, number: int) -> bytes:
-    """Name of the map of a revision."""
-    wanted = select(schema.revision.c.content).where(schema.revision.c.number == number)
-    return _bytes(connection.execute(wanted).scalar())
-
-
-def _fetched(connection: Connection, names: Iterable[bytes]) -> Mapping[bytes, bytes]:
-    """`content.Fetch` from the database."""
-    wanted = list(names)
-    question = select(schema.chunk).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
-    found: dict[bytes, bytes] = {}
-    for at in range(0, len(wanted), _AT_ONCE):
-        rows = connection.execute(question, {"names": wanted[at : at + _AT_ONCE]})
-        found.update((_bytes(name), _bytes(data)) for name, data in rows)
-    if found.keys() != set(wanted):
-        raise DamagedError("a part of the map is missing")
-    return found
-
-
-def _present(connection: Connection, names: Iterable[bytes]) -> set[bytes]:
-    """Those that are in the store already."""
-    wanted = list(names)
-    question = select(schema.chunk.c.name).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
-    found: set[bytes] = set()
-    for at in range(0, len(wanted), _AT_ONCE):
-        found |= {_bytes(row[0]) for row in connection.execute(question, {"names": wanted[at : at + _AT_ONCE]})}
-    return found
-
-
-def _cliques_of(connection: Connection, landmark_id: int, numbers: Iterable[int]) -> dict[int, int]:
-    """The clique that a landmark belonged to, by revision."""
-    cliques: dict[int, int] = {}
-    for number in numbers:
-        columns = content.unpack_columns(
-            _content(connection, number),
-            ("members.landmark_id", "members.clique_id"),
-            lambda names: _fetched(connection, names),
-        )
-        row = np.flatnonzero(columns["members.landmark_id"] == landmark_id)
-        if len(row):
-            cliques[number] = int(columns["members.clique_id"][row[0]])
-    return cliques
-
-
 def _evidence_rows(number: int, evidence: Evidence) -> Iterator[dict[str, Any]]:
     """A row for each clique."""
     for clique in np.unique(evidence.clique_id):
@@ -367,13 +322,6 @@ def _evidence_rows(number: int, evidence: Evidence) -> Iterator[dict[str, Any]]:
             "last_s": float(mine.stamp_s.max()),
             "looks": looks_to_bytes(mine),
         }
-
-
-def _bytes(value: Any) -> bytes:
-    """Of a column of bytes, in which a damaged file may have anything."""
-    if not isinstance(value, bytes | memoryview):
-        raise DamagedError("a part of the map is missing")
-    return bytes(value)
 
 
 def _no_nan(value: float) -> float | None:
