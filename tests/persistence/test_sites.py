@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.linalg import expm
 from scipy.special import betaln
 
 from evermap.errors import InputError
@@ -242,7 +243,8 @@ def one(rows: list[tuple[float, int, int, int, bool]], p_here: float = 0.9, **ch
     """One clique with one site, without end, looked at along one line of sight of 4 hits in 5 looks."""
     known = alone(Exponential(1e-30), np.zeros(1))
     line = free(np.array([4.0]), np.array([1.0]))
-    given_ = {"lines": line, "start_s": 0.0, "until_s": 1e3, "p_false": 0.01, "p_occluded": 0.0} | changed
+    given_ = {"lines": line, "start_s": 0.0, "until_s": 1e3, "p_false": 0.01, "p_occluded": 0.0, "occluded_s": 0.0}
+    given_ |= changed
     return follow_sites(np.array([p_here]), np.zeros(1, np.int64), known, looks(rows), **given_)
 
 
@@ -270,6 +272,37 @@ def test_occlusion_is_near_the_sum_over_who_was_occluded(pattern: str) -> None:
     exact = np.log(total) - np.where(hit, np.log(p_false), np.log1p(-p_false)).sum()
     assert found.log_evidence[0] == pytest.approx(np.log(0.9 * np.exp(exact) + 0.1), abs=0.12 * len(pattern))
     assert found.trace.log_odds.sum() == pytest.approx(exact, abs=0.12 * len(pattern))
+
+
+@pytest.mark.parametrize("pattern", ["0", "000000", "0010000", "1100000000", "0000000001"])
+def test_somebody_who_stands_before_it_for_a_while_is_the_sum_over_his_comings_and_goings(pattern: str) -> None:
+    p_occluded, occluded_s, p_false, rate = 0.1, 3.0, 0.01, 0.7
+    hit = np.array([c == "1" for c in pattern])
+    stamp = np.cumsum(np.random.default_rng(len(pattern)).uniform(0.3, 2.0, len(hit)))
+    found = one(
+        [(float(t), 0, 0, 0, bool(h)) for t, h in zip(stamp, hit, strict=True)],
+        lines=free(SURE * np.array([rate]), SURE * np.array([1 - rate])),
+        p_occluded=p_occluded,
+        occluded_s=occluded_s,
+    )
+    go = 1.0 / occluded_s
+    come = go * p_occluded / (1.0 - p_occluded)
+    rates = np.array([[-come, come], [go, -go]])
+    gone = np.where(hit, p_false, 1 - p_false)
+    likelihood = np.column_stack([np.where(hit, rate, 1 - rate), gone]) / gone[:, None]
+    p = np.array([1 - p_occluded, p_occluded]) * likelihood[0]
+    for k in range(1, len(hit)):
+        p = (p @ expm(rates * (stamp[k] - stamp[k - 1]))) * likelihood[k]
+    assert found.log_evidence[0] == pytest.approx(np.log(0.9 * p.sum() + 0.1), rel=1e-6)
+
+
+def test_a_blind_spell_is_one_event() -> None:
+    spell = [(0.3 * t, 0, 0, 0, t < 20) for t in range(100)]
+    known = {"lines": free(SURE * np.array([0.8]), SURE * np.array([0.2])), "p_occluded": 0.05}
+    for_a_while = one(spell, occluded_s=20.0, **known).trace.log_odds[20:].sum()
+    every_frame = one(spell, occluded_s=0.0, **known).trace.log_odds[20:].sum()
+    assert -10.0 < for_a_while < -3.0  # he came, once: log 0.05, and did not leave
+    assert every_frame < -80.0
 
 
 @pytest.mark.parametrize("pattern", ["000000", "011000", "110001"])
@@ -318,7 +351,7 @@ def test_misses_along_a_hidden_line_of_sight_say_little() -> None:
         rows = looks([(float(t), 0, 0, 0, False) for t in range(n)])
         found = follow_sites(
             np.array([0.9]), np.zeros(1, np.int64), known, rows, free(np.array([alpha]), np.array([beta])),
-            start_s=0.0, until_s=1e3, p_false=0.01,
+            start_s=0.0, until_s=1e3, p_false=0.01, occluded_s=0.0,
         )  # fmt: skip
         return float(found.p_here[0])
 

@@ -73,6 +73,7 @@ def said_by(
     *,
     p_false: float,
     p_occluded: float,
+    occluded_s: float,
     use_misses: bool,
 ) -> Said:
     """What every frame says; arguments as those of `sites.follow_sites`."""
@@ -88,6 +89,7 @@ def said_by(
     frame_evidence(
         np.searchsorted(frames.of_look, np.arange(len(frames) + 1)),
         frames.clique,
+        frames.stamp_s,
         slot.ravel(),
         chains.row_of_site[site] - chains.first[looks.clique[frames.order]],
         np.asarray(looks.hit, dtype=np.bool_)[frames.order],
@@ -97,6 +99,7 @@ def said_by(
         float(lines.p_blocked),
         p_false,
         p_occluded,
+        occluded_s,
         use_misses,
         said.log_ratio,
         said.n_hits,

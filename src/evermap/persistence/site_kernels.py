@@ -26,6 +26,7 @@ def _log_add(a: Any, b: Any) -> Any:
 def frame_evidence(
     first: IntArray,
     clique: IntArray,
+    stamp_s: FloatArray,
     slot: IntArray,
     seat: IntArray,
     hit: BoolArray,
@@ -35,6 +36,7 @@ def frame_evidence(
     p_blocked: float,
     p_false: float,
     p_occluded: float,
+    occluded_s: float,
     use_misses: bool,
     log_ratio: FloatArray,
     n_hits: IntArray,
@@ -47,11 +49,13 @@ def frame_evidence(
     before count too: a little too cautious then.) Whether the lines of sight to it are free changes as seldom as what
     is known of each by itself allows, for one wall hides a clique from many cells. Detections along a free line are
     exchangeable (Beta-Bernoulli): their probabilities multiply, each given those before. And somebody may stand before
-    the whole clique in a frame (MATH.md section 3); what is seen of it then is false, and teaches nothing.
+    the whole clique (MATH.md section 3), for a while: a chain in continuous time over the frames. What is seen of it
+    then is false, and teaches nothing.
 
     Args:
         first: (F + 1,) rows of frame f are `first[f]` to `first[f + 1]`, those of a seat next to each other.
-        clique: (F,) frames of a clique are next to each other.
+        clique: (F,) frames of a clique are next to each other, in order of time.
+        stamp_s: (F,) of the frames.
         slot: (N,) rows of `hits` and `misses`: one for each pair of seat and line of sight.
         seat: (N,) number of the seat within its clique.
         hit: (N,) detected.
@@ -60,7 +64,8 @@ def frame_evidence(
         misses: of misses.
         p_blocked: probability of a detection if it is not.
         p_false: of a detection of nothing.
-        p_occluded: that somebody stands before the whole clique, in a frame.
+        p_occluded: that somebody stands before the whole clique.
+        occluded_s: mean time that he stays; 0 for another one in every frame.
         use_misses: False has only hits speak.
         log_ratio: (F, W) filled in: log likelihood, of a seat less that of being away.
         n_hits: (F, W) filled in: detections.
@@ -69,6 +74,7 @@ def frame_evidence(
     """
     width = log_ratio.shape[1]
     free, likely = np.empty(width), np.empty(width)  # of each seat: after the last frame, and by its lines alone
+    veil, looked_s = np.empty(width), np.empty(width)  # that somebody stood before it then, if its line is free
     for f in range(first.size - 1):
         log_ratio[f], n_hits[f], n_misses[f], expected[f] = 0.0, 0, 0, 0.0
         if f == 0 or clique[f] != clique[f - 1]:
@@ -82,13 +88,16 @@ def frame_evidence(
                 high += 1
             p_line /= high - low
             if likely[k] < 0.0:
-                free[k] = p_line
+                free[k], veil[k] = p_line, p_occluded
             elif p_line >= likely[k]:
                 opened = (p_line - likely[k]) / (1.0 - likely[k]) if likely[k] < 1.0 else 0.0
                 free[k] += (1.0 - free[k]) * opened
             else:
                 free[k] *= p_line / likely[k]
-            likely[k] = p_line
+            if likely[k] >= 0.0:
+                lasting = np.exp(-(stamp_s[f] - looked_s[k]) / (occluded_s * (1.0 - p_occluded))) if occluded_s else 0.0
+                veil[k] = p_occluded + (veil[k] - p_occluded) * lasting
+            likely[k], looked_s[k] = p_line, stamp_s[f]
 
             seen, hidden = 0.0, 0.0
             for row in range(low, high):
@@ -107,12 +116,14 @@ def frame_evidence(
                         misses[slot[row]] += 1.0
                         seen += np.log(min(b / (a + b), 1.0 - p_false) / (1.0 - p_false))
                         hidden += np.log((1.0 - q) / (1.0 - p_false))
-            seen += np.log(free[k] * (1.0 - p_occluded))
-            veiled = np.log(free[k] * p_occluded)
+            seen += np.log(free[k] * (1.0 - veil[k]))
+            veiled = np.log(free[k] * veil[k])
             hidden += np.log(1.0 - free[k])
             total = _log_add(_log_add(seen, veiled), hidden)
             log_ratio[f, k] = total
-            free[k] = min(np.exp(_log_add(seen, veiled) - total), 1.0)
+            open_line = _log_add(seen, veiled)
+            free[k] = min(np.exp(open_line - total), 1.0)
+            veil[k] = min(np.exp(veiled - open_line), 1.0) if open_line > -np.inf else p_occluded
             nothing = 1.0 - min(np.exp(seen - total), 1.0)
             for row in range(low, high):  # looks that were none
                 if hit[row]:

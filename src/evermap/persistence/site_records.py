@@ -114,6 +114,7 @@ def check_sites(
     until_s: float,
     p_false: float,
     p_occluded: float,
+    occluded_s: float,
 ) -> None:
     """Raise `InputError` for what cannot be."""
     n_cliques, n_sites, n_looks = len(dynamics.p_hop), len(p_here), len(looks)
@@ -161,6 +162,8 @@ def check_sites(
         raise InputError(f"{lines.p_blocked} is no probability below 1", field="p_blocked")
     if not 0.0 <= p_occluded < 1.0:
         raise InputError(f"{p_occluded} is no probability below 1", field="p_occluded")
+    if not 0.0 <= occluded_s < np.inf:
+        raise InputError(f"{occluded_s} s is no time", field="occluded_s")
     for field, counts in (("hits", lines.hits), ("misses", lines.misses)):
         good = np.isfinite(counts) & (np.asarray(counts) > 0.0)
         if not good.all():

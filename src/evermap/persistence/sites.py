@@ -39,7 +39,8 @@ def follow_sites(
     start_s: FloatArray | float,
     until_s: float,
     p_false: float,
-    p_occluded: float = 0.05,
+    p_occluded: float = 0.02,
+    occluded_s: float = 5.0,
     held: BoolArray | None = None,
     use_misses: bool = True,
 ) -> SiteBeliefs:
@@ -54,7 +55,9 @@ def follow_sites(
         start_s: when `p_here` held, for all or (C,) of each clique; none of its looks is earlier.
         until_s: end of the session; no look is later.
         p_false: probability of a detection at a place where nothing of the clique is.
-        p_occluded: that somebody stands before the whole clique, in a frame.
+        p_occluded: that somebody stands before the whole clique.
+        occluded_s: mean time that he stays, so that a blind spell is one event and not as many as it has frames; 0 for
+            another one in every frame.
         held: (C,) cliques that are never believed away (an operator's word); none where None.
         use_misses: False has only hits speak.
 
@@ -66,7 +69,7 @@ def follow_sites(
     n_cliques, n_sites = len(dynamics.p_hop), len(p_here)
     start = checks.as_rows(start_s, n_cliques, "start_s")
     pinned = np.zeros(n_cliques, dtype=np.bool_) if held is None else np.asarray(held, dtype=np.bool_)
-    check_sites(p_here, clique_of_site, dynamics, looks, lines, start, until_s, p_false, p_occluded)
+    check_sites(p_here, clique_of_site, dynamics, looks, lines, start, until_s, p_false, p_occluded, occluded_s)
     chains = Chains.of(clique_of_site, n_cliques)
     frames = Frames.of(looks, n_cliques, until_s)
 
@@ -95,7 +98,10 @@ def follow_sites(
         kernels.forward(*chain, log_here, said.log_ratio, *found)
         return found
 
-    say = partial(said_by, frames, looks, chains, lines, p_false=float(p_false), p_occluded=float(p_occluded))
+    say = partial(
+        said_by, frames, looks, chains, lines,
+        p_false=float(p_false), p_occluded=float(p_occluded), occluded_s=float(occluded_s),
+    )  # fmt: skip
     hits, said = say(use_misses=False), say(use_misses=use_misses)
     log_after, log_odds, log_evidence = filtered(said)
     smoothed = np.empty(log_rest.shape)
