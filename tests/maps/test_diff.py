@@ -156,6 +156,15 @@ def test_moved_twice_between_leaving_the_first_place_and_coming_to_the_last() ->
     assert (change.kind, change.stamp_from_s, change.stamp_to_s) == (ChangeKind.VANISHED, 190.0, 195.0)
 
 
+def test_moved_by_leaving_and_coming_back_elsewhere() -> None:
+    places = [(0, 5, 1.0, 2.0), (1, 5, 4.0, 4.0)]
+    old = a_map([(0, 3, 0.9)], places[:1], cliques={5: 3})
+    stays = [(3, 0, NEVER, 1.0, 110.0, 130.0), (3, 1, 130.0, 160.0, 190.0, np.inf)]
+    new = a_map([(0, 3, 0.0), (1, 3, 0.9)], places, cliques={5: 3}, stays=stays, stamp_s=LATER_S)
+    change = only(old, new)
+    assert (change.kind, change.stamp_from_s, change.stamp_to_s) == (ChangeKind.MOVED, 110.0, 160.0)
+
+
 def test_another_site_within_the_noise_is_no_move() -> None:
     """Sites are named anew where bodies are put together otherwise; the things did not move for that."""
     old = a_map([(0, 3, 0.9)], [(0, 5, 1.0, 2.0)], cliques={5: 3}, sigma_m=0.1)

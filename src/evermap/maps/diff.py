@@ -197,7 +197,7 @@ def _between(
         from_s += [float(earlier.max())] if len(earlier) else []
     start = max(from_s, default=a.stamp_s)
     end = min([*to_s, b.stamp_s])
-    if start > end:  # it stood elsewhere in between: from when it left to when it came
+    if start >= end:  # it was away, or elsewhere, in between: from when it left to when it came
         start, end = min(from_s, default=np.nan), max(to_s, default=end)
     return (float(start) if np.isfinite(start) else np.nan), float(end)
 
