@@ -23,7 +23,8 @@ ALONE_S = 10.0
 """Landmarks that must stand to each other as in the map; where no third one comes into view for a while, two do."""
 ENOUGH = 5
 """So many agree by no accident, even if they are fewer than half."""
-MIN_SPREAD_M = 1.0
+MIN_SPREAD_M = 2.0
+"""Farther apart than what stands on one body, which moves as one."""
 SIGMA_M = 0.5 * AGREE_M
 """Of one landmark of the drive, laid over the map."""
 LEAST_BELIEF = 0.05

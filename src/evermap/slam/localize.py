@@ -44,6 +44,8 @@ REMEMBERED = 8
 """Different landmarks, compared last, by which the filter judges whether it is lost."""
 LEAST_REMEMBERED = 3
 MEMORY_S = 20.0
+BETTER_BY = 1.5
+"""Times by which another pose must fit better than the present one: one that is chosen to fit always fits somewhat."""
 
 
 class Sightings(NamedTuple):
@@ -189,11 +191,10 @@ class Localizer:
         placed = self._track.placed(stamp_s, self.places)
         if placed is None:
             return
-        if self._is_placed and 2.0 * self._track.agreement(self._pose, self.places) >= self._track.agreement(
-            placed.pose, self.places
+        if self._is_placed and (
+            self._track.agreement(placed.pose, self.places) < BETTER_BY * self._track.agreement(self._pose, self.places)
         ):
-            # a pose that is chosen to fit always fits somewhat better: it is the world that differs from the map
-            self._track = None
+            self._track = None  # it is the world that differs from the map
             self._agreed.clear()
             return
         self._place_at(placed)
