@@ -15,6 +15,7 @@ from evermap.lifelong.geometry import anchored, drifted, of_places, resized
 from evermap.lifelong.overlaying import Laid, laid_over, with_glimpsed
 from evermap.maps.learning import learned_lives
 from evermap.maps.living import Evidence, LivingMap
+from evermap.maps.missed import without_missed
 from evermap.slam import session as of_slam
 from evermap.slam.align import rigid
 from evermap.slam.calibration import CalibrationPrior
@@ -226,6 +227,8 @@ def decided(
     """The map with its stays up to date and without what is forgotten, and what changed since the session before."""
     after = decide.with_stays(before, now.living, seen, visit.start_s)
     changes = decide.changes_between(before, after, seen) if len(before.places) else ()
+    if config.cliques and config.existence and config.misses:
+        after = without_missed(before, after)
     return decide.without_forgotten(after, config.most_sites), changes
 
 
