@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sqlite3
 from pathlib import Path
 
@@ -121,3 +122,13 @@ def test_a_newer_schema_is_left_alone(tmp_path: Path) -> None:
     assert f"knows up to {schema.SCHEMA_VERSION}" in line
     assert "try: a newer evermap" in line
     assert path.read_bytes() == content
+
+
+def test_the_page_lists_every_table_and_column(repository: Path) -> None:
+    page = (repository / "docs" / "maps.md").read_text(encoding="utf-8")
+    rows = [line.split("|")[1:4] for line in page.splitlines() if line.startswith("| `") and line.count("|") == 4]
+    shown = {name.strip(" `"): set(re.findall(r"`(\w+)`", columns)) for name, _, columns in rows}
+    told_in_words = {"store": {"created_at", "evermap_version"}}
+    assert shown.keys() == schema.metadata.tables.keys()
+    for name, table in schema.metadata.tables.items():
+        assert shown[name] | told_in_words.get(name, set()) == {column.name for column in table.columns}
