@@ -381,7 +381,10 @@ def test_figures_show_the_rows() -> None:
     np.testing.assert_allclose(figure.axes[2].lines[0].get_ydata(), 0.9)
     np.testing.assert_allclose(figure.axes[3].lines[0].get_ydata(), 0.75)
     flat = draw_flat(fake_rows("fifty", 10, [WHOLE], {}))
-    np.testing.assert_allclose(flat.axes[1].lines[0].get_ydata(), 20)
+    dots, mean = flat.axes[1].lines[:2]
+    np.testing.assert_allclose(dots.get_ydata(), 20)
+    np.testing.assert_array_equal(mean.get_xdata(), np.arange(3, 9))
+    np.testing.assert_allclose(flat.axes[3].lines[1].get_ydata(), 1.2 + 0.1 * np.arange(6))
 
 
 def test_settings_that_cannot_be_are_refused(tmp_path: Path) -> None:

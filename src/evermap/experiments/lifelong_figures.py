@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Series = Callable[[Row], float | None]
 
+ROUND = 5
+"""Sessions until a robot's turn comes again."""
 COLOURS = dict(zip((c.name for c in CONTENDERS), (ALERT, ODOMETRY, ONLINE, GROUP, ESTIMATE, INK), strict=True))
 
 
@@ -66,12 +68,14 @@ def draw_flat(rows: list[Row]) -> Figure:
         for key, colour, label in (("step_p99_ms", ESTIMATE, "99th percentile"), ("step_p50_ms", MUTED, "median")):
             _dots(step, mine, key, colour, label)
         _dots(time, mine, "cpu_s", ESTIMATE, "processor")
-        error.set(title="RMSE [m]", ylim=(0.0, None))
-        size.set(title="size of the map", ylim=(0.0, None))
-        step.set(title="step [ms]", ylim=(0.0, None), xlabel="session")
-        time.set(title="time of a session [s]", ylim=(0.0, None), xlabel="session")
+        error.set(title="RMSE [m]")
+        size.set(title="size of the map")
+        step.set(title="step [ms]", xlabel="session")
+        time.set(title="time of a session [s]", xlabel="session")
+        for axes in (error, size, step, time):
+            axes.set_ylim(0.0, 1.4 * axes.get_ylim()[1])  # room for the legend
         for axes in (error, size, step):
-            axes.legend(loc="upper left")
+            axes.legend(loc="upper left", ncols=2)
         settle(figure)
     return figure
 
@@ -85,8 +89,12 @@ def _line(axes: Axes, rows: list[Row], value: Series, name: str) -> None:
 
 
 def _dots(axes: Axes, rows: list[Row], key: str, colour: str, label: str) -> None:
+    """A dot a session, and the mean of a round of all robots."""
     session, mean = _mean(rows, lambda row: row[key])
-    axes.plot(session + 1, mean, color=colour, lw=1.0, marker="o", ms=2.5, label=label)
+    axes.plot(session + 1, mean, color=colour, ls="", marker="o", ms=2.5, alpha=0.5)
+    if len(session) >= ROUND:
+        smooth = np.convolve(mean, np.full(ROUND, 1.0 / ROUND), mode="valid")
+        axes.plot(session[ROUND - 1 :] + 1 - ROUND // 2, smooth, color=colour, lw=1.5, label=label)
 
 
 def _mean(rows: list[Row], value: Series) -> tuple[IntArray, FloatArray]:

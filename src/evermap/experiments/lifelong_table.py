@@ -68,6 +68,14 @@ MEASURES: tuple[tuple[str, str, Callable[[list[Row]], float | None]], ...] = (
 """Title, format and value of what is scored; the value is None where nothing is known."""
 
 
+def measures(name: str) -> tuple[tuple[str, str, Callable[[list[Row]], float | None]], ...]:
+    """`MEASURES`; nobody finds changes of which he is told."""
+    return tuple(
+        (title, form, (lambda _: None) if name in TOLD and title.startswith("changes") else value)
+        for title, form, value in MEASURES
+    )
+
+
 def spread(rows: Sequence[Row], value: Callable[[list[Row]], float | None]) -> tuple[float | None, float | None]:
     """Mean over seeds, and its standard error; None where there is none."""
     each = [value([row for row in rows if row["seed"] == seed]) for seed in sorted({row["seed"] for row in rows})]
@@ -85,10 +93,7 @@ def summary(rows: list[Row], names: Sequence[str]) -> str:
         mine = _of(rows, name)
         if mine:
             lost = sum(not row["placed"] for row in mine)
-            cells = [
-                "–" if name in TOLD and title.startswith("changes") else _with_error(form, *spread(mine, value))
-                for title, form, value in MEASURES
-            ]
+            cells = [_with_error(form, *spread(mine, value)) for _, form, value in measures(name)]
             lines.append((_bold(name), SAYS[name], *cells, str(lost)))
     return markdown_table(("", "", *(title for title, _, _ in MEASURES), "not placed"), lines, words=(0, 1))
 
@@ -131,7 +136,7 @@ def fifths(rows: list[Row]) -> str:
                 (
                     _bold(name) if k == 0 else "",
                     f"{sessions[0]} to {sessions[-1]}",
-                    *(number(form, value(part)) for _, form, value in MEASURES),
+                    *(number(form, value(part)) for _, form, value in measures(name)),
                     number("{:.0f}", sites),
                     number("{:.2f}", cpu_s),
                     number("{:.2f}", step_ms),
