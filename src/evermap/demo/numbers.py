@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from evermap.demo.lifetimes import LearnedLife
-from evermap.demo.methods import METHODS
+from evermap.demo.methods import method_named
 from evermap.demo.scores import Counts, alignment_of, map_counts, pose_counts
 from evermap.demo.study import Study
 from evermap.metrics.existence import NEAR_M
-from evermap.types import FloatArray, Trajectory
+from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
 
 WEEK_DAYS = 7
 POSE_RATIO_BOUND, EXISTENCE_BOUND, COST_BOUND = 1.15, 0.98, 1.2
@@ -60,7 +60,7 @@ def _known(path: Trajectory | None) -> Trajectory:
     return path
 
 
-def week_of(study: Study) -> FloatArray:
+def week_of(study: Study) -> IntArray:
     """(S,) week of every session, from 0."""
     return np.array([truth.day // WEEK_DAYS for truth in study.building.truths])
 
@@ -171,21 +171,19 @@ def _sessions(study: Study) -> list[dict[str, Any]]:
 
 
 def _method(study: Study, name: str, line: Line) -> dict[str, Any]:
-    week = week_of(study)
-    labels = {method.name: (method.label, method.says) for method in METHODS}
-    label, says = labels[name]
+    week, method = week_of(study), method_named(name)
     sizes = [{"landmarks": len(v.snapshot.landmarks), "places": len(v.snapshot.place_id), "sites": v.snapshot.n_sites}
              for v in study.visits[name]]  # fmt: skip
     return {
-        "label": label,
-        "says": says,
+        "label": method.label,
+        "says": method.says,
         "sessions": [ratios(counts) | size for counts, size in zip(line.counts, sizes, strict=True)],
         "weeks": [ratios(_sum(line.counts, week == which)) for which in np.unique(week)],
         "whole": ratios(_sum(line.counts, week >= 0)),
     }
 
 
-def _sum(counts: tuple[Counts, ...], rows: Any) -> Counts:
+def _sum(counts: tuple[Counts, ...], rows: BoolArray) -> Counts:
     return sum((counts[k] for k in np.flatnonzero(rows)), start=Counts())
 
 

@@ -24,8 +24,8 @@ def demo_sections(
     """The story; `numbers` are those of `demo_dict`, `cost` of `cost`; figures: hero, scores, lifetimes."""
     hero, scores, lifetimes = figures
     html = (
-        f"<p>A robot patrols a simulated building for {numbers['scenario']['days']} days,"
-        f" {numbers['scenario']['sessions_per_day']} times a day. {_what_happened(numbers)} The same recordings go,"
+        f"<p>A robot patrols a simulated building {len(numbers['sessions'])} times in {numbers['scenario']['days']}"
+        f" days. {_what_happened(numbers)} The same recordings go,"
         " session after session, into one map for each of these methods; they are one engine with parts switched"
         f" off:</p>{_who(numbers)}"
     )
