@@ -253,6 +253,8 @@ class Recording:
         truth: reference trajectory, for evaluation only; None where unknown, may cover a part of the recording.
         true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
         robot_sightings: sightings of other robots, reported only.
+        objects: (K, 2) landmark ids and the objects that they are on, as an object detector says; empty where there is
+            none. Objects are numbered within the recording.
         warnings: counted, human-readable remarks of the reader ('3 detections of unknown barcodes dropped').
         source: where it was read from.
     """
@@ -265,6 +267,7 @@ class Recording:
     truth: Trajectory | None = None
     true_landmarks: Landmarks | None = None
     robot_sightings: RobotSightings | None = None
+    objects: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
     class_names: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     source: str = ""

@@ -19,13 +19,14 @@ from evermap.io.table import Table, parse_csv, parse_parquet
 from evermap.types import (
     Clock,
     FloatArray,
+    IntArray,
     Odometry,
     Recording,
     RobotSightings,
     Trajectory,
 )
 
-TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings")
+TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings", "objects")
 ENDINGS = (".csv", ".parquet")
 SENSOR_FILE = "sensor.toml"
 
@@ -38,7 +39,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
 
     Args:
         path: folder, or zip of a folder, with `odometry` and `detections` as `.csv` or `.parquet`, and optionally
-            `frames`, `truth`, `landmarks`, `robot_sightings` and `sensor.toml`.
+            `frames`, `truth`, `landmarks`, `robot_sightings`, `objects` and `sensor.toml`.
         robot: must be None; a native recording is of one robot.
 
     Returns:
@@ -83,6 +84,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         if landmarks is None or not len(landmarks)
         else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock),
         robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
+        objects=_objects(tables["objects"]),
         class_names=class_names,
         source=str(path),
         clock=clock,
@@ -195,6 +197,21 @@ def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None
     table.expect(("stamp_s", "robot_id", *POLAR))
     range_m, bearing_rad = polar(table)
     return RobotSightings(forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
+
+
+def _objects(table: Table | None) -> IntArray:
+    """(K, 2) landmarks and the objects that they are on, sorted by landmark."""
+    if table is None:
+        return np.zeros((0, 2), dtype=np.int64)
+    table.expect(("landmark_id", "object_id"))
+    pairs = np.column_stack([table.ids(name, optional=False) for name in ("landmark_id", "object_id")])
+    pairs = np.unique(pairs, axis=0)
+    twice = np.flatnonzero(np.diff(pairs[:, 0]) == 0)
+    if len(twice):
+        name = int(pairs[twice[0], 0])
+        row = int(np.flatnonzero(table.ids("landmark_id", optional=False) == name)[-1])
+        raise table.error(f"landmark {name} is on two objects", row=row, field="object_id", hint="one object each")
+    return pairs
 
 
 def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:

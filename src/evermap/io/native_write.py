@@ -96,6 +96,8 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
             "range_m": sightings.range_m,
             "bearing_rad": sightings.bearing_rad,
         }
+    if len(recording.objects):
+        tables["objects"] = {"landmark_id": recording.objects[:, 0], "object_id": recording.objects[:, 1]}
     return tables
 
 

@@ -24,6 +24,7 @@ class Found:
         probability: (K,) of that.
         position_m: (K, 2) posterior.
         covariance_m2: (2 K, 2 K) joint covariance of it.
+        object_id: (K,) object that it is on, as an object detector says; -1 for none.
         first_s: (K,) first sighting.
         last_s: (K,) last sighting.
     """
@@ -34,6 +35,7 @@ class Found:
     probability: FloatArray
     position_m: FloatArray
     covariance_m2: FloatArray
+    object_id: IntArray
     first_s: FloatArray
     last_s: FloatArray
 
@@ -43,6 +45,7 @@ class Extended:
     """The map, before its beliefs are updated.
 
     Attributes:
+        before: the map as it was, but for bodies that this session took apart or put together.
         living: with the session's places and sites.
         landmark_id: (K,) landmarks of the session.
         place: (K,) row of the map's places at which each of them stands.
@@ -50,6 +53,7 @@ class Extended:
         is_new: (S,) sites that the session found.
     """
 
+    before: LivingMap
     living: LivingMap
     landmark_id: IntArray
     place: IntArray
@@ -71,10 +75,16 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         config: how far landmarks of one body may be apart.
         drift_m: by which places may have been off when the session was solved.
     """
-    living, moved_to = _regrouped(replace(living, sites=replace(living.sites, p_here=p_site)), found, config, drift_m)
-    p_site = living.sites.p_here
-    if len(moved_to):
+    expected = replace(living, sites=replace(living.sites, p_here=p_site))
+    clique_id = _bodies(expected, found, config, drift_m)
+    if not np.array_equal(clique_id, living.members.clique_id):
+        before, (living, moved_to) = relabelled(living, clique_id)[0], relabelled(expected, clique_id)
+        if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
+            before = living
+        p_site = living.sites.p_here
         found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
+    else:
+        before = living
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
     site_of = _standing_at(living, found, clique)
@@ -105,6 +115,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
     place = found.place.copy()
     place[new] = len(living.places) + np.arange(len(new))
     return Extended(
+        before,
         replace(
             living,
             members=members,
@@ -129,9 +140,8 @@ def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tupl
     if not len(new):
         return members, living.n_cliques_ever
     if config.cliques:
-        number = group(found.position_m[new], found.class_id[new], reach_m=config.clique_reach_m)
-        clique = living.n_cliques_ever + number
-        _join_neighbours(clique, new, members, found, config.clique_reach_m)
+        clique = living.n_cliques_ever + _numbered(found.object_id[new], found, new, config.clique_reach_m)
+        _join_known(clique, new, members, found, config.clique_reach_m)
     else:
         clique = living.n_cliques_ever + np.arange(len(new))
     off = np.zeros(len(new), dtype=np.bool_)
@@ -139,30 +149,43 @@ def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tupl
     return both[np.argsort(both.landmark_id, kind="stable")], int(clique.max(initial=living.n_cliques_ever - 1)) + 1
 
 
-def _join_neighbours(clique: IntArray, new: IntArray, members: Members, found: Found, reach_m: float) -> None:
-    """A body of which another landmark was missed at first: all of a new clique within reach of all of an old one."""
+def _numbered(object_id: IntArray, found: Found, new: IntArray, reach_m: float) -> IntArray:
+    """Bodies of new landmarks, from 0: by the detector of objects where it says something, else by proximity."""
+    number = np.zeros(len(new), dtype=np.int64)
+    told = object_id >= 0
+    number[told] = np.unique(object_id[told], return_inverse=True)[1].ravel()
+    first = len(np.unique(object_id[told]))
+    rest = new[~told]
+    if len(rest):
+        number[~told] = first + group(found.position_m[rest], found.class_id[rest], reach_m=reach_m)
+    return number
+
+
+def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found, reach_m: float) -> None:
+    """A body of which another landmark was missed at first: the same object, or within reach of all of its class."""
     old = np.flatnonzero(np.isin(found.landmark_id, members.landmark_id))
     old_clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id[old])]
     for name in np.unique(clique):
-        mine = new[clique == name]
-        kind = found.class_id[mine[0]]
-        if kind < 0:
+        mine = np.flatnonzero(clique == name)
+        body, kind = found.object_id[new[mine[0]]], found.class_id[new[mine[0]]]
+        if body >= 0:
+            same = old_clique[found.object_id[old] == body]
+            clique[mine] = same[0] if len(same) else name
             continue
         near = {}
-        for other in np.unique(old_clique[found.class_id[old] == kind]):
+        for other in np.unique(old_clique[(found.class_id[old] == kind) & (kind >= 0)]):
             theirs = old[old_clique == other]
-            gap = np.linalg.norm(found.position_m[mine][:, None] - found.position_m[theirs][None], axis=2).max()
+            gap = np.linalg.norm(found.position_m[new[mine]][:, None] - found.position_m[theirs][None], axis=2).max()
             if gap <= reach_m:
                 near[float(gap)] = int(other)
         if near:
-            clique[clique == name] = near[min(near)]
+            clique[mine] = near[min(near)]
 
 
-def _regrouped(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> tuple[LivingMap, IntArray]:
-    """The map with bodies taken apart whose members went apart, and put together that moved as one."""
-    nowhere = np.arange(len(living.places))
+def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> IntArray:
+    """(L,) cliques of the map's landmarks: taken apart whose members went apart, and put together that moved as one."""
     if not config.cliques or not len(living.members):
-        return living, nowhere
+        return living.members.clique_id
     members, places = living.members, living.places
     stood = living.place_row(members.landmark_id, living.site_of())
     _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
@@ -171,7 +194,7 @@ def _regrouped(living: LivingMap, found: Found, config: LivingConfig, drift_m: f
     fate = np.full(len(members), Fate.UNSEEN, dtype=np.int64)
     fate[member] = np.where(found.place[row] == stood[member], Fate.STAYED, Fate.MOVED)
     if not (fate == Fate.MOVED).any():
-        return living, nowhere
+        return _torn(living, members.clique_id, found, config.clique_reach_m)
     before = places.position_m[np.maximum(stood, 0)]
     after, spread = before.copy(), np.zeros((len(members), 2, 2))
     after[member] = found.position_m[row]
@@ -187,9 +210,40 @@ def _regrouped(living: LivingMap, found: Found, config: LivingConfig, drift_m: f
         reach_m=config.clique_reach_m,
         next_id=living.n_cliques_ever,
     )
-    if np.array_equal(clique_id, members.clique_id):
-        return living, nowhere
-    return relabelled(living, clique_id)
+    return _torn(living, clique_id, found, config.clique_reach_m)
+
+
+def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
+    """Cliques without members that cannot be where the others are: a clique stands at one site.
+
+    Those who stand at another known site, or at a new place though they have one at the site of the others, or out of
+    reach of these, are cliques of their own. Those at the site that was believed in most keep the clique.
+    """
+    members, places, sites = living.members, living.places, living.sites
+    label = clique_id.copy()
+    next_id = max(living.n_cliques_ever, int(label.max(initial=-1)) + 1)
+    _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
+    at = np.where(found.place[row] >= 0, np.append(places.site_id, -1)[found.place[row]], -1)
+    for name in np.unique(label[member]):
+        mine = np.flatnonzero(label[member] == name)
+        known = mine[at[mine] >= 0]
+        if len(mine) < 2 or not len(known):
+            continue
+        believed = sites.p_here[np.searchsorted(sites.site_id, at[known])]
+        main = at[known[np.argmax(believed)]]
+        there = mine[at[mine] == main]
+        has_one = living.place_row(members.landmark_id[member[mine]], np.full(len(mine), main)) >= 0
+        gap = np.linalg.norm(found.position_m[row[mine]][:, None] - found.position_m[row[there]][None], axis=2)
+        apart = mine[(at[mine] != main) & ((at[mine] >= 0) | has_one | (gap.max(axis=1) > reach_m))]
+        nowhere = row[apart[at[apart] < 0]]
+        bodies = [apart[at[apart] == site] for site in np.unique(at[apart]) if site >= 0]
+        if len(nowhere):
+            number = group(found.position_m[nowhere], found.class_id[nowhere], reach_m=reach_m)
+            bodies += [apart[at[apart] < 0][number == k] for k in np.unique(number)]
+        for body in bodies:
+            label[member[body]] = next_id
+            next_id += 1
+    return label
 
 
 def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:

@@ -169,7 +169,10 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Vi
     covariance = of_places(own.covariance_m2, seen)
     if where is None:
         covariance = anchored(own.position_m[seen], covariance)
-    found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, first[row], last[row])
+    body = np.full(len(names), UNKNOWN, dtype=np.int64)
+    _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
+    body[here] = visit.recording.objects[there, 1]
+    found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row])
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
