@@ -33,6 +33,8 @@ FIRST_POSE_INFORMATION = 1e8
 """The first pose is the origin, to 0.1 mm."""
 TRAJECTORY_STEP_S = 0.1
 """Longest step between poses of the trajectory that is written."""
+LONGEST_PAUSE_S = 60.0
+"""Longer pauses are divided no further: a clock that was set forward by a day would make a million poses of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +311,8 @@ def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> Flo
     stamps = recording.frames.stamp_s
     stamps = stamps[stamps <= last + 1e-9]
     steps = np.diff(stamps)
-    pieces = np.maximum(np.ceil(steps / TRAJECTORY_STEP_S - 1e-9), 1).astype(np.int64)
+    pieces = np.ceil(np.minimum(steps, LONGEST_PAUSE_S) / TRAJECTORY_STEP_S - 1e-9)
+    pieces = np.maximum(pieces, 1).astype(np.int64)
     offsets = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     dense = np.repeat(stamps[:-1], pieces) + offsets * np.repeat(steps / pieces, pieces)
     return np.append(dense, stamps[-1])
