@@ -1,0 +1,166 @@
+"""A living map on duty: hours of driving with everything going wrong. No crash, no nan, no growth, no collapse."""
+
+from __future__ import annotations
+
+import tracemalloc
+from contextlib import suppress
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from evermap.cli.bench import load_benchmarks
+from evermap.errors import DataError
+from evermap.maps.living import LivingMap
+from evermap.pipeline import Session, run_session
+from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
+from evermap.sim.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
+from evermap.types import Recording
+
+LARGEST_FACTOR = 1.5
+"""Median pose error with a bad day's faults, over that without any."""
+
+
+@pytest.fixture(scope="module")
+def soak() -> ModuleType:
+    load_benchmarks()  # puts the checkout on the path
+    import benchmarks.soak
+
+    return benchmarks.soak
+
+
+@pytest.fixture(scope="module")
+def visits() -> tuple[Recording, ...]:
+    """Three short patrols of a small building."""
+    config = BuildingConfig(
+        days=3,
+        patrol_s=40.0,
+        length_m=12.0,
+        rooms_per_side=1,
+        change_rate=2.0,
+        drive=DriveConfig(truth_hz=20.0),
+        odometry=OdometryConfig(rate_hz=10.0),
+        sensor=SensorConfig(rate_hz=2.0),
+    )
+    return simulate_building(config, seed=1).sessions
+
+
+@pytest.fixture(scope="module")
+def known(visits: tuple[Recording, ...]) -> Session:
+    return run_session(visits[0])
+
+
+rate = st.sampled_from([0.0, 0.02, 0.2])
+per_h = st.sampled_from([0.0, 100.0])
+streams = st.builds(
+    StreamFaults,
+    p_dropped=rate, p_twice=rate, p_late=rate, p_misstamped=rate, p_stamp_garbled=rate, outages_per_h=per_h,
+    outage_s=st.sampled_from([2.0, 20.0]), jumps_per_h=per_h, jump_s=st.sampled_from([2.0, 60.0]),
+)  # fmt: skip
+mixes = st.builds(
+    FaultConfig,
+    frames=streams, odometry=streams, p_wrong_identity=rate, p_shuffled=rate, p_impossible=rate, freezes_per_h=per_h,
+    p_spike=rate, p_odometry_impossible=rate, clock_jumps_per_h=per_h, p_empty=rate,
+)  # fmt: skip
+
+
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(faults=mixes, seed=st.integers(0, 10_000))
+def test_whatever_goes_wrong_in_a_session_its_numbers_are_numbers(
+    soak: ModuleType, visits: tuple[Recording, ...], known: Session, faults: FaultConfig, seed: int
+) -> None:
+    """In the map as it was, and from scratch; or the session is refused in one line and the map stays."""
+    for living in (known.living, LivingMap()):
+        with suppress(DataError):  # nothing can be estimated: no odometry, fewer than two frames
+            session = run_session(with_faults(visits[1], faults, seed), living)
+            assert list(soak.problems(session)) == []
+
+
+def test_an_hour_of_faults_does_not_spoil_the_map(soak: ModuleType) -> None:
+    """Quick version of the soak below: fewer sessions, the same demands but for memory."""
+    recordings = soak.world(1.0, seed=3)[:8]
+    faulty, plain = soak.soak(recordings, FaultConfig(), seed=3), soak.soak(recordings)
+    assert faulty.defects == plain.defects == []
+    assert plain.refused == []
+    assert np.nanmedian(faulty.rmse_m) < LARGEST_FACTOR * np.median(plain.rmse_m)
+    assert faulty.n_landmarks[-1] < 1.5 * plain.n_landmarks[-1]
+
+
+def test_the_same_faults_make_the_same_map(visits: tuple[Recording, ...]) -> None:
+    def maps() -> list[LivingMap]:
+        living, after = LivingMap(), []
+        for row, visit in enumerate(visits):
+            living = run_session(with_faults(visit, replace(FaultConfig(), p_empty=0.0), row), living).living
+            after.append(living)
+        return after
+
+    for one, other in zip(maps(), maps(), strict=True):
+        assert _bytes_of(one) == _bytes_of(other)
+
+
+def _bytes_of(value: object) -> bytes:
+    """All numbers of nested dataclasses, in order."""
+    if isinstance(value, np.ndarray):
+        return value.tobytes()
+    if isinstance(value, tuple):
+        return b"".join(map(_bytes_of, value))
+    names = getattr(value, "__dataclass_fields__", None)
+    return repr(value).encode() if names is None else b"".join(_bytes_of(getattr(value, name)) for name in names)
+
+
+def test_defects_are_seen(soak: ModuleType, known: Session) -> None:
+    """The checks of the soak themselves: what is put wrong is reported."""
+    assert list(soak.problems(known)) == []
+    living = known.living
+    p_here = living.sites.p_here.copy()
+    p_here[0] = 1.5
+    skew = living.covariance_m2.copy()
+    skew[0, 1] += 1e-3
+    negative = living.covariance_m2 - 1.0 * np.eye(len(living.covariance_m2))
+    gone = living.places.position_m.copy()
+    gone[0, 0] = np.nan
+    for wrong, said in (
+        (replace(living, sites=replace(living.sites, p_here=p_here)), "no probability"),
+        (replace(living, covariance_m2=skew), "not symmetric"),
+        (replace(living, covariance_m2=negative), "not positive semidefinite"),
+        (replace(living, places=replace(living.places, position_m=gone)), "not finite"),
+    ):
+        assert any(said in line for line in soak.problems(replace(known, living=wrong)))
+
+
+@pytest.mark.slow
+def test_sessions_leave_nothing_behind(soak: ModuleType) -> None:
+    """All that Python and numpy have allocated, after sessions that bring nothing new: to the map, and else nothing."""
+    first, recording = soak.world(0.1, seed=0)[:2]
+    living = run_session(first).living
+    held = []
+    for seed in range(12):
+        if seed == 4:
+            tracemalloc.start()
+        run_session(with_faults(recording, replace(FAULTLESS, frames=NOTHING, p_wrong_identity=0.02), seed), living)
+        if seed >= 4:
+            held.append(tracemalloc.get_traced_memory()[0] / 1e6)
+    tracemalloc.stop()
+    assert held[-1] - held[2] < 0.5, held
+
+
+@pytest.mark.slow
+@pytest.mark.experiment
+def test_24_hours_of_faults(soak: ModuleType) -> None:
+    """480 sessions, 24 hours of driving in ten days, with all faults and without."""
+    recordings = soak.world(24.0, seed=0)
+    faulty, plain = soak.soak(recordings, FaultConfig()), soak.soak(recordings)
+    assert faulty.driven_s > 23.9 * 3600.0
+    assert faulty.defects == plain.defects == []
+    assert plain.refused == []
+    # of a hundred sessions two have no odometry, frames or detections at all
+    assert len(faulty.refused) < 0.04 * len(recordings)
+    ours, theirs = faulty.summary(), plain.summary()
+    assert ours["rmse_median_m"] < LARGEST_FACTOR * theirs["rmse_median_m"]
+    assert ours["precision"] > theirs["precision"] - 0.05
+    assert ours["recall"] > theirs["recall"] - 0.05
+    # the map grows with what has come and gone, and with strangers; the process grows by no more than that and noise
+    assert faulty.growth_mb() < 20.0 + 3e-3 * (faulty.map_kb[-1] - faulty.map_kb[len(recordings) // 4])
