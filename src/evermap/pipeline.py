@@ -177,7 +177,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         entry = lifelong.entered(living, expected, where, visit, config.living)
         looks = lifelong.looks(entry, visit)
         now = lifelong.believed(entry, looks, visit, config.living)
-        after, changes = lifelong.decided(living, now, looks, visit, config.living)
+        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living)
         after = lifelong.learned(after, now, looks, config.living)
         frame = "first_pose" if where is None else "prior_map"
         landmarks = replace(after.landmarks(p_least=0.5), frame=frame)

@@ -34,6 +34,7 @@ def found(
         np.full(count, probability),
         np.array(position_m, dtype=np.float64),
         SIGMA_M**2 * np.eye(2 * count) if covariance_m2 is None else covariance_m2,
+        np.full(count, -1),
         np.full(count, first_s),
         np.full(count, last_s),
     )

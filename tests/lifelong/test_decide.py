@@ -53,7 +53,6 @@ class Story:
         p_away: float = 0.99,
     ) -> tuple[MapChange, ...]:
         """One more session; `stands` are the landmarks it saw, `away` those it no longer believes in."""
-        before = self.living
         names = sorted(stands)
         place = [self._place_at(name, stands[name]) for name in names]
         of = {n: [look.stamp_s for look in looks if look.landmark == n and look.hit] for n in names}
@@ -63,7 +62,8 @@ class Story:
             first_s=np.array([min(of[n]) for n in names]),
             last_s=np.array([max(of[n]) for n in names]),
         )
-        entry = begun(entry_of) if not len(before.places) else next_map(before, entry_of)
+        entry = begun(entry_of) if not len(self.living.places) else next_map(self.living, entry_of)
+        before = entry.before
         after = self._believed(entry, {*names}, away, p_away)
         seen = self._looks(after, looks)
         hit = seen.rows.hit
@@ -281,6 +281,13 @@ def test_nothing_is_told_of_what_was_not_looked_at() -> None:
     before = story.living.stays
     assert story.session(1000.0, {8: AT[8], 9: AT[9]}, seen(8, 9, since_s=1000.0)) == ()
     assert story.stays_of(1).last_s.tolist() == before[before.clique_id == story.body(1)].last_s.tolist()
+
+
+def test_of_a_body_that_comes_apart_only_what_moved_has_changed() -> None:
+    story = told()
+    (change,) = story.session(1000.0, AT | {2: (3.0, 3.0)}, [*seen(*AT, since_s=1000.0)])
+    assert (change.kind, change.landmark_ids) == (ChangeKind.MOVED, (2,))
+    assert change.displacement_m == pytest.approx((2.4, 3.0))
 
 
 def wandered(times: int) -> LivingMap:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.config import LivingConfig
-from evermap.lifelong.extend import extended
+from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import with_session
 from evermap.maps.living import LivingMap
 from evermap.types import FloatArray
@@ -25,22 +25,22 @@ def some_covariance(random: np.random.Generator, points: int) -> FloatArray:
     return np.asarray(factor @ factor.T)
 
 
-def random_session(random: np.random.Generator, living: LivingMap) -> tuple:
+def believing(entry: Extended) -> LivingMap:
+    return replace(entry.living, sites=replace(entry.living.sites, p_here=entry.p_start))
+
+
+def random_session(random: np.random.Generator, living: LivingMap) -> Found:
     """Some landmarks of the map, each at one of its places or somewhere new, and some that nobody saw before."""
     known = living.members.landmark_id
     again = np.sort(random.permutation(known)[: random.integers(0, len(known) + 1)])
     pool = np.setdiff1d(np.arange(40), known)
     names = np.sort(np.concatenate([again, random.choice(pool, random.integers(1, 4), replace=False)]))
     place, at = [], []
-    side = {}  # a body stands at one of its sites
     for name in names:
         rows = np.flatnonzero(living.places.landmark_id == name)
-        clique = int(living.members.clique_id[known == name][0]) if len(rows) else -1
-        site = side.setdefault(clique, int(random.choice(living.places.site_id[rows]))) if len(rows) else -1
-        mine = rows[living.places.site_id[rows] == site]
-        stays = len(mine) > 0 and random.random() < 0.7
-        place.append(int(mine[0]) if stays else -1)
-        at.append(living.places.position_m[mine[0]] if stays else random.uniform(0, 15, 2))
+        stays = len(rows) > 0 and random.random() < 0.7
+        place.append(int(random.choice(rows)) if stays else -1)
+        at.append(living.places.position_m[place[-1]] if stays else random.uniform(0, 15, 2))
     return found(
         names.tolist(),
         np.array(at) + random.normal(size=(len(at), 2)) * 0.01,
@@ -61,7 +61,7 @@ def test_a_map_is_consistent_whatever_is_found_and_names_are_never_used_again(se
         session = random_session(random, living)
         entry = extended(living, living.sites.p_here, session, config, 0.01)
         after = entry.living
-        assert_consistent(replace(after, sites=replace(after.sites, p_here=entry.p_start)))
+        assert_consistent(believing(entry))
         fresh = set(after.sites.site_id.tolist()) - set(living.sites.site_id.tolist())
         assert not fresh & ever
         assert fresh == set() or min(fresh) >= living.n_sites_ever
@@ -74,7 +74,7 @@ def test_a_map_is_consistent_whatever_is_found_and_names_are_never_used_again(se
         assert len(after.places) == len(living.places) + int((session.place < 0).sum())
         keep = np.sort(random.permutation(len(after.sites))[:1])
         forgotten = after.sites.site_id[keep] if random.random() < 0.3 else np.zeros(0, dtype=np.int64)
-        living = replace(after, sites=replace(after.sites, p_here=entry.p_start))
+        living = believing(entry)
         if len(forgotten):
             of = after.places.landmark_id[np.isin(after.places.site_id, forgotten)]
             living = living.without(of)
@@ -167,7 +167,7 @@ def test_a_member_that_went_away_from_its_body_is_a_body_of_its_own_with_its_old
     assert sorted(after.places.position_m[rows].tolist()) == [[0.0, 0.5], [5.0, 5.0]]
     there = after.place_row(np.array([3]), after.site_of()[after.members.landmark_id == 3])
     back = extended(
-        replace(after, sites=replace(after.sites, p_here=entry.p_start)),
+        believing(entry),
         entry.p_start,
         found([3], [[0.0, 0.5]], place=[int(next(r for r in rows if r != there[0]))]),
         LivingConfig(),
@@ -175,3 +175,43 @@ def test_a_member_that_went_away_from_its_body_is_a_body_of_its_own_with_its_old
     )
     assert len(back.living.places) == len(after.places), "no new place: it is back"
     assert_consistent(back.living)
+
+
+def test_bodies_are_taken_apart_in_the_old_map_too() -> None:
+    """What changed is told of the bodies as they are known now: two moved, and the third stayed where it was."""
+    living = begun(found([1, 2, 3, 9], [[0, 0], [0.5, 0], [0, 0.5], [9, 9]])).living
+    entry = next_map(living, found([1, 2, 3, 9], [[5, 5], [5.5, 5], [0, 0.5], [9, 9]], place=[-1, -1, 2, 3]))
+    assert_consistent(entry.before)
+    assert entry.before.members.clique_id.tolist() == entry.living.members.clique_id.tolist()
+    assert len(set(entry.before.members.clique_id.tolist())) == 3
+    sites = dict(zip(entry.before.sites.site_id.tolist(), entry.before.sites.clique_id.tolist(), strict=True))
+    after = dict(zip(entry.living.sites.site_id.tolist(), entry.living.sites.clique_id.tolist(), strict=True))
+    assert sites.items() <= after.items()
+    np.testing.assert_allclose(entry.before.sites.p_here, 0.9)
+    np.testing.assert_array_equal(
+        np.sort(entry.before.places.position_m, axis=0), np.sort(living.places.position_m, axis=0)
+    )
+
+
+def test_one_that_was_missed_while_its_body_moved_and_is_found_where_it_was_is_a_body_of_its_own() -> None:
+    living = begun(found([1, 2, 9], [[0, 0], [0.5, 0], [9, 9]])).living
+    living = believing(next_map(living, found([2, 9], [[6, 0], [9, 9]], place=[-1, 2])))
+    one, nine = (int(np.flatnonzero(living.places.landmark_id == name)[0]) for name in (1, 9))
+    entry = next_map(living, found([1, 2, 9], [[0, 0], [3, 3], [9, 9]], place=[one, -1, nine]))
+    assert_consistent(believing(entry))
+    body = entry.living.members.clique_id
+    assert body[0] != body[1]
+    assert len(entry.living.places) == len(living.places) + 1
+
+
+def test_members_that_are_found_at_two_sites_are_no_body() -> None:
+    living = begun(found([1, 2, 9], [[0, 0], [0.5, 0], [9, 9]])).living
+    living = believing(next_map(living, found([1, 2, 9], [[5, 5], [5.5, 5], [9, 9]], place=[-1, -1, 2])))
+    rows = living.place_row(np.array([1, 2]), np.array([0, living.n_sites_ever - 1]))
+    assert (rows >= 0).all()
+    nine = int(np.flatnonzero(living.places.landmark_id == 9)[0])
+    entry = next_map(living, found([1, 2, 9], [[0, 0], [5.5, 5], [9, 9]], place=[*rows, nine]))
+    assert_consistent(believing(entry))
+    body = entry.living.members.clique_id
+    assert body[0] != body[1]
+    assert len(entry.living.places) == len(living.places), "each has been there before"
