@@ -108,6 +108,7 @@ def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatA
 def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, sightlines: SightLines) -> Looks:
     """Which places of a map were looked at, frame by frame, and which of them were seen."""
     places = living.places
+    used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
     in_view: list[IntArray] = []
     seen_from: list[IntArray] = []
     nominal: list[FloatArray] = []
@@ -119,7 +120,7 @@ def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, sightlines:
         mine = (sighting.frame >= start) & (sighting.frame < start + len(poses))
         hit = np.zeros(p.shape, dtype=np.bool_)
         hit[sighting.frame[mine] - start, sighting.place[mine]] = True
-        frame, place = np.nonzero((p >= WORTH_A_LOOK * sensor.p_detect) | hit)
+        frame, place = np.nonzero(((p >= WORTH_A_LOOK * sensor.p_detect) | hit) & used)
         in_view.append(place)
         seen_from.append(frame + start)
         nominal.append(np.where(hit, 1.0, -1.0)[frame, place] * np.maximum(p[frame, place], 1e-3))
