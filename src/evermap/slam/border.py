@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.arrow import Smoother
+from evermap.slam.frame_kernels import linearise_frame, spread_of_frame, turn_pose
 from evermap.slam.kernels import (
     AT_PLACES,
     adjoint,
     composed,
-    detection_residual,
     inlier_weight,
     inverted,
     kernel,
@@ -197,43 +197,15 @@ def _update(
         return
     start, start_states, start_place = pose.copy(), states.copy(), place.copy()
     step, weight = np.zeros(size), np.ones(count)
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    residual, jacobian = np.zeros(2 * count), np.zeros((2 * count, 10))
-    column = np.zeros((count, 10), dtype=np.int64)
+    residual = np.zeros(2 * count)
+    jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
     spread, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
     for iteration in range(ITERATIONS):
-        turn_c, turn_s = np.cos(step[2]), np.sin(step[2])
-        for m in range(count):
-            detection_residual(pose, place[slot[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
-            for k in range(2):
-                row = 2 * m + k
-                residual[row] = e[k]
-                # by the step of the pose, which is told in the frame of where it started
-                jacobian[row, 0] = turn_c * jx[k, 0] - turn_s * jx[k, 1]
-                jacobian[row, 1] = turn_s * jx[k, 0] + turn_c * jx[k, 1]
-                jacobian[row, 2] = jx[k, 2]
-                for a in range(5):
-                    jacobian[row, 3 + a] = jc[k, a] if free[a] else 0.0
-                jacobian[row, 8], jacobian[row, 9] = jl[k, 0], jl[k, 1]
-            for a in range(8):
-                column[m, a] = a
-            column[m, 8], column[m, 9] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
-            if iteration > 0:
-                squared = (e[0] / sigma[m, 0]) ** 2 + (e[1] / sigma[m, 1]) ** 2
-                weight[m] = inlier_weight(squared, 0.0, True) if robust else 1.0
-        for row in range(2 * count):
-            at = row // 2
-            for k in range(size):
-                total = 0.0
-                for a in range(10):
-                    total += jacobian[row, a] * covariance[column[at, a], k]
-                gain[row, k] = total
-        for row in range(2 * count):
-            for other in range(2 * count):
-                total = 0.0
-                for a in range(10):
-                    total += gain[row, column[other // 2, a]] * jacobian[other, a]
-                spread[row, other] = total
+        linearise_frame(pose, states, place, slot, reading, mount, free, step[2], residual, jacobian, column)
+        spread_of_frame(covariance, jacobian, column, gain, spread)
+        for m in range(count if iteration > 0 and robust else 0):
+            squared = (residual[2 * m] / sigma[m, 0]) ** 2 + (residual[2 * m + 1] / sigma[m, 1]) ** 2
+            weight[m] = inlier_weight(squared, 0.0, True)
         if iteration == 0 and robust:
             # before anything is known of this frame: as surprising as its innovation is
             for m in range(count):
@@ -275,11 +247,4 @@ def _update(
             covariance[i, k] -= total
             if k > i:
                 covariance[k, i] = covariance[i, k]
-    # the covariance of the pose belongs to its own frame, which has turned
-    c, s = np.cos(step[2]), np.sin(step[2])
-    for k in range(size):
-        x, y = covariance[0, k], covariance[1, k]
-        covariance[0, k], covariance[1, k] = c * x + s * y, -s * x + c * y
-    for k in range(size):
-        x, y = covariance[k, 0], covariance[k, 1]
-        covariance[k, 0], covariance[k, 1] = c * x + s * y, -s * x + c * y
+    turn_pose(covariance, step[2])
