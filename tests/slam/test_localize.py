@@ -58,6 +58,20 @@ def test_pose_and_calibration_are_as_uncertain_as_the_filter_says(sigma_m):
     assert within_chance(of_states, 9 * runs)
 
 
+def test_a_long_stay_among_the_same_landmarks_makes_nobody_too_sure():
+    """Their errors are the same in every frame: a filter that takes them for fresh noise would be sure of anything."""
+    of_pose, of_states, runs = 0.0, 0.0, 6
+    for seed in range(runs):
+        rng, true = world(seed, n_frames=1000)
+        localizer, located = run(true, surveyed(rng, true.landmark, 0.05))
+        of_pose += nees(errors(true, located)[-1:], located[-1].covariance[None])[0]
+        wrong = localizer.states - true.states
+        of_states += wrong @ np.linalg.solve(localizer.states_covariance, wrong)
+        assert not any(one.lost for one in located[5:])
+    assert within_chance(of_pose, 3 * runs)
+    assert within_chance(of_states, 9 * runs)
+
+
 def test_a_map_that_is_turned_as_a_whole_is_as_good_as_its_parts_fit_together():
     of_pose, gated_moved, gated_others, runs = 0.0, [], [], 25
     for seed in range(runs):
