@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from judged import arrays_of, judge, judged, recording_of, surveyed
@@ -119,3 +121,24 @@ def test_a_robot_whose_odometry_fails_while_it_turns_is_not_lost_for_words():
     passed = result.online.stamp_s - recording.odometry.stamp_s[0]
     size = np.sqrt(np.einsum("nii->ni", result.online.covariance)[:, :2].sum(axis=1))
     assert size[passed > 60.0].min() > size[passed < 30.0].max()
+
+
+@pytest.mark.parametrize("pause_s", [1e3, 1e8])
+def test_a_clock_that_was_set_forward_is_a_pause_and_costs_no_more_than_one(pause_s: float):
+    """By minutes, or by years: the rest of the session is estimated, with as many poses, in as many places."""
+    recording = building(0, patrol_s=60.0, rate_hz=2.0).sessions[0]
+    middle = recording.odometry.stamp_s[0] + 30.0
+    later = [np.where(t > middle, t + pause_s, t) for t in (recording.odometry.stamp_s, recording.frames.stamp_s)]
+    paused = replace(
+        recording,
+        odometry=replace(recording.odometry, stamp_s=later[0]),
+        frames=replace(recording.frames, stamp_s=later[1]),
+    )
+    result = run_slam(paused)
+    for name, value in arrays_of(result):
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and "nis" not in name:
+            assert np.isfinite(value).all(), name
+    assert len(result.trajectory) < 10 * 60.0 + 700
+    assert result.trajectory.stamp_s[-1] == pytest.approx(
+        run_slam(recording).trajectory.stamp_s[-1] + pause_s, abs=1e-3
+    )

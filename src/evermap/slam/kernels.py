@@ -174,7 +174,7 @@ def integrate_odometry(
             w = scale_w * reported_w
             extra = unknown[row]
             pieces, h = 1, until - now
-            if h > MAX_STEP_S:
+            if h > MAX_STEP_S and (reported_v != 0.0 or reported_l != 0.0 or reported_w != 0.0):  # else it is exact
                 pieces = math.ceil(h / MAX_STEP_S)
                 h /= pieces
             by_distance, by_angle = h * math.sqrt(reported_v * reported_v + reported_l * reported_l), h * turn_abs

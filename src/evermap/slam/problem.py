@@ -14,6 +14,8 @@ SILENCE_S = 1.0
 """Odometry that says nothing for longer than this is not believed to go on as before."""
 SILENT_VARIANCE = 0.25
 """Variance per second, (m^2 or rad^2) / s, that is added while the odometry is silent, at least."""
+LONGEST_SILENCE_S = 60.0
+"""After a longer silence no more is unknown than after this: a clock set forward by a day is no drive of one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +41,16 @@ class Drive:
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:
         """Velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'.
 
-        What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`.
+        What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
+        to that of `LONGEST_SILENCE_S`.
         """
-        silent = np.flatnonzero(np.diff(stamp_s) > SILENCE_S)
+        silence = np.diff(stamp_s)
+        silent = np.flatnonzero(silence > SILENCE_S)
         at = silent + 1
         stamps = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
-        rate = (velocity[silent] ** 2).sum(axis=1) * np.diff(stamp_s)[silent]
-        unknown = np.insert(np.zeros(len(stamp_s)), at, SILENT_VARIANCE + rate)
+        counted = np.minimum(silence[silent], LONGEST_SILENCE_S)
+        rate = (SILENT_VARIANCE + (velocity[silent] ** 2).sum(axis=1) * counted) * counted / silence[silent]
+        unknown = np.insert(np.zeros(len(stamp_s)), at, rate)
         velocities = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
         stamps = np.append(stamps, stamps[-1] + 0.5 * SILENCE_S)
