@@ -76,7 +76,11 @@ def place_of(living: LivingMap, landmark_id: int) -> tuple[int, FloatArray, Floa
     """Site, position and covariance of a landmark's most probable place."""
     site = living.site_of()[living.members.landmark_id == landmark_id]
     row = int(living.place_row(np.array([landmark_id]), site)[0])
-    return int(site[0]), living.places.position_m[row], living.covariance_m2[2 * row : 2 * row + 2, 2 * row : 2 * row + 2]
+    return (
+        int(site[0]),
+        living.places.position_m[row],
+        living.covariance_m2[2 * row : 2 * row + 2, 2 * row : 2 * row + 2],
+    )
 
 
 def body_of(living: LivingMap, landmark_id: int) -> list[int]:

@@ -290,6 +290,13 @@ def test_of_a_body_that_comes_apart_only_what_moved_has_changed() -> None:
     assert change.displacement_m == pytest.approx((2.4, 3.0))
 
 
+def test_of_a_body_of_which_a_part_was_seen_the_shift_is_that_of_this_part() -> None:
+    story = told()
+    (change,) = story.session(1000.0, {1: (2.0, 1.0), 8: AT[8], 9: AT[9]}, seen(1, 8, 9, since_s=1000.0))
+    assert (change.kind, change.landmark_ids) == (ChangeKind.MOVED, (1,))
+    assert change.displacement_m == pytest.approx((2.0, 1.0))
+
+
 def wandered(times: int) -> LivingMap:
     """8 stands somewhere else in every session."""
     story = told()

@@ -163,7 +163,6 @@ def changes_between(before: LivingMap, after: LivingMap, looks: Looks) -> tuple[
         looks: of the session, at places of `after`.
     """
     then, now = standing(before), standing(after)
-    middle = site_middles(after)
     hits, misses = _counted(looks, len(after.sites))
     found: list[MapChange] = []
     for clique, site in zip(now.clique_id.tolist(), now.site.tolist(), strict=True):
@@ -179,9 +178,8 @@ def changes_between(before: LivingMap, after: LivingMap, looks: Looks) -> tuple[
         p_here = after.sites.p_here
         mine = after.sites.clique_id == clique
         probability = 1.0 - float(p_here[mine].sum()) if site < 0 else float(p_here[site])
-        step = middle[site] - middle[left] if site >= 0 and left >= 0 else np.full(2, np.nan)
+        step, turn = _motion(after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
         from_s, to_s = _when(after, clique, site)
-        turn = _turn(after, left, site) if site >= 0 and left >= 0 else 0.0
         found.append(
             MapChange(
                 landmark_ids=_members_at(after, site if site >= 0 else left),
@@ -240,16 +238,22 @@ def _exchanged(change: MapChange, other: MapChange) -> MapChange:
     )
 
 
-def _turn(living: LivingMap, old: int, new: int) -> float:
-    """Rotation of a body from one site to another, by the landmarks that have places at both; 0 for fewer than two."""
+def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
+    """Shift and rotation of a body from one site to another, by the landmarks that have places at both.
+
+    Of none the shift is that of the middles; the rotation of fewer than two is 0.
+    """
     a = np.flatnonzero(living.places.site_id == living.sites.site_id[old])
     b = np.flatnonzero(living.places.site_id == living.sites.site_id[new])
     _, i, j = np.intersect1d(living.places.landmark_id[a], living.places.landmark_id[b], return_indices=True)
+    if len(i):
+        a, b = a[i], b[j]
+    was, now = living.places.position_m[a], living.places.position_m[b]
+    shift = now.mean(axis=0) - was.mean(axis=0)
     if len(i) < 2:
-        return 0.0
-    was = living.places.position_m[a[i]] - living.places.position_m[a[i]].mean(axis=0)
-    now = living.places.position_m[b[j]] - living.places.position_m[b[j]].mean(axis=0)
-    return float(np.arctan2((was[:, 0] * now[:, 1] - was[:, 1] * now[:, 0]).sum(), (was * now).sum()))
+        return shift, 0.0
+    was, now = was - was.mean(axis=0), now - now.mean(axis=0)
+    return shift, float(np.arctan2((was[:, 0] * now[:, 1] - was[:, 1] * now[:, 0]).sum(), (was * now).sum()))
 
 
 def _when(living: LivingMap, clique: int, site: int) -> tuple[float, float]:
