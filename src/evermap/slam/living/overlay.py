@@ -128,9 +128,8 @@ def _joint(options: _Options) -> IntArray:
     for k, options.drift_m in enumerate(DRIFTS_M):
         chosen = options.climb(best)
         score = options.log_probability(chosen) + k * LOG_P_COARSER
-        if score <= highest:
-            break
-        best, highest, drift_m = chosen, score, options.drift_m
+        if score > highest:  # the next may still be better: with more drift other bodies stay
+            best, highest, drift_m = chosen, score, options.drift_m
     options.drift_m = drift_m
     return best
 
