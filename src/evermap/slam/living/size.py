@@ -67,6 +67,8 @@ def log_ratio(
         map_m: (K, 2) the same in the map.
         map_m2: (2 K, 2 K) covariance of these.
     """
+    if len(session_m) < 2:  # a point has no size
+        return 0.0, np.inf
     size = float(
         np.sqrt(((map_m - map_m.mean(0)) ** 2).sum() / max(((session_m - session_m.mean(0)) ** 2).sum(), 1e-12))
     )
