@@ -231,6 +231,7 @@ def test_where_a_landmark_has_several_places_the_right_one_is_chosen():
     best[places.most_probable()] = True
     for one, seen in zip(located, true.sightings, strict=True):
         assert best[one.expected[one.missed]].all()
+        assert (places.p_here[one.expected[one.missed]] >= 0.5).all()
         assert not np.isin(places.landmark_id[one.expected[one.missed]], seen.landmark_id).any()
 
 

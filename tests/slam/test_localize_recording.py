@@ -162,6 +162,8 @@ def test_a_landmark_of_several_places_has_several_rows():
     )  # fmt: skip
     result = located(recording, replace(both, p_exists=np.where(both.p_exists == 1.0, 0.7, 0.3)))
     alone = located(recording, landmarks)
+    gone = located(recording, replace(both, p_exists=np.where(both.p_exists == 1.0, 1.0, 0.0)))
+    assert (gone.online.pose_world_robot == alone.online.pose_world_robot).all()
     assert result.landmarks.landmark_id.tolist() == landmarks.landmark_id.tolist()
     assert result.landmarks.position_m == pytest.approx(landmarks.position_m)
     assert rmse(error(recording, result.online)) < 1.2 * rmse(error(recording, alone.online))

@@ -36,6 +36,8 @@ NEIGHBOURS = 8
 EXPECTING_SIGMA_M = 0.5
 """No landmark is expected while the robot's position is less certain than this, along either axis."""
 HARDLY_EXPECTED = 0.01
+BELIEVED = 0.5
+"""Probability of being there from which not to be seen is a miss."""
 DOUBT = 1.0
 MOST_DOUBT = 6.0
 """Nats by which a place is believed less for every frame in which its landmark was found elsewhere (and more again for
@@ -68,7 +70,7 @@ class Located:
         p_inlier: (M,) probability that the detection is of that place; below 1/2 it was gated. nan likewise.
         expected: (E,) rows of places that are in view.
         p_detect: (E,) probability of a detection, did the landmark stand there.
-        missed: (E,) True where the most probable place of a landmark is well in view and the landmark was not detected.
+        missed: (E,) True where a landmark is believed to stand, well in view, and was not detected anywhere.
         lost: the pose is kept by odometry alone, or not known at all, while it is searched for.
     """
 
@@ -88,7 +90,7 @@ class Localizer:
 
     Args:
         places: the map.
-        sensor: limits, mounting and detection probability.
+        sensor: limits, mounting and detection probability. Where it has no largest range, all of the map is expected.
         prior: of the calibration states.
         noise: standard deviations of detections and odometry; they are not estimated.
         start: (3,) pose and (3, 3) covariance at the first frame, where these are known.
@@ -109,8 +111,9 @@ class Localizer:
         self._log_p = np.log(np.maximum(places.p_here, LEAST_BELIEF))
         self._believed = self._log_p.copy()
         self._near = Neighbourhood(places.position_m, sensor.range_max_m + 3.0 * RANGE_MARGIN_M)
-        self._most_probable = np.zeros(len(places), dtype=np.bool_)
-        self._most_probable[places.most_probable()] = True
+        self._believed_there = np.zeros(len(places), dtype=np.bool_)
+        self._believed_there[places.most_probable()] = True
+        self._believed_there &= places.p_here >= BELIEVED
         self._stamp_s: float | None = None
         self._pose = np.full(3, np.nan)
         self._states = prior.mean.copy()
@@ -297,7 +300,7 @@ class Localizer:
         rows = self._near(se2.compose(self._pose, self._mount)[:2])
         p = detection_probability(self._pose[None], self.places.position_m[rows], self._sensor)[0]
         rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
-        well = self._most_probable[rows] & (p >= WORTH_A_MISS * self._sensor.p_detect)
+        well = self._believed_there[rows] & (p >= WORTH_A_MISS * self._sensor.p_detect)
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
 
 

@@ -49,7 +49,7 @@ def localize(
     Args:
         recording: what a reader returned; its truth is not looked at.
         landmarks: the map. Here, other than elsewhere, a landmark may have several rows: one a site where it may stand,
-            with `p_exists` the probability of each.
+            with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
         noise: standard deviations; they are not estimated.
         joint_m2: (2 L, 2 L) covariance of all rows together, x and y by turns; None takes `covariance_m2`, and the rows
@@ -70,6 +70,11 @@ def localize(
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
+    there = np.flatnonzero(landmarks.p_exists > 0.0)
+    if joint_m2 is not None:
+        corner = (2 * there[:, None] + np.arange(2)).ravel()
+        joint_m2 = joint_m2[np.ix_(corner, corner)]
+    landmarks = _rows(landmarks, there)
     covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
     places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists)
     _compile()
@@ -215,16 +220,19 @@ def _with_counts(
     landmarks: Landmarks, recording: Recording, run: _Run, places: KnownPlaces, misses: Misses
 ) -> Landmarks:
     """One row a landmark, with the hits and misses of this recording."""
-    rows = np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()]
-    columns: dict[str, Any] = {item.name: getattr(landmarks, item.name) for item in fields(landmarks)}
-    columns = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
-    best = replace(landmarks, **columns)
+    best = _rows(landmarks, np.argsort(landmarks.landmark_id, kind="stable")[places.most_probable()])
     names, hit = best.landmark_id, run.detection[run.all("p_inlier") > 0.5]
     n_hits, n_misses = (
         np.bincount(np.searchsorted(names, seen), minlength=len(names)).astype(np.int64)
         for seen in (recording.detections.landmark_id[hit], misses.landmark_id)
     )
     return replace(best, n_hits=n_hits, n_misses=n_misses, frame="prior_map")
+
+
+def _rows(landmarks: Landmarks, rows: IntArray) -> Landmarks:
+    columns: dict[str, Any] = {item.name: getattr(landmarks, item.name) for item in fields(landmarks)}
+    columns = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    return replace(landmarks, **columns)
 
 
 def _warnings(recording: Recording, run: _Run, places: KnownPlaces) -> list[str]:
