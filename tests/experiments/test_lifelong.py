@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap import se2
+from evermap.config import LivingConfig
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.experiments import lifelong, lifelong_runs
 from evermap.experiments.lifelong_figures import draw_errors, draw_flat
@@ -187,7 +188,7 @@ def test_scores_of_a_session_by_hand() -> None:
     )
     path = np.column_stack([0.1 * np.arange(20.0) + 0.3, np.full(20, 0.4), np.zeros(20)])
     changes = (found(ChangeKind.MOVED, 2), found(ChangeKind.MOVED, 3), found(ChangeKind.APPEARED, 4))
-    row = session_scores(made_session(living, path, changes), world, 1, np.zeros(3), 0.5)
+    row = session_scores(made_session(living, path, changes), world, 1, np.zeros(3), LivingConfig(), 0.5)
     assert row["pose_rmse_m"] == pytest.approx(0.5)  # 0.3 and 0.4 off, all the way
     assert row["pose_own_rmse_m"] == pytest.approx(0.0, abs=1e-6)
     # believed and there: 1, 2 and 4, of which 4 is two metres off
@@ -196,6 +197,14 @@ def test_scores_of_a_session_by_hand() -> None:
     assert row["existence"] == {
         "n_claims": 3, "n_right": 2, "n_there": 3, "n_statements": 3, "squared_error": pytest.approx(squared),
     }  # fmt: skip
+    assert row["forecast"]["n_statements"] == 3
+    still = replace(living, sites=replace(living.sites, p_here=np.array([1.0, 0.3, 0.6, 0.2, 0.9])))
+    config = LivingConfig(
+        existence=False
+    )  # nothing changes until the next session, in which 1 stands there, 2 is gone, and 3 is elsewhere
+    later = session_scores(made_session(still, path), world, 1, np.zeros(3), config, 0.5)["forecast"]
+    assert later["squared_error"] == pytest.approx(0.0 + 0.6**2 + 0.2**2)
+    assert session_scores(made_session(living, path), world, 2, np.zeros(3), config, 0.5)["forecast"] is None
     assert row["changes"]["all"] == [3, 3, 2]
     assert row["changes"]["moved"] == [2, 1, 1]
     assert row["changes"]["vanished"] == [0, 1, 0]
@@ -214,10 +223,10 @@ def test_the_frame_is_that_of_the_first_map_and_creeping_away_is_wrong() -> None
     path = world.recordings[1].truth
     assert path is not None
     creeping = se2.compose(inverse, path.pose_world_robot) + [0.2, 0.0, 0.0]
-    row = session_scores(made_session(living, creeping), world, 1, pose, 0.5)
+    row = session_scores(made_session(living, creeping), world, 1, pose, LivingConfig(), 0.5)
     assert row["pose_rmse_m"] == pytest.approx(0.2)
     assert row["pose_own_rmse_m"] == pytest.approx(0.0, abs=1e-6)
-    lost = session_scores(made_session(living, creeping, placed=False), world, 1, pose, 0.5)
+    lost = session_scores(made_session(living, creeping, placed=False), world, 1, pose, LivingConfig(), 0.5)
     assert not lost["placed"]
     assert lost["pose_rmse_m"] is None
     nothing = Landmarks.at([], np.zeros((0, 2)))
@@ -230,7 +239,7 @@ def test_the_first_session_has_no_changes_to_find() -> None:
     path = world.recordings[0].truth
     assert path is not None
     session = made_session(living, path.pose_world_robot, (found(ChangeKind.APPEARED, 1),))
-    assert session_scores(session, world, 0, np.zeros(3), 0.5)["changes"] is None
+    assert session_scores(session, world, 0, np.zeros(3), LivingConfig(), 0.5)["changes"] is None
     assert changes_found(session, world, 2)["all"] == [1, 2, 0]
     rows = [{"changes": None}, {"changes": changes_found(session, world, 2)}]
     assert change_counts(rows).recall == 0.0
@@ -333,6 +342,7 @@ def fake_rows(part: str, sessions: int, contenders: Any, pose_m: dict[str, float
             "pose_own_rmse_m": 0.05,
             "landmark_rmse_m": 0.04,
             "existence": {"n_claims": 10, "n_right": 9, "n_there": 12, "n_statements": 10, "squared_error": 1.0},
+            "forecast": {"n_claims": 0, "n_right": 0, "n_there": 0, "n_statements": 10, "squared_error": 2.0},
             "changes": counts if session else None,
             "landmarks": 15,
             "places": 20,

@@ -33,8 +33,8 @@ PARTS = ("five", "fifty", "ablation-recorded", SIMULATED_PART)
 SCORING = (
     "poses at 2 Hz and landmarks in the frame of the map, tied to the truth once, by the landmarks of the first "
     "session's map; landmarks that are there and that the map believes in (p >= 0.5), however far off; a claim is "
-    "right within 0.25 m; Brier score of 'the landmark stands where it stood last' for all that were ever detected; "
-    "changes by landmark and kind; nothing is left out"
+    "right within 0.25 m; Brier scores of 'the landmark stands where it stood last' for all that were ever detected, "
+    "now and, as a forecast, in the next session; changes by landmark and kind; nothing is left out"
 )
 
 

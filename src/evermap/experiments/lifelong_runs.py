@@ -119,7 +119,8 @@ def _session(life: _Life, halves: _Halves, world: World, number: int) -> Row:
     life.living = session.living
     if life.pose_truth_map is None:
         life.pose_truth_map = alignment_of(life.living, world)
-    return {**session_scores(session, world, number, life.pose_truth_map, P_CLAIMED), "cpu_s": cpu_s}
+    scores = session_scores(session, world, number, life.pose_truth_map, life.config.living, P_CLAIMED)
+    return {**scores, "cpu_s": cpu_s}
 
 
 class _Halves:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap import se2
+from evermap.demo.study import snapshot_of
 from evermap.experiments.lifelong_world import World
 from evermap.metrics.alignment import align_points
 from evermap.metrics.changes import ChangeCounts, count_changes
@@ -22,6 +23,7 @@ from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.types import ChangeKind, FloatArray, Landmarks
 
 if TYPE_CHECKING:
+    from evermap.config import LivingConfig
     from evermap.maps.living import LivingMap
     from evermap.pipeline import Session
 
@@ -33,8 +35,8 @@ NOTHING: Row = {
     "placed": False,
     **dict.fromkeys(
         (
-            "pose_rmse_m", "pose_own_rmse_m", "landmark_rmse_m", "existence", "changes", "landmarks", "places", "sites",
-            "cpu_s", "step_p50_ms", "step_p99_ms",
+            "pose_rmse_m", "pose_own_rmse_m", "landmark_rmse_m", "existence", "forecast", "changes", "landmarks",
+            "places", "sites", "cpu_s", "step_p50_ms", "step_p99_ms",
         )
     ),
 }  # fmt: skip
@@ -51,7 +53,9 @@ def alignment_of(living: LivingMap, world: World) -> FloatArray:
     return align_points(mine, true)
 
 
-def session_scores(session: Session, world: World, number: int, pose_truth_map: FloatArray, p_least: float) -> Row:
+def session_scores(
+    session: Session, world: World, number: int, pose_truth_map: FloatArray, config: LivingConfig, p_least: float
+) -> Row:
     """Plain JSON values.
 
     Args:
@@ -59,6 +63,7 @@ def session_scores(session: Session, world: World, number: int, pose_truth_map: 
         world: what was so.
         number: of the session, from 0.
         pose_truth_map: (3,) of `alignment_of`.
+        config: with which the map lives.
         p_least: a landmark is claimed from this probability on.
     """
     living, slam = session.living, session.slam
@@ -69,7 +74,7 @@ def session_scores(session: Session, world: World, number: int, pose_truth_map: 
         "pose_rmse_m": _fixed(session, world, number, pose_truth_map) if placed else None,
         "pose_own_rmse_m": _own(session, world, number),
         "landmark_rmse_m": landmark_rmse_m(living.landmarks(p_least=p_least), world.landmarks(number), pose_truth_map),
-        "existence": _existence(living, world, number, pose_truth_map, p_least),
+        **_existence(living, world, number, pose_truth_map, config, p_least),
         "changes": changes_found(session, world, number) if number else None,
         "landmarks": len(living.members),
         "places": len(living.places),
@@ -126,13 +131,16 @@ def _own(session: Session, world: World, number: int) -> float | None:
 
 
 def _existence(
-    living: LivingMap, world: World, number: int, pose_truth_map: FloatArray, p_least: float
-) -> dict[str, float]:
-    places, sites = living.places, living.sites
-    truth = world.landmarks(number)
-    p_here = sites.p_here[np.searchsorted(sites.site_id, places.site_id)]
-    claims = existence_score(living.landmarks(), truth, pose_truth_map=pose_truth_map, p_least=p_least)
-    statements = statement_score(
-        world.asked(number), truth, places.landmark_id, places.position_m, p_here, pose_truth_map=pose_truth_map
-    )
-    return asdict(claims + statements)
+    living: LivingMap, world: World, number: int, pose_truth_map: FloatArray, config: LivingConfig, p_least: float
+) -> Row:
+    """What the map says of now, and of the beginning of the next session; no forecast after the last."""
+    is_last = number + 1 == len(world)
+    until_s = np.nan if is_last else float(world.recordings[number + 1].frames.stamp_s[0])
+    said = snapshot_of(living, config, until_s)
+    asked, place = world.asked(number), (said.place_id, said.place_m)
+    claims = existence_score(said.landmarks, world.landmarks(number), pose_truth_map=pose_truth_map, p_least=p_least)
+    now = statement_score(asked, world.landmarks(number), *place, said.p_now, pose_truth_map=pose_truth_map)
+    if is_last:
+        return {"existence": asdict(claims + now), "forecast": None}
+    then = statement_score(asked, world.landmarks(number + 1), *place, said.p_next, pose_truth_map=pose_truth_map)
+    return {"existence": asdict(claims + now), "forecast": asdict(then)}

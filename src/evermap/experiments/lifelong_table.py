@@ -52,7 +52,16 @@ def rms(rows: Iterable[Row], key: str) -> float | None:
 
 def existence(rows: Iterable[Row]) -> Existence:
     """Counts of many sessions together."""
-    return sum((Existence(**row["existence"]) for row in rows if row["existence"] is not None), start=Existence())
+    return _sum(rows, "existence")
+
+
+def forecast(rows: Iterable[Row]) -> Existence:
+    """Statements about the next session."""
+    return _sum(rows, "forecast")
+
+
+def _sum(rows: Iterable[Row], key: str) -> Existence:
+    return sum((Existence(**row[key]) for row in rows if row[key] is not None), start=Existence())
 
 
 MEASURES: tuple[tuple[str, str, Callable[[list[Row]], float | None]], ...] = (
@@ -62,6 +71,7 @@ MEASURES: tuple[tuple[str, str, Callable[[list[Row]], float | None]], ...] = (
     ("precision", "{:.3f}", lambda rows: existence(rows).precision),
     ("recall", "{:.3f}", lambda rows: existence(rows).recall),
     ("Brier", "{:.4f}", lambda rows: existence(rows).brier),
+    ("forecast, Brier", "{:.4f}", lambda rows: forecast(rows).brier),
     ("changes: precision", "{:.2f}", lambda rows: change_counts(rows).precision),
     ("changes: recall", "{:.2f}", lambda rows: change_counts(rows).recall),
 )
