@@ -1,0 +1,234 @@
+"""`evermap slam --map` from the command line: sessions into a file, localisation in it, and what is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from evermap import se2
+from evermap.cli.main import app
+from evermap.io import read_tum, write_native
+from evermap.maps.store import open_store
+from evermap.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
+from evermap.slam.align import rigid
+
+# pictures have tests of their own, and take most of the time
+QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
+KNOWN_METRE = ["--set", "slam.calibration.fix.range_slope=0.0"]
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def slam(recording: Path, map_file: Path, out: Path, *more: str | Path) -> Result:
+    return run("slam", recording, "--map", map_file, "--out", out, "--json", *more, *KNOWN_METRE, *QUICK)
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def one_line(result: Result) -> str:
+    """What a user reads who did something wrong."""
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.startswith("evermap: error: ")
+    assert result.stderr.count("\n") == 1
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def building() -> BuildingSimulation:
+    return simulate_building(
+        BuildingConfig(
+            days=3,
+            patrol_s=60.0,
+            length_m=14.0,
+            depth_m=13.0,
+            rooms_per_side=1,
+            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0),
+        ),
+        seed=4,
+    )
+
+
+@pytest.fixture(scope="module")
+def recordings(building: BuildingSimulation, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("recordings")
+    for day, recording in enumerate(building.sessions):
+        write_native(recording, folder / f"day{day}")
+    return [folder / f"day{day}" for day in range(len(building.sessions))]
+
+
+@pytest.fixture(scope="module")
+def kept(recordings: list[Path], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[dict[str, Any]]]:
+    """A map of the first two days, and the summaries."""
+    folder = tmp_path_factory.mktemp("kept")
+    printed = []
+    for day in (0, 1):
+        result = slam(recordings[day], folder / "building.evermap", folder / f"day{day}")
+        assert result.exit_code == 0, result.stderr
+        printed.append(json.loads(result.stdout))
+    return folder / "building.evermap", printed
+
+
+@pytest.fixture
+def copy(kept: tuple[Path, list[dict[str, Any]]], tmp_path: Path) -> Path:
+    path = tmp_path / "building.evermap"
+    path.write_bytes(kept[0].read_bytes())
+    return path
+
+
+def test_a_session_is_one_more_revision_and_has_its_folder(
+    kept: tuple[Path, list[dict[str, Any]]], building: BuildingSimulation
+) -> None:
+    path, printed = kept
+    for day in (0, 1):
+        out = path.parent / f"day{day}"
+        assert printed[day] == json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert printed[0]["frames"]["map"].startswith("first_pose")
+    assert printed[1]["frames"]["map"].startswith("prior_map")
+    with open_store(path) as store:
+        living = store.load(store.head())
+    assert living.stamp_s == pytest.approx(building.sessions[1].frames.stamp_s[-1], abs=1.0)
+    seen = np.unique(np.concatenate([one.detections.landmark_id for one in building.sessions[:2]]))
+    assert set(living.members.landmark_id.tolist()) <= set(seen.tolist())
+    assert len(living.members) > 0.8 * len(seen)
+
+
+def test_the_history_of_the_map_and_the_folders_say_the_same(kept: tuple[Path, list[dict[str, Any]]]) -> None:
+    path, printed = kept
+    result = run("map", "log", path, "--json")
+    assert result.exit_code == 0, result.stderr
+    revisions = json.loads(result.stdout)["revisions"]
+    assert len(revisions) == 2
+    for revision, summary, folder in zip(revisions, printed, ("day0", "day1"), strict=True):
+        kinds = Counter(change["kind"] for change in summary["changes"])
+        assert revision["changes"] == dict(kinds)
+        lines = (path.parent / folder / "changes.jsonl").read_text(encoding="utf-8").splitlines()
+        assert Counter(json.loads(line)["kind"] for line in lines) == kinds
+        assert revision["source"] == summary["source"]
+        assert (revision["seed"], revision["kind"]) == (0, "session")
+        assert tomllib.loads(revision["config"])["slam"]["calibration"]["fix"] == {"range_slope": 0.0}
+    assert not revisions[0]["changes"]
+    assert revisions[1]["changes"]["moved"] > 1
+
+
+def test_localising_finds_the_robot_and_leaves_the_map(
+    copy: Path, recordings: list[Path], building: BuildingSimulation, tmp_path: Path
+) -> None:
+    before = digest(copy)
+    result = slam(recordings[2], copy, tmp_path / "run", "--localize")
+    assert result.exit_code == 0, result.stderr
+    assert digest(copy) == before
+    path = read_tum(tmp_path / "run" / "trajectory.tum")
+    # the truth in the map's frame, by the landmarks that stand where they stood on the first day
+    with open_store(copy) as store:
+        landmarks = store.load(store.head()).landmarks(p_least=0.9)
+    truth = building.sessions[1].true_landmarks
+    assert truth is not None
+    names, here, there = np.intersect1d(landmarks.landmark_id, truth.landmark_id, return_indices=True)
+    assert len(names) > 10
+    motion = rigid(truth.position_m[there], landmarks.position_m[here])
+    driven = building.sessions[2].truth
+    assert driven is not None
+    late = path.stamp_s > path.stamp_s[0] + 10.0
+    at = np.column_stack([np.interp(path.stamp_s[late], driven.stamp_s, driven.pose_world_robot[:, k]) for k in (0, 1)])
+    gap = np.linalg.norm(se2.transform(motion, at) - path.pose_world_robot[late, :2], axis=1)
+    assert np.sqrt(np.mean(gap**2)) < 0.3
+
+
+def test_the_next_session_goes_into_the_same_map(copy: Path, recordings: list[Path], tmp_path: Path) -> None:
+    with open_store(copy) as store:
+        before = store.load(store.head())
+    result = slam(recordings[2], copy, tmp_path / "run")
+    assert result.exit_code == 0, result.stderr
+    with open_store(copy) as store:
+        after = store.load(store.head())
+    assert after.stamp_s > before.stamp_s
+    assert (tmp_path / "run" / "summary.json").is_file()
+    again = np.intersect1d(before.members.landmark_id, after.members.landmark_id)
+    assert len(again) > 0.8 * len(before.members)
+
+
+@pytest.mark.parametrize(
+    ("more", "problem"),
+    [
+        (["--prior-map", "truth"], "--prior-map"),
+        (["--method", "viterbi"], "--method"),
+        (["--realtime"], "--realtime"),
+        (["--unknown-ids"], "needs identities"),
+        (["--set", "living.search=guess"], "living.search"),
+    ],
+)
+def test_options_that_contradict_a_map(
+    more: list[str], problem: str, copy: Path, recordings: list[Path], tmp_path: Path
+) -> None:
+    before = digest(copy)
+    assert problem in one_line(slam(recordings[2], copy, tmp_path / "run", *more))
+    assert digest(copy) == before
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_earlier_session_is_refused(copy: Path, recordings: list[Path], tmp_path: Path) -> None:
+    before = digest(copy)
+    for more in ((), ("--localize",)):
+        problem = one_line(slam(recordings[0], copy, tmp_path / "run", *more))
+        assert "has seen" in problem
+        assert "in their order" in problem
+        assert digest(copy) == before
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSimulation, tmp_path: Path) -> None:
+    """Its folder is written, for it was driven and solved; the map stays as it was."""
+    other = building.sessions[2]
+    names = np.where(other.detections.landmark_id >= 0, other.detections.landmark_id + 1000, -1)
+    detections = replace(other.detections, landmark_id=names)
+    write_native(replace(other, detections=detections, true_landmarks=None), tmp_path / "elsewhere")
+    before = digest(copy)
+    result = slam(tmp_path / "elsewhere", copy, tmp_path / "run")
+    assert result.exit_code == 2
+    assert "was not found in this map" in result.stderr.splitlines()[-1]
+    assert digest(copy) == before
+    assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))["frames"]["map"].startswith(
+        "first_pose"
+    )
+
+
+def test_localising_needs_a_map_with_something_in_it(recordings: list[Path], tmp_path: Path) -> None:
+    assert "--map FILE" in one_line(run("slam", recordings[0], "--out", tmp_path / "run", "--localize"))
+    missing = tmp_path / "none.evermap"
+    assert str(missing) in one_line(slam(recordings[0], missing, tmp_path / "run", "--localize"))
+    assert not missing.exists()
+    empty = tmp_path / "empty.evermap"
+    open_store(empty, create=True).close()
+    before = digest(empty)
+    assert "empty" in one_line(slam(recordings[0], empty, tmp_path / "run", "--localize"))
+    assert digest(empty) == before
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("content", [b"landmark_id,x_m,y_m\n1,0.0,0.0\n", b"SQLite format 3\0" + bytes(4000)])
+def test_a_file_that_is_no_map_is_left_alone(content: bytes, recordings: list[Path], tmp_path: Path) -> None:
+    path = tmp_path / "something.csv"
+    path.write_bytes(content)
+    for more in ((), ("--localize",)):
+        assert str(path) in one_line(slam(recordings[0], path, tmp_path / "run", *more))
+        assert path.read_bytes() == content
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_recording_that_cannot_be_read_makes_no_map(tmp_path: Path) -> None:
+    one_line(slam(tmp_path / "nothing", tmp_path / "new.evermap", tmp_path / "run"))
+    assert not (tmp_path / "new.evermap").exists()
