@@ -39,7 +39,7 @@ HARDLY_EXPECTED = 0.01
 BELIEVED = 0.5
 """Probability of being there from which not to be seen is a miss."""
 DOUBT = 1.0
-MOST_DOUBT = 6.0
+MOST_DOUBT = 9.0
 """Nats by which a place is believed less for every frame in which its landmark was found elsewhere (and more again for
 every other one), and in all: one that has moved must not mislead where there are few others to contradict it."""
 REMEMBERED = 8
@@ -166,8 +166,7 @@ class Localizer:
         place = np.full(len(usable), UNKNOWN, dtype=np.int64)
         nis, p_inlier = np.full((2, len(usable)), np.nan)
         if self._is_placed and len(used):
-            place[used], nis[used], p_inlier[used] = self._update(first[used], last[used], seen, used)
-            self._judge(stamp_s, seen.landmark_id[used], p_inlier[used] > 0.5)
+            place[used], nis[used], p_inlier[used] = self._update(stamp_s, first[used], last[used], seen, used)
         return Located(
             self._pose.copy(),
             self._covariance[:3, :3].copy(),
@@ -221,7 +220,7 @@ class Localizer:
         self._agreed.clear()
 
     def _update(
-        self, first: IntArray, last: IntArray, seen: Sightings, used: IntArray
+        self, stamp_s: float, first: IntArray, last: IntArray, seen: Sightings, used: IntArray
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Place, innovation and weight of the detections `used`."""
         places, reading = self.places, np.ascontiguousarray(seen.reading[used])
@@ -238,8 +237,10 @@ class Localizer:
             self._pose, self._states, self._covariance, places.position_m[self._considered], self._slot[row], reading,
             sigma, log_odds, self._mount, self._prior.free, nis, weight,
         )  # fmt: skip
-        more = self._believed[row] + np.where(weight > 0.5, DOUBT, -DOUBT)
-        self._believed[row] = np.clip(more, self._log_p[row] - MOST_DOUBT, self._log_p[row])
+        doubt = self._log_p[row] - self._believed[row]
+        agrees = weight * (1.0 + np.exp(doubt)) > 1.0  # would be more likely there than not, if it were not doubted
+        self._believed[row] = self._log_p[row] - np.clip(doubt + np.where(agrees, -DOUBT, DOUBT), 0.0, MOST_DOUBT)
+        self._judge(stamp_s, seen.landmark_id[used], agrees)
         return row, nis, weight
 
     def _consider(self, rows: IntArray) -> None:
