@@ -171,7 +171,7 @@ def test_a_pause_is_no_step_of_a_clock() -> None:
     for asleep in (
         reordered(patrol(), "frames", np.flatnonzero((frames < start + 20.0) | (frames > start + 40.0))),
         reordered(patrol(), "odometry", np.flatnonzero((odometry < start + 20.0) | (odometry > start + 40.0))),
-        reordered(patrol(), "odometry", np.flatnonzero(odometry < start + 40.0)),
+        reordered(patrol(), "odometry", np.flatnonzero(odometry < start + 55.0)),
     ):
         assert clean(asleep) is asleep
 
@@ -264,3 +264,13 @@ def test_garbled_stamps_lose_their_rows_only() -> None:
         kept, all_s = getattr(cleaned, part).stamp_s, getattr(patrol(), part).stamp_s
         assert np.isin(kept, all_s).all()
         assert 0.9 * len(all_s) < len(kept) < len(all_s)
+
+
+def test_frames_far_from_any_odometry_are_left_out() -> None:
+    start, stamp_s = patrol().odometry.stamp_s[0], patrol().odometry.stamp_s
+    late = reordered(patrol(), "odometry", np.flatnonzero(stamp_s > start + 25.0))
+    cleaned = clean(late)
+    check_valid(cleaned)
+    kept = patrol().frames.stamp_s
+    np.testing.assert_array_equal(cleaned.frames.stamp_s, kept[kept >= late.odometry.stamp_s[0] - 10.0])
+    assert set(cleaned.detections.range_m) < set(patrol().detections.range_m)

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evermap.slam.clocks import restored, running_median, set_forward
+from evermap.slam.clocks import STRAY_S, restored, running_median, set_forward
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording
 
 FASTEST = 100.0
@@ -40,8 +40,9 @@ def clean(recording: Recording) -> Recording:
 
         * stamps that are none or stand alone: their rows are left out;
         * late rows: sorted in; rows with equal stamps: the last odometry is kept, frames are united;
-        * clocks that were set back, by more than 1 s, and clocks of one sensor set forward, by more than 2 s: taken back,
+        * clocks that were set back by over 1 s, and clocks of one sensor set forward by over 2 s: taken back,
           to within a few periods of the sensor;
+        * frames more than 10 s before or after the odometry: left out;
         * odometry that is no number, beyond `FASTEST`, or a spike: left out, the row before holds on;
         * readings that are no number, not positive, or beyond the sensor's reach: left out;
         * readings repeated in the same frame, or in the next one though the robot moved: left out;
@@ -52,6 +53,7 @@ def clean(recording: Recording) -> Recording:
     detections = _readings(recording, remarks)
     frames, detections = _in_time(recording.frames, detections, remarks)
     frames, odometry = _one_clock(frames, odometry, remarks)
+    frames, detections = _while_driving(frames, detections, odometry, remarks)
     frames, detections = _fresh(frames, detections, odometry, remarks)
     if not remarks:
         return recording
@@ -153,6 +155,26 @@ def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks
     return np.append(stamp_s[:row], stamp_s[row:] - by_s)
 
 
+def _while_driving(
+    frames: Frames, detections: Detections, odometry: Odometry, remarks: list[str]
+) -> tuple[Frames, Detections]:
+    """Without frames far before the first or after the last odometry: nobody knows what the robot did then."""
+    if len(odometry) == 0:
+        return frames, detections
+    near = (frames.stamp_s >= odometry.stamp_s[0] - STRAY_S) & (frames.stamp_s <= odometry.stamp_s[-1] + STRAY_S)
+    if near.all():
+        return frames, detections
+    _remark(remarks, f"frames more than {STRAY_S:g} s before or after the odometry left out", int(np.sum(~near)))
+    return _some_frames(frames, detections, near)
+
+
+def _some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tuple[Frames, Detections]:
+    """The `kept` (F,) frames with their detections."""
+    seen = _rows(detections, kept[detections.frame])
+    row: IntArray = (np.cumsum(kept) - 1).astype(np.int64)
+    return replace(frames, stamp_s=frames.stamp_s[kept]), replace(seen, frame=row[seen.frame])
+
+
 def _fresh(frames: Frames, detections: Detections, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Detections]:
     """Without frames that repeat the one before, number by number, though the robot moved: the sensor hangs.
 
@@ -173,9 +195,7 @@ def _fresh(frames: Frames, detections: Detections, odometry: Odometry, remarks: 
     if not repeated.any():
         return frames, detections
     _remark(remarks, "frames left out that repeat the one before, though the robot moved", int(repeated.sum()))
-    kept = _rows(detections, ~repeated[detections.frame])
-    row: IntArray = (np.cumsum(~repeated) - 1).astype(np.int64)
-    return replace(frames, stamp_s=frames.stamp_s[~repeated]), replace(kept, frame=row[kept.frame])
+    return _some_frames(frames, detections, ~repeated)
 
 
 def _moved_since(row: IntArray, frames: Frames, odometry: Odometry) -> BoolArray:
