@@ -177,6 +177,8 @@ def test_what_cannot_be_localised_is_one_line():
         located(recording, elsewhere)
     with pytest.raises(DataError, match="cannot localise in the map"):
         located(with_ids(recording, lambda ids: ids + 100_000), landmarks)
+    with pytest.raises(DataError, match="cannot localise in the map"):
+        located(recording, replace(landmarks, p_exists=np.zeros(len(landmarks))))
     with pytest.raises(DataError, match="no odometry"):
         located(with_odometry(recording, np.zeros(len(recording.odometry), dtype=bool)), landmarks)
 
