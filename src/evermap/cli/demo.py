@@ -62,7 +62,7 @@ def demo(
 @contextmanager
 def _patience(bar: Progress | None) -> Iterator[Progress]:
     """Say why it takes so long, if it does: a fresh installation compiles before it runs."""
-    note = "the first run on a machine compiles its kernels; that takes about half a minute, once"
+    note = "the first run on a machine compiles its kernels; that takes about a minute, once"
     timer = threading.Timer(PATIENCE_S, say, [note])
     timer.daemon = True
 
