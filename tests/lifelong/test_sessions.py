@@ -251,6 +251,20 @@ def test_a_session_elsewhere_leaves_the_map_as_it_was(still: tuple[BuildingSimul
     assert session.slam.landmarks.frame == "first_pose"
 
 
+@pytest.mark.parametrize("seed", [5, 6, 7, 8])
+def test_another_building_with_the_same_identities_is_not_this_one(
+    seed: int, still: tuple[BuildingSimulation, list[Session]]
+) -> None:
+    """By chance some of its landmarks stand to each other as here; that all others moved is less probable."""
+    _, sessions = still
+    other = building(seed, days=2, change_rate=0.0).sessions[1]
+    common = np.isin(np.unique(other.detections.landmark_id), sessions[0].living.members.landmark_id)
+    assert common.sum() > 20
+    session = run_session(other, sessions[0].living, settings())
+    assert not session.found
+    assert_same_bytes(session.living, sessions[0].living)
+
+
 def _on_its_own_clock(recording: Recording) -> Recording:
     odometry = replace(recording.odometry, clock=Clock.RECORDING)
     frames = replace(recording.frames, clock=Clock.RECORDING)

@@ -157,6 +157,12 @@ class Densely:
                 total += float(known.log_p_elsewhere[clique]) + max(self._moved(s) for s in self.sites[clique])
         return total
 
+    def is_this_place(self, chosen: IntArray, drift_m: float) -> bool:
+        """Against another place, one session in a thousand, where what stands stands anywhere in the room."""
+        moved = sum(max(self._moved(s) for s in self.sites[c]) for c, site in enumerate(chosen) if site < 0)
+        standing = int(np.isin(self.known.site, chosen[chosen >= 0]).sum())
+        return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
+
     def best(self) -> tuple[IntArray, float, float]:
         """The most probable assignment, the drift with it, and by how much the next one is less probable."""
         scored = sorted(

@@ -36,6 +36,8 @@ DRIFTS_M = (0.01, 0.02, 0.04, 0.08)
 """Standard deviations by which landmarks may not quite be where they were, though nobody moved them: another robot with
 errors of its own, warmth, a sensor that sees another corner. Each is half as probable as the one before, a session."""
 LOG_P_COARSER = math.log(0.5)
+LOG_P_ANOTHER_PLACE = math.log(1e-3)
+"""Log probability that a session is of another place, where the map's identities stand anywhere."""
 MOST_FLIPS = 400
 
 
@@ -101,7 +103,7 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
             itself, at the motion that most landmarks agree on; 'none' leaves each at its most probable site.
 
     Returns:
-        None where no two landmarks stand to each other as in the map.
+        None where no two landmarks stand to each other as in the map, or where another place explains all better.
     """
     if len(known.landmark) < 2:
         return None
@@ -119,6 +121,8 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
         chosen = options.gated(options.agreeing())
     else:
         chosen = _joint(options)
+    if options.n_standing(chosen) < 2 or (search == "joint" and not options.is_this_place(chosen)):
+        return None
     return options.concluded(chosen, split=search == "joint")
 
 
@@ -216,6 +220,24 @@ class _Options:
                 total += float(self.known.log_p_elsewhere[clique])
                 total += max(self._log_elsewhere(self._rows[other]) for other in sites)
         return total
+
+    def is_this_place(self, chosen: IntArray) -> bool:
+        """Whether what stands where it stood outweighs the surprise that all else was moved.
+
+        In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
+        """
+        error, inverse, rows = self._field(chosen)
+        here = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - float(error @ inverse @ error))
+        here -= len(rows) * math.log(2.0 * math.pi)
+        for clique, sites in enumerate(self.sites):
+            if sites:
+                site = int(chosen[clique])
+                here += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self.known.log_p_site[site])
+        return here > LOG_P_ANOTHER_PLACE + len(rows) * self._log_room
+
+    def n_standing(self, chosen: IntArray) -> int:
+        """Landmarks that stand where the map has them."""
+        return len(np.unique(self.known.landmark[self._chosen_rows(chosen)]))
 
     def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
         """The assignment, landmark by landmark, with bodies taken apart whose members disagree."""
