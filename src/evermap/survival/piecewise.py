@@ -57,7 +57,7 @@ class PiecewiseConstantHazard(Lifetime):
 
 
 def integrate_steps(edges: FloatArray, rates: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """`int_a^b h` for a step function with `len(rates) + 1` edges; nothing cancels for `a` and `b` in neighbouring steps.
+    """`int_a^b h` for a step function with `len(rates) + 1` edges; in neighbouring steps nothing cancels.
 
     Two ends and the whole steps between them, all positive; only these are a difference, of sums of whole steps.
     """
