@@ -100,7 +100,7 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
     where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config.search)
-    if where is None:
+    if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, p_site, where, glimpsed)
