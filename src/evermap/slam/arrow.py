@@ -367,7 +367,7 @@ class Smoother:
         known = np.append(np.repeat(estimate.known, 2), np.ones(9, dtype=bool))
         solved = solve(self.normal(estimate), 0.0, True)
         shared = np.zeros((len(known), len(known)))
-        shared[np.ix_(known, known)] = solved.cov_shared
+        shared[np.ix_(known, known)] = _semidefinite(solved.cov_shared)
         cross = np.zeros((len(estimate.pose), 3, len(known)))
         cross[:, :, known] = solved.cov_cross
         return Marginals(solved.cov_pose, solved.cov_next, cross, shared)
@@ -429,6 +429,17 @@ class Smoother:
         )
         self._last = (estimate, parts)
         return parts
+
+
+def _semidefinite(covariance: FloatArray) -> FloatArray:
+    """A covariance (n, n) that rounding may have robbed of its smallest eigenvalues, where others are huge."""
+    symmetric: FloatArray = 0.5 * (covariance + covariance.T)
+    try:
+        np.linalg.cholesky(symmetric)
+    except np.linalg.LinAlgError:
+        size, direction = np.linalg.eigh(symmetric)
+        symmetric = (direction * np.maximum(size, 1e-12 * size[-1])) @ direction.T
+    return symmetric
 
 
 def _moved(estimate: Estimate, step_pose: FloatArray, step_shared: FloatArray) -> Estimate:

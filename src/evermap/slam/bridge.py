@@ -66,7 +66,15 @@ def bridged(
         out,
         spread,
     )
-    return out, 0.5 * (spread + spread.transpose(0, 2, 1))
+    return out, _semidefinite(0.5 * (spread + spread.transpose(0, 2, 1)))
+
+
+def _semidefinite(covariance: FloatArray) -> FloatArray:
+    """(K, 3, 3) without the negative eigenvalues that rounding leaves of the difference of two huge ones."""
+    size, direction = np.linalg.eigh(covariance)
+    for k in np.flatnonzero(size[:, 0] < 0.0):
+        covariance[k] = (direction[k] * np.maximum(size[k], 0.0)) @ direction[k].T
+    return covariance
 
 
 def dead_reckoned(stamp_s: FloatArray, drive: Drive, states: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
