@@ -160,10 +160,12 @@ def _no_covariance(name: str, covariance: FloatArray) -> Iterator[str]:
     if covariance.size == 0 or not np.isfinite(covariance).all():
         return
     scale = np.abs(covariance).max(axis=(1, 2)) + 1e-300
-    if np.any(np.abs(covariance - covariance.swapaxes(1, 2)).max(axis=(1, 2)) > 1e-9 * scale):
-        yield f"{name} is not symmetric"
-    if np.any(np.linalg.eigvalsh(covariance)[:, 0] < -1e-9 * scale):
-        yield f"{name} is not positive semidefinite"
+    skew = np.abs(covariance - covariance.swapaxes(1, 2)).max(axis=(1, 2)) / scale
+    if np.any(skew > 1e-9):
+        yield f"{name} is not symmetric, by {skew.max():.1e}"
+    least = np.linalg.eigvalsh(covariance)[:, 0] / scale
+    if np.any(least < -1e-9):
+        yield f"{name} is not positive semidefinite, by {least.min():.1e}"
 
 
 def _arrays(value: Any, name: str) -> Iterator[tuple[str, FloatArray]]:

@@ -17,11 +17,13 @@ from evermap.errors import DataError
 from evermap.maps.living import LivingMap
 from evermap.pipeline import Session, run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
-from evermap.sim.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
+from evermap.sim.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 from evermap.types import Recording
 
 LARGEST_FACTOR = 1.5
 """Median pose error with a bad day's faults, over that without any."""
+LEAST_SHARE = 0.7
+"""Median precision and recall with them, over those without: a session that went wrong bends the map for a while."""
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +79,19 @@ def test_whatever_goes_wrong_in_a_session_its_numbers_are_numbers(
         with suppress(DataError):  # nothing can be estimated: no odometry, fewer than two frames
             session = run_session(with_faults(visits[1], faults, seed), living)
             assert list(soak.problems(session)) == []
+
+
+@pytest.mark.parametrize("n_known", [0, 1])
+def test_a_session_that_shows_no_two_places_of_the_map_leaves_it(
+    visits: tuple[Recording, ...], known: Session, n_known: int
+) -> None:
+    """All identities but one are misread: nobody can say where that was."""
+    detections = visits[1].detections
+    familiar = np.unique(detections.landmark_id)[:n_known]
+    misread = np.where(np.isin(detections.landmark_id, familiar), 0, STRANGER) + detections.landmark_id
+    session = run_session(replace(visits[1], detections=replace(detections, landmark_id=misread)), known.living)
+    np.testing.assert_array_equal(session.living.places.position_m, known.living.places.position_m)
+    assert any("map" in warning for warning in session.slam.warnings)
 
 
 def test_a_few_sessions_of_faults_do_not_spoil_the_map(soak: ModuleType) -> None:
@@ -160,7 +175,7 @@ def test_24_hours_of_faults(soak: ModuleType) -> None:
     assert len(faulty.refused) < 0.04 * len(recordings)
     ours, theirs = faulty.summary(), plain.summary()
     assert ours["rmse_median_m"] < LARGEST_FACTOR * theirs["rmse_median_m"]
-    assert ours["precision"] > theirs["precision"] - 0.05
-    assert ours["recall"] > theirs["recall"] - 0.05
+    assert ours["precision"] > LEAST_SHARE * theirs["precision"]
+    assert ours["recall"] > LEAST_SHARE * theirs["recall"]
     # the map grows with what has come and gone, and with strangers; the process grows by no more than that and noise
     assert faulty.growth_mb() < 20.0 + 3e-3 * (faulty.map_kb[-1] - faulty.map_kb[len(recordings) // 4])
