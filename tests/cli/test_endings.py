@@ -13,7 +13,10 @@ from evermap.cli.main import app
 from evermap.errors import InputError
 
 VERBS = ["demo", "slam", "persist", "track", "convert", "simulate", "reproduce", "bench"]
-GROUPS = {"survival": ["fit", "learn", "plot"]}
+GROUPS = {
+    "map": ["log", "show", "diff", "export", "why", "revert", "pin", "unpin", "delete", "undelete"],
+    "survival": ["fit", "learn", "plot"],
+}
 
 
 def run(*arguments: str) -> Result:

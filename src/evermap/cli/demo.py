@@ -29,7 +29,7 @@ def demo(
         bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
     ] = False,
 ) -> None:
-    """Live for four weeks in a simulated building in which things come and go.
+    """Live for four weeks in a building that changes.
 
     A robot patrols the building twice a day. The same 56 recordings go into one map each of static SLAM, of three
     papers' methods alone, of evermap, and of an oracle that is told every change. Open report.html in the folder for

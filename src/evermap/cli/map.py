@@ -19,12 +19,10 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="map",
-    help="Living maps: their revisions, what changed and why, and the operator's word.",
+    help="Living maps: history, differences, reasons, orders.",
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-for command in (revert, pin, unpin, delete, undelete):
-    app.command()(command)
 
 _File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 _AtRevision = Annotated[
@@ -35,7 +33,9 @@ _AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 
 @app.command("log")
 def log(file: _File, as_json: _AsJson = False) -> None:
-    """List the revisions: every session, edit and revert, with what it changed.
+    """List the revisions.
+
+    Every session, edit and revert, with what it changed.
 
     \b
     Example:
@@ -65,7 +65,9 @@ def show(
     figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map.", show_default="none")] = None,
     as_json: _AsJson = False,
 ) -> None:
-    """List the landmarks: whether they exist, where, since when, and whether they will be there tomorrow.
+    """List the landmarks.
+
+    Whether they exist, where, since when, and whether they will be there tomorrow.
 
     \b
     Example:
@@ -108,7 +110,9 @@ def diff(
     b: Annotated[int | None, typer.Argument(metavar="B", help="The later one.", show_default="newest")] = None,
     as_json: _AsJson = False,
 ) -> None:
-    """What appeared, vanished, moved, swapped places and returned between two revisions, and what operators did.
+    """Tell what changed between two revisions.
+
+    What appeared, vanished, moved, swapped places and returned, and what operators did.
 
     \b
     Example:
@@ -145,7 +149,9 @@ def export(
     ] = 0.5,
     as_json: _AsJson = False,
 ) -> None:
-    """Write the landmarks that exist as a table, for other tools and for `evermap slam --prior-map`.
+    """Write the landmarks that exist as a table.
+
+    For other tools, and for `evermap slam --prior-map`.
 
     \b
     Example:
@@ -174,7 +180,9 @@ def why(
     ] = None,
     as_json: _AsJson = False,
 ) -> None:
-    """Why a landmark is believed to be there, or gone: what was seen of it, and how much each of that says.
+    """Tell why a landmark is believed to be there, or gone.
+
+    What was seen of it, and how much each of that says.
 
     \b
     Example:
@@ -255,3 +263,7 @@ def _finite(value: float) -> float | None:
     from evermap.cli.map_content import number
 
     return number(value)
+
+
+for command in (revert, pin, unpin, delete, undelete):
+    app.command()(command)

@@ -21,7 +21,9 @@ def revert(
     note: _Note = "",
     as_json: _AsJson = False,
 ) -> None:
-    """Go back to an older revision, by a new one with its content: nothing is lost, and a revert can be reverted.
+    """Go back to an older revision.
+
+    By a new one with its content: nothing is lost, and a revert can be reverted.
 
     \b
     Example:
@@ -59,7 +61,9 @@ def unpin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = Fal
 
 
 def delete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
-    """Do not use these landmarks any more; their detections are ignored until that is taken back.
+    """Do not use these landmarks any more.
+
+    Their detections are ignored until that is taken back.
 
     \b
     Example:
