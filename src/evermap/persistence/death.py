@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.survival import GeneralPurpose, LifetimePrior
+from evermap.survival import GeneralPurpose, LifetimePrior, PiecewiseConstantHazard
 from evermap.types import FloatArray, IntArray
 
 WIDE = 1.01
@@ -34,6 +34,9 @@ def log_death_odds(
             start, stop = start_s[rows], stop_s[rows]
             if isinstance(prior, GeneralPurpose) and prior.high > WIDE * prior.low:
                 odds[rows] = np.log(_unknown_rate(prior, start, stop))
+                continue
+            if isinstance(prior, PiecewiseConstantHazard):  # what maps learn, and thus asked for millions of gaps
+                odds[rows] = np.log(np.expm1(prior.integrated_hazard(start, stop)))
                 continue
             survival = np.asarray(prior.log_conditional_survival(start, stop), dtype=np.float64)
             death = np.asarray(prior.log_conditional_death(start, stop), dtype=np.float64)

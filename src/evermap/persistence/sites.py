@@ -27,6 +27,8 @@ __all__ = ["SiteBeliefs", "SiteDynamics", "SiteLooks", "SiteTrace", "follow_site
 
 STEPS = 32
 """Of a gap between sessions, in each of which a clique leaves or returns at most once."""
+SELDOM = 0.01
+"""A gap in which nobody leaves or returns with more than these odds is one step."""
 
 
 def follow_sites(
@@ -78,12 +80,14 @@ def follow_sites(
     prior = chains.by_row(number[:n_sites], number[n_sites:])
     since = chains.by_row(dynamics.since_s, dynamics.away_since_s)
     route, moves = chains.routes(dynamics.p_hop, dynamics.return_share, pinned)
-    first_s = frames.stamp_s[frames.first[:-1]]
+    gap_s = (frames.stamp_s[frames.first[:-1]] - start)[chains.clique]
     age = np.maximum(start[chains.clique] - since, 0.0)
-    step_s = ((first_s - start) / STEPS)[chains.clique]
+    brief = odds(priors, prior, np.stack([age, np.zeros(len(age))], 1), np.stack([age + gap_s, gap_s], 1)) < SELDOM
+    steps = 1 if brief.all() else STEPS
+    step_s = gap_s / steps
     old, new, came = chains.start(p_here, pinned), np.zeros(len(since)), np.zeros(len(since))
-    edges = age[:, None] + np.arange(STEPS + 1) * step_s[:, None]
-    since_middle = np.maximum(np.arange(STEPS + 1) - 0.5, 0.0) * step_s[:, None]
+    edges = age[:, None] + np.arange(steps + 1) * step_s[:, None]
+    since_middle = np.maximum(np.arange(steps + 1) - 0.5, 0.0) * step_s[:, None]
     death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, since_middle))
     kernels.renew(chains.first, route, moves, death_old, death_new, old, new, came)
     came = start[chains.clique] + came * step_s

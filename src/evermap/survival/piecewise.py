@@ -45,8 +45,12 @@ class PiecewiseConstantHazard(Lifetime):
         lasts = np.append(np.diff(self.edges_s), np.inf)
         return mean_of_stretches(lasts, np.asarray(self.rates))[0]
 
-    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+    def integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """`int_a^b h`, for arrays of one shape with `a <= b`, unchecked."""
         return integrate_steps(np.append(self.edges_s, np.inf), np.asarray(self.rates), a, b)
+
+    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return self.integrated_hazard(a, b)
 
     def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
         return np.asarray(np.log(self._integrated_hazard(a, b)))
