@@ -249,6 +249,8 @@ def test_changes_and_alternatives_are_kept_in_every_form(run, tmp_path):
         "displacement_m": [-1.0, 0.0],
         "rotation_rad": 0.0,
         "probability": 0.97,
+        "hits": 0,
+        "misses": 0,
     }
     assert (second["kind"], second["stamp_from_s"], second["rotation_rad"]) == ("rotated", 150.0, 0.35)
     lines = (tmp_path / "run" / "changes.jsonl").read_text().splitlines()

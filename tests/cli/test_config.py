@@ -61,7 +61,7 @@ def test_printed_configuration_reads_back_as_it_was(tmp_path: Path) -> None:
         ("[slam]\nrobst = true", ["slam.robst", "unknown key", "try: slam.robust"]),
         ("[slam.calibraton]\n", ["slam.calibraton", "try: slam.calibration"]),
         ("robust = true", ["'robust'", "try: slam.robust"]),
-        ("[colour]\nx = 1", ["'colour'", "one of slam, sensor"]),
+        ("[colour]\nx = 1", ["'colour'", "one of slam, living, sensor"]),
         ("[slam]\nseed = -1", ["slam.seed", "greater than or equal to 0", "-1"]),
         ("[slam]\nseed = 1.5", ["slam.seed", "1.5"]),
         ("[slam]\nsensor_model = 'magic'", ["slam.sensor_model", "'calibrated' or 'plain'", "magic"]),
