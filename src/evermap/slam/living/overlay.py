@@ -35,6 +35,9 @@ SMALLEST_ROOM_M2 = 50.0
 DRIFTS_M = (0.01, 0.02, 0.04, 0.08)
 """Standard deviations by which landmarks may not quite be where they were, though nobody moved them: another robot with
 errors of its own, warmth, a sensor that sees another corner. Each is half as probable as the one before, a session."""
+FAR_M = 2.0
+HOPELESS = -200.0
+"""Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
 LOG_P_COARSER = math.log(0.5)
 LOG_P_ANOTHER_PLACE = math.log(1e-3)
 """Log probability that a session is of another place, where the map's identities stand anywhere."""
@@ -160,6 +163,9 @@ class _Options:
         order = np.argsort(known.site, kind="stable")
         parts = np.split(order, np.flatnonzero(np.diff(known.site[order])) + 1)
         self._rows = {int(known.site[part[0]]): part for part in parts if len(part)}
+        gap = np.linalg.norm(self.landmark_m[known.landmark] - known.position_m, axis=1)
+        self._gap_m = {site: float(gap[rows].max()) for site, rows in self._rows.items()}
+        self._hopeless: dict[int, float] = {}
         for site, rows in self._rows.items():
             self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
 
@@ -311,9 +317,14 @@ class _Options:
                     scores[site] = prior + 0.5 * float(np.linalg.slogdet(precision)[1]) - 0.5 * squared
                     scores[site] -= 0.5 * len(precision) * math.log(2.0 * math.pi)
                     continue
+                if site in self._hopeless:
+                    scores[site] = self._hopeless[site]
+                    continue
                 if others is None:
                     others = self._without(mine, rows, error, inverse, start)
                 scores[site] = prior + self._log_at(self._rows[site], *others)
+                if self._gap_m[site] > FAR_M and scores[site] < HOPELESS:
+                    self._hopeless[site] = scores[site]
             best = max(sites, key=lambda site: scores[site])
             scores[ELSEWHERE] += self._log_elsewhere(self._rows[best])
             table.append(scores)
