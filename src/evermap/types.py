@@ -329,7 +329,7 @@ class ChangeKind(StrEnum):
     SWAPPED = "swapped"
     """Two landmarks carry each other's identity."""
     APPEARED = "appeared"
-    """Never seen before, in a place that was looked at."""
+    """Never seen before, in a place that had been looked at."""
     VANISHED = "vanished"
     """Not where the map has it, and nowhere else."""
     RETURNED = "returned"

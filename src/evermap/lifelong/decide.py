@@ -180,6 +180,8 @@ def changes_between(before: LivingMap, after: LivingMap, looks: Looks) -> tuple[
         probability = 1.0 - float(p_here[mine].sum()) if site < 0 else float(p_here[site])
         step, turn = _motion(after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
         from_s, to_s = _when(after, clique, site)
+        if kind is ChangeKind.APPEARED and np.isnan(from_s):
+            continue  # nobody had ever looked there: the map grew, the world did not change
         found.append(
             MapChange(
                 landmark_ids=_members_at(after, site if site >= 0 else left),
