@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 
 def wrap(angle_rad: ArrayLike) -> FloatArray:
@@ -100,3 +100,17 @@ def rotation(angle_rad: ArrayLike) -> FloatArray:
     angle = np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+
+
+def xy_rows(rows: ArrayLike) -> IntArray:
+    """(2 k,) rows of x and y, by turns, of points (k,) in a vector or covariance of all points together."""
+    return np.asarray(2 * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(2)).ravel()
+
+
+def rigid_directions(point: ArrayLike) -> FloatArray:
+    """(2 k, 3) how points (k, 2) move, x and y by turns, when all of them are shifted along x, along y, and turned."""
+    at = np.asarray(point, dtype=np.float64)
+    columns = np.zeros((2 * len(at), 3))
+    columns[0::2, 0] = columns[1::2, 1] = 1.0
+    columns[0::2, 2], columns[1::2, 2] = -at[:, 1], at[:, 0]
+    return columns

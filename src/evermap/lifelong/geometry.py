@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap import se2
 from evermap.maps.living import LivingMap
 from evermap.types import FloatArray, IntArray
 
@@ -37,7 +38,7 @@ def with_session(
         (P + N, 2) and (2 (P + N), 2 (P + N)).
     """
     count, new = len(position_m), len(session_m) - len(seen)
-    s = _coordinates(seen)
+    s = se2.xy_rows(seen)
     k = len(s)
     u = np.setdiff1d(np.arange(2 * count), s)
     before = drifted(covariance_m2[np.ix_(s, s)], drift_m)
@@ -63,10 +64,7 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
     This is the S-transformation of geodesy (Baarda 1973) to inner constraints.
     """
-    middle = position_m - position_m.mean(axis=0)
-    motion = np.zeros((2 * len(position_m), 3))
-    motion[0::2, 0] = motion[1::2, 1] = 1.0
-    motion[0::2, 2], motion[1::2, 2] = -middle[:, 1], middle[:, 0]
+    motion = se2.rigid_directions(position_m - position_m.mean(axis=0))
     onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
     return np.asarray(onto @ covariance_m2 @ onto.T)
 
@@ -97,9 +95,5 @@ def blocks(covariance_m2: FloatArray) -> FloatArray:
 
 def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
     """(2 K, 2 K) joint covariance of some places, in their order."""
-    at = _coordinates(rows)
+    at = se2.xy_rows(rows)
     return np.asarray(covariance_m2[np.ix_(at, at)])
-
-
-def _coordinates(rows: IntArray) -> IntArray:
-    return (2 * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(2)).ravel()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.types import FloatArray, IntArray
@@ -65,16 +66,14 @@ def laid_over(
     clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
     used_sites, site = np.unique(places.site_id[used], return_inverse=True)
     site_rows = np.searchsorted(sites.site_id, used_sites)
-    corner = (2 * used[:, None] + np.arange(2)).ravel()
-    inner = (2 * seen[:, None] + np.arange(2)).ravel()
     total = np.zeros(len(clique_ids))
     of_known = np.isin(sites.clique_id, clique_ids)
     np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
     found = lay_over(
-        Sighted(position_m[seen], covariance_m2[np.ix_(inner, inner)], clique.ravel().astype(np.int64)),
+        Sighted(position_m[seen], of_places(covariance_m2, seen), clique.ravel().astype(np.int64)),
         Known(
             position_m=places.position_m[used],
-            covariance_m2=living.covariance_m2[np.ix_(corner, corner)],
+            covariance_m2=of_places(living.covariance_m2, used),
             landmark=landmark[used],
             site=site.ravel().astype(np.int64),
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),

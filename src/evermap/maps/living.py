@@ -18,6 +18,7 @@ from typing import Self
 
 import numpy as np
 
+from evermap import se2
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
@@ -312,7 +313,7 @@ class LivingMap:
         members = self.members[~np.isin(self.members.landmark_id, landmark_ids)]
         kept = np.flatnonzero(~np.isin(self.places.landmark_id, landmark_ids))
         places = self.places[kept]
-        corner = (2 * kept[:, None] + np.arange(2)).ravel()
+        corner = se2.xy_rows(kept)
         return replace(
             self,
             members=members,

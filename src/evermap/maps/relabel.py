@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap import se2
 from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -49,7 +50,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     order = np.lexsort((moved.landmark_id, moved.site_id))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    corner = (2 * order[:, None] + np.arange(2)).ravel()
+    corner = se2.xy_rows(order)
     no_more = np.setdiff1d(sites.clique_id, owner)
     return replace(
         living,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evermap import se2
 from evermap.types import FloatArray, IntArray, Landmarks
 
 LEAST_VARIANCE = 1e-6
@@ -43,7 +44,7 @@ class KnownPlaces:
         order = np.argsort(landmark_id, kind="stable")
         joint = None
         if covariance_m2.ndim == 2:
-            corner = (2 * order[:, None] + np.arange(2)).ravel()
+            corner = se2.xy_rows(order)
             joint = covariance_m2[np.ix_(corner, corner)] + LEAST_VARIANCE * np.eye(len(corner))
             rows = np.arange(len(order))
             blocks = joint.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]

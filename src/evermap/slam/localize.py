@@ -307,5 +307,5 @@ class Localizer:
 
 def _columns(rows: IntArray) -> IntArray:
     """Columns of x and y of places."""
-    columns: IntArray = (2 * rows[:, None] + np.arange(2)).ravel()
+    columns: IntArray = se2.xy_rows(rows)
     return columns

@@ -72,7 +72,7 @@ def localize(
     drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
     there = np.flatnonzero(landmarks.p_exists > 0.0)
     if joint_m2 is not None:
-        corner = (2 * there[:, None] + np.arange(2)).ravel()
+        corner = se2.xy_rows(there)
         joint_m2 = joint_m2[np.ix_(corner, corner)]
     landmarks = _rows(landmarks, there)
     covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2

@@ -116,7 +116,7 @@ def explained(
         offset, motion_covariance = group.motion_prior(mean, spread)
         members = group.members
         if group.since_s is None:
-            rows = (2 * members[:, None] + np.arange(2)).ravel()
+            rows = se2.xy_rows(members)
             own = independent(covariance[members])
             landmark[members] = group.moved(mean)
             mean[members] += offset
@@ -124,8 +124,8 @@ def explained(
             continue
         new = len(places) + np.arange(len(members))
         places.extend(int(j) for j in members)
-        old_rows = (2 * members[:, None] + np.arange(2)).ravel()
-        new_rows = (2 * new[:, None] + np.arange(2)).ravel()
+        old_rows = se2.xy_rows(members)
+        new_rows = se2.xy_rows(new)
         tie = np.linalg.inv(motion_covariance + SLACK_M**2 * np.eye(len(old_rows)))
         information = np.pad(information, (0, len(new_rows)))
         for first, second, sign in ((old_rows, old_rows, 1), (new_rows, new_rows, 1), (old_rows, new_rows, -1)):

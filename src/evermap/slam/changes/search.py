@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap import se2
 from evermap.slam.changes.climb import Tables, Weighed, climb_from_many_starts, weigh_neighbours
 from evermap.slam.changes.evidence import Comparison, Evidence
 from evermap.slam.changes.gain import hypothesis_gain
@@ -99,7 +100,7 @@ def _candidates(
     gain = np.full(n_landmarks, -np.inf)
     for j in np.unique(evidence.landmark):
         rows = np.flatnonzero(evidence.landmark == j)
-        both = (2 * rows[:, None] + np.arange(2)).ravel()
+        both = se2.xy_rows(rows)
         identity = np.tile(np.eye(2), (len(rows), 1))
         pull = identity.T @ comparison.pull[both]
         precision = identity.T @ comparison.precision[np.ix_(both, both)] @ identity
@@ -123,7 +124,7 @@ def item_columns(
     x, y = position[evidence.landmark[rows]].T
     zero, one = np.zeros(len(rows)), np.ones(len(rows))
     columns = np.array([[one, zero, x, -y], [zero, one, y, x]]).transpose(2, 0, 1)  # (R, 2, 4)
-    both = (2 * rows[:, None] + np.arange(2)).ravel()
+    both = se2.xy_rows(rows)
     precision = comparison.precision[np.ix_(both, both)].reshape(len(rows), 2, len(rows), 2)
     # what a copy says is said by every item that begins in its window or before: sums from the last window backwards
     size = (n_windows, len(candidates), 4)

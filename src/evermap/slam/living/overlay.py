@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from evermap import se2
-from evermap.slam.align import AGREE_M, consensus
+from evermap.slam.align import AGREE_M, consensus, rigid
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
@@ -150,10 +150,7 @@ class _Options:
         turn = np.kron(np.eye(len(self.landmark_m)), se2.rotation(motion[2]))
         # the session turned with the map, and the motion's own freedom
         middle = self.landmark_m - self.landmark_m.mean(axis=0)
-        freedom = np.zeros((2 * len(middle), 3))
-        freedom[0::2, 0] = freedom[1::2, 1] = 1.0
-        freedom[0::2, 2], freedom[1::2, 2] = -middle[:, 1], middle[:, 0]
-        freedom *= FREE_MOTION
+        freedom = se2.rigid_directions(middle) * FREE_MOTION
         self._session = turn @ sighted.covariance_m2 @ turn.T
         self._freedom = freedom @ freedom.T
         self.drift_m = DRIFTS_M[0]
@@ -181,10 +178,9 @@ class _Options:
 
     def agreeing(self) -> IntArray:
         """(C,) for every clique the site that it lies nearest to, if that is near."""
-        gap = np.linalg.norm(self.landmark_m[self.known.landmark] - self.known.position_m, axis=1)
         chosen = np.full(len(self.sites), ELSEWHERE, dtype=np.int64)
         for clique, sites in enumerate(self.sites):
-            near = [(float(gap[self._rows[site]].max()), site) for site in sites]
+            near = [(self._gap_m[site], site) for site in sites]
             if near and min(near)[0] < AGREE_M:
                 chosen[clique] = min(near)[1]
         return chosen
@@ -215,15 +211,9 @@ class _Options:
 
     def log_probability(self, chosen: IntArray) -> float:
         """Of an assignment with all that was seen, up to a constant that all assignments share."""
-        error, inverse, rows = self._field(chosen)
-        sign_log = np.linalg.slogdet(inverse)[1] if len(rows) else 0.0
-        total = 0.5 * float(sign_log) - 0.5 * float(error @ inverse @ error) - len(rows) * math.log(2.0 * math.pi)
+        total, _ = self._log_standing(chosen)
         for clique, sites in enumerate(self.sites):
-            site = int(chosen[clique])
-            if site != ELSEWHERE:
-                total += float(self.known.log_p_site[site])
-            elif sites:
-                total += float(self.known.log_p_elsewhere[clique])
+            if sites and chosen[clique] == ELSEWHERE:
                 total += max(self._log_elsewhere(self._rows[other]) for other in sites)
         return total
 
@@ -232,14 +222,19 @@ class _Options:
 
         In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
         """
+        here, count = self._log_standing(chosen)
+        return here > LOG_P_ANOTHER_PLACE + count * self._log_room
+
+    def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
+        """Log probability of the options, with the density of all that stands at its site; and how many places do."""
         error, inverse, rows = self._field(chosen)
-        here = 0.5 * (float(np.linalg.slogdet(inverse)[1]) - float(error @ inverse @ error))
-        here -= len(rows) * math.log(2.0 * math.pi)
+        log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
+        total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - len(rows) * math.log(2.0 * math.pi)
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
-                here += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self.known.log_p_site[site])
-        return here > LOG_P_ANOTHER_PLACE + len(rows) * self._log_room
+                total += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self.known.log_p_site[site])
+        return total, len(rows)
 
     def n_standing(self, chosen: IntArray) -> int:
         """Landmarks that stand where the map has them."""
@@ -266,7 +261,7 @@ class _Options:
         matched = self.known.landmark[rows]
         motion = self.motion
         if len(rows) >= 2:
-            motion, _ = consensus(self.sighted.position_m[matched], self.known.position_m[rows], landmark=matched)
+            motion = rigid(self.sighted.position_m[matched], self.known.position_m[rows])
         return Overlay(motion, place, probability, self.drift_m)
 
     def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
@@ -385,15 +380,10 @@ class _Options:
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places."""
-        la, lb = _coordinates(self.known.landmark[a]), _coordinates(self.known.landmark[b])
-        pa, pb = _coordinates(a), _coordinates(b)
+        la, lb = se2.xy_rows(self.known.landmark[a]), se2.xy_rows(self.known.landmark[b])
+        pa, pb = se2.xy_rows(a), se2.xy_rows(b)
         both: FloatArray = (
             self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)] + self._freedom[np.ix_(la, lb)]
         )
         both[pa[:, None] == pb[None, :]] += self.drift_m**2
         return both
-
-
-def _coordinates(rows: IntArray) -> IntArray:
-    """(2 k,) x and y rows of points (k,)."""
-    return (2 * rows[:, None] + np.arange(2)).ravel()

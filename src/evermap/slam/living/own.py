@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evermap import se2
 from evermap.slam.streaming import Outcome
 from evermap.types import FloatArray, IntArray
 
@@ -42,7 +43,7 @@ def own_landmarks(outcome: Outcome, in_place: IntArray | None = None) -> OwnLand
     least = np.full(len(estimate.known), SIGHTINGS)
     least[[] if in_place is None else in_place] = SIGHTINGS_IN_PLACE
     row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
-    at = (2 * row[:, None] + np.arange(2)).ravel()
+    at = se2.xy_rows(row)
     position = estimate.landmark[row] * outcome.scale
     return OwnLandmarks(row, position, outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2)
 

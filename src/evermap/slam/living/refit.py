@@ -44,7 +44,7 @@ def refitted(
     """
     count = len(outcome.problem.landmark_mean)
     mean, information = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
-    at = (2 * row[:, None] + np.arange(2)).ravel()
+    at = se2.xy_rows(row)
     mean[row] = mean_m
     information[np.ix_(at, at)] = np.linalg.inv(covariance_m2)
     own = outcome.graph_estimate

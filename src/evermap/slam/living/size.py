@@ -78,10 +78,7 @@ def log_ratio(
         factor = np.exp(log_size)
         turned = se2.transform(np.array([0.0, 0.0, motion[2]]), session_m) * factor
         turn = factor * np.kron(np.eye(len(session_m)), se2.rotation(motion[2]))
-        columns = np.zeros((2 * len(session_m), 4))
-        columns[0::2, 0] = columns[1::2, 1] = 1.0
-        columns[0::2, 2], columns[1::2, 2] = -turned[:, 1], turned[:, 0]
-        columns[:, 3] = turned.ravel()
+        columns = np.column_stack([se2.rigid_directions(turned), turned.ravel()])
         weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, columns)
         information = columns.T @ weighed
         step = np.linalg.solve(information, weighed.T @ (map_m - turned - motion[:2]).ravel())
