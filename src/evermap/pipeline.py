@@ -110,8 +110,10 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
+    from evermap.maps.living import LivingMap
+
     config = _or_default(config)
-    living = _or_begun(living, recording)
+    living = LivingMap(clock=recording.clock) if living is None else living
     return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
 
 
@@ -191,12 +193,6 @@ def _or_default(config: Config | None) -> Config:
     from evermap.config import Config
 
     return config or Config()
-
-
-def _or_begun(living: LivingMap | None, recording: Recording) -> LivingMap:
-    from evermap.maps.living import LivingMap
-
-    return LivingMap(clock=recording.clock) if living is None else living
 
 
 def run_localization(

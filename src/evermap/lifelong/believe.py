@@ -67,7 +67,7 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     """How the cliques of a map stay, leave and return, by what was learned of their class and place."""
     sites = living.sites
     cliques, row = clique_rows(sites)
-    class_id = _class_of(living, cliques)
+    class_id = class_of(living, cliques)
     middle = site_middles(living)
     lives = [_life(living, config, int(class_id[c]), middle[s]) for s, c in enumerate(row)]
     seen = np.full(len(cliques), -np.inf)
@@ -230,7 +230,7 @@ def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
     return np.isin(cliques, living.members.clique_id[living.members.pinned])
 
 
-def _class_of(living: LivingMap, cliques: IntArray) -> IntArray:
+def class_of(living: LivingMap, cliques: IntArray) -> IntArray:
     """(C,) class of every clique: that of its members."""
     order = np.argsort(living.members.clique_id, kind="stable")
     first = np.searchsorted(living.members.clique_id[order], cliques)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.lifelong.believe import Looks, clique_rows, site_middles
+from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
 from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap, Stays
-from evermap.types import UNKNOWN, BoolArray, ChangeKind, FloatArray, IntArray, MapChange
+from evermap.slam.align import rigid
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
 EXISTS = 0.5
 """A clique is said to stand at a site that is more probable than this, and to be away where that is more probable."""
@@ -35,8 +36,7 @@ class Standing:
 
     def of(self, clique_id: int) -> int:
         """The row of a clique's site; -1 where it is away or unknown."""
-        at = int(np.searchsorted(self.clique_id, clique_id))
-        return int(self.site[at]) if at < len(self.clique_id) and self.clique_id[at] == clique_id else -1
+        return int(np.append(self.site, -1)[_found(self.clique_id, clique_id)])
 
 
 def standing(living: LivingMap) -> Standing:
@@ -84,7 +84,7 @@ def with_stays(before: LivingMap, after: LivingMap, looks: Looks, start_s: float
     stays = replace(after.stays, last_s=last, gone_s=gone)
     if begun:
         clique_id, rows, elsewhere, first, until = (np.array(column) for column in zip(*begun, strict=True))
-        kind = _class_of(after, clique_id)
+        kind = class_of(after, clique_id)
         stays = stays.joined(
             Stays(
                 clique_id,
@@ -140,7 +140,7 @@ def _gone_for_good(living: LivingMap) -> IntArray:
     np.maximum.at(seen, row, sites.seen_s)
     operated = living.members.pinned | living.members.deleted
     away = np.flatnonzero((p_here < SURELY_AWAY) & ~np.isin(cliques, living.members.clique_id[operated]))
-    kinds, middle = _class_of(living, cliques[away]), site_middles(living)
+    kinds, middle = class_of(living, cliques[away]), site_middles(living)
     newest = {int(row[s]): s for s in np.argsort(sites.seen_s, kind="stable")}
     p_return = np.zeros(len(away))
     for k, clique in enumerate(away):
@@ -202,9 +202,9 @@ def _swaps(found: list[MapChange], before: LivingMap, after: LivingMap) -> tuple
     """Two that moved to each other's place have been exchanged, or carry each other's identity."""
     then, now = before.landmarks(), after.landmarks()
 
-    def at(records: object, names: tuple[int, ...]) -> FloatArray:
-        rows = np.isin(records.landmark_id, names)  # type: ignore[attr-defined]
-        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(2, np.nan)  # type: ignore[attr-defined]
+    def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
+        rows = np.isin(records.landmark_id, names)
+        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(2, np.nan)
 
     moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
     was = {k: at(then, found[k].landmark_ids) for k in moved}
@@ -254,8 +254,7 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     shift = now.mean(axis=0) - was.mean(axis=0)
     if len(i) < 2:
         return shift, 0.0
-    was, now = was - was.mean(axis=0), now - now.mean(axis=0)
-    return shift, float(np.arctan2((was[:, 0] * now[:, 1] - was[:, 1] * now[:, 0]).sum(), (was * now).sum()))
+    return shift, float(rigid(was, now)[2])
 
 
 def _when(living: LivingMap, clique: int, site: int) -> tuple[float, float]:
@@ -295,8 +294,13 @@ def _counted(looks: Looks, count: int) -> tuple[IntArray, IntArray]:
 
 
 def _row(living: LivingMap, site_id: int) -> int:
-    at = int(np.searchsorted(living.sites.site_id, site_id))
-    return at if at < len(living.sites) and living.sites.site_id[at] == site_id else -1
+    return _found(living.sites.site_id, site_id)
+
+
+def _found(ids: IntArray, wanted: int) -> int:
+    """The row of an id among sorted ones, -1 where it is none of them."""
+    at = int(np.searchsorted(ids, wanted))
+    return at if at < len(ids) and ids[at] == wanted else -1
 
 
 def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
@@ -312,10 +316,3 @@ def _members_at(living: LivingMap, site: int) -> tuple[int, ...]:
         return ()
     rows = living.places.site_id == living.sites.site_id[site]
     return tuple(int(name) for name in np.sort(living.places.landmark_id[rows]))
-
-
-def _class_of(living: LivingMap, clique_id: IntArray) -> IntArray:
-    kinds = np.full(len(clique_id), UNKNOWN, dtype=np.int64)
-    for k, name in enumerate(clique_id):
-        kinds[k] = living.members.class_id[np.flatnonzero(living.members.clique_id == name)[0]]
-    return kinds
