@@ -11,9 +11,9 @@ Conventions that hold everywhere:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -407,3 +407,13 @@ class SlamResult:
     interrupted: bool = False
     changes: tuple[MapChange, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+
+
+_Table = TypeVar("_Table", Odometry, Frames, Detections)
+
+
+def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
+    """Some rows of a table of columns, by number, in that order, or by a mask; what is no column stays."""
+    columns = {item.name: getattr(table, item.name) for item in fields(table)}
+    some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    return replace(table, **some)

@@ -12,7 +12,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +23,7 @@ from evermap.errors import EvermapError, InputError
 from evermap.experiments.mrclam_figure import Drawn, draw_robots
 from evermap.experiments.mrclam_scores import bound_scores, odometry_scores, run_scores
 from evermap.experiments.mrclam_table import as_markdown, means, verdicts
-from evermap.types import Landmarks, Recording
+from evermap.types import Landmarks, Recording, rows_of
 
 if TYPE_CHECKING:
     from evermap.config import Config
@@ -238,12 +238,10 @@ def _warm_up(recording: Recording) -> None:
 def first_frames(recording: Recording, count: int) -> Recording:
     """The beginning of a recording."""
     frames, detections = recording.frames, recording.detections
-    rows = detections.frame < count
-    columns = {item.name: getattr(detections, item.name)[rows] for item in fields(detections)}
     return replace(
         recording,
         frames=replace(frames, stamp_s=frames.stamp_s[:count]),
-        detections=replace(detections, **columns),
+        detections=rows_of(detections, detections.frame < count),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from evermap.slam.living.refit import refitted
 from evermap.slam.living.size import log_ratio, settled
 from evermap.slam.session import Prepared
 from evermap.slam.streaming import Outcome
-from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording
+from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
 
 INLIER = 0.5
 
@@ -84,11 +84,9 @@ def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, Living
         )
     names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
     number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
-    detections = recording.detections
-    kept = ~np.isin(detections.landmark_id, living.members.landmark_id[living.members.deleted])
-    columns = {item.name: getattr(detections, item.name)[kept] for item in fields(detections)}
-    columns["class_id"] = number[columns["class_id"]]
-    detections = replace(detections, **columns)
+    kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
+    detections = rows_of(recording.detections, kept)
+    detections = replace(detections, class_id=number[detections.class_id])
     return replace(recording, detections=detections, class_names=names), replace(
         living, class_names=names, clock=recording.clock
     )

@@ -7,12 +7,12 @@ looks that miss it.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 
 from evermap import se2
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Recording
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Recording, rows_of
 
 DEPTH_LAW = (0.0, 0.0, -0.5)
 """Range law of a camera that reports depth: slope, skew [1/rad] and curvature [1/rad^2]."""
@@ -100,6 +100,4 @@ def _within(recording: Recording, range_max_m: float, bearing_max_rad: float | N
 
 
 def _selected(recording: Recording, keep: BoolArray) -> Recording:
-    detections = recording.detections
-    columns = {item.name: getattr(detections, item.name)[keep] for item in fields(detections)}
-    return replace(recording, detections=replace(detections, **columns))
+    return replace(recording, detections=rows_of(recording.detections, keep))

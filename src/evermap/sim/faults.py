@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from evermap.sim.classes import require_within
-from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording
+from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 
 Item = TypeVar("Item")
 
@@ -208,11 +208,11 @@ def with_faults(recording: Recording, config: FaultConfig | None = None, seed: i
     missing = ("odometry", "frames", "detections")[int(empty_rng.integers(3))]
     if empty_rng.random() < config.p_empty:
         if missing == "odometry":
-            odometry = _rows(odometry, np.zeros(0, dtype=np.int64))
+            odometry = rows_of(odometry, np.zeros(0, dtype=np.int64))
         if missing == "frames":
             frames = replace(frames, stamp_s=np.zeros(0))
         if missing != "odometry":
-            detections = _rows(detections, np.zeros(0, dtype=np.int64))
+            detections = rows_of(detections, np.zeros(0, dtype=np.int64))
     return replace(recording, odometry=odometry, frames=frames, detections=detections)
 
 
@@ -250,7 +250,7 @@ def _faulty_frames(
     length = first[source + 1] - first[source]
     frame = np.repeat(np.arange(len(source)), length)
     within_frame = np.arange(len(frame)) - np.repeat(np.cumsum(length) - length, length)
-    seen = _rows(detections, np.repeat(first[source], length) + within_frame)
+    seen = rows_of(detections, np.repeat(first[source], length) + within_frame)
     return replace(frames, stamp_s=arrived.stamp_s), replace(seen, frame=frame.astype(np.int64))
 
 
@@ -287,21 +287,11 @@ def _faulty_odometry(odometry: Odometry, config: FaultConfig, rng: np.random.Gen
         column = np.where(spike, rng.uniform(-config.spike_mps, config.spike_mps, len(column)), column)
         columns[name] = _garbled(column, config.p_odometry_impossible, wild, rng)
     arrived = arrivals(odometry.stamp_s, config.odometry, rng, clock)
-    return replace(_rows(replace(odometry, **columns), arrived.row), stamp_s=arrived.stamp_s)
+    return replace(rows_of(replace(odometry, **columns), arrived.row), stamp_s=arrived.stamp_s)
 
 
 def _garbled(values: FloatArray, p: float, by: tuple[float, ...], rng: np.random.Generator) -> FloatArray:
     return np.where(rng.random(len(values)) < p, rng.choice(by, len(values)), values)
-
-
-TableOfRows = TypeVar("TableOfRows", Detections, Odometry)
-
-
-def _rows(table: TableOfRows, rows: IntArray) -> TableOfRows:
-    """Some rows of a table of columns, in that order."""
-    columns = {item.name: getattr(table, item.name) for item in fields(table)}
-    some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
-    return replace(table, **some)
 
 
 def _check(config: StreamFaults | FaultConfig, where: str) -> None:

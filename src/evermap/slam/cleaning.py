@@ -7,13 +7,12 @@ comes back as it is.
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from typing import Any, TypeVar
+from dataclasses import replace
 
 import numpy as np
 
 from evermap.slam.clocks import STRAY_S, restored, running_median, set_forward
-from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording
+from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 
 FASTEST = 100.0
 """No robot drives [m/s] or turns [rad/s] faster."""
@@ -70,11 +69,11 @@ def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
     _remark(remarks, "odometry rows with the stamp of another left out", int(np.sum(~last)))
     kept = order[last]
     if len(kept) < len(stamps) or np.any(np.diff(kept) != 1) or np.any(stamps != odometry.stamp_s):
-        odometry = replace(_rows(odometry, kept), stamp_s=stamps[kept])
+        odometry = replace(rows_of(odometry, kept), stamp_s=stamps[kept])
     velocity = np.stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     possible = np.all(np.abs(velocity) <= FASTEST, axis=0)
     _remark(remarks, "odometry rows that no robot can drive left out", int(np.sum(~possible)))
-    odometry, velocity = _rows(odometry, possible), velocity[:, possible]
+    odometry, velocity = rows_of(odometry, possible), velocity[:, possible]
     if len(odometry) < 3:
         return odometry
     step_s = np.diff(odometry.stamp_s)
@@ -83,7 +82,7 @@ def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
     usual = np.stack([running_median(column) for column in velocity])
     spike = np.any(np.abs(velocity - usual) > np.maximum(HARDEST * step_s, SHARPEST), axis=0)
     _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
-    return _rows(odometry, ~spike)
+    return rows_of(odometry, ~spike)
 
 
 def _readings(recording: Recording, remarks: list[str]) -> Detections:
@@ -98,7 +97,7 @@ def _readings(recording: Recording, remarks: list[str]) -> Detections:
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
     _remark(remarks, "readings that no sensor can make left out", int(np.sum(~real)))
     if not real.all():
-        detections = _rows(detections, real)
+        detections = rows_of(detections, real)
     strange = detections.landmark_id < UNKNOWN
     unnamed = (detections.class_id < UNKNOWN) | (detections.class_id >= max(len(recording.class_names), 1))
     unnamed &= len(recording.class_names) > 0
@@ -126,13 +125,13 @@ def _in_time(frames: Frames, detections: Detections, remarks: list[str]) -> tupl
     row: IntArray = np.searchsorted(instants, stamps).astype(np.int64)[detections.frame]
     order = np.argsort(row, kind="stable")
     order = order[np.isfinite(stamps[detections.frame[order]])]
-    detections = replace(_rows(detections, order), frame=row[order])
+    detections = replace(rows_of(detections, order), frame=row[order])
     same = np.column_stack([detections.frame, detections.landmark_id, detections.range_m, detections.bearing_rad])
     _, first = np.unique(same, axis=0, return_index=True)
     _remark(remarks, "readings that a frame has twice left out", len(same) - len(first))
     if not sorted_already:
         remarks.append("detections sorted by frame")
-    return replace(frames, stamp_s=instants), _rows(detections, np.sort(first))
+    return replace(frames, stamp_s=instants), rows_of(detections, np.sort(first))
 
 
 def _one_clock(frames: Frames, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Odometry]:
@@ -170,7 +169,7 @@ def _while_driving(
 
 def _some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tuple[Frames, Detections]:
     """The `kept` (F,) frames with their detections."""
-    seen = _rows(detections, kept[detections.frame])
+    seen = rows_of(detections, kept[detections.frame])
     row: IntArray = (np.cumsum(kept) - 1).astype(np.int64)
     return replace(frames, stamp_s=frames.stamp_s[kept]), replace(seen, frame=row[seen.frame])
 
@@ -223,13 +222,3 @@ def _mended(what: str, stamp_s: FloatArray, remarks: list[str]) -> FloatArray:
 def _remark(remarks: list[str], what: str, count: int) -> None:
     if count:
         remarks.append(f"{what}: {count}")
-
-
-Table = TypeVar("Table", Detections, Odometry)
-
-
-def _rows(table: Table, rows: BoolArray | IntArray) -> Table:
-    """Some rows of a table of columns, in that order."""
-    columns = {item.name: getattr(table, item.name) for item in fields(table)}
-    some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
-    return replace(table, **some)
