@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
 from evermap.io import read_recording
-from evermap.sim import BuildingConfig, simulate_building
+from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
 
 SIMULATION = ["--days", "2", "--sessions-per-day", "2", "--patrol-s", "20", "--seed", "3"]
 
@@ -90,3 +91,27 @@ def test_convert_of_a_public_recording(shared_data: Path, tmp_path: Path) -> Non
     result = run("convert", source, tmp_path / "robot9", "--robot", "9")
     assert result.exit_code == 2
     assert not (tmp_path / "robot9").exists()
+
+
+def test_a_building_of_partial_views_says_what_was_looked_at(tmp_path: Path) -> None:
+    """The options reach the simulation, and the table is its truth."""
+    lengths = ["--patrol-s", "20", "--patrol-s", "30"]
+    hard = ["--doors", "--wing-opens-day", "2", "--clutter", "--days", "3", "--seed", "2"]
+    assert run("simulate", tmp_path / "hard", *lengths, *hard).exit_code == 0
+    config = BuildingConfig(
+        days=3, patrol_s=30.0, patrol_lengths_s=(20.0, 30.0), doors=ROOM_DOORS, wing_opens_day=2,
+        classes=(*DEFAULT_CLASSES, CLUTTER),
+    )  # fmt: skip
+    simulation = simulate_building(config, seed=2)
+    looks = looked_at(simulation)
+    with (tmp_path / "hard" / "looks_truth.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == looks.present.size
+    for row, (k, place) in zip(rows, np.ndindex(looks.present.shape), strict=True):
+        assert row["session"] == f"day{k:02d}_session00"
+        assert int(row["landmark_id"]) == looks.landmark_id[place]
+        assert [float(row["x_m"]), float(row["y_m"])] == looks.position_m[place].tolist()
+        assert [row["present"], row["looked_at"]] == [str(int(x[k, place])) for x in (looks.present, looks.looked_at)]
+        assert float(row["p_seen"]) == pytest.approx(looks.p_seen[k, place], abs=1e-6)
+    for folder, expected in zip(sorted((tmp_path / "hard").glob("day*")), simulation.sessions, strict=True):
+        np.testing.assert_array_equal(read_recording(folder).detections.range_m, expected.detections.range_m)

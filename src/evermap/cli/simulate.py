@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from evermap.sim import BuildingSimulation
 
 EVENTS_FILE = "changes_truth.jsonl"
+LOOKS_FILE = "looks_truth.csv"
 
 
 def simulate(
@@ -22,31 +23,58 @@ def simulate(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same recordings.")] = 0,
     days: Annotated[int, typer.Option(min=1, help="Days that the patrols span.")] = 6,
     sessions_per_day: Annotated[int, typer.Option(min=1, help="Patrols a day.")] = 1,
-    patrol_s: Annotated[float, typer.Option(help="Length of a patrol [s]; 165 is about one lap.")] = 165.0,
+    patrol_s: Annotated[
+        list[float],
+        typer.Option(
+            help="Length of a patrol [s]; 165 is about one lap. Given several times: every patrol draws one of them,"
+            " and a route of its own that sees a part of the building."
+        ),
+    ] = [165.0],  # noqa: B006
     change_rate: Annotated[float, typer.Option(min=0.0, help="How often things change; 0 is a static world.")] = 1.0,
+    doors: Annotated[
+        bool, typer.Option("--doors", help="Doors to the rooms, shut now and then; none sees through.")
+    ] = False,
+    wing_opens_day: Annotated[
+        int, typer.Option(min=0, help="The eastern wing is closed before this day, counted from 0; 0: no such wing.")
+    ] = 0,
+    clutter: Annotated[
+        bool, typer.Option("--clutter", help="Add crates, many, that stay in one place for hours.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
 ) -> None:
     """Record patrols of a simulated building.
 
-    Every session is a folder in the native format with its true trajectory and landmarks; what changed and when is
-    in changes_truth.jsonl.
+    Every session is a folder in the native format with its true trajectory and landmarks. What changed and when is in
+    changes_truth.jsonl; where each landmark stood in every session, and whether the robot really looked there, in
+    looks_truth.csv.
 
     \b
     Example:
       evermap simulate building --days 3 --seed 1
       evermap slam building/day00_session00
+      evermap simulate hard --patrol-s 20 --patrol-s 60 --patrol-s 165 --doors --wing-opens-day 3 --clutter
     """
     from evermap.io import write_native
-    from evermap.sim import BuildingConfig, simulate_building
+    from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
 
     check_out_folder(out, force)
-    config = BuildingConfig(days=days, sessions_per_day=sessions_per_day, patrol_s=patrol_s, change_rate=change_rate)
+    config = BuildingConfig(
+        days=days,
+        sessions_per_day=sessions_per_day,
+        patrol_s=max(patrol_s),
+        change_rate=change_rate,
+        classes=(*DEFAULT_CLASSES, CLUTTER) if clutter else DEFAULT_CLASSES,
+        patrol_lengths_s=tuple(patrol_s) if len(patrol_s) > 1 else (),
+        doors=ROOM_DOORS if doors else None,
+        wing_opens_day=wing_opens_day,
+    )
     building = simulate_building(config, seed=seed)
     names = session_names(building)
     for name, recording in zip(names, building.sessions, strict=True):
         write_native(recording, out / name, overwrite=force)
     _write_events(building, out / EVENTS_FILE)
+    _write_looks(building, names, out / LOOKS_FILE)
     if as_json:
         print_json({"out": str(out), "sessions": names, "changes": len(building.events), "seed": seed})
     else:
@@ -70,3 +98,20 @@ def _write_events(building: BuildingSimulation, path: Path) -> None:
     from evermap.io.atomic import write_atomic
 
     write_atomic(path, "".join(json.dumps(asdict(event)) + "\n" for event in building.events))
+
+
+def _write_looks(building: BuildingSimulation, names: list[str], path: Path) -> None:
+    """One row for every session and every place at which a landmark ever stood."""
+    from evermap.io.atomic import write_atomic
+    from evermap.sim import looked_at
+
+    looks = looked_at(building)
+    lines = ["session,landmark_id,x_m,y_m,present,looked_at,p_seen\n"]
+    columns = [looks.landmark_id.tolist(), looks.position_m.tolist()]
+    for k, name in enumerate(names):
+        told = [part[k].tolist() for part in (looks.present, looks.looked_at, looks.p_seen)]
+        lines += [
+            f"{name},{landmark},{x!r},{y!r},{int(here)},{int(seen)},{p:.6f}\n"
+            for landmark, (x, y), here, seen, p in zip(*columns, *told, strict=True)
+        ]
+    write_atomic(path, "".join(lines))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from evermap.sim.changes import ChangeEvent, ChangeKind, Stay
-from evermap.sim.classes import DEFAULT_CLASSES, Duration, ObjectClass
+from evermap.sim.classes import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, Duration, ObjectClass
 from evermap.sim.config import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig
 from evermap.sim.floorplan import FloorPlan, Room
+from evermap.sim.looked import LookedAt, looked_at
 from evermap.sim.world import BuildingSimulation, SessionTruth, simulate_building
 
 __all__ = [
+    "CLUTTER",
     "DEFAULT_CLASSES",
+    "ROOM_DOORS",
     "BuildingConfig",
     "BuildingSimulation",
     "ChangeEvent",
@@ -17,11 +20,13 @@ __all__ = [
     "DriveConfig",
     "Duration",
     "FloorPlan",
+    "LookedAt",
     "ObjectClass",
     "OdometryConfig",
     "Room",
     "SensorConfig",
     "SessionTruth",
     "Stay",
+    "looked_at",
     "simulate_building",
 ]

@@ -28,6 +28,11 @@ class Duration:
         """One duration in seconds."""
         return float(rng.gamma(self.shape, self.mean_days * DAY_S / self.shape))
 
+    def check(self, where: str) -> None:
+        """Raise `ConfigError` if a field is out of range."""
+        require_within(self.mean_days, f"{where}.mean_days", 0.01, 1e6)
+        require_within(self.shape, f"{where}.shape", 0.1, 1e3)
+
 
 @dataclass(frozen=True, slots=True)
 class ObjectClass:
@@ -81,8 +86,7 @@ class ObjectClass:
             require_within(size, f"{where}.size_m", 0.05, 3.0)
         for label, duration in (("stay", self.stay), ("absence", self.absence)):
             if duration is not None:
-                require_within(duration.mean_days, f"{where}.{label}.mean_days", 0.01, 1e6)
-                require_within(duration.shape, f"{where}.{label}.shape", 0.1, 1e3)
+                duration.check(f"{where}.{label}")
         for name in ("p_vanish", "p_return", "p_same_place", "p_nudge", "p_other_room"):
             require_within(getattr(self, name), f"{where}.{name}", 0.0, 1.0)
         if self.p_nudge + self.p_other_room > 1.0 + 1e-12:
@@ -114,6 +118,15 @@ DEFAULT_CLASSES: tuple[ObjectClass, ...] = (
     ),
 )  # fmt: skip
 """A warehouse with offices: 14 wall markers, 5 exterior doors and 23 objects that come and go."""
+
+CLUTTER: ObjectClass = ObjectClass(
+    "crate", count=16, landmarks=(1, 1), size_m=(0.4, 0.4), stay=Duration(0.3), absence=Duration(0.4),
+    p_vanish=0.9, p_return=0.8, p_same_place=0.1, p_nudge=0.2, p_other_room=0.5, arrivals_per_day=4.0,
+)  # fmt: skip
+"""Crates that are put down for a few hours, taken away and reused: rarely in one place on two patrols."""
+
+ROOM_DOORS: tuple[Duration, Duration] = (Duration(1.0), Duration(0.4))
+"""How long the door to a room stays open, and then shut."""
 
 
 def require_within(value: object, name: str, low: float, high: float) -> None:

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field, fields
 
 from evermap.errors import ConfigError
-from evermap.sim.classes import DEFAULT_CLASSES, ObjectClass, require_within
+from evermap.sim.classes import DEFAULT_CLASSES, Duration, ObjectClass, require_within
 from evermap.types import FloatArray, Sensor
 
 
@@ -178,6 +178,13 @@ class BuildingConfig:
         first_day_unix_s: midnight of day 0, seconds since 1970 UTC (default: Monday, 1 January 2024).
         classes: what stands in the building.
         drive, odometry, sensor: the robot.
+        patrol_lengths_s: where given, every patrol draws its length from these instead of `patrol_s`, and its own
+            route: a random subset of the rooms, a random direction, starting anywhere along it. Empty: every patrol
+            is the lap from the dock.
+        doors: how long the door to a room stays open, and then shut; None leaves all doorways open. The sensor does
+            not see through a shut door and the robot does not enter. Independent of `change_rate`.
+        wing_opens_day: before this day a partition closes the eastern wing (the last room on either side and the
+            corridor between them). Its objects live on unseen. 0: no closed wing.
     """
 
     days: int = 6
@@ -193,19 +200,31 @@ class BuildingConfig:
     drive: DriveConfig = field(default_factory=DriveConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    patrol_lengths_s: tuple[float, ...] = ()
+    doors: tuple[Duration, Duration] | None = None
+    wing_opens_day: int = 0
+
+    @property
+    def longest_patrol_s(self) -> float:
+        """Length of the longest patrol."""
+        return max(self.patrol_lengths_s, default=self.patrol_s)
 
     def check(self) -> None:
         """Raise `ConfigError` if a field is out of range or contradicts another."""
         bounds = {
             "days": (1, 3660), "sessions_per_day": (1, 48), "patrol_s": (5.0, 7200.0), "change_rate": (0.0, 100.0),
             "length_m": (12.0, 500.0), "depth_m": (13.0, 60.0), "corridor_m": (2.4, 6.0), "rooms_per_side": (1, 20),
-            "first_day_unix_s": (0.0, 1e10),
+            "first_day_unix_s": (0.0, 1e10), "wing_opens_day": (0, 3660),
         }  # fmt: skip
         _all_within(self, "", bounds)
-        for name in ("days", "sessions_per_day", "rooms_per_side"):
+        for row, length_s in enumerate(self.patrol_lengths_s):
+            require_within(length_s, f"patrol_lengths_s[{row}]", 5.0, 7200.0)
+        for name, duration in zip(("open", "shut"), self.doors or (), strict=False):
+            duration.check(f"doors.{name}")
+        for name in ("days", "sessions_per_day", "rooms_per_side", "wing_opens_day"):
             if int(getattr(self, name)) != getattr(self, name):
                 raise ConfigError(f"is {getattr(self, name)}, not a whole number", field=name)
-        if self.patrol_s * self.sessions_per_day > 0.5 * 10 * 3600.0:
+        if self.longest_patrol_s * self.sessions_per_day > 0.5 * 10 * 3600.0:
             raise ConfigError(
                 "the patrols of one day fill more than half of the 10 working hours",
                 field="patrol_s",
@@ -217,6 +236,8 @@ class BuildingConfig:
                 field="rooms_per_side",
                 hint="at least 7 m a room",
             )
+        if self.wing_opens_day and self.rooms_per_side < 2:
+            raise ConfigError("a closed wing leaves no room", field="rooms_per_side", hint="at least 2")
         if (self.depth_m - self.corridor_m) / 2 < 5.0:
             raise ConfigError("leaves rooms of less than 5 m", field="corridor_m", hint="a narrower corridor")
         if not self.classes:

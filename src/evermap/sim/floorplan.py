@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -46,6 +49,7 @@ class FloorPlan:
         rooms: south rooms from west to east, then north rooms from west to east.
         length_m, depth_m: outer size.
         corridor_y_m: southern and northern wall of the corridor.
+        wing_x_m: where the eastern wing begins, inf where there is none.
     """
 
     walls_m: FloatArray
@@ -53,6 +57,23 @@ class FloorPlan:
     length_m: float
     depth_m: float
     corridor_y_m: tuple[float, float]
+    wing_x_m: float = math.inf
+
+    @property
+    def wing(self) -> tuple[int, ...]:
+        """Rows of the rooms in the eastern wing."""
+        return tuple(row for row, room in enumerate(self.rooms) if room.low_m[0] >= self.wing_x_m)
+
+    def shut(self, rooms: Iterable[int], *, wing: bool) -> Self:
+        """The plan with walls in the doorways of these rooms (rows), and across the corridor where the wing begins."""
+        south_y, north_y = self.corridor_y_m
+        walls = [self.walls_m]
+        for room in (self.rooms[row] for row in rooms):
+            y, half = north_y if room.north else south_y, DOORWAY_M / 2
+            walls.append(np.array([[[room.doorway_x_m - half, y], [room.doorway_x_m + half, y]]]))
+        if wing:
+            walls.append(np.array([[[self.wing_x_m, south_y], [self.wing_x_m, north_y]]]))
+        return replace(self, walls_m=np.concatenate(walls))
 
     def room_of(self, point_m: FloatArray) -> int:
         """Row of the room that holds the point (2,), -1 in the corridor and outside."""
@@ -90,11 +111,14 @@ def draw_floor_plan(config: BuildingConfig, rng: np.random.Generator) -> FloorPl
         ((0.0, depth), (0.0, 0.0)),
     ]
     spare_m = length / count - 6.5  # rooms stay at least 6.5 m wide
+    wing_x = math.inf
     for north in (False, True):
         y_low, y_high = (north_y, depth) if north else (0.0, south_y)
         corridor_y = north_y if north else south_y
         edges = np.linspace(0.0, length, count + 1)
         edges[1:-1] += rng.uniform(-0.35, 0.35, count - 1) * spare_m
+        if config.wing_opens_day:  # the partition stands where the last rooms of both sides begin
+            wing_x = edges[-2] = wing_x if north else float(edges[-2])
         wall_start = 0.0
         for row in range(count):
             x_low, x_high = float(edges[row]), float(edges[row + 1])
@@ -113,6 +137,7 @@ def draw_floor_plan(config: BuildingConfig, rng: np.random.Generator) -> FloorPl
         length_m=length,
         depth_m=depth,
         corridor_y_m=(south_y, north_y),
+        wing_x_m=wing_x,
     )
 
 

@@ -7,6 +7,7 @@ and noise-free odometry agree to rounding.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,18 +47,32 @@ class Drive:
         return se2.compose(self.pose_world_robot[row], se2.exp(self.twist[row] * passed_s[:, None]))
 
 
-def patrol_route(plan: FloorPlan, *, reverse: bool = False, jitter_m: FloatArray | None = None) -> FloatArray:
+def patrol_route(
+    plan: FloorPlan,
+    *,
+    reverse: bool = False,
+    jitter_m: FloatArray | None = None,
+    skip: Collection[int] = (),
+    wing_shut: bool = False,
+    start: float = 0.0,
+) -> FloatArray:
     """One closed lap from the dock (west end of the corridor) through all rooms, (N, 2) about 5 cm apart.
 
     Args:
         plan: the building.
         reverse: visit the northern rooms on the way out instead of the southern ones.
         jitter_m: (rooms, 4) shifts of the loops' four sides (west, east, near, far), None for the nominal lap.
+        skip: rooms (rows of the plan) that are passed by.
+        wing_shut: turn round before the partition of the eastern wing; its rooms have to be in `skip`.
+        start: where the lap begins, as a share of its length from the dock.
     """
     middle = sum(plan.corridor_y_m) / 2
     jitter = np.zeros((len(plan.rooms), 4)) if jitter_m is None else jitter_m
-    dock_x, end_x = 1.2, plan.length_m - 1.2
-    rows = {north: [row for row, room in enumerate(plan.rooms) if room.north == north] for north in (False, True)}
+    dock_x, end_x = 1.2, (plan.wing_x_m if wing_shut else plan.length_m) - 1.2
+    rows = {
+        north: [row for row, room in enumerate(plan.rooms) if room.north == north and row not in skip]
+        for north in (False, True)
+    }
     out_y, back_y = middle - LANE_M, middle + LANE_M
     corners: list[tuple[float, float]] = [(dock_x + 0.8, out_y)]
     for row in rows[reverse]:
@@ -66,7 +81,8 @@ def patrol_route(plan: FloorPlan, *, reverse: bool = False, jitter_m: FloatArray
     for row in reversed(rows[not reverse]):
         corners += _room_loop(plan, row, back_y, jitter[row], eastward=False)
     corners += [(dock_x, back_y), (dock_x, out_y)]
-    return _resample(_round_corners(np.array(corners)))
+    route = _resample(_round_corners(np.array(corners)))
+    return np.roll(route, -int(start * len(route)), axis=0)
 
 
 def _room_loop(

@@ -12,6 +12,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from evermap import se2
 from evermap.errors import ConfigError
 from evermap.sim.building import Placer, SceneObject, furnish
 from evermap.sim.changes import ChangeEvent, Stay, Timeline, events_of, live
@@ -21,6 +22,9 @@ from evermap.sim.detect import Scene, detect
 from evermap.sim.floorplan import FloorPlan, draw_floor_plan
 from evermap.sim.patrol import drive, patrol_route, report_odometry
 from evermap.types import Clock, FloatArray, Frames, IntArray, Landmarks, Recording, Trajectory
+
+P_PASS_BY: float = 1.0 / 3.0
+"""Probability that a patrol with a route of its own does not visit a room."""
 
 
 class _Stream(IntEnum):
@@ -32,6 +36,8 @@ class _Stream(IntEnum):
     DRIVE = 5
     ODOMETRY = 6
     SENSOR = 7
+    PATROLS = 8
+    DOORS = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +48,18 @@ class SessionTruth:
         day: 0 for the first.
         start_s, end_s: of the recording, seconds since 1970 UTC.
         detection_landmark_id: (M,) the landmark that each detection truly came from, `UNKNOWN` if from nothing.
+        pose_world_sensor: (F, 3) true pose of the sensor at every frame.
+        shut_rooms: rooms (rows of the plan) whose doors were shut.
+        wing_shut: whether the eastern wing was closed.
     """
 
     day: int
     start_s: float
     end_s: float
     detection_landmark_id: IntArray
+    pose_world_sensor: FloatArray
+    shut_rooms: tuple[int, ...] = ()
+    wing_shut: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +95,11 @@ class BuildingSimulation:
     def n_landmarks(self) -> int:
         """Landmarks that were ever there; their ids count from 0."""
         return sum(len(item.landmark_ids) for item in self.objects)
+
+    def plan_in(self, session: int) -> FloorPlan:
+        """The plan with what was shut during a session as walls: what blocked the sensor's view."""
+        truth = self.truths[session]
+        return self.plan.shut(truth.shut_rooms, wing=truth.wing_shut)
 
     def landmarks_at(self, stamp_s: float) -> Landmarks:
         """True landmarks that are there at a time, exact, in the frame 'truth'."""
@@ -122,16 +139,18 @@ def simulate_building(config: BuildingConfig | None = None, seed: int = 0) -> Bu
     plan = draw_floor_plan(config, _rng(seed, _Stream.PLAN))
     placer = Placer(plan, np.concatenate([patrol_route(plan), patrol_route(plan, reverse=True)]))
     first_objects, _ = furnish(config.classes, placer, _rng(seed, _Stream.FURNITURE))
-    timeline = _timeline(config, _rng(seed, _Stream.TIMES))
+    patrols = _patrols(config, plan, seed)
+    timeline = _timeline(config, [patrol.length_s for patrol in patrols], _rng(seed, _Stream.TIMES))
     everyone, history = live(first_objects, config, placer, timeline, _sequence(seed, _Stream.CHANGES))
     objects, stays = tuple(everyone), tuple(history)
     n_known = sum(len(item.landmark_ids) for item in first_objects)
 
+    doors = _shut_rooms(config, plan, timeline, seed)
     sessions, truths = [], []
     for row, start_s in enumerate(timeline.sessions_s[:, 0]):
         position = positions_at(objects, stays, float(start_s))
         scene = Scene(position, _class_ids(objects), n_known)
-        recording, truth = _record(config, seed, row, float(start_s), plan, scene)
+        recording, truth = _record(config, seed, row, float(start_s), plan, scene, patrols[row], doors[row])
         sessions.append(recording)
         truths.append(truth)
     return BuildingSimulation(
@@ -146,19 +165,92 @@ def simulate_building(config: BuildingConfig | None = None, seed: int = 0) -> Bu
     )
 
 
+@dataclass(frozen=True, slots=True)
+class _Patrol:
+    """What a patrol sets out to do.
+
+    Attributes:
+        length_s: how long it takes.
+        reverse: the direction of its lap.
+        passed_by: rooms that it does not visit even if it could.
+        start: where on its lap it begins, as a share.
+    """
+
+    length_s: float
+    reverse: bool
+    passed_by: frozenset[int] = frozenset()
+    start: float = 0.0
+
+
+def _patrols(config: BuildingConfig, plan: FloorPlan, seed: int) -> list[_Patrol]:
+    """Full laps from the dock, in alternating directions; with `patrol_lengths_s` each patrol its own."""
+    count = config.days * config.sessions_per_day
+    if not config.patrol_lengths_s:
+        return [_Patrol(config.patrol_s, row % 2 == 1) for row in range(count)]
+    patrols = []
+    for row in range(count):
+        rng = _rng(seed, _Stream.PATROLS, row)
+        length_s = float(rng.choice(config.patrol_lengths_s))
+        reverse, start = bool(rng.random() < 0.5), float(rng.random())
+        passed_by = frozenset(np.flatnonzero(rng.random(len(plan.rooms)) < P_PASS_BY).tolist())
+        patrols.append(_Patrol(length_s, reverse, passed_by, start))
+    return patrols
+
+
+def _shut_rooms(
+    config: BuildingConfig, plan: FloorPlan, timeline: Timeline, seed: int
+) -> list[tuple[tuple[int, ...], bool]]:
+    """For every session: rooms whose doors are shut, and whether the wing is closed."""
+    starts = timeline.sessions_s[:, 0]
+    opens_s = timeline.start_s + config.wing_opens_day * DAY_S
+    shut = np.zeros((len(starts), len(plan.rooms)), dtype=np.bool_)
+    if config.doors is not None:
+        for row in range(len(plan.rooms)):
+            rng = _rng(seed, _Stream.DOORS, row)
+            is_shut, since_s = bool(rng.random() < 0.5), timeline.start_s
+            while since_s < timeline.end_s:
+                end_s = since_s + config.doors[is_shut].sample_s(rng)
+                shut[(starts >= since_s) & (starts < end_s), row] = is_shut
+                since_s, is_shut = end_s, not is_shut
+    return [
+        (tuple(np.flatnonzero(rooms).tolist()), bool(start_s < opens_s))
+        for rooms, start_s in zip(shut, starts, strict=True)
+    ]
+
+
 def _record(
-    config: BuildingConfig, seed: int, row: int, start_s: float, plan: FloorPlan, scene: Scene
+    config: BuildingConfig,
+    seed: int,
+    row: int,
+    start_s: float,
+    plan: FloorPlan,
+    scene: Scene,
+    patrol: _Patrol,
+    doors: tuple[tuple[int, ...], bool],
 ) -> tuple[Recording, SessionTruth]:
     """Drive, listen to the encoders and look around, once."""
+    shut_rooms, wing_shut = doors
     jitter = _rng(seed, _Stream.ROUTE, row).uniform(-0.15, 0.15, (len(plan.rooms), 4))
-    route = patrol_route(plan, reverse=row % 2 == 1, jitter_m=jitter)
-    path = drive(route, config.drive, start_s, config.patrol_s, _rng(seed, _Stream.DRIVE, row))
+    closed = {*shut_rooms, *(plan.wing if wing_shut else ())}
+    within_reach = set(range(len(plan.rooms))) - closed
+    # a patrol that would pass by all rooms visits those that it can
+    visited = (within_reach - patrol.passed_by) or within_reach
+    route = patrol_route(
+        plan,
+        reverse=patrol.reverse,
+        jitter_m=jitter,
+        skip=set(range(len(plan.rooms))) - visited,
+        wing_shut=wing_shut,
+        start=patrol.start,
+    )
+    path = drive(route, config.drive, start_s, patrol.length_s, _rng(seed, _Stream.DRIVE, row))
     odometry = report_odometry(path, config.odometry, _rng(seed, _Stream.ODOMETRY, row))
     # the camera runs on its own beat, a fraction of a period after the encoders
-    passed_s = (np.arange(int(config.patrol_s * config.sensor.rate_hz) + 1) + 0.37) / config.sensor.rate_hz
+    passed_s = (np.arange(int(patrol.length_s * config.sensor.rate_hz) + 1) + 0.37) / config.sensor.rate_hz
     frame_s = start_s + passed_s[start_s + passed_s <= odometry.stamp_s[-1]]
     pose = path.pose_at(frame_s)
-    detections, true_ids = detect(pose, scene, plan, config.sensor, _sequence(seed, _Stream.SENSOR, row))
+    sight = plan.shut(shut_rooms, wing=wing_shut)
+    detections, true_ids = detect(pose, scene, sight, config.sensor, _sequence(seed, _Stream.SENSOR, row))
     day = row // config.sessions_per_day
     class_names = tuple(kind.name for kind in config.classes)
     recording = Recording(
@@ -179,16 +271,20 @@ def _record(
         source=f"simulated building, seed {seed}",
         clock=Clock.UNIX,
     )
-    return recording, SessionTruth(day, start_s, float(path.stamp_s[-1]), true_ids)
+    mounted = se2.compose(pose, np.array(config.sensor.mount_robot_sensor))
+    return recording, SessionTruth(
+        day, start_s, float(path.stamp_s[-1]), true_ids, mounted, shut_rooms=shut_rooms, wing_shut=wing_shut
+    )
 
 
-def _timeline(config: BuildingConfig, rng: np.random.Generator) -> Timeline:
+def _timeline(config: BuildingConfig, lengths_s: list[float], rng: np.random.Generator) -> Timeline:
     """Sessions spread over the working hours of every day, each somewhere in the first third of its share."""
     share_s = 10 * 3600.0 / config.sessions_per_day
-    late_s = rng.random((config.days, config.sessions_per_day)) * min(share_s / 3, share_s - config.patrol_s - 1.0)
+    longest_s = config.longest_patrol_s
+    late_s = rng.random((config.days, config.sessions_per_day)) * min(share_s / 3, share_s - longest_s - 1.0)
     clock_s = 8 * 3600.0 + np.arange(config.sessions_per_day) * share_s + late_s
     start_s = np.floor(config.first_day_unix_s + np.arange(config.days)[:, None] * DAY_S + clock_s).ravel()
-    sessions_s = np.stack([start_s, start_s + config.patrol_s + 1.0], axis=1)
+    sessions_s = np.stack([start_s, start_s + np.array(lengths_s) + 1.0], axis=1)
     return Timeline(config.first_day_unix_s, float(sessions_s[-1, 1]), sessions_s)
 
 
