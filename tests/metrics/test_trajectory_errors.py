@@ -135,6 +135,8 @@ def test_truth_is_scored_where_it_is_and_never_invented():
     rows = scored_stamps(trajectory(fast, figure_eight(fast)), 0.0, 30.0, 2.0)
     np.testing.assert_allclose(np.diff(fast[rows]), 0.5, atol=0.011)
     assert len(scored_stamps(truth, 70.0, 80.0, 2.0)) == 0
+    stray = np.append(stamps, 4e10)  # a regular clock over that span would need hundreds of gigabytes
+    assert len(scored_stamps(trajectory(stray, figure_eight(stray)), 0.0, 5e10, 2.0)) > 40
 
 
 def test_estimates_far_from_any_pose_can_be_left_out():

@@ -108,3 +108,18 @@ def test_kernel_parameters() -> None:
         look_exponential(one, 0 * one, one, one, seen, 0.1 * one, 0.1 * one, out=Look(one, np.empty(1)))
     with pytest.raises(InputError, match="'inverse_odds': row 0"):
         look_exponential(-one, 0 * one, one, one, seen, 0.1 * one, 0.1 * one)
+
+
+def test_a_prior_may_be_text_and_anything_else_is_refused_at_once() -> None:
+    by_text, by_name = (
+        PersistenceFilter("exponential:half-life=1d"),
+        PersistenceFilter(Exponential.from_half_life(86400)),
+    )
+    assert by_text.update(3600.0, False, 0.1, 0.1) == by_name.update(3600.0, False, 0.1, 0.1)
+    assert single.init(2, "exponential:half-life=1d").priors == (Exponential.from_half_life(86400),)
+    for build in (PersistenceFilter, lambda prior: single.init(2, prior)):
+        with pytest.raises(ConfigError, match="exponentiel"):
+            build("exponentiel:half-life=1d")
+        for wrong in (Exponential, 3.0, None):
+            with pytest.raises(InputError, match="a lifetime prior is needed"):
+                build(wrong)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -195,7 +196,7 @@ def test_an_impossible_look_is_named_with_feature_and_line(tmp_path: Path) -> No
         run_persist(looks, PersistConfig(prior="uniform:limit=1min"))
     path.write_text("stamp_s,feature_id,detected,p_miss,p_false\n0,a,0,0,0.5\n0,b,0,0,1\n")
     save_model(PhaseType.two_state(0.1, 0.1), tmp_path / "m.json")
-    with pytest.raises(InputError, match=r"looks\.csv:3: field 'detected': feature 'b' at 0 s: this observation is"):
+    with pytest.raises(InputError, match=r"looks\.csv:3: field 'p_miss': 0 and p_false 1 make 1 or more"):
         run_persist(read_looks(path), PersistConfig(model=str(tmp_path / "m.json")))
 
 
@@ -271,3 +272,50 @@ def test_priors_by_class_are_told_from_priors() -> None:
 
 def test_nice_steps() -> None:
     assert [nice_step(s) for s in (0.9, 1.0, 1.1, 4.9, 5.5, 432.0, 0.0)] == [1.0, 1.0, 2.0, 5.0, 10.0, 500.0, 1.0]
+
+
+def test_looks_that_make_beliefs_wrong_are_told(tmp_path: Path) -> None:
+    def remarks(rows: str) -> str:
+        path = tmp_path / "looks.csv"
+        path.write_text(f"stamp_s,feature_id,detected\n{rows}")
+        return " ".join(run_persist(read_looks(path)).warnings)
+
+    assert "not one of 4 looks is a miss" in remarks("0,a,1\n0,b,1\n9,a,1\n9,b,1\n")
+    assert "not one of 3 looks is a detection" in remarks("0,a,0\n5,a,0\n9,a,0\n")
+    odd = remarks("0,a,1\n0,a,1\n5,a,1\n5,a,0\n5,b,1\n9,b,0\n")
+    assert "1 look that repeat another" in odd
+    assert "1 look that contradict another" in odd
+    assert remarks("0,a,1\n5,a,0\n9,a,1\n") == ""
+
+
+@pytest.mark.parametrize("rates", [(0.6, 0.6), (0.5, 0.5), (1.0, 0.0)])
+def test_an_inverted_detector_is_refused_by_file_option_and_array(tmp_path: Path, rates: tuple[float, float]) -> None:
+    path = tmp_path / "looks.csv"
+    path.write_text("stamp_s,feature_id,detected\n0,a,1\n5,a,1\n")
+    with pytest.raises(ConfigError, match=r"'--p-miss': .* make 1 or more"):
+        read_looks(path, p_miss=rates[0], p_false=rates[1])
+    table = read_looks(path)
+    with pytest.raises(InputError, match="make 1 or more"):
+        replace(table, p_miss=np.full(2, rates[0]), p_false=np.full(2, rates[1]))
+    path.write_text(f"stamp_s,feature_id,detected,p_miss,p_false\n0,a,1,.1,.1\n5,a,1,{rates[0]},{rates[1]}\n")
+    with pytest.raises(InputError, match=r"looks\.csv:3: field 'p_miss': .* make 1 or more"):
+        read_looks(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"stamp_s": np.array([0.0, np.nan])}, "'stamp_s': nan where a finite number"),
+        ({"stamp_s": np.array([0.0, 1e12])}, "'stamp_s'.*milli"),
+        ({"detected": np.array([1.0, 2.0])}, "'detected': is neither 1 nor 0"),
+        ({"detected": np.ones(3)}, "'detected': shape"),
+        ({"p_miss": np.array([0.1, -0.1])}, "'p_miss': -0.1 is outside"),
+        ({"feature": np.array([0, 7])}, "'feature': there is no such feature"),
+        ({"class_of_feature": np.zeros(3, dtype=np.int64)}, "'class_of_feature'"),
+    ],
+)
+def test_a_table_made_in_python_is_held_to_the_same(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = tmp_path / "looks.csv"
+    path.write_text("stamp_s,feature_id,detected\n0,a,1\n5,a,1\n")
+    with pytest.raises(InputError, match=message):
+        replace(read_looks(path), **change)

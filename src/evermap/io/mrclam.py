@@ -7,6 +7,7 @@ Read from the zip or its unpacked folder; only one robot at a time.
 from __future__ import annotations
 
 import re
+from bisect import bisect_right
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -33,6 +34,7 @@ from evermap.types import (
     UNKNOWN,
     Clock,
     Detections,
+    FloatArray,
     Frames,
     IntArray,
     Landmarks,
@@ -56,6 +58,9 @@ CAMERA = Sensor(
 )
 """The robots' forward camera. Rounded outwards from what all robots report (0.8 to 9.6 m, -0.59 to 0.57 rad); no truth
 is used. Of the barcodes in view it decodes less than half. Noise is left to be estimated from the recording."""
+
+MOST_STRAY = 1e-3
+"""Share of rows that may be out of order in a file that is put in order."""
 
 _NAME = re.compile(r"Robot(\d{1,6})_(Odometry|Measurement)\.dat", re.ASCII)
 _SUBJECT = Quantity("subject", 1, 1e6, hint="subjects count from 1")
@@ -168,7 +173,7 @@ def _read_measurements(
     rows = _parse(files, name, (STAMP_S, _BARCODE, RANGE_M, BEARING_RAD), warnings)
     if len(rows) == 0:
         raise DataError("holds no measurement", path=rows.path)
-    check_forward(rows.column(0), path=rows.path, line=rows.line)
+    rows = _sorted(rows, warnings)
     subject = _subjects(files, _whole(rows, 1, "barcode"), name, warnings)
     stamps, frame = np.unique(rows.column(0), return_inverse=True)
     landmark = np.flatnonzero(subject > LAST_ROBOT_SUBJECT)
@@ -245,10 +250,37 @@ def _parse(files: FileSet, name: str, quantities: tuple[Quantity, ...], warnings
 
 
 def _forward_in_time(rows: Rows, warnings: list[str]) -> Rows:
-    stamp_s = rows.column(0)
-    check_forward(stamp_s, path=rows.path, line=rows.line)
-    keep = last_of_equal(stamp_s, path=rows.path, warnings=warnings)
+    rows = _sorted(rows, warnings)
+    keep = last_of_equal(rows.column(0), path=rows.path, warnings=warnings)
     return Rows(rows.path, rows.values[keep], rows.line[keep])
+
+
+def _sorted(rows: Rows, warnings: list[str]) -> Rows:
+    """The rows by time, where only a few are out of order: the first odometry row of data set 9 is, as published.
+
+    Raises:
+        InputError: so many are that the clock was set back, or the file is another one.
+    """
+    stamp_s = rows.column(0)
+    if np.all(np.diff(stamp_s) >= 0.0):
+        return rows
+    stray = len(rows) - _longest_forward(stamp_s)
+    if stray > max(1, MOST_STRAY * len(rows)):
+        check_forward(stamp_s, path=rows.path, line=rows.line)
+    row = int(np.argmax(np.diff(stamp_s) < 0.0)) + 1
+    where = f"time runs backwards at line {rows.line[row]}"
+    warnings.append(f"{rows.path.name}: {counted(stray, 'row')} out of order sorted in ({where})")
+    order = np.argsort(stamp_s, kind="stable")
+    return Rows(rows.path, rows.values[order], rows.line[order])
+
+
+def _longest_forward(stamp_s: FloatArray) -> int:
+    """Length of the longest subsequence that never runs backwards (patience sorting)."""
+    ends: list[float] = []
+    for stamp in stamp_s.tolist():
+        place = bisect_right(ends, stamp)
+        ends[place : place + 1] = [stamp]
+    return len(ends)
 
 
 def _refuse_repeats(rows: Rows, numbers: IntArray, field: str) -> None:

@@ -93,7 +93,10 @@ def scored_stamps(truth: Trajectory, first_s: float, last_s: float, rate_hz: flo
     if len(overlap) == 0:
         return overlap.astype(np.int64)
     stamps = truth.stamp_s[overlap]
-    ticks = np.arange(stamps[0], stamps[-1] + 1e-6, period_s)
+    # only ticks that can have a stamp within half a tick: a stray stamp may lie years away
+    count = np.unique(np.rint((stamps - stamps[0]) / period_s)[:, None] + [-1.0, 0.0, 1.0])
+    ticks = stamps[0] + count[count >= 0.0] * period_s
+    ticks = ticks[ticks < stamps[-1] + 1e-6]
     right = np.clip(np.searchsorted(stamps, ticks), 1, max(len(stamps) - 1, 1))
     left = right - 1
     right = np.minimum(right, len(stamps) - 1)

@@ -7,7 +7,26 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError, NumericalError
+from evermap.survival.protocol import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
+
+
+def as_prior(prior: LifetimePrior | str) -> LifetimePrior:
+    """A lifetime prior, or the one that a text such as `exponential:half-life=30d` describes.
+
+    Raises:
+        ConfigError: a text that describes none.
+        InputError: something else.
+    """
+    if isinstance(prior, str):
+        from evermap.survival.text import parse_prior
+
+        return parse_prior(prior)
+    if isinstance(prior, type) or not hasattr(prior, "log_conditional_survival"):
+        name = prior.__name__ if isinstance(prior, type) else type(prior).__name__
+        hint = "'exponential:half-life=30d', or a distribution of evermap.survival"
+        raise InputError(f"a lifetime prior is needed, not {name}", field="prior", hint=hint)
+    return prior
 
 
 def as_rows(values: Any, n: int, field: str) -> FloatArray:

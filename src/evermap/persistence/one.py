@@ -7,7 +7,7 @@ from functools import partial
 from math import exp, expm1, inf, isfinite, log
 
 from evermap.errors import InputError, NumericalError
-from evermap.persistence.checks import impossible
+from evermap.persistence.checks import as_prior, impossible
 from evermap.persistence.death import WIDE
 from evermap.persistence.state import LARGEST, LOG_LARGEST, SMALLEST
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior
@@ -21,13 +21,16 @@ class PersistenceFilter:
     Times count from the feature's birth, in seconds; it is certainly there at 0.
 
     Args:
-        prior: how long such features stay.
+        prior: how long such features stay; a text such as `exponential:half-life=30d` is read as one.
+
+    Raises:
+        ConfigError, InputError: `prior` is no lifetime prior.
     """
 
     __slots__ = ("_death_odds", "_evidence", "_inverse_odds", "_stamp")
 
-    def __init__(self, prior: LifetimePrior) -> None:
-        self._death_odds = _death_odds_under(prior)
+    def __init__(self, prior: LifetimePrior | str) -> None:
+        self._death_odds = _death_odds_under(as_prior(prior))
         self._inverse_odds = 0.0
         self._stamp = 0.0
         self._evidence = 0.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.errors import ConfigError
+from evermap.persistence.checks import as_prior
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
@@ -53,7 +54,7 @@ class Belief:
 
 def init(
     n: int,
-    prior: LifetimePrior | Sequence[LifetimePrior],
+    prior: LifetimePrior | str | Sequence[LifetimePrior | str],
     *,
     prior_of_row: IntArray | Sequence[int] | None = None,
     evidence: bool = False,
@@ -62,16 +63,19 @@ def init(
 
     Args:
         n: number of features.
-        prior: one lifetime prior for all rows, or several.
+        prior: one lifetime prior for all rows, or several; each may be a text, as `exponential:half-life=30d`.
         prior_of_row: (n,) index into `prior`, needed as soon as there is more than one.
         evidence: keep the running log evidence too (for model choice and for learning priors).
 
     Raises:
-        ConfigError: a negative `n`, no prior, or an index that points at none.
+        ConfigError: a negative `n`, no prior, a text that describes none, or an index that points at none.
+        InputError: something else in place of a prior.
     """
     if n < 0:
         raise ConfigError(f"{n} features cannot be filtered", field="n", hint="a number of rows >= 0")
-    priors: tuple[LifetimePrior, ...] = tuple(prior) if isinstance(prior, Sequence) else (prior,)
+    given: Sequence[LifetimePrior | str]
+    given = (prior,) if isinstance(prior, str) or not isinstance(prior, Sequence) else prior
+    priors = tuple(as_prior(one) for one in given)
     if not priors:
         raise ConfigError("no lifetime prior was given", field="prior")
     if prior_of_row is None:

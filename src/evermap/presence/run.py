@@ -201,7 +201,7 @@ def _score(
 
 
 def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: Beliefs, changes: Changes) -> list[str]:
-    remarks = []
+    remarks = _odd_looks(looks)
     if config.learns and len(looks.stamp_s) > config.learn_from:
         remarks.append(
             f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (--learn-from)"
@@ -219,6 +219,31 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
     back = len(np.unique(changes.feature[changes.returned]))
     if back and config.stays_once:
         remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try --recurrent")
+    return remarks
+
+
+def _odd_looks(looks: Looks) -> list[str]:
+    """What makes beliefs wrong without being impossible: no miss or no hit at all, and looks that came twice."""
+    remarks = []
+    count = len(looks.stamp_s)
+    hits = int(looks.detected.sum())
+    if hits == count and count > looks.n_features:
+        remarks.append(
+            f"not one of {count:,} looks is a miss, so nothing can vanish: a row with detected 0 is needed wherever a "
+            "feature was looked at and not detected"
+        )
+    elif hits == 0 and count > looks.n_features:
+        remarks.append(f"not one of {count:,} looks is a detection: is the column 'detected' inverted?")
+    of_look = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    again = (np.diff(of_look) == 0) & (np.diff(looks.stamp_s) == 0.0)
+    other = again & (np.diff(looks.detected) != 0.0)
+    for what, many in (("repeat", again & ~other), ("contradict", other)):
+        if many.any():
+            row = int(np.argmax(many))
+            remarks.append(
+                f"{counted(int(many.sum()), 'look')} that {what} another at the same feature and time, each taken as "
+                f"evidence of its own (first at {looks.stamp_s[row]:.15g} s): one row a look is meant"
+            )
     return remarks
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,10 @@ class LookTable:
         source: file it came from, '' if none.
         line: (R,) line of each row in that file.
         warnings: remarks of the reader.
+
+    Raises:
+        InputError: columns of different lengths, a value that the reader would refuse, or error rates under which a
+            detection speaks against the feature.
     """
 
     names: tuple[str, ...]
@@ -52,6 +56,44 @@ class LookTable:
     source: str
     line: IntArray
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.class_of_feature.shape != (self.n_features,):
+            problem = f"{len(self.class_of_feature)} classes for {self.n_features} features"
+            raise InputError(problem, field="class_of_feature")
+        columns = {
+            name: getattr(self, name) for name in ("feature", "detected", "p_miss", "p_false", "present", "line")
+        }
+        for name, column in columns.items():
+            if column is not None and column.shape != self.stamp_s.shape:
+                problem = f"shape {column.shape} where stamp_s has {self.stamp_s.shape}"
+                raise InputError(problem, path=self.source or None, field=name, hint="one value a row")
+        path = Path(self.source or "looks")
+        for quantity in (STAMP_S, _P_MISS, _P_FALSE):
+            replace(quantity, optional=False).check(getattr(self, quantity.name), path=path, line=self.line)
+        nobody = ~np.isin(self.feature, np.arange(self.n_features))
+        self._refuse(nobody, "feature", "there is no such feature", "an index into names")
+        for name in ("detected", "present"):
+            if columns[name] is not None:
+                self._refuse(~(np.isin(columns[name], (0.0, 1.0)) | np.isnan(columns[name])), name,
+                             "is neither 1 nor 0", "1, 0, or nan where nobody looked")  # fmt: skip
+        inverted = self.looked & (self.p_miss + self.p_false >= 1.0)
+        if inverted.any():
+            row = int(np.argmax(inverted))
+            sure = self.p_miss[row] + self.p_false[row] == 1.0
+            told = "tells nothing" if sure else "would speak against the feature, a miss for it"
+            self._refuse(
+                inverted,
+                "p_miss",
+                f"{self.p_miss[row]:g} and p_false {self.p_false[row]:g} make 1 or more: a detection {told}",
+                "p_miss + p_false below 1; P(detection | there) is 1 - p_miss; leave out looks that tell nothing",
+            )
+
+    def _refuse(self, wrong: BoolArray, field: str, problem: str, hint: str) -> None:
+        """Raise InputError for the first row that is wrong."""
+        if wrong.any():
+            line = int(self.line[np.argmax(wrong)]) or None
+            raise InputError(problem, path=self.source or None, line=line, field=field, hint=hint)
 
     def __len__(self) -> int:
         return len(self.stamp_s)
@@ -135,6 +177,10 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
     for option, value in (("--p-miss", p_miss), ("--p-false", p_false)):
         if not 0.0 <= value <= 1.0:
             raise ConfigError(f"{value} is no probability", field=option, hint="a number between 0 and 1")
+    if p_miss + p_false >= 1.0:
+        problem = f"{p_miss:g} and --p-false {p_false:g} make 1 or more: a detection would speak against the feature"
+        hint = "both below 0.5; P(detection | there) is 1 - p_miss"
+        raise ConfigError(problem, field="--p-miss", hint=hint)
     warnings: list[str] = []
     table = read_columns(path, warnings)
     _explain_missing(table)
