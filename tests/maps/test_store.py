@@ -18,10 +18,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from random_maps import assert_same, random_changes, random_evidence, random_map
 
-from evermap.errors import ConfigError, InputError
+from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, content, open_store
-from evermap.types import ChangeKind
+from evermap.types import UNKNOWN, ChangeKind
 
 SESSION = Provenance(
     recording="robot 1",
@@ -62,20 +62,22 @@ def test_every_revision_reads_back_bit_by_bit(store: MapStore) -> None:
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
 def test_any_numbers_read_back_bit_by_bit(data: st.DataObject, store: MapStore) -> None:
-    """Minus zero, infinities, subnormal numbers and nan too; matrices that are not quite symmetric too."""
+    """Minus zero, subnormal numbers, and infinite stamps too; matrices that are not quite symmetric too."""
     living = random_map(data.draw(st.integers(0, 5)), cliques=2)
     anything = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
     count, size = len(living.places), len(living.covariance_m2)
-    matrix = data.draw(hnp.arrays(np.float64, (size, size), elements=anything))
+    finite = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=True)
+    matrix = data.draw(hnp.arrays(np.float64, (size, size), elements=finite))
+    matrix[np.diag_indices(size)] = np.abs(matrix.diagonal())
     symmetric = np.where(np.tri(size, dtype=bool), matrix, matrix.T)
     living = replace(
         living,
         stamp_s=data.draw(anything.filter(lambda x: x == x)),
         covariance_m2=data.draw(st.sampled_from([matrix, symmetric])),
-        places=replace(living.places, position_m=data.draw(hnp.arrays(np.float64, (count, 2), elements=anything))),
+        places=replace(living.places, position_m=data.draw(hnp.arrays(np.float64, (count, 2), elements=finite))),
         members=replace(
             living.members,
-            class_id=data.draw(hnp.arrays(np.int64, len(living.members), elements=st.integers(-(2**63), 2**63 - 1))),
+            class_id=data.draw(hnp.arrays(np.int64, len(living.members), elements=st.integers(UNKNOWN, 2**63 - 1))),
         ),
         class_names=tuple(data.draw(st.lists(st.text(), max_size=3))),
     )
@@ -177,7 +179,7 @@ def test_evidence_by_clique_by_landmark_and_by_time(store: MapStore) -> None:
     first, second = random_map(1, stamp_s=1000.0), random_map(1, stamp_s=2000.0)
     # in the second session landmark 0's clique has another number
     renamed = replace(second.members, clique_id=np.where(second.members.clique_id == 0, 99, second.members.clique_id))
-    second = replace(second, members=renamed)
+    second = replace(second, members=renamed, n_cliques_ever=100)
     early, late = random_evidence(5, first), random_evidence(6, second)
     store.commit(first, SESSION, (), early, parent=0)
     store.commit(second, SESSION, (), late, parent=1)
@@ -198,6 +200,38 @@ def test_evidence_by_clique_by_landmark_and_by_time(store: MapStore) -> None:
     store.revert(1)  # what a session saw that was taken back says nothing any more
     assert_same(store.evidence(landmark_id=landmark).stamp_s, early[early.clique_id == 0].stamp_s)
     assert len(store.evidence(landmark_id=-5)) == 0
+
+
+def test_attachments_are_kept_once_and_read_on_demand(store: MapStore) -> None:
+    session, scan = b"\0\1\2" * 70_000, np.random.default_rng(0).bytes(50_000)
+    living = random_map(1)
+    store.commit(living, SESSION, parent=0, attachments={"session": session, "scan": scan})
+    store.commit(living, SESSION, parent=1)
+    assert [(item.revision, item.name, item.n_bytes) for item in store.attachments()] == [
+        (1, "scan", 50_000),
+        (1, "session", 210_000),
+    ]
+    (first,) = (item for item in store.attachments([1]) if item.name == "scan")
+    assert store.attached(first) == scan
+    size = Path(store.where).stat().st_size
+    store.commit(living, SESSION, parent=2, attachments={"again": first, "too": session})
+    assert Path(store.where).stat().st_size < size + 20_000
+    assert {item.name: store.attached(item) for item in store.attachments([3])} == {"again": scan, "too": session}
+    store.revert(1)
+    assert [item.name for item in store.attachments()] == ["scan", "session"]  # of 1 and 4
+    unknown = replace(first, digest="00" * 32)
+    with pytest.raises(InputError, match="a part of the map is missing"):
+        store.commit(living, SESSION, parent=4, attachments={"x": unknown})
+    assert store.head() == 4
+
+
+def test_a_map_that_contradicts_itself_is_not_committed(store: MapStore) -> None:
+    living = random_map(1)
+    store.commit(living, SESSION, parent=0)
+    lame = replace(living, places=replace(living.places, position_m=living.places.position_m * np.nan))
+    with pytest.raises(NumericalError, match=r"'places.position_m' is not finite"):
+        store.commit(lame, SESSION, parent=1)
+    assert store.head() == 1
 
 
 def test_an_unknown_revision_is_one_line(store: MapStore) -> None:

@@ -67,18 +67,15 @@ def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
         use_all(path)
 
 
-def test_a_part_that_is_missing_or_another_is_found(path: Path) -> None:
+def test_a_part_that_is_missing_is_found(path: Path) -> None:
+    with open_store(path) as store, store._reading() as connection:  # type: ignore[attr-defined]
+        kept = store._record(connection, 1).content  # type: ignore[attr-defined]
     with sqlite3.connect(path) as database:
-        names = [row[0] for row in database.execute("SELECT name FROM chunk")]
-        kept = database.execute("SELECT content FROM revision WHERE number = 1").fetchone()[0]
-        database.execute("UPDATE revision SET content = ? WHERE number = 2", (kept,))
-        database.execute("PRAGMA foreign_keys = OFF")
         database.execute("DELETE FROM chunk WHERE name = ?", (kept,))
     database.close()
-    assert len(names) > 30
     with open_store(path) as store:
         assert_same(store.load(3), random_map(2))
-        with pytest.raises(InputError, match=r"damaged: a part of the map is missing \(try: evermap map log"):
+        with pytest.raises(InputError, match=r"damaged: a part of the map is missing"):
             store.load(1)
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from random_maps import assert_same, random_changes, random_evidence, random_map
 from sqlalchemy import create_engine, inspect
@@ -31,8 +33,14 @@ def write(path: Path, revisions: int = 3) -> None:
             store.commit(living, Provenance(), random_changes(seed, living), random_evidence(seed, living), parent=seed)
 
 
-def make_old(path: Path) -> None:
-    """A store as schema 1 had it, with the same content."""
+def copy_of_schema_2(path: Path) -> None:
+    """The store that evermap wrote when schema 2 was that of the day: three sessions, then back to the first one."""
+    path.write_bytes((Path(__file__).parent / "data" / "schema_2.evermap").read_bytes())
+
+
+def make_schema_1(path: Path) -> None:
+    """The same as schema 1 had it."""
+    copy_of_schema_2(path)
     with sqlite3.connect(path) as database:
         rows = database.execute("SELECT * FROM change ORDER BY revision, position").fetchall()
         named: dict[tuple[int, int], list[int]] = {}
@@ -65,29 +73,39 @@ def tables(path: Path) -> object:
     }
 
 
-def test_schema_1_becomes_that_of_today(tmp_path: Path) -> None:
+@pytest.mark.parametrize("make", [make_schema_1, copy_of_schema_2])
+def test_an_old_schema_becomes_that_of_today(tmp_path: Path, make: Callable[[Path], None]) -> None:
     today, old = tmp_path / "today.evermap", tmp_path / "old.evermap"
     write(today)
-    write(old)
-    make_old(old)
+    make(old)
     assert tables(old) != tables(today)
     with open_store(old) as store:
-        assert store.head() == 3
+        assert store.head() == 4
+        seen = 0
         for seed in range(3):
-            living = random_map(seed)
+            living = random_map(seed, cliques=3)
             assert_same(store.load(seed + 1), living)
             for mine, theirs in zip(store.changes(seed + 1), random_changes(seed, living), strict=True):
                 assert_same(mine, theirs)
-        assert len(store.evidence()) == sum(len(random_evidence(seed, random_map(seed))) for seed in range(3))
+            evidence = random_evidence(seed, living, looks=9)
+            found = store.evidence(revisions=[seed + 1])
+            order = np.argsort(evidence.stamp_s, kind="stable")
+            for name in ("clique_id", "stamp_s", "n_hits", "n_misses"):
+                assert_same(getattr(found, name), getattr(evidence[order], name))
+            seen += len(found)
+        assert seen == len(store.evidence(revisions=[1, 2, 3]))
+        log = store.log()
+        assert [item.provenance.recording for item in log] == ["session 0", "session 1", "session 2", ""]
+        assert [item.provenance.config for item in log] == ["x = 1"] * 3 + [""]
+        assert store.lineage() == (1, 4)
         living = random_map(9)
-        store.commit(living, Provenance(), random_changes(9, living), parent=3)
+        store.commit(living, Provenance(), random_changes(9, living), parent=4)
     assert tables(old) == tables(today)
 
 
 def test_a_migration_that_fails_leaves_the_old_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "m.evermap"
-    write(path)
-    make_old(path)
+    make_schema_1(path)
     before = tables(path)
 
     def fail(connection: object) -> None:
@@ -101,7 +119,7 @@ def test_a_migration_that_fails_leaves_the_old_store(tmp_path: Path, monkeypatch
             open_store(path)
     assert tables(path) == before
     with open_store(path) as store:
-        assert_same(store.load(), random_map(2))
+        assert_same(store.load(3), random_map(2, cliques=3))
 
 
 def test_there_is_a_step_from_every_schema_to_the_next() -> None:

@@ -9,24 +9,32 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evermap.errors import EvermapError
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap
 from evermap.survival.plain import prior_from_dict, prior_to_dict
-from evermap.types import FloatArray
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import UNKNOWN, FloatArray
 
 FORMAT = 1
 """Of manifests; how columns are named and cut."""
 _CHUNK = 4096
 """Values a chunk: some 30 kB, so that one changed row costs little and a large map has some hundred chunks."""
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
+DTYPES = tuple(_KINDS.values())
+"""Types of the values of a chunk."""
+NAME_BYTES = 32
 _LIFE = "lives.life"
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -74,12 +82,41 @@ class Chunk:
 
 def text_chunk(text: str) -> Chunk:
     """Any text."""
-    return Chunk("|u1", text.encode())
+    return Chunk("|u1", text.encode("utf-8", "surrogatepass"))
 
 
 def read_text(name: bytes, stored: bytes) -> str:
-    """What `text_chunk` held."""
-    return Chunk.of_stored(name, "|u1", stored).raw.decode()
+    """Read what `text_chunk` held."""
+    try:
+        return Chunk.of_stored(name, "|u1", stored).raw.decode("utf-8", "surrogatepass")
+    except UnicodeDecodeError as error:
+        raise DamagedError(f"a text is not valid UTF-8: {error}") from None
+
+
+def json_object(text: str | bytes) -> dict[str, Any]:
+    """Parse a JSON object.
+
+    Raises:
+        DamagedError: it is anything else.
+    """
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DamagedError(f"a description cannot be parsed: {error}") from None
+    if not isinstance(content, dict):
+        raise DamagedError("a description is not a JSON object")
+    return content
+
+
+def name_of(text: Any) -> bytes:
+    """Parse the name of a chunk from 64 hexadecimal digits; `DamagedError` if it is anything else."""
+    try:
+        name = bytes.fromhex(text)
+    except (ValueError, TypeError):
+        name = b""
+    if len(name) != NAME_BYTES:
+        raise DamagedError("the name of a part is not valid")
+    return name
 
 
 def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
@@ -110,24 +147,97 @@ def unpack(name: bytes, fetch: Fetch) -> LivingMap:
     """The map of this name.
 
     Raises:
-        DamagedError: a chunk is missing or is not what was written.
+        DamagedError: a chunk is missing or is not what was written, or the content contradicts itself.
     """
     manifest = _manifest(name, fetch)
     parts = {**manifest["values"], **_arrays(manifest["columns"], fetch)}
     living: LivingMap = _build(LivingMap(), "", parts)
     if parts:
         raise DamagedError(f"it holds '{min(parts)}', which this evermap does not know; a newer one wrote it")
-    for table in ("members", "sites", "places", "stays"):
-        rows = getattr(living, table)
-        if len({len(getattr(rows, item.name)) for item in fields(rows)}) > 1:
-            raise DamagedError(f"columns of different lengths in '{table}'")
+    problem = flaw(living)
+    if problem:
+        raise DamagedError(problem)
     return living
 
 
 def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[str, NDArray[Any]]:
     """Some columns of a map, such as 'members.landmark_id', without reading the rest. Errors as `unpack`."""
     listed = _manifest(name, fetch)["columns"]
-    return _arrays({column: listed[column] for column in columns}, fetch)
+    wanted = {column: listed.get(column) for column in columns}
+    if None in wanted.values():
+        raise DamagedError("a column is missing")
+    return _arrays(wanted, fetch)
+
+
+def names_in(name: bytes, fetch: Fetch) -> set[bytes]:
+    """The names of all chunks of a map, its manifest's among them. Errors as `unpack`."""
+    columns = _manifest(name, fetch)["columns"].values()
+    return {name, *(name_of(part) for _, _, _, names in columns for part in names)}
+
+
+def flaw(living: LivingMap) -> str:
+    """Say in what a map contradicts itself; '' if it is consistent.
+
+    The rules are those that the rest of the package relies on: columns of equal length, sorted unique ids, references
+    that lead somewhere, finite positions, probabilities in [0, 1].
+    """
+    members, sites, places, stays = living.members, living.sites, living.places, living.stays
+    lives, lines = living.lives, living.sightlines
+    for table, rows in (("members", members), ("sites", sites), ("places", places), ("stays", stays)):
+        if len({len(getattr(rows, item.name)) for item in fields(rows)}) > 1:
+            return f"columns of different lengths in '{table}'"
+    if len({len(lives.class_id), len(lives.chunk), len(lives.life)}) > 1:
+        return "columns of different lengths in 'lives'"
+    in_lines = (getattr(lines, item.name) for item in fields(lines))
+    if len({len(part) for part in in_lines if isinstance(part, np.ndarray)}) > 1:
+        return "columns of different lengths in 'sightlines'"
+    if living.covariance_m2.shape != (2 * len(places), 2 * len(places)):
+        return f"a covariance of shape {living.covariance_m2.shape} for {len(places)} places"
+    for column, ids in (("members.landmark_id", members.landmark_id), ("sites.site_id", sites.site_id)):
+        if np.any(ids[1:] <= ids[:-1]):
+            return f"'{column}' is not sorted, or not unique"
+    site, name = places.site_id, places.landmark_id
+    if np.any((site[1:] < site[:-1]) | ((site[1:] == site[:-1]) & (name[1:] <= name[:-1]))):
+        return "'places' are not sorted by site and landmark, or not unique"
+    if np.any(lines.key[1:] <= lines.key[:-1]):
+        return "'sightlines.key' is not sorted, or not unique"
+    for column, ids, known in (
+        ("places.site_id", places.site_id, sites.site_id),
+        ("places.landmark_id", places.landmark_id, members.landmark_id),
+    ):
+        if not np.isin(ids, known).all():
+            return f"'{column}' names one that is not there"
+    for column, least in (
+        ("members.class_id", members.class_id),
+        ("stays.class_id", stays.class_id),
+        ("lives.class_id", lives.class_id),
+    ):
+        if np.any(least < UNKNOWN):
+            return f"'{column}' has a number below {UNKNOWN}"
+    for column, values in (
+        ("places.position_m", places.position_m),
+        ("stays.position_m", stays.position_m),
+        ("covariance_m2", living.covariance_m2),
+        ("log_size_variance", np.array(living.log_size_variance)),
+        ("lives.chunk_m", np.array(lives.chunk_m)),
+        ("sightlines.cell_m", np.array(lines.cell_m)),
+    ):
+        if not np.isfinite(values).all():
+            return f"'{column}' is not finite"
+    if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0:
+        return "a cell without size"
+    if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):
+        return "a negative variance"
+    if not np.all((sites.p_here >= 0.0) & (sites.p_here <= 1.0 + 1e-6)):
+        return "'sites.p_here' is not a probability"
+    for column, ids, ever in (
+        ("sites.site_id", sites.site_id, living.n_sites_ever),
+        ("sites.clique_id", sites.clique_id, living.n_cliques_ever),
+        ("members.clique_id", members.clique_id, living.n_cliques_ever),
+    ):
+        if len(ids) and ids.max() >= ever:
+            return f"'{column}' has {ids.max()}, but the next free one is {ever}"
+    return ""
 
 
 def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
@@ -159,12 +269,40 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
         elif name not in parts:
             content[item.name] = part
         elif name == _LIFE:
-            content[item.name] = tuple(_life_from_dict(life) for life in json.loads(parts.pop(name).tobytes()))
+            content[item.name] = _lives_from_bytes(parts.pop(name))
         elif isinstance(part, np.ndarray):
-            content[item.name] = parts.pop(name)
+            content[item.name] = _column(name, part, parts.pop(name))
         else:
-            content[item.name] = type(part)(parts.pop(name))
+            content[item.name] = _value(name, part, parts.pop(name))
     return type(default)(**content)
+
+
+def _column(name: str, like: NDArray[Any], found: Any) -> NDArray[Any]:
+    """A column, if it has the type and the shape of rows that the empty one has."""
+    kinds = {"f": "fi"}.get(like.dtype.kind, like.dtype.kind)
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in kinds or found.ndim != like.ndim:
+        raise DamagedError(f"column '{name}' is of another type")
+    if like.ndim == 2 and like.shape[1] and found.shape[1] != like.shape[1]:
+        raise DamagedError(f"column '{name}' has rows of {found.shape[1]}, not {like.shape[1]}")
+    return found
+
+
+def _value(name: str, like: Any, found: Any) -> Any:
+    """A single value, if it is of the type of `like`."""
+    if isinstance(like, Enum):
+        with suppress(ValueError):
+            return type(like)(found)
+    elif isinstance(like, tuple):
+        if isinstance(found, list) and all(isinstance(item, str) for item in found):
+            return tuple(found)
+    elif isinstance(like, float):
+        if isinstance(found, float | int) and not isinstance(found, bool) and abs(found) < 2**1023:
+            return float(found)
+        if isinstance(found, float):  # infinite, or nan
+            return found
+    elif isinstance(found, int) and isinstance(found, bool) == isinstance(like, bool) and abs(found) < 2**63:
+        return type(like)(found)
+    raise DamagedError(f"'{name}' is of another type")
 
 
 def _flat(column: str, array: NDArray[Any]) -> NDArray[Any]:
@@ -177,12 +315,14 @@ def _flat(column: str, array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _arrays(columns: Mapping[str, Any], fetch: Fetch) -> dict[str, NDArray[Any]]:
-    stored = fetch({bytes.fromhex(name) for _, _, _, names in columns.values() for name in names})
+    stored = fetch({name_of(name) for _, _, _, names in columns.values() for name in names})
     arrays = {}
     for column, (dtype, shape, lower, names) in columns.items():
-        keys = [bytes.fromhex(name) for name in names]
+        keys = [name_of(name) for name in names]
         raw = b"".join(Chunk.of_stored(key, dtype, stored[key]).raw for key in keys)
         flat = np.frombuffer(bytearray(raw), dtype)  # of a bytearray it can be written to, as any other array
+        if len(flat) != (shape[0] * (shape[0] + 1) // 2 if lower else math.prod(shape)):
+            raise DamagedError(f"column '{column}' has {len(flat)} values, which is not its shape {shape}")
         arrays[column] = _unfolded(flat, shape[0]) if lower else flat.reshape(shape)
     return arrays
 
@@ -197,10 +337,44 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
 
 
 def _manifest(name: bytes, fetch: Fetch) -> Any:
-    content = json.loads(read_text(name, fetch([name])[name]))
-    if content["format"] != FORMAT:
-        raise DamagedError(f"columns of format {content['format']}, this evermap reads {FORMAT}")
+    """The values and the columns of a map, of the types that they have to have."""
+    content = json_object(read_text(name, fetch([name])[name]))
+    if content.get("format") != FORMAT:
+        raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads {FORMAT}")
+    columns = content.get("columns")
+    if not isinstance(content.get("values"), dict) or not isinstance(columns, dict):
+        raise DamagedError("a list of columns is missing")
+    for column, listed in columns.items():
+        if not (isinstance(listed, list) and len(listed) == 4 and _is_column(*listed)):
+            raise DamagedError(f"column '{column}' is not described as columns are")
     return content
+
+
+def _is_column(dtype: Any, shape: Any, lower: Any, names: Any) -> bool:
+    return (
+        dtype in DTYPES
+        and isinstance(lower, bool)
+        and isinstance(names, list)
+        and isinstance(shape, list)
+        and len(shape) in (1, 2)
+        and all(type(size) is int and 0 <= size < 2**31 for size in shape)
+        and (not lower or (dtype == "<f8" and len(shape) == 2 and shape[0] == shape[1]))
+    )
+
+
+def _lives_from_bytes(values: NDArray[Any]) -> tuple[Life, ...]:
+    """What `_collect` wrote of `lives.life`."""
+    try:
+        listed = json.loads(values.tobytes())
+        lives = tuple(_life_from_dict(life) for life in listed)
+    except (ValueError, TypeError, AttributeError, RecursionError, EvermapError) as error:
+        raise DamagedError(f"what was learned of lifetimes cannot be read: {error}") from None
+    for life in lives:
+        parts: tuple[Any, ...] = (life.stay, life.absence, life.p_hop, life.p_known, life.n_stays, life.n_ended)
+        numbers = all(isinstance(value, int | float) and 0 <= value < 2**53 for value in parts[2:])
+        if not (all(isinstance(value, LifetimePrior) for value in parts[:2]) and numbers and max(parts[2:4]) <= 1):
+            raise DamagedError("what was learned of lifetimes is of another type")
+    return lives
 
 
 def _life_to_dict(life: Life) -> dict[str, Any]:

@@ -1,19 +1,185 @@
-"""Rows of the history: revisions and changes, and which revisions are in which."""
+"""The record of a revision: everything about it but its content, as one text.
+
+Records, contents, configurations, evidence and attachments are all chunks, named by the SHA-256 of what is in them. A
+record holds the names of its parts and that of its parent's record, so its own name is a checksum over the revision and
+over all revisions before it.
+"""
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from evermap.maps.store.content import DamagedError
-from evermap.maps.store.protocol import Provenance, Revision, RevisionKind
+from evermap.maps.store.content import Chunk, DamagedError, json_object, name_of, text_chunk
+from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
 from evermap.types import ChangeKind, MapChange
+
+FORMAT = 1
+"""Of records."""
+_TYPES: Mapping[str, type | tuple[type, ...]] = {
+    "number": int,
+    "parent": int,
+    "restores": (int, type(None)),
+    "created_at": str,
+    "evermap_version": str,
+    "kind": str,
+    "recording": str,
+    "source": str,
+    "command": str,
+    "seed": (int, type(None)),
+    "stamp_from_s": (float, int, type(None)),
+    "stamp_to_s": (float, int, type(None)),
+    "wall_s": (float, int, type(None)),
+    "note": str,
+    "n_landmarks": int,
+    "n_existing": int,
+    "n_cliques_ever": int,
+    "n_sites_ever": int,
+    "changes": list,
+    "attachments": dict,
+    "lost": dict,
+}
+"""Values of a record, and their types in JSON; null for nan."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A revision as it is stored.
+
+    Attributes:
+        about: provenance and counts, as `Revision` tells them.
+        parent: name of the record of the revision before; None for the first, and where that one was lost.
+        content, config, evidence: names of chunks; `evidence` is None where nothing was looked at.
+        changes: that the revision told.
+        attachments: name of the chunk and number of bytes, by name of the attachment.
+        next_ids: the next free ids of cliques and sites.
+        lost: revisions that damage has destroyed before this one was made, with the name of the record before each.
+    """
+
+    about: Mapping[str, Any]
+    parent: bytes | None
+    content: bytes
+    config: bytes
+    evidence: bytes | None = None
+    changes: tuple[MapChange, ...] = ()
+    attachments: Mapping[str, tuple[bytes, int]] = field(default_factory=dict)
+    next_ids: tuple[int, int] = (0, 0)
+    lost: Mapping[int, bytes | None] = field(default_factory=dict)
+
+    @property
+    def number(self) -> int:
+        """Of the revision."""
+        return int(self.about["number"])
+
+    @property
+    def origin(self) -> int:
+        """The revision whose map this one started from: its parent, or what it restored."""
+        restores = self.about["restores"]
+        return self.number - 1 if restores is None else int(restores)
+
+    def parts(self) -> set[bytes]:
+        """The chunks that it names, without those that are named by its content and its evidence in turn."""
+        named = {self.content, self.config, *(name for name, _ in self.attachments.values())}
+        return named | ({self.evidence} if self.evidence is not None else set())
+
+    def attached(self) -> list[Attachment]:
+        """Its attachments."""
+        return [
+            Attachment(self.number, name, chunk.hex(), size) for name, (chunk, size) in sorted(self.attachments.items())
+        ]
+
+    def revision(self, config: str) -> Revision:
+        """As the history tells it."""
+        row = self.about
+        counts: dict[ChangeKind, int] = {}
+        for change in self.changes:
+            counts[change.kind] = counts.get(change.kind, 0) + 1
+        return Revision(
+            number=self.number,
+            parent=row["parent"],
+            restores=row["restores"],
+            created_at=row["created_at"],
+            evermap_version=row["evermap_version"],
+            provenance=Provenance(
+                kind=RevisionKind(row["kind"]),
+                recording=row["recording"],
+                source=row["source"],
+                command=row["command"],
+                config=config,
+                seed=row["seed"],
+                stamp_from_s=_or_nan(row["stamp_from_s"]),
+                stamp_to_s=_or_nan(row["stamp_to_s"]),
+                wall_s=_or_nan(row["wall_s"]),
+                note=row["note"],
+            ),
+            n_landmarks=row["n_landmarks"],
+            n_existing=row["n_existing"],
+            n_changes=counts,
+        )
+
+    def chunk(self) -> Chunk:
+        """As bytes."""
+        return text_chunk(
+            json.dumps(
+                {
+                    "evermap": "revision",
+                    "format": FORMAT,
+                    **self.about,
+                    "parent_record": _hex(self.parent),
+                    "content": self.content.hex(),
+                    "config": self.config.hex(),
+                    "evidence": _hex(self.evidence),
+                    "changes": [_change_to_list(change) for change in self.changes],
+                    "attachments": {name: [chunk.hex(), size] for name, (chunk, size) in self.attachments.items()},
+                    "n_cliques_ever": self.next_ids[0],
+                    "n_sites_ever": self.next_ids[1],
+                    "lost": {str(number): _hex(before) for number, before in self.lost.items()},
+                }
+            )
+        )
+
+    @classmethod
+    def of_text(cls, text: str) -> Record:
+        """Read what `chunk` wrote; `DamagedError` if it is anything else."""
+        row = json_object(text)
+        if row.get("evermap") != "revision":
+            raise DamagedError("a part is not the record of a revision")
+        if row.get("format") != FORMAT:
+            raise DamagedError(f"a record of format {row.get('format')!r}, this evermap reads {FORMAT}")
+        for name, kind in _TYPES.items():
+            if name not in row or not isinstance(row[name], kind) or isinstance(row[name], bool):
+                raise DamagedError(f"'{name}' of a revision is missing or of another type")
+        number, restores = row["number"], row["restores"]
+        if number < 1 or row["parent"] != number - 1 or (restores is not None and not 0 <= restores < number):
+            raise DamagedError(
+                f"revision {number} comes from revision {row['parent'] if restores is None else restores}"
+            )
+        try:
+            RevisionKind(row["kind"])
+            return cls(
+                about={name: row[name] for name in _TYPES if name not in _PARTS},
+                parent=_name_or_none(row.get("parent_record")),
+                content=name_of(row.get("content")),
+                config=name_of(row.get("config")),
+                evidence=_name_or_none(row.get("evidence")),
+                changes=tuple(_change_from_list(change) for change in row["changes"]),
+                attachments={name: (name_of(chunk), int(size)) for name, (chunk, size) in row["attachments"].items()},
+                next_ids=(row["n_cliques_ever"], row["n_sites_ever"]),
+                lost={int(number): _name_or_none(before) for number, before in row["lost"].items()},
+            )
+        except (ValueError, TypeError, OverflowError) as error:
+            raise DamagedError(f"the record of revision {number} is not valid: {error}") from None
+
+
+_PARTS = {"changes", "attachments", "lost", "n_cliques_ever", "n_sites_ever"}
+"""Values of a record that are attributes of their own."""
 
 
 def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
-    """The revisions that one was made from, oldest first, itself included.
+    """The revisions that one was made from, oldest first, itself included; those that were lost are left out.
 
     Args:
         origin: the revision whose map each one started from: its parent, or what it restored.
@@ -21,85 +187,62 @@ def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
     """
     line = []
     while number > 0:
-        line.append(number)
-        earlier = origin.get(number, number)
-        if earlier >= number:
-            raise DamagedError(f"revision {number} comes from revision {earlier}")
-        number = earlier
+        if number in origin:
+            line.append(number)
+        number = origin.get(number, number - 1)
     return tuple(reversed(line))
 
 
-@contextmanager
-def _damage() -> Iterator[None]:
-    """A row of words that nobody wrote."""
-    try:
-        yield
-    except (ValueError, TypeError) as error:
-        raise DamagedError(str(error)) from error
-
-
-@_damage()
-def revision_from_row(row: Mapping[str, Any], config: str, n_changes: Mapping[str, int]) -> Revision:
-    """A row of the table `revision`, with its configuration and the number of its changes by kind."""
-    return Revision(
-        number=row["number"],
-        parent=row["parent"],
-        restores=row["restores"],
-        created_at=row["created_at"],
-        evermap_version=row["evermap_version"],
-        provenance=Provenance(
-            kind=RevisionKind(row["kind"]),
-            recording=row["recording"],
-            source=row["source"],
-            command=row["command"],
-            config=config,
-            seed=row["seed"],
-            stamp_from_s=_or_nan(row["stamp_from_s"]),
-            stamp_to_s=_or_nan(row["stamp_to_s"]),
-            wall_s=_or_nan(row["wall_s"]),
-            note=row["note"],
-        ),
-        n_landmarks=row["n_landmarks"],
-        n_existing=row["n_existing"],
-        n_changes={ChangeKind(kind): count for kind, count in n_changes.items()},
-    )
-
-
-def change_to_row(revision: int, position: int, change: MapChange) -> dict[str, Any]:
-    """A row of the table `change`; nan becomes nothing, about which databases agree."""
-    numbers = {
-        "stamp_from_s": change.stamp_from_s,
-        "stamp_to_s": change.stamp_to_s,
-        "dx_m": change.displacement_m[0],
-        "dy_m": change.displacement_m[1],
-        "rotation_rad": change.rotation_rad,
-        "probability": change.probability,
-    }
+def about(provenance: Provenance, **counts: Any) -> dict[str, Any]:
+    """The values of `Record.about`."""
     return {
-        "revision": revision,
-        "position": position,
-        "kind": change.kind.value,
-        **{name: None if math.isnan(value) else float(value) for name, value in numbers.items()},
-        "n_hits": int(change.n_hits),
-        "n_misses": int(change.n_misses),
+        "kind": provenance.kind.value,
+        "recording": provenance.recording,
+        "source": provenance.source,
+        "command": provenance.command,
+        "seed": provenance.seed,
+        "stamp_from_s": _no_nan(provenance.stamp_from_s),
+        "stamp_to_s": _no_nan(provenance.stamp_to_s),
+        "wall_s": _no_nan(provenance.wall_s),
+        "note": provenance.note,
+        **counts,
     }
 
 
-@_damage()
-def change_from_row(row: Mapping[str, Any], landmark_ids: Sequence[int]) -> MapChange:
-    """What `change_to_row` was given, and the rows of `change_landmark`."""
+def _change_to_list(change: MapChange) -> list[Any]:
+    numbers = (change.stamp_from_s, change.stamp_to_s, *change.displacement_m, change.rotation_rad, change.probability)
+    counts = [int(change.n_hits), int(change.n_misses)]
+    return [change.kind.value, [int(name) for name in change.landmark_ids], *map(_no_nan, numbers), *counts]
+
+
+def _change_from_list(values: Iterable[Any]) -> MapChange:
+    kind, names, *numbers = values
+    from_s, to_s, dx_m, dy_m, rotation_rad, probability, n_hits, n_misses = map(_or_nan, numbers)
     return MapChange(
-        landmark_ids=tuple(landmark_ids),
-        kind=ChangeKind(row["kind"]),
-        stamp_from_s=_or_nan(row["stamp_from_s"]),
-        stamp_to_s=_or_nan(row["stamp_to_s"]),
-        displacement_m=(_or_nan(row["dx_m"]), _or_nan(row["dy_m"])),
-        rotation_rad=_or_nan(row["rotation_rad"]),
-        probability=_or_nan(row["probability"]),
-        n_hits=row["n_hits"],
-        n_misses=row["n_misses"],
+        landmark_ids=tuple(int(name) for name in names),
+        kind=ChangeKind(kind),
+        stamp_from_s=from_s,
+        stamp_to_s=to_s,
+        displacement_m=(dx_m, dy_m),
+        rotation_rad=rotation_rad,
+        probability=probability,
+        n_hits=int(n_hits),
+        n_misses=int(n_misses),
     )
+
+
+def _name_or_none(text: Any) -> bytes | None:
+    return None if text is None else name_of(text)
+
+
+def _hex(name: bytes | None) -> str | None:
+    return None if name is None else name.hex()
+
+
+def _no_nan(value: float) -> float | None:
+    """Of JSON, which has no nan."""
+    return None if math.isnan(value) else float(value)
 
 
 def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else value
+    return math.nan if value is None else float(value)

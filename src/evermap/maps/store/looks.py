@@ -1,14 +1,15 @@
-"""Evidence of one clique in one session as bytes: some ten a look."""
+"""Evidence of a session as chunks: one a clique, some ten bytes a look, and an index of them."""
 
 from __future__ import annotations
 
-import zlib
-from typing import Any
+import json
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.maps.living import Evidence
-from evermap.maps.store.content import DamagedError
+from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
 
 _COLUMNS = {
     "stamp_s": "<f8",
@@ -21,30 +22,64 @@ _COLUMNS = {
 """Evidence explains what was decided and decides nothing: 7 digits of it are enough."""
 
 
-def looks_to_bytes(evidence: Evidence) -> bytes:
-    """All columns but the clique's id, each with the first bytes of its values in front: neighbours are alike there."""
-    planes = []
-    for name, dtype in _COLUMNS.items():
-        column = np.ascontiguousarray(getattr(evidence, name), dtype=dtype)
-        planes.append(column.view(np.uint8).reshape(len(column), column.itemsize).T.tobytes())
-    return zlib.compress(b"".join(planes), level=6)
+class Looks(NamedTuple):
+    """Where the looks at one clique are.
 
-
-def looks_from_bytes(clique_id: int, stored: bytes) -> Evidence:
-    """What `looks_to_bytes` was given.
-
-    Raises:
-        DamagedError: it was anything else.
+    Attributes:
+        clique_id: whose.
+        first_s, last_s: stamps of the first and the last one.
+        name: of the chunk.
     """
+
+    clique_id: int
+    first_s: float
+    last_s: float
+    name: bytes
+
+
+def evidence_to_chunks(evidence: Evidence) -> tuple[Chunk, list[Chunk]]:
+    """The index of what a session saw, and a chunk for each clique."""
+    listed, parts = [], []
+    for clique in np.unique(evidence.clique_id):
+        mine = evidence[evidence.clique_id == clique]
+        parts.append(Chunk("|u1", _looks_to_bytes(mine)))
+        listed.append([int(clique), float(mine.stamp_s.min()), float(mine.stamp_s.max()), parts[-1].name.hex()])
+    return text_chunk(json.dumps(listed)), parts
+
+
+def read_index(text: str) -> list[Looks]:
+    """Read the index that `evidence_to_chunks` made; `DamagedError` if it is anything else."""
     try:
-        planes = np.frombuffer(zlib.decompress(stored), np.uint8)
-    except zlib.error as error:
-        raise DamagedError(f"a part cannot be unpacked: {error}") from None
+        listed = json.loads(text)
+        looks = [Looks(clique, float(first), float(last), name_of(name)) for clique, first, last, name in listed]
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
+        raise DamagedError(f"the index of the evidence is not valid: {error}") from None
+    if not all(type(item.clique_id) is int and abs(item.clique_id) < 2**63 for item in looks):
+        raise DamagedError("the index of the evidence is not valid")
+    return looks
+
+
+def looks_of(clique_id: int, stored: bytes, name: bytes) -> Evidence:
+    """The looks at one clique; `DamagedError` if the chunk is not what was written."""
+    planes = np.frombuffer(Chunk.of_stored(name, "|u1", stored).raw, np.uint8)
     sizes = [np.dtype(dtype).itemsize for dtype in _COLUMNS.values()]
-    count = len(planes) // sum(sizes)
+    count, rest = divmod(len(planes), sum(sizes))
+    if rest:
+        raise DamagedError("a part of the evidence has another length")
     parts = np.split(planes, np.cumsum(np.multiply(sizes, count))[:-1])
     columns: dict[str, Any] = {
         name: part.reshape(size, count).T.copy().view(dtype)[:, 0].astype(np.float64 if "f" in dtype else np.int64)
         for (name, dtype), part, size in zip(_COLUMNS.items(), parts, sizes, strict=True)
     }
+    if not all(map(math.isfinite, columns["stamp_s"].tolist())):
+        raise DamagedError("a look without a stamp")
     return Evidence(clique_id=np.full(count, clique_id, dtype=np.int64), **columns)
+
+
+def _looks_to_bytes(evidence: Evidence) -> bytes:
+    """All columns but the clique's id, each with the first bytes of its values in front: neighbours are alike there."""
+    planes = []
+    for name, dtype in _COLUMNS.items():
+        column = np.ascontiguousarray(getattr(evidence, name), dtype=dtype)
+        planes.append(column.view(np.uint8).reshape(len(column), column.itemsize).T.tobytes())
+    return b"".join(planes)

@@ -29,6 +29,33 @@ class StaleRevisionError(InputError):
     """Somebody else committed since the map was read; nothing was written."""
 
 
+class DamagedMapError(InputError):
+    """A map file whose bytes are not those that were written.
+
+    Attributes:
+        intact: numbers of the revisions that are whole; `revert` goes back to any of them.
+    """
+
+    intact: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """Bytes that belong to a revision, such as what its session measured.
+
+    Attributes:
+        revision: that they were committed with.
+        name: what they are, unique in a revision.
+        digest: their checksum (SHA-256, hexadecimal); equal bytes have the same one and are stored once.
+        n_bytes: how many.
+    """
+
+    revision: int
+    name: str
+    digest: str
+    n_bytes: int
+
+
 @dataclass(frozen=True, slots=True)
 class Provenance:
     """Where a revision comes from.
@@ -119,6 +146,7 @@ class MapStore(Protocol):
         evidence: Evidence | None = None,
         *,
         parent: int,
+        attachments: Mapping[str, bytes | Attachment] | None = None,
     ) -> int:
         """A new revision, durable when this returns its number.
 
@@ -128,9 +156,12 @@ class MapStore(Protocol):
             changes: how it differs from its parent, as its session says.
             evidence: what the session saw of every clique; kept with 7 digits.
             parent: the revision that the map was made from.
+            attachments: bytes to keep with the revision, by name, or attachments of earlier ones to share; neither is
+                handed on to the next revision.
 
         Raises:
             StaleRevisionError: `parent` is not the newest revision.
+            NumericalError: the map contradicts itself, or holds a position that is not finite; nothing was written.
         """
         ...
 
@@ -165,6 +196,18 @@ class MapStore(Protocol):
             since_s: leave out what is older.
             revisions: whose sessions; None for those of `lineage()`.
         """
+        ...
+
+    def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
+        """What is attached to revisions, oldest first, without reading it.
+
+        Args:
+            revisions: which; None for those of `lineage()`.
+        """
+        ...
+
+    def attached(self, attachment: Attachment) -> bytes:
+        """Read the bytes of an attachment; their checksum is compared."""
         ...
 
     def close(self) -> None:

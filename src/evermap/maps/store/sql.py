@@ -2,27 +2,38 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Self
 
 import numpy as np
-from sqlalchemy import Connection, Engine, and_, exists, func, insert, inspect, select
+from sqlalchemy import Connection, Engine, bindparam, func, insert, inspect, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from evermap import __version__
-from evermap.errors import InputError
+from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.maps.living import Evidence, LivingMap
-from evermap.maps.store import content, queries, schema
-from evermap.maps.store.content import DamagedError
-from evermap.maps.store.history import change_to_row, lineage, revision_from_row
-from evermap.maps.store.looks import looks_from_bytes, looks_to_bytes
+from evermap.maps.store import content, schema
+from evermap.maps.store.content import Chunk, DamagedError
+from evermap.maps.store.history import Record, about, lineage
+from evermap.maps.store.looks import evidence_to_chunks, looks_of, read_index
 from evermap.maps.store.migrations import migrate
-from evermap.maps.store.protocol import Provenance, Revision, RevisionKind, StaleRevisionError
+from evermap.maps.store.protocol import (
+    Attachment,
+    DamagedMapError,
+    Provenance,
+    Revision,
+    RevisionKind,
+    StaleRevisionError,
+)
 from evermap.types import MapChange
+
+_AT_ONCE = 500
+"""Names in one question to the database."""
+_LONGEST = 900_000_000
+"""Bytes of an attachment; a database takes no more in one piece."""
 
 
 class SqlStore:
@@ -31,10 +42,20 @@ class SqlStore:
     def __init__(self, engine: Engine, where: str) -> None:
         self._engine = engine
         self._where = where
+        self._records: dict[bytes, Record] = {}  # they never change, and their names are their checksums
+        self._history: tuple[Any, int, dict[int, Record], dict[int, bytes | None]] | None = None  # of `_chain`
+        self._checked: set[bytes] = set()  # chunks that this object has read, and found to be what was written
 
     @classmethod
-    def opened(cls, engine: Engine, where: str, *, create: bool) -> SqlStore:
-        """The store behind an engine; its tables are made or brought up to date. Errors as `open_store`."""
+    def opened(cls, engine: Engine, where: str, *, create: bool, tidy: Callable[[], None] = lambda: None) -> SqlStore:
+        """The store behind an engine; its tables are made or brought up to date. Errors as `open_store`.
+
+        Args:
+            engine: of the database.
+            where: path or address, for messages.
+            create: make the tables where there are none.
+            tidy: called once old tables have been replaced.
+        """
         store = cls(engine, where)
         with store._reading() as connection:
             version = store._schema_version(connection)
@@ -45,11 +66,13 @@ class SqlStore:
                 version = store._schema_version(connection)  # somebody may have been faster
                 if version == 0:
                     schema.metadata.create_all(connection)
-                    connection.execute(insert(schema.store).values(
-                        schema_version=schema.SCHEMA_VERSION, created_at=_now(), evermap_version=__version__
-                    ))  # fmt: skip
+                    values = (schema.SCHEMA_VERSION, now_utc(), __version__, 0, None)
+                    row = dict(zip(_STORE_COLUMNS, values, strict=True)) | {"checksum": schema.checksum(*values)}
+                    connection.execute(insert(schema.store).values(row))
                 elif version < schema.SCHEMA_VERSION:
                     migrate(connection, version)
+            if version > 0:
+                tidy()
         return store
 
     @property
@@ -70,21 +93,15 @@ class SqlStore:
     def head(self) -> int:
         """The newest revision."""
         with self._reading() as connection:
-            return queries.head(connection)
+            return self._anchor(connection)[0]
 
     def log(self) -> tuple[Revision, ...]:
         """All revisions."""
         with self._reading() as connection:
-            rows = connection.execute(select(schema.revision).order_by(schema.revision.c.number)).mappings().all()
-            stored = queries.fetched(connection, {row["config"] for row in rows})
+            records = self._chain(connection)[0]
+            stored = self._fetched(connection, {record.config for record in records.values()})
             configs = {name: content.read_text(name, data) for name, data in stored.items()}
-            counts: dict[int, dict[str, int]] = {}
-            by = schema.change.c.revision, schema.change.c.kind
-            for number, kind, count in connection.execute(select(*by, func.count()).group_by(*by)):
-                counts.setdefault(number, {})[kind] = count
-            return tuple(
-                revision_from_row(dict(row), configs[row["config"]], counts.get(row["number"], {})) for row in rows
-            )
+            return tuple(record.revision(configs[record.config]) for _, record in sorted(records.items()))
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
         """The revisions that are in one."""
@@ -95,10 +112,7 @@ class SqlStore:
         """The map as it was committed."""
         with self._reading() as connection:
             number = self._known(connection, revision)
-            if number == 0:
-                return LivingMap()
-            name = queries.content_of(connection, number)
-            return content.unpack(name, lambda names: queries.fetched(connection, names))
+            return LivingMap() if number == 0 else self._unpacked(connection, self._record(connection, number))
 
     def commit(
         self,
@@ -108,42 +122,62 @@ class SqlStore:
         evidence: Evidence | None = None,
         *,
         parent: int,
+        attachments: Mapping[str, bytes | Attachment] | None = None,
     ) -> int:
         """A new revision."""
-        return self._commit(living, provenance, changes, evidence, parent=parent, restores=None)
+        return self._commit(living, provenance, changes, evidence, parent=parent, attachments=attachments)
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
         """A new revision with the content of an older one."""
-        head = self.head()
-        newest, old = self.load(head), self.load(revision)
-        if revision == head:
-            raise InputError(f"revision {revision} is the newest already", path=self._where, hint="an older one")
+        with self._reading() as connection:
+            head = self._known(connection, None)
+            number = self._known(connection, revision)
+            next_ids = self._record(connection, head).next_ids if head else (0, 0)
+        old = self.load(number)
+        if number == head:
+            raise InputError(f"revision {number} is the newest already", path=self._where, hint="an older one")
+        return self.restore(old, number, head, next_ids, provenance)
+
+    def restore(
+        self,
+        old: LivingMap,
+        revision: int,
+        head: int,
+        next_ids: tuple[int, int],
+        provenance: Provenance | None = None,
+        lost: Mapping[int, bytes | None] | None = None,
+    ) -> int:
+        """Commit the map of an older revision again, so that no id that was given since is given twice.
+
+        Args:
+            old: the map.
+            revision: where it comes from.
+            head: the newest revision.
+            next_ids: next free ids of cliques and sites.
+            provenance: of the new revision.
+            lost: revisions that damage has destroyed, see `Record`.
+        """
         restored = replace(
             old,
-            n_cliques_ever=max(old.n_cliques_ever, newest.n_cliques_ever),
-            n_sites_ever=max(old.n_sites_ever, newest.n_sites_ever),
+            n_cliques_ever=max(old.n_cliques_ever, next_ids[0]),
+            n_sites_ever=max(old.n_sites_ever, next_ids[1]),
         )
         origin = Provenance() if provenance is None else provenance
         origin = replace(origin, kind=RevisionKind.REVERT, note=origin.note or f"back to revision {revision}")
-        return self._commit(restored, origin, (), None, parent=head, restores=revision)
+        return self._commit(restored, origin, (), None, parent=head, restores=revision, lost=lost)
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         """Changes of one revision."""
         with self._reading() as connection:
             number = self._known(connection, revision)
-            found = queries.changes_where(connection, schema.change.c.revision == number)
-        return tuple(change for _, change in found)
+            return self._record(connection, number).changes if number else ()
 
     def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
         """Changes of a landmark."""
-        change, named = schema.change, schema.change_landmark.alias()
-        mine = and_(
-            named.c.revision == change.c.revision,
-            named.c.position == change.c.position,
-            named.c.landmark_id == landmark_id,
-        )
         with self._reading() as connection:
-            return tuple(queries.changes_where(connection, exists().where(mine)))
+            records = self._chain(connection)[0]
+        told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
+        return tuple((number, change) for number, change in told if landmark_id in change.landmark_ids)
 
     def evidence(
         self,
@@ -154,22 +188,53 @@ class SqlStore:
         revisions: Collection[int] | None = None,
     ) -> Evidence:
         """What sessions saw."""
-        table = schema.evidence
+        kept = [Evidence.empty()]
         with self._reading() as connection:
-            numbers = self._lineage(connection, None) if revisions is None else revisions
-            wanted = select(table).where(table.c.last_s >= since_s).order_by(table.c.revision, table.c.first_s)
-            wanted = wanted.where(table.c.revision.in_(list(numbers)))
-            if clique_id is not None:
-                wanted = wanted.where(table.c.clique_id == clique_id)
-            cliques = None if landmark_id is None else queries.cliques_of(connection, landmark_id, numbers)
-            kept = [Evidence.empty()]
-            for row in connection.execute(wanted).mappings():
-                mine = cliques is None or cliques.get(row["revision"]) == row["clique_id"]
-                if mine:
-                    kept.append(looks_from_bytes(row["clique_id"], row["looks"]))
+            wanted: dict[bytes, set[int | None]] = {}  # None: every clique
+            for record in self._records_of(connection, revisions):
+                clique = clique_id if landmark_id is None else self._clique_of(connection, record, landmark_id)
+                mine = landmark_id is None or (clique is not None and clique_id in (None, clique))
+                if record.evidence is not None and mine:
+                    wanted.setdefault(record.evidence, set()).add(clique)
+            rows = [
+                row
+                for name, data in self._fetched(connection, wanted).items()
+                for row in read_index(content.read_text(name, data))
+                if row.last_s >= since_s and not wanted[name].isdisjoint({None, row.clique_id})
+            ]
+            stored = self._fetched(connection, {row.name for row in rows})
+            kept += [looks_of(row.clique_id, stored[row.name], row.name) for row in rows]
         found = Evidence(*(np.concatenate([getattr(part, item.name) for part in kept]) for item in fields(Evidence)))
         found = found[found.stamp_s >= since_s]
         return found[np.argsort(found.stamp_s, kind="stable")]
+
+    def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
+        """What is attached to revisions."""
+        with self._reading() as connection:
+            return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
+
+    def attached(self, attachment: Attachment) -> bytes:
+        """The bytes of an attachment."""
+        with self._reading() as connection:
+            name = content.name_of(attachment.digest)
+            return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
+
+    def fill(self, chunks: Mapping[bytes, bytes], records: Mapping[int, bytes], head: int) -> None:
+        """Put revisions from elsewhere into an empty store.
+
+        Args:
+            chunks: stored bytes by name.
+            records: names of the records by number; what is missing up to `head` is lost.
+            head: number of the newest.
+        """
+        with self._writing() as connection:
+            rows = [{"name": name, "data": data} for name, data in chunks.items()]
+            if rows:
+                connection.execute(insert(schema.chunk), rows)
+            numbers = [{"number": number, "record": records.get(number)} for number in range(1, head + 1)]
+            if numbers:
+                connection.execute(insert(schema.revision), numbers)
+            self._move_anchor(connection, head, records.get(head))
 
     def _commit(
         self,
@@ -179,60 +244,199 @@ class SqlStore:
         evidence: Evidence | None,
         *,
         parent: int,
-        restores: int | None,
+        restores: int | None = None,
+        attachments: Mapping[str, bytes | Attachment] | None = None,
+        lost: Mapping[int, bytes | None] | None = None,
     ) -> int:
         """Whole or not at all; what takes time is done before the store is locked."""
+        problem = content.flaw(living)
+        if problem:
+            raise NumericalError(f"not a map that can be kept: {problem}", path=self._where)
         name, chunks = content.pack(living)
         config = content.text_chunk(provenance.config)
         chunks[config.name] = config
+        index = None
+        if evidence is not None and len(evidence):
+            listed, looks = evidence_to_chunks(evidence)
+            index = listed.name
+            chunks.update((part.name, part) for part in (listed, *looks))
+        attached = self._attach(attachments or {}, chunks)
         number = parent + 1
-        row = {
-            "number": number,
-            "parent": parent,
-            "restores": restores,
-            "created_at": _now(),
-            "evermap_version": __version__,
-            "kind": provenance.kind.value,
-            "recording": provenance.recording,
-            "source": provenance.source,
-            "command": provenance.command,
-            "config": config.name,
-            "seed": provenance.seed,
-            "stamp_from_s": _no_nan(provenance.stamp_from_s),
-            "stamp_to_s": _no_nan(provenance.stamp_to_s),
-            "wall_s": _no_nan(provenance.wall_s),
-            "note": provenance.note,
-            "n_landmarks": len(living.members),
-            "n_existing": int(np.sum((living.p_exists() >= 0.5) & ~living.members.deleted)),
-            "content": name,
-        }
-        change_rows = [change_to_row(number, position, change) for position, change in enumerate(changes)]
-        named_rows = [
-            {"revision": number, "position": position, "rank": rank, "landmark_id": int(landmark)}
-            for position, change in enumerate(changes)
-            for rank, landmark in enumerate(change.landmark_ids)
-        ]
-        evidence_rows = [] if evidence is None else list(_evidence_rows(number, evidence))
+        told = about(
+            provenance,
+            number=number,
+            parent=parent,
+            restores=restores,
+            created_at=now_utc(),
+            evermap_version=__version__,
+            n_landmarks=len(living.members),
+            n_existing=int(np.sum((living.p_exists() >= 0.5) & ~living.members.deleted)),
+        )
+        stored = {key: chunk.stored() for key, chunk in chunks.items() if key not in self._checked}
         with self._writing() as connection:
-            head = queries.head(connection)
+            head, before = self._anchor(connection)
             if head != parent:
-                raise self._stale(parent, head)
-            new = chunks.keys() - queries.present(connection, chunks)
-            rows: list[dict[str, Any]] = [{"name": key, "data": chunks[key].stored()} for key in sorted(new)]
-            for table, content_rows in (
-                (schema.chunk, rows),
-                (schema.revision, [row]),
-                (schema.change, change_rows),
-                (schema.change_landmark, named_rows),
-                (schema.evidence, evidence_rows),
-            ):
-                if content_rows:
-                    connection.execute(insert(table), content_rows)
+                problem = f"revision {head} came in after revision {parent} was read; nothing was written"
+                hint = "the same again, which continues from the newest"
+                raise StaleRevisionError(problem, path=self._where, hint=hint)
+            record = Record(
+                told,
+                before,
+                name,
+                config.name,
+                index,
+                tuple(changes),
+                attached,
+                (living.n_cliques_ever, living.n_sites_ever),
+                lost or {},
+            ).chunk()
+            chunks[record.name] = record
+            self._put(connection, chunks, {**stored, record.name: record.stored()})
+            self._fetched(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
+            connection.execute(insert(schema.revision).values(number=number, record=record.name))
+            self._move_anchor(connection, number, record.name)
+        self._checked |= chunks.keys()
         return number
 
-    def _stale(self, parent: int, head: int) -> StaleRevisionError:
-        problem = f"revision {head} came in after revision {parent} was read; nothing was written"
-        return StaleRevisionError(problem, path=self._where, hint="the same again, which continues from the newest")
+    def _attach(
+        self, attachments: Mapping[str, bytes | Attachment], chunks: dict[bytes, Chunk]
+    ) -> dict[str, tuple[bytes, int]]:
+        """Names and sizes of attachments; bytes that are new are added to `chunks`."""
+        attached = {}
+        for name, item in attachments.items():
+            if isinstance(item, Attachment):
+                attached[name] = content.name_of(item.digest), item.n_bytes
+                continue
+            if len(item) > _LONGEST:
+                raise ConfigError(f"has {len(item)} bytes, more than {_LONGEST}", path=self._where, field=name)
+            chunk = Chunk("|u1", bytes(item))
+            chunks[chunk.name] = chunk
+            attached[name] = chunk.name, len(item)
+        return attached
+
+    def _put(self, connection: Connection, chunks: Mapping[bytes, Chunk], stored: Mapping[bytes, bytes]) -> None:
+        """Store the chunks that are not there yet; one that is there, but damaged, is written anew."""
+        present: dict[bytes, bytes | None] = {}
+        question = select(schema.chunk.c.name).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
+        for some in _batches(chunks):
+            present.update((bytes(row[0]), None) for row in connection.execute(question, {"names": some}))
+        unread = present.keys() - self._checked
+        for key, data in self._fetched(connection, unread & chunks.keys(), missing_ok=True).items():
+            try:
+                Chunk.of_stored(key, chunks[key].dtype, data)
+            except DamagedError:
+                connection.execute(
+                    update(schema.chunk).where(schema.chunk.c.name == key).values(data=chunks[key].stored())
+                )
+        new = sorted(chunks.keys() - present.keys())
+        rows = [{"name": key, "data": stored[key] if key in stored else chunks[key].stored()} for key in new]
+        if rows:
+            connection.execute(insert(schema.chunk), rows)
+
+    def _anchor(self, connection: Connection) -> tuple[int, bytes | None]:
+        """The newest revision, and the name of its record: of these all others are checked."""
+        rows = connection.execute(select(schema.store)).all()
+        if len(rows) != 1:
+            raise DamagedError(f"{len(rows)} rows say which revision is the newest")
+        values = tuple(rows[0])
+        if not is_anchor(values):
+            raise DamagedError("a checksum does not match: of the row that names the newest revision")
+        newest = connection.execute(select(func.max(schema.revision.c.number))).scalar()
+        if (newest or 0) != values[3]:
+            raise DamagedError(f"the newest revision is {values[3]}, but the last one listed is {newest}")
+        return values[3], values[4]
+
+    def _move_anchor(self, connection: Connection, head: int, record: bytes | None) -> None:
+        row = connection.execute(select(schema.store)).one()
+        values = (row.schema_version, row.created_at, row.evermap_version, head, record)
+        connection.execute(update(schema.store).values(head=head, record=record, checksum=schema.checksum(*values)))
+
+    def _chain(self, connection: Connection, since: int = 1) -> tuple[dict[int, Record], dict[int, bytes | None]]:
+        """Records from a revision to the newest, each checked against the one after it; and which are lost."""
+        head, expected = self._anchor(connection)
+        if self._history is not None and self._history[0] == (head, expected) and self._history[1] <= since:
+            return self._history[2:]
+        anchor = head, expected
+        table = schema.revision.c
+        listed: dict[int, Any] = {
+            row.number: row.record
+            for row in connection.execute(select(table.number, table.record).where(table.number >= since))
+        }
+        names = {bytes(name) for name in listed.values() if isinstance(name, bytes)}
+        for name, data in self._fetched(connection, names - self._records.keys(), missing_ok=True).items():
+            try:
+                self._records[name] = Record.of_text(content.read_text(name, data))
+            except DamagedError as error:
+                raise DamagedError(f"{error}, of the record of a revision") from None
+        found: dict[int, Record] = {}
+        lost: dict[int, bytes | None] = {}
+        for number in range(head, max(since, 1) - 1, -1):
+            if number in lost:
+                expected = lost[number]
+                continue
+            record = None if expected is None else self._records.get(expected)
+            if record is None or record.number != number or listed.get(number) != expected:
+                raise DamagedError(f"a checksum does not match: revision {number} is not the one that was written")
+            found[number] = record
+            lost |= record.lost
+            expected = record.parent
+        self._history = anchor, since, found, lost
+        return found, lost
+
+    def _record(self, connection: Connection, number: int) -> Record:
+        """The record of a revision.
+
+        Raises:
+            InputError: it is lost.
+        """
+        found, _ = self._chain(connection, number)
+        if number not in found:
+            hint = f"evermap map log {self._where}"
+            raise InputError(f"revision {number} was lost to damage of the file", path=self._where, hint=hint)
+        return found[number]
+
+    def _records_of(self, connection: Connection, revisions: Collection[int] | None) -> list[Record]:
+        """Records of some revisions, oldest first; of the lineage of the newest if not told which."""
+        records, _ = self._chain(connection)
+        head, _ = self._anchor(connection)
+        wanted = lineage({k: r.origin for k, r in records.items()}, head) if revisions is None else sorted(revisions)
+        return [records[number] for number in wanted if number in records]
+
+    def _unpacked(self, connection: Connection, record: Record) -> LivingMap:
+        read: set[bytes] = set()
+
+        def fetch(names: Iterable[bytes]) -> Mapping[bytes, bytes]:
+            found = self._fetched(connection, names)
+            read.update(found)
+            return found
+
+        living = content.unpack(record.content, fetch)
+        self._checked |= read
+        return living
+
+    def _clique_of(self, connection: Connection, record: Record, landmark_id: int) -> int | None:
+        """The clique that a landmark belonged to in a revision."""
+        names = ("members.landmark_id", "members.clique_id")
+        columns = content.unpack_columns(record.content, names, lambda keys: self._fetched(connection, keys))
+        row = np.flatnonzero(columns["members.landmark_id"] == landmark_id)
+        cliques = columns["members.clique_id"]
+        return int(cliques[row[0]]) if len(row) and row[0] < len(cliques) else None
+
+    def _fetched(
+        self, connection: Connection, names: Iterable[bytes], *, missing_ok: bool = False
+    ) -> dict[bytes, bytes]:
+        """`content.Fetch` from the database."""
+        question = select(schema.chunk).where(schema.chunk.c.name.in_(bindparam("names", expanding=True)))
+        found: dict[bytes, bytes] = {}
+        wanted = set(names)
+        for some in _batches(wanted):
+            for name, data in connection.execute(question, {"names": some}):
+                if not isinstance(name, bytes) or not isinstance(data, bytes):
+                    raise DamagedError("a part of the map is not made of bytes")
+                found[name] = data
+        if not missing_ok and found.keys() != wanted:
+            raise DamagedError("a part of the map is missing")
+        return found
 
     def _schema_version(self, connection: Connection) -> int:
         """0 where there are no tables at all.
@@ -248,6 +452,8 @@ class SqlStore:
         version = connection.execute(select(schema.store.c.schema_version)).scalar()
         if not isinstance(version, int) or version < 1:
             raise DamagedError(f"its schema version is {version!r}")
+        if (version < schema.SCHEMA_VERSION) == (set(tables) == schema.metadata.tables.keys()):
+            raise DamagedError(f"its schema version is {version}, but its tables are of another")
         if version > schema.SCHEMA_VERSION:
             problem = (
                 f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.SCHEMA_VERSION}"
@@ -257,7 +463,7 @@ class SqlStore:
 
     def _known(self, connection: Connection, revision: int | None) -> int:
         """The number of a revision that exists."""
-        head = queries.head(connection)
+        head, _ = self._anchor(connection)
         number = head if revision is None else revision
         if not 0 <= number <= head:
             there = f"it has {head} of them" if head else "it has none yet"
@@ -266,9 +472,8 @@ class SqlStore:
 
     def _lineage(self, connection: Connection, revision: int | None) -> tuple[int, ...]:
         number = self._known(connection, revision)
-        table = schema.revision.c
-        rows = connection.execute(select(table.number, table.parent, table.restores)).all()
-        return lineage({row.number: row.parent if row.restores is None else row.restores for row in rows}, number)
+        records, _ = self._chain(connection)
+        return lineage({k: record.origin for k, record in records.items()}, number)
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:
@@ -286,48 +491,55 @@ class SqlStore:
         try:
             yield
         except (DamagedError, UnicodeDecodeError) as error:  # the latter even from the driver's own messages
-            hint = "evermap map log, then load an older --revision, or a copy of the file"
-            raise InputError(f"damaged: {error}", path=self._where, hint=hint) from error
+            raise self._damaged(str(error)) from error
         except IntegrityError as error:
             raise StaleRevisionError(
                 f"somebody else committed at the same time: {error.orig}", path=self._where, hint="the same again"
             ) from error
         except DBAPIError as error:
-            raise _in_words(str(error.orig), self._where) from error
+            message = str(error.orig)
+            for part, problem, hint in _FAILURES:
+                if part in message:
+                    raise InputError(problem, path=self._where, hint=hint) from error
+            raise self._damaged(message) from error
+
+    def _damaged(self, problem: str) -> InputError:
+        """One line that says which revisions are whole, and how to go back to them."""
+        return DamagedMapError(f"damaged: {problem}", path=self._where, hint="a copy of the file")
 
 
-def _in_words(message: str, where: str) -> InputError:
-    """The common failures of a database with what to do about them."""
-    for part, problem, hint in (
-        ("readonly", "cannot be written: it is read-only", "chmod u+w, or a copy of it"),
-        ("locked", "another process keeps it locked", "wait for that one to end"),
-        ("is not a database", "is no evermap map", "another file"),
-        ("malformed", f"damaged: {message}", "a copy of the file"),
-        ("full", "cannot be written: the disk is full", "make room"),
-        ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
-    ):
-        if part in message:
-            return InputError(problem, path=where, hint=hint)
-    return InputError(f"damaged or not reachable: {message}", path=where, hint="a copy of the file")
+_STORE_COLUMNS = ("schema_version", "created_at", "evermap_version", "head", "record")
+_FAILURES = (
+    ("readonly", "cannot be written: it is read-only", "chmod u+w, or a copy of it"),
+    ("locked", "another process keeps it locked", "wait for that one to end"),
+    ("is not a database", "is no evermap map", "another file"),
+    ("is full", "cannot be written: the disk is full", "make room"),
+    ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
+)
+"""Common failures of a database that are no damage, with what to do about them."""
 
 
-def _evidence_rows(number: int, evidence: Evidence) -> Iterator[dict[str, Any]]:
-    """A row for each clique."""
-    for clique in np.unique(evidence.clique_id):
-        mine = evidence[evidence.clique_id == clique]
-        yield {
-            "revision": number,
-            "clique_id": int(clique),
-            "first_s": float(mine.stamp_s.min()),
-            "last_s": float(mine.stamp_s.max()),
-            "looks": looks_to_bytes(mine),
-        }
+def is_anchor(values: Sequence[Any]) -> bool:
+    """Whether these are the values of the row of `store`, as it was written."""
+    if len(values) != 6:
+        return False
+    version, created_at, writer, head, record, checksum = values
+    return (
+        type(version) is int
+        and type(head) is int
+        and isinstance(created_at, str)
+        and isinstance(writer, str)
+        and (record is None or isinstance(record, bytes))
+        and checksum == schema.checksum(version, created_at, writer, head, record)
+    )
 
 
-def _no_nan(value: float) -> float | None:
-    """Databases differ in what they do with nan; they agree about nothing."""
-    return None if math.isnan(value) else float(value)
-
-
-def _now() -> str:
+def now_utc() -> str:
+    """ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _batches(names: Iterable[bytes]) -> Iterator[list[bytes]]:
+    wanted = list(names)
+    for at in range(0, len(wanted), _AT_ONCE):
+        yield wanted[at : at + _AT_ONCE]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
@@ -29,7 +30,15 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
     if not path.parent.is_dir():
         raise InputError(f"the folder {path.parent} does not exist", path=path, hint=f"mkdir -p {path.parent}")
     engine = _engine(path, writable=os.access(path if path.exists() else path.parent, os.W_OK))
-    return SqlStore.opened(engine, str(path), create=create)
+    return SqlStore.opened(engine, str(path), create=create, tidy=lambda: _compact(engine))
+
+
+def _compact(engine: Engine) -> None:
+    """Give back the pages that a migration has left; without room to do that they stay."""
+    connection = engine.raw_connection()
+    with suppress(sqlite3.OperationalError):
+        connection.cursor().execute("VACUUM")
+    connection.close()
 
 
 def _engine(path: Path, *, writable: bool) -> Engine:
@@ -45,7 +54,6 @@ def _engine(path: Path, *, writable: bool) -> Engine:
 
     @event.listens_for(engine, "connect")
     def _prepare(connection: sqlite3.Connection, _: object) -> None:
-        connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = EXTRA")
 
     @event.listens_for(engine, "begin")
