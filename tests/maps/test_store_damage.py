@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from random_maps import assert_same, random_changes, random_evidence, random_map
 
 from evermap.errors import EvermapError, InputError
-from evermap.maps.store import Provenance, open_store, sqlite
+from evermap.maps.store import DamagedMapError, Provenance, content, open_store, revert_store, sqlite, verify_store
 
 
 @pytest.fixture
@@ -75,8 +76,118 @@ def test_a_part_that_is_missing_is_found(path: Path) -> None:
     database.close()
     with open_store(path) as store:
         assert_same(store.load(3), random_map(2))
-        with pytest.raises(InputError, match=r"damaged: a part of the map is missing"):
+        line = r"damaged: a part of the map is missing; revisions 2, 3 are intact \(try: evermap map revert .* 3\)"
+        with pytest.raises(DamagedMapError, match=line) as caught:
             store.load(1)
+        assert caught.value.intact == (2, 3)
+
+
+def rows_are_changed(database: sqlite3.Connection) -> None:
+    database.execute("UPDATE chunk SET data = zeroblob(9) WHERE name = (SELECT record FROM revision WHERE number = 2)")
+
+
+def rows_are_swapped(database: sqlite3.Connection) -> None:
+    database.execute("UPDATE revision SET record = (SELECT record FROM revision WHERE number = 1) WHERE number = 2")
+
+
+def the_newest_is_taken_away(database: sqlite3.Connection) -> None:
+    database.execute("DELETE FROM revision WHERE number = 3")
+
+
+def the_newest_is_called_older(database: sqlite3.Connection) -> None:
+    database.execute("UPDATE store SET head = 2")
+    database.execute("DELETE FROM revision WHERE number = 3")
+
+
+def the_schema_is_called_older(database: sqlite3.Connection) -> None:
+    database.execute("UPDATE store SET schema_version = 2")
+
+
+@pytest.mark.parametrize(
+    ("change", "intact"),
+    [
+        (rows_are_changed, (1, 3)),
+        (rows_are_swapped, (1, 2, 3)),
+        (the_newest_is_taken_away, (1, 2, 3)),
+        (the_newest_is_called_older, (1, 2, 3)),
+        (the_schema_is_called_older, (1, 2, 3)),
+    ],
+)
+def test_rows_that_nobody_wrote_are_found_and_undone(
+    path: Path, change: Callable[[sqlite3.Connection], None], intact: tuple[int, ...]
+) -> None:
+    assert verify_store(path).sound
+    with sqlite3.connect(path) as database:
+        change(database)
+    database.close()
+    with pytest.raises(DamagedMapError) as caught:
+        use_all(path)
+    assert caught.value.intact == intact
+    found = verify_store(path)
+    assert not found.sound
+    assert found.intact == intact
+    assert verify_store(path).error(path).one_line().endswith(f"(try: evermap map revert {path} 3)")
+    damaged = path.read_bytes()
+    number, aside = revert_store(path, 1)
+    assert number == 4
+    assert aside == path.with_name("m.evermap.damaged")
+    assert aside.read_bytes() == damaged
+    again = verify_store(path)
+    assert again.sound
+    assert again.intact == (*intact, 4)
+    with open_store(path) as store:
+        old, new = random_map(0), random_map(2)
+        # ids that were given in what is lost are not given again
+        assert_same(
+            store.load(),
+            replace(
+                old,
+                n_cliques_ever=max(random_map(k).n_cliques_ever for k in range(3) if k + 1 in intact),
+                n_sites_ever=max(random_map(k).n_sites_ever for k in range(3) if k + 1 in intact),
+            ),
+        )
+        assert_same(store.load(3), new)
+        assert [item.number for item in store.log()] == [*intact, 4]
+        if 2 not in intact:
+            with pytest.raises(InputError, match="revision 2 was lost to damage of the file"):
+                store.load(2)
+        assert store.commit(new, Provenance(), parent=4) == 5
+    assert revert_store(path, 3) == (6, None)  # an ordinary one
+
+
+@pytest.mark.parametrize("start", [0, 16, 4096, 8192])
+def test_pages_that_are_overwritten(path: Path, start: int) -> None:
+    """The header, the lists of tables and the first pages: what is in the others is saved without them."""
+    data = bytearray(path.read_bytes())
+    size = 84 if start == 16 else 4096
+    data[start : start + size] = b"\xff" * size
+    path.write_bytes(data)
+    intact = verify_store(path).intact
+    assert 3 in intact
+    with pytest.raises(DamagedMapError, match=r"are intact \(try: evermap map revert"):
+        use_all(path)
+    assert revert_store(path, 3)[0] == 4
+    assert verify_store(path).sound
+    with open_store(path) as store:
+        for number in intact:
+            assert_same(store.load(number), random_map(number - 1))
+
+
+def test_a_damaged_part_that_is_shared_is_written_anew(path: Path) -> None:
+    """A commit that has a piece in common with a damaged revision does not rely on that."""
+    living = random_map(2)
+    with open_store(path) as store:
+        store.commit(random_map(7), Provenance(), parent=3)
+    shared = [name for name in content.pack(living)[1] if name not in content.pack(random_map(7))[1]]
+    with sqlite3.connect(path) as database:
+        database.executemany("UPDATE chunk SET data = zeroblob(99) WHERE name = ?", [(name,) for name in shared])
+    database.close()
+    with open_store(path) as store:
+        with pytest.raises(DamagedMapError):
+            store.load(3)
+        number = store.commit(living, Provenance(), parent=4)
+        assert_same(store.load(number), living)
+        assert_same(store.load(3), living)  # and is whole again
 
 
 @pytest.mark.parametrize("content", [b"not a database, but long enough to be one" * 50, b"PK\3\4", b"\0" * 5000])

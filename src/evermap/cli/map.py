@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.map_edits import delete, pin, revert, undelete, unpin
+from evermap.cli.map_edits import delete, pin, revert, undelete, unpin, verify
 from evermap.cli.picture import check_picture, write_picture
 from evermap.cli.terminal import print_json, print_rows, say
 from evermap.errors import ConfigError
@@ -49,7 +49,12 @@ def log(file: _File, as_json: _AsJson = False) -> None:
         clock = store.load().clock
     if as_json:
         print_json(
-            {"map": file, "head": len(revisions), "clock": clock.value, "revisions": [*map(revision_dict, revisions)]}
+            {
+                "map": file,
+                "head": revisions[-1].number if revisions else 0,
+                "clock": clock.value,
+                "revisions": [*map(revision_dict, revisions)],
+            }
         )
         return
     head = ("revision", "written (UTC)", "kind", "of", "starts", "landmarks", "changes", "took")
@@ -265,5 +270,5 @@ def _finite(value: float) -> float | None:
     return number(value)
 
 
-for command in (revert, pin, unpin, delete, undelete):
+for command in (verify, revert, pin, unpin, delete, undelete):
     app.command()(command)

@@ -23,21 +23,60 @@ def revert(
 ) -> None:
     """Go back to an older revision.
 
-    By a new one with its content: nothing is lost, and a revert can be reverted.
+    By a new one with its content: nothing is lost, and a revert can be reverted. Of a damaged file every intact
+    revision is kept; the file itself is set aside as FILE.damaged.
 
     \b
     Example:
       evermap map revert site.evermap 6 --note "the lidar was dirty"
     """
-    from evermap.maps.store import Provenance, open_store
+    from evermap.maps.store import Provenance, revert_store
 
-    with open_store(file) as store:
-        before = store.head()
-        now = store.revert(revision, Provenance(command=command_line(), note=note))
+    now, damaged = revert_store(file, revision, Provenance(command=command_line(), note=note))
     if as_json:
-        print_json({"map": file, "revision": now, "restores": revision, "parent": before})
+        aside = None if damaged is None else str(damaged)
+        print_json({"map": file, "revision": now, "restores": revision, "parent": now - 1, "damaged_file": aside})
         return
-    say(f"revision {now} has the content of revision {revision}; back again with: evermap map revert {file} {before}")
+    if damaged is None:
+        back = f"; back again with: evermap map revert {file} {now - 1}"
+    else:
+        back = f"; the file was damaged: what was intact is kept, the damaged file is {damaged} now"
+    say(f"revision {now} has the content of revision {revision}{back}")
+
+
+def verify(file: _File, as_json: _AsJson = False) -> None:
+    """Check every byte of a map against its checksums.
+
+    Exit code 2 if anything is damaged, with the revisions that are intact and how to go back to them.
+
+    \b
+    Example:
+      evermap map verify site.evermap
+    """
+    from pathlib import Path
+
+    from evermap.maps.store import verify_store
+
+    found = verify_store(file)
+    if as_json:
+        print_json(
+            {
+                "map": file,
+                "sound": found.sound,
+                "head": found.head,
+                "intact": list(found.intact),
+                "damaged": {str(number): reason for number, reason in found.damaged.items()},
+                "lost": list(found.lost),
+                "problems": list(found.problems),
+                "chunks": found.n_chunks,
+                "bytes": found.n_bytes,
+            }
+        )
+    if not found.sound:
+        raise found.error(Path(file))
+    if not as_json:
+        earlier = f"; lost to earlier damage: {', '.join(map(str, found.lost))}" if found.lost else ""
+        say(f"{file}: all {len(found.intact)} revisions are intact ({found.n_chunks} parts were checked){earlier}")
 
 
 def pin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:

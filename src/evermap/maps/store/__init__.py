@@ -7,12 +7,36 @@ importing this package.
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from evermap.errors import ConfigError
-from evermap.maps.store.protocol import MapStore, Provenance, Revision, RevisionKind, StaleRevisionError
+from evermap.maps.store.protocol import (
+    Attachment,
+    DamagedMapError,
+    MapStore,
+    Provenance,
+    Revision,
+    RevisionKind,
+    StaleRevisionError,
+)
 
-__all__ = ["MapStore", "Provenance", "Revision", "RevisionKind", "StaleRevisionError", "open_store"]
+if TYPE_CHECKING:
+    from evermap.maps.store.salvage import Verification
+
+__all__ = [
+    "Attachment",
+    "DamagedMapError",
+    "MapStore",
+    "Provenance",
+    "Revision",
+    "RevisionKind",
+    "StaleRevisionError",
+    "open_store",
+    "revert_store",
+    "verify_store",
+]
 
 
 def open_store(where: str | Path, *, create: bool = False) -> MapStore:
@@ -28,9 +52,52 @@ def open_store(where: str | Path, *, create: bool = False) -> MapStore:
         ConfigError: no store is made for such an address.
         InputError: there is none, it is no map, damaged, or of a newer evermap.
     """
+    from evermap.maps.store.sqlite import open_sqlite
+
+    return open_sqlite(_path(where), create=create)
+
+
+def verify_store(where: str | Path) -> Verification:
+    """Check every revision of a map, and the file that it is in.
+
+    Raises:
+        ConfigError, InputError: as `open_store`, but not for damage: that is what the answer tells.
+    """
+    from evermap.maps.store.salvage import verify
+
+    path = _path(where)
+    with suppress(DamagedMapError):
+        open_store(where).close()  # is a map, of this schema
+    return verify(path)
+
+
+def revert_store(where: str | Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path | None]:
+    """Go back to an older revision, whether or not the file is damaged.
+
+    A damaged file is replaced by one with all that is intact, and kept beside it.
+
+    Returns:
+        The number of the new revision; where the damaged file is now, None if it was sound.
+
+    Raises:
+        DamagedMapError: the revision itself is damaged.
+        ConfigError, InputError: as `open_store` and `MapStore.revert`.
+    """
+    from evermap.maps.store.salvage import rescue
+
+    if verify_store(where).sound:
+        with open_store(where) as store:
+            return store.revert(revision, provenance), None
+    return rescue(_path(where), revision, provenance)
+
+
+def _path(where: str | Path) -> Path:
+    """The file of a path or an address.
+
+    Raises:
+        ConfigError: no store is made for such an address.
+    """
     address = re.fullmatch(r"([a-z][a-z0-9+.-]+)://(.*)", str(where), flags=re.DOTALL)
     if address is not None and address[1] != "sqlite":
         raise ConfigError(f"no map store for '{address[1]}'", field="map", hint="the path of a file")
-    from evermap.maps.store.sqlite import open_sqlite
-
-    return open_sqlite(Path(where if address is None else address[2].removeprefix("/")), create=create)
+    return Path(where if address is None else address[2].removeprefix("/"))

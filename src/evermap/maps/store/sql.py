@@ -39,15 +39,26 @@ _LONGEST = 900_000_000
 class SqlStore:
     """`MapStore` over an engine of SQLAlchemy, see there. Made by `opened`."""
 
-    def __init__(self, engine: Engine, where: str) -> None:
+    def __init__(
+        self, engine: Engine, where: str, explain: Callable[[str], InputError | None] = lambda _: None
+    ) -> None:
         self._engine = engine
         self._where = where
+        self._explain = explain
         self._records: dict[bytes, Record] = {}  # they never change, and their names are their checksums
         self._history: tuple[Any, int, dict[int, Record], dict[int, bytes | None]] | None = None  # of `_chain`
         self._checked: set[bytes] = set()  # chunks that this object has read, and found to be what was written
 
     @classmethod
-    def opened(cls, engine: Engine, where: str, *, create: bool, tidy: Callable[[], None] = lambda: None) -> SqlStore:
+    def opened(
+        cls,
+        engine: Engine,
+        where: str,
+        *,
+        create: bool,
+        tidy: Callable[[], None] = lambda: None,
+        explain: Callable[[str], InputError | None] = lambda _: None,
+    ) -> SqlStore:
         """The store behind an engine; its tables are made or brought up to date. Errors as `open_store`.
 
         Args:
@@ -55,8 +66,9 @@ class SqlStore:
             where: path or address, for messages.
             create: make the tables where there are none.
             tidy: called once old tables have been replaced.
+            explain: makes the error of a problem with the bytes, saying what is whole; None where there is no map.
         """
-        store = cls(engine, where)
+        store = cls(engine, where, explain)
         with store._reading() as connection:
             version = store._schema_version(connection)
         if version == 0 and not create:
@@ -505,6 +517,11 @@ class SqlStore:
 
     def _damaged(self, problem: str) -> InputError:
         """One line that says which revisions are whole, and how to go back to them."""
+        explained = self._explain(problem)
+        if explained is not None:
+            return explained
+        if "is not a database" in problem:
+            return InputError("is no evermap map", path=self._where, hint="another file")
         return DamagedMapError(f"damaged: {problem}", path=self._where, hint="a copy of the file")
 
 
@@ -512,7 +529,6 @@ _STORE_COLUMNS = ("schema_version", "created_at", "evermap_version", "head", "re
 _FAILURES = (
     ("readonly", "cannot be written: it is read-only", "chmod u+w, or a copy of it"),
     ("locked", "another process keeps it locked", "wait for that one to end"),
-    ("is not a database", "is no evermap map", "another file"),
     ("is full", "cannot be written: the disk is full", "make room"),
     ("unable to open", "cannot be opened or written", "check the rights of the file and of its folder"),
 )

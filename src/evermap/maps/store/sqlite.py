@@ -15,6 +15,8 @@ from urllib.parse import quote
 from sqlalchemy import Connection, Engine, NullPool, create_engine, event
 
 from evermap.errors import InputError
+from evermap.maps.store.content import DamagedError
+from evermap.maps.store.salvage import survey
 from evermap.maps.store.sql import SqlStore
 
 _PATIENCE_S = 20.0
@@ -30,7 +32,12 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
     if not path.parent.is_dir():
         raise InputError(f"the folder {path.parent} does not exist", path=path, hint=f"mkdir -p {path.parent}")
     engine = _engine(path, writable=os.access(path if path.exists() else path.parent, os.W_OK))
-    return SqlStore.opened(engine, str(path), create=create, tidy=lambda: _compact(engine))
+
+    def explain(problem: str) -> InputError | None:
+        found = survey(path)
+        return None if found is None else found.error(path, problem)
+
+    return SqlStore.opened(engine, str(path), create=create, tidy=lambda: _compact(engine), explain=explain)
 
 
 def _compact(engine: Engine) -> None:
@@ -61,5 +68,10 @@ def _engine(path: Path, *, writable: bool) -> Engine:
         # who is going to write locks at once, so that what was read at the beginning still holds at the end
         writes = connection.get_execution_options().get("writes", False)
         connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+        # pages that are listed as free are written to: if they are not free, older revisions would be overwritten
+        if writes and connection.exec_driver_sql("PRAGMA freelist_count").scalar():
+            found = connection.exec_driver_sql("PRAGMA integrity_check(1)").scalar()
+            if found != "ok":
+                raise DamagedError(f"SQLite: {' '.join(str(found).split())}")
 
     return engine
