@@ -16,7 +16,8 @@ SOURCE = Path(__file__).resolve().parents[1] / "src" / "evermap"
 # part -> what it may import of ours, beside itself
 RULES = {
     "errors": "",
-    "compiled": "",
+    "interrupts": "",
+    "compiled": "errors interrupts",
     "types": "",
     "se2": "types",
     "config": "errors types",
@@ -25,24 +26,25 @@ RULES = {
     "persistence": "errors types se2 compiled survival sensing",
     "recurrence": "errors types compiled survival persistence io",
     "tracking": "errors types se2 compiled config survival sensing persistence recurrence",
-    "slam": "errors types se2 compiled config survival sensing persistence recurrence",
+    "slam": "errors interrupts types se2 compiled config survival sensing persistence recurrence",
     "maps": "errors types se2 config survival sensing persistence recurrence",
-    "io": "errors types se2",
+    "io": "errors interrupts types se2",
     "sim": "errors types se2 survival sensing",
     "metrics": "errors types se2 survival",
     "viz": "errors types se2 survival recurrence metrics",
     "lifelong": "errors types se2 config survival sensing persistence slam maps",
-    "pipeline": "errors types se2 config survival sensing persistence recurrence tracking slam maps lifelong",
+    "pipeline": "errors interrupts types se2 config survival sensing persistence recurrence tracking slam maps "
+    "lifelong",
     "runsummary": "errors types",
-    "runfolder": "errors types se2 config io metrics viz runsummary",
+    "runfolder": "errors interrupts types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors types se2 config survival sensing persistence recurrence tracking slam maps sim io metrics "
-    "viz pipeline runsummary runfolder demo",
-    "demo": "errors types se2 config survival maps lifelong sim io metrics viz pipeline runfolder",
+    "experiments": "errors interrupts types se2 config survival sensing persistence recurrence tracking slam maps sim "
+    "io metrics viz pipeline runsummary runfolder demo",
+    "demo": "errors interrupts types se2 config survival maps lifelong sim io metrics viz pipeline runfolder",
     "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types survival tracking io viz runsummary runfolder",
-    "cli": "errors types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder presence "
-    "objects server experiments demo",
+    "cli": "errors interrupts types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder "
+    "presence objects server experiments demo",
 }
 
 # loaded by the functions that need them, never by starting up

@@ -4,6 +4,7 @@ import dataclasses
 import errno
 import json
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from evermap.config import load_config
 from evermap.errors import ConfigError, MissingExtraError
 from evermap.io.landmarks import read_prior_map
 from evermap.io.tum import read_tum
-from evermap.runfolder import RunFolder, RunInfo, check_replaceable, write_run
+from evermap.runfolder import MANIFEST, RunFolder, RunInfo, check_replaceable, write_run
 from evermap.runsummary import summary_dict, timing_dict
 
 sys.path.insert(0, str(Path(__file__).parent / "metrics"))
@@ -41,13 +42,19 @@ def quick(out, run, **options):
 
 
 def leftovers(folder):
-    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith(".") and path.name != MANIFEST)
+
+
+def listed(folder):
+    return [path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()]
 
 
 def test_everything_that_is_listed_is_there_and_nothing_else(written):
     out, summary = written
     there = sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
     assert there == summary["outputs"]
+    listed = json.loads((out / MANIFEST).read_text())["files"]
+    assert listed == {name: [sha256((out / name).read_bytes()).hexdigest()] for name in there if name != MANIFEST}
     assert {
         "summary.json",
         "trajectory.tum",
@@ -96,7 +103,7 @@ def test_the_same_run_gives_the_same_bytes_but_for_time(written, run, tmp_path):
     out, _ = written
     slower = RunInfo(command=INFO.command, seeds=INFO.seeds, processing_s=9.0)
     write_run(tmp_path / "second", *run, load_config(), info=slower)
-    volatile = {"summary.json", "report.html", "scene.rrd", "figures/latency.png", "figures/latency.svg"}
+    volatile = {MANIFEST, "summary.json", "report.html", "scene.rrd", "figures/latency.png", "figures/latency.svg"}
     for path in out.rglob("*"):
         name = path.relative_to(out).as_posix()
         if path.is_file() and name not in volatile:
@@ -166,7 +173,10 @@ def test_a_new_run_replaces_the_old_one_completely(run, tmp_path):
         quick(out, run)
     assert (out / "notes.txt").read_text() == "mine"
     quick(out, run, force=True)
-    assert not (out / "notes.txt").exists()
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "notes.txt").unlink()
+    quick(out, run)
+    assert sorted(listed(out)) == json.loads((out / "summary.json").read_text())["outputs"]
 
 
 def test_only_run_folders_and_empty_ones_are_replaced(tmp_path, monkeypatch):
@@ -177,7 +187,7 @@ def test_only_run_folders_and_empty_ones_are_replaced(tmp_path, monkeypatch):
     (tmp_path / "thesis" / "chapter.tex").write_text("x")
     with pytest.raises(ConfigError, match=r"chapter\.tex"):
         check_replaceable(tmp_path / "thesis")
-    check_replaceable(tmp_path / "thesis", force=True)
+    check_replaceable(tmp_path / "thesis", force=True)  # beside it
     with pytest.raises(ConfigError, match="is a file"):
         check_replaceable(tmp_path / "thesis" / "chapter.tex", force=True)
     (tmp_path / "thesis" / "summary.json").write_text('{"outputs": ["chapter.tex"]}')  # somebody else's summary

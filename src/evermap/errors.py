@@ -67,3 +67,7 @@ class NumericalError(EvermapError):
 
 class MissingExtraError(EvermapError):
     """An optional dependency is needed for this output; the message names the extra that brings it."""
+
+
+class EvermapWarning(UserWarning):
+    """A remark in one line about how evermap works here; the command line prints it as such."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evermap.interrupts import watched
 from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult
 
 if TYPE_CHECKING:
@@ -317,15 +318,17 @@ def _feed(
     began = time.perf_counter()
     done = 0
     try:
-        for row, stamp in enumerate(stamps):
-            if realtime:
-                time.sleep(max(0.0, (stamp - stamps[0]) - (time.perf_counter() - began)))
-            start = time.perf_counter()
-            slam.step()
-            step_s[row] = time.perf_counter() - start
-            done = row + 1
-            if progress is not None:
-                progress(float(stamp - stamps[0]), float(stamps[-1] - stamps[0]))
+        with watched() as watch:  # Ctrl-C waits for the end of a frame: the estimator is whole then
+            for row, stamp in enumerate(stamps):
+                if realtime:
+                    watch.sleep((stamp - stamps[0]) - (time.perf_counter() - began))
+                start = time.perf_counter()
+                slam.step()
+                step_s[row] = time.perf_counter() - start
+                done = row + 1
+                if progress is not None:
+                    progress(float(stamp - stamps[0]), float(stamps[-1] - stamps[0]))
+                watch.stop_if_asked()
     except KeyboardInterrupt:
         if done < 2:
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -110,7 +111,8 @@ def test_damaged_zip(data: st.DataObject, mrclam: dict[str, str], tmp_path: Path
 def test_damaged_parquet(
     data: st.DataObject, native: dict[str, str], lay_out: Callable, tmp_path: Path, check_recording: Callable
 ) -> None:
-    folder = write_native(read_recording(lay_out(native)), tmp_path / "parquet", "parquet", overwrite=True)
+    shutil.rmtree(tmp_path / "parquet", ignore_errors=True)
+    folder = write_native(read_recording(lay_out(native)), tmp_path / "parquet", "parquet")
     file = data.draw(st.sampled_from(sorted(folder.glob("*.parquet"))))
     file.write_bytes(data.draw(damaged(file.read_bytes())))
     sound_or_one_line(lambda: read_recording(folder), check_recording)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -225,7 +226,8 @@ def recordings(draw: st.DrawFn) -> Recording:
 def test_what_is_written_reads_back_the_same(
     recording: Recording, form: str, tmp_path: Path, assert_same: Callable, check_recording: Callable
 ) -> None:
-    folder = write_native(recording, tmp_path / "out", form, overwrite=True)  # type: ignore[arg-type]
+    shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    folder = write_native(recording, tmp_path / "out", form)  # type: ignore[arg-type]
     again = read_native(folder)
     check_recording(again)
     assert_same(replace(recording, name=recording.name or "out"), again, but=NOT_WRITTEN)
@@ -396,12 +398,12 @@ def test_nothing_is_overwritten_unasked(native: Files, lay_out: Callable, tmp_pa
     write_native(recording, target)
     with pytest.raises(InputError, match="not empty"):
         write_native(recording, target)
-    write_native(recording, target, "parquet", overwrite=True)
-    assert not list(target.glob("*.csv"))
-    (target / "thesis.txt").write_text("years of work")
-    with pytest.raises(InputError, match=r"thesis\.txt"):
-        write_native(recording, target, overwrite=True)
-    assert (target / "thesis.txt").exists()
+    thesis = tmp_path / "target" / "thesis.txt"
+    thesis.write_text("years of work")
+    with pytest.raises(InputError, match="not empty"):
+        write_native(recording, target, "parquet")
+    assert thesis.read_text() == "years of work"
+    assert not list(target.glob("*.parquet"))
     with pytest.raises(ConfigError, match="xlsx"):
         write_native(recording, tmp_path / "other", "xlsx")  # type: ignore[arg-type]
     assert sorted(child.name for child in tmp_path.iterdir()) == ["MRCLAM_Test", "target"]

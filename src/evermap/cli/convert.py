@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from evermap.cli.terminal import check_out_folder, print_json, say, warn
+from evermap.cli.terminal import print_json, say, warn
 
 
 class TableFormat(StrEnum):
@@ -26,7 +26,10 @@ def convert(
     ] = None,
     table_format: Annotated[TableFormat, typer.Option("--format", help="Format of the tables.")] = TableFormat.CSV,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Write into OUT even if it is not empty; other files stay."),
+    ] = False,
 ) -> None:
     """Write any readable recording in the native format.
 
@@ -35,10 +38,12 @@ def convert(
       evermap convert MRCLAM_Dataset6.zip robot1 --robot 1
     """
     from evermap.io import read_recording, write_native
+    from evermap.runfolder import RunFolder
 
-    check_out_folder(out, force)
+    folder = RunFolder(out, force=force, inputs=[recording_path], renew=False)
     recording = read_recording(recording_path, robot=robot)
-    write_native(recording, out, table_format.value, overwrite=force)
+    with folder:
+        write_native(recording, folder.path("."), table_format.value)
     for remark in recording.warnings:
         warn(remark)
     if as_json:

@@ -26,7 +26,7 @@ def demo(
     processes: Annotated[int, typer.Option(min=1, help="Methods that are run at a time.")] = 2,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
+        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
     ] = False,
 ) -> None:
     """Live for four weeks in a building that changes.

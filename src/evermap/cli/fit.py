@@ -65,11 +65,14 @@ def fit(
     """
     from evermap.objects.estimate import check_estimator, estimates
     from evermap.objects.lifetimes import BY_CHUNK, groups_of, parse_by, read_lifetimes
+    from evermap.runfolder import check_output_file
 
     check_estimator(estimator)
     words = parse_by(by)
     if figure is not None:
-        check_picture(figure, "--figure")
+        check_picture(figure, "--figure", inputs=[table_path])
+    if out is not None:
+        check_output_file(out, inputs=[table_path], ending=".json")
     if out is not None and BY_CHUNK in words:
         raise ConfigError("a model file knows no places", field="--out", hint="--by class, or the texts of --json")
     table = read_lifetimes(table_path)

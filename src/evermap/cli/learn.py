@@ -42,11 +42,13 @@ def learn(
       evermap persist tomorrow.csv --model model.json
     """
     if figure is not None:
-        check_picture(figure, "--figure")
+        check_picture(figure, "--figure", inputs=[table_path])
     from evermap.presence.learning import learn_models
     from evermap.presence.modelfile import save_models
     from evermap.presence.table import read_looks
+    from evermap.runfolder import check_output_file
 
+    check_output_file(out, inputs=[table_path], ending=".json")
     table = read_looks(table_path, p_miss=p_miss, p_false=p_false)
     looks = table.looks(table.order())
     with progress_bar(f"{table_path.name}: learning", speed=False) as progress:

@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import errno
 import sys
+import warnings
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
-from evermap import __version__
+from evermap import __version__, interrupts
 from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival, track
 from evermap.cli import map as living_map
-from evermap.cli.terminal import fail, say
-from evermap.errors import EvermapError
+from evermap.cli.terminal import fail, say, warn
+from evermap.errors import EvermapError, EvermapWarning
 
 EXIT_DEFECT = 1
 EXIT_USER = 2
 EXIT_INTERRUPTED = 130
+
+_show_any_warning = warnings.showwarning
 
 # The bases of what the command line library raises (it exports only the leaves).
 _UsageError: Any = typer.BadParameter.__mro__[1]
@@ -45,6 +48,7 @@ class Verbs(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run the verb; every exception that we cause or can explain becomes a line on stderr and an exit code."""
+        warnings.showwarning = _show_warning
         try:
             return super().invoke(ctx)
         except EvermapError as error:
@@ -90,6 +94,14 @@ app.command("reproduce")(reproduce.reproduce)
 app.command("bench")(bench.bench)
 
 
+def _show_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+    """Our own in one line; those of libraries with the place in the code, as ever."""
+    if issubclass(category, EvermapWarning):
+        warn(str(message))
+    else:
+        _show_any_warning(message, category, *where, **more)
+
+
 def _print_version(wanted: bool) -> None:
     if wanted:
         typer.echo(f"evermap {__version__}")
@@ -107,5 +119,10 @@ def options(
 
 
 def run() -> None:
-    """Entry point of the installed command."""
-    app(prog_name="evermap")
+    """Parse what was typed, run it, and end this process."""
+    interrupts.leave_on_signals()
+    try:
+        app(prog_name="evermap")
+    except SystemExit as end:
+        interrupts.ends_with(end.code if isinstance(end.code, int) else 0 if end.code is None else EXIT_DEFECT)
+        raise

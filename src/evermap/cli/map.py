@@ -85,7 +85,7 @@ def show(
 
     ahead_s = parse_duration_s(ahead)
     if figure is not None:
-        check_picture(figure, "--figure")
+        check_picture(figure, "--figure", inputs=[file])
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         living = store.load(number)
@@ -163,8 +163,10 @@ def export(
       evermap map export site.evermap --out map.geojson
     """
     from evermap.maps.store import open_store
+    from evermap.runfolder import check_output_file
 
     write = _writer(out)
+    check_output_file(out, inputs=[file])
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         landmarks = store.load(number).landmarks(p_least=p_least)
@@ -199,7 +201,7 @@ def why(
     from evermap.maps.why import why as of_landmark
 
     if figure is not None:
-        check_picture(figure, "--figure")
+        check_picture(figure, "--figure", inputs=[file])
     with open_store(file) as store:
         answer = of_landmark(store, landmark, revision)
     if figure is not None:

@@ -75,7 +75,7 @@ def persist(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
+        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
     ] = False,
     init: Annotated[
         Path | None,
@@ -120,7 +120,8 @@ def persist(
     from evermap.types import Clock
 
     out = out or default_out(table_path)
-    check_replaceable(out, force=force)  # better now than after the run
+    inputs = [table_path, model, truth_path]
+    check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
     common, by_class = split_priors(priors or [])
     config = PersistConfig(
         prior=common or DEFAULT_PRIOR,
@@ -152,6 +153,7 @@ def persist(
             command=command_line(),
             read_s=read_s,
             force=force,
+            inputs=inputs,
             progress=progress,
         )
     for remark in [*remarks, *summary["warnings"]]:

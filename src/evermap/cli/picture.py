@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,18 +15,22 @@ if TYPE_CHECKING:
 SUFFIXES = (".png", ".svg")
 
 
-def check_picture(path: Path, field: str) -> None:
+def check_picture(path: Path, field: str, *, inputs: Sequence[str | Path] = ()) -> None:
     """Refuse a file that cannot be drawn, before the work that it shows is done.
 
     Args:
         path: the file.
         field: the option that named it.
+        inputs: files that are read.
 
     Raises:
-        ConfigError: a suffix that is neither .png nor .svg.
+        ConfigError: a suffix that is neither .png nor .svg, or the file is an input.
     """
+    from evermap.runfolder import check_output_file
+
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"cannot draw a '{path.suffix}' file", path=path, field=field, hint="a name ending in .png")
+    check_output_file(path, inputs=inputs)
 
 
 def write_picture(path: Path, figure: Figure) -> None:

@@ -104,7 +104,7 @@ def reproduce(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the table as JSON.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace --out even if it holds other things than results.")
+        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
     ] = False,
 ) -> None:
     """Compute a table of the documents again.
@@ -146,7 +146,7 @@ def reproduce(
     }
     _refuse_options(experiment, given)
     target = out or Path("evermap-out") / experiment.value
-    check_replaceable(target, force=force)
+    check_replaceable(target, force=force, inputs=[data or DATA.get(experiment)])
     with progress_bar(experiment.value, speed=experiment not in COUNTED) as progress:
         if experiment is Experiment.MRCLAM:
             from evermap.experiments import mrclam

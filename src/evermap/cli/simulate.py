@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evermap.cli.terminal import check_out_folder, print_json, say
+from evermap.cli.terminal import print_json, say
 
 if TYPE_CHECKING:
     from evermap.sim import BuildingSimulation
@@ -41,7 +41,10 @@ def simulate(
         bool, typer.Option("--clutter", help="Add crates, many, that stay in one place for hours.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print what was written as JSON.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
+    force: Annotated[
+        bool,
+        typer.Option("--force", help="Write into OUT even if it is not empty; other files stay."),
+    ] = False,
 ) -> None:
     """Record patrols of a simulated building.
 
@@ -56,9 +59,10 @@ def simulate(
       evermap simulate hard --patrol-s 20 --patrol-s 60 --patrol-s 165 --doors --wing-opens-day 3 --clutter
     """
     from evermap.io import write_native
+    from evermap.runfolder import RunFolder
     from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
 
-    check_out_folder(out, force)
+    folder = RunFolder(out, force=force, renew=False)
     config = BuildingConfig(
         days=days,
         sessions_per_day=sessions_per_day,
@@ -71,10 +75,11 @@ def simulate(
     )
     building = simulate_building(config, seed=seed)
     names = session_names(building)
-    for name, recording in zip(names, building.sessions, strict=True):
-        write_native(recording, out / name, overwrite=force)
-    _write_events(building, out / EVENTS_FILE)
-    _write_looks(building, names, out / LOOKS_FILE)
+    with folder:
+        for name, recording in zip(names, building.sessions, strict=True):
+            write_native(recording, folder.path(name))
+        _write_events(building, folder.path(EVENTS_FILE))
+        _write_looks(building, names, folder.path(LOOKS_FILE))
     if as_json:
         print_json({"out": str(out), "sessions": names, "changes": len(building.events), "seed": seed})
     else:

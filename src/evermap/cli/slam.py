@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -101,7 +102,7 @@ def slam(
     realtime: Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
+        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
     ] = False,
     init: Annotated[
         Path | None,
@@ -145,19 +146,30 @@ def slam(
     if shifts and prior_map is None:
         raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
+    inputs = [recording_path, config_file, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
-        check_replaceable(out, force=force)
+        check_replaceable(out, force=force, inputs=inputs)
     recording = read_recording(recording_path, robot=robot)
     if out is None:
         out = default_out(recording.name)
-        check_replaceable(out, force=force)
+        check_replaceable(out, force=force, inputs=inputs)
     if map_file is not None:
         from evermap.cli.slam_in_map import run_in_map
 
-        run_in_map(recording, config, map_file, out, localize=localize, realtime=realtime, as_json=as_json, force=force)
+        run_in_map(
+            recording,
+            config,
+            map_file,
+            out,
+            localize=localize,
+            realtime=realtime,
+            as_json=as_json,
+            force=force,
+            inputs=inputs,
+        )
         return
     prior = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force)
+    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force, inputs=inputs)
 
 
 def run_and_write(
@@ -169,6 +181,7 @@ def run_and_write(
     realtime: bool = False,
     as_json: bool = False,
     force: bool = False,
+    inputs: Sequence[str | Path | None] = (),
 ) -> None:
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
@@ -186,7 +199,7 @@ def run_and_write(
         processing_s=None if realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
     )
-    summary = write_run(out, recording, result, config, info=info, force=force)
+    summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
     for remark in summary["warnings"]:
         warn(remark)
     show_run(summary, out, as_json=as_json, findings=explanations(result))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evermap.cli.summary import show_run
 from evermap.cli.terminal import command_line, progress_bar, warm_up, warn
 from evermap.errors import ConfigError
+from evermap.interrupts import held, kept
 
 if TYPE_CHECKING:
     from evermap.config import Config
@@ -25,6 +27,7 @@ def run_in_map(
     realtime: bool,
     as_json: bool,
     force: bool,
+    inputs: Sequence[str | Path | None],
 ) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
     from evermap.config import to_toml
@@ -36,7 +39,10 @@ def run_in_map(
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
     warm_up()
-    with open_store(map_file, create=not localize) as store:
+    with held():  # a map without its tables is none
+        opened = open_store(map_file, create=not localize)
+    kept(map_file, f"the map {map_file} stays as it was")
+    with opened as store:
         parent = store.head()
         living = store.load(parent)
         start = time.perf_counter()
@@ -47,29 +53,28 @@ def run_in_map(
                 session = run_session(recording, living, config, progress=progress)
                 result, recording = session.slam, session.recording
         elapsed_s = time.perf_counter() - start
-        _write(recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force)
+        _write(
+            recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force, inputs=inputs
+        )
         if localize or result.interrupted:
             return
         if not session.found:
             raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
         stamps = recording.frames.stamp_s
-        store.commit(
-            session.living,
-            Provenance(
-                kind=RevisionKind.SESSION,
-                recording=recording.name,
-                source=recording.source,
-                command=command_line(),
-                config=to_toml(config),
-                seed=config.slam.seed,
-                stamp_from_s=float(stamps[0]),
-                stamp_to_s=float(stamps[-1]),
-                wall_s=elapsed_s,
-            ),
-            session.changes,
-            session.evidence,
-            parent=parent,
+        provenance = Provenance(
+            kind=RevisionKind.SESSION,
+            recording=recording.name,
+            source=recording.source,
+            command=command_line(),
+            config=to_toml(config),
+            seed=config.slam.seed,
+            stamp_from_s=float(stamps[0]),
+            stamp_to_s=float(stamps[-1]),
+            wall_s=elapsed_s,
         )
+        with held():
+            revision = store.commit(session.living, provenance, session.changes, session.evidence, parent=parent)
+            kept(map_file, f"the session is revision {revision} of {map_file}")
 
 
 def _write(
@@ -82,6 +87,7 @@ def _write(
     realtime: bool,
     as_json: bool,
     force: bool,
+    inputs: Sequence[str | Path | None],
 ) -> None:
     from evermap.runfolder import RunInfo, write_run
     from evermap.viz.change_words import explanations
@@ -92,7 +98,7 @@ def _write(
         processing_s=None if realtime else elapsed_s,
         total_s=elapsed_s,
     )
-    summary = write_run(out, recording, result, config, info=info, force=force)
+    summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
     for remark in summary["warnings"]:
         warn(remark)
     show_run(summary, out, as_json=as_json, findings=explanations(result))

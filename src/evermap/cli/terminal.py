@@ -10,12 +10,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, TextIO
 
 import typer
-
-from evermap.errors import ConfigError
 
 PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
@@ -141,18 +138,6 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 def command_line() -> str:
     """What was typed, for the summary."""
     return shlex.join(["evermap", *sys.argv[1:]])
-
-
-def check_out_folder(out: Path, force: bool) -> None:
-    """Refuse, before any work is done, to mix new recordings with what is already there.
-
-    Raises:
-        ConfigError: `out` is a file, or a folder that holds something and `force` is off.
-    """
-    if out.exists() and not out.is_dir():
-        raise ConfigError("is a file; a folder is needed", path=out)
-    if not force and out.is_dir() and any(out.iterdir()):
-        raise ConfigError("is not empty", path=out, hint="another folder, or --force to write into it")
 
 
 def _colour(stream: TextIO) -> bool:

@@ -68,7 +68,7 @@ def track(
     scene: Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for rerun, if installed.")] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
     force: Annotated[
-        bool, typer.Option("--force", help="Replace --out even if it holds other things than a run.")
+        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
     ] = False,
     init: Annotated[
         Path | None,
@@ -119,7 +119,8 @@ def track(
     from evermap.runfolder import check_replaceable
 
     out = out or default_out(table_path)
-    check_replaceable(out, force=force)  # better now than after the run
+    inputs = [table_path, confusion_path]
+    check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
     common, by_class = split_priors(priors or [])
     config = TrackConfig(
         settings=parse_settings(settings or []),
@@ -139,7 +140,14 @@ def track(
         result = run_track(table, config, confusion=confusion, progress=progress)
     with progress_bar(f"{table_path.name}: writing", speed=False) as progress:
         summary = write_track(
-            out, result, command=command_line(), read_s=read_s, scene=scene, force=force, progress=progress
+            out,
+            result,
+            command=command_line(),
+            read_s=read_s,
+            scene=scene,
+            force=force,
+            inputs=inputs,
+            progress=progress,
         )
     for remark in summary["warnings"]:
         warn(remark)

@@ -12,7 +12,7 @@ from typing import Any
 from evermap.demo.methods import method_named
 from evermap.demo.scenario import Scenario
 from evermap.demo.study import Progress, run_study
-from evermap.runfolder import SUMMARY, RunFolder, RunInfo, check_replaceable, summary_text, write_run
+from evermap.runfolder import SUMMARY, RunFolder, RunInfo, summary_text, write_run
 from evermap.sim import ChangeEvent
 
 TRUE_EVENTS = "true_events.jsonl"
@@ -41,7 +41,7 @@ def run_demo(
         scenario: how much is simulated; default: 56 patrols of 110 s on 28 days.
         processes: methods at a time; above 1 the calling script needs its `__main__` guard.
         command: what was typed, for the summary.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Raises:
         ConfigError: `out` must not be replaced, or the scenario is out of range.
@@ -54,7 +54,6 @@ def run_demo(
     from evermap.demo.story import demo_sections
     from evermap.viz.style import save_png, save_svg
 
-    check_replaceable(out, force=force)
     scenario = scenario or Scenario()
     config = method_named("evermap").config()
     start = time.perf_counter()

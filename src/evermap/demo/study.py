@@ -16,6 +16,7 @@ from evermap.demo.methods import METHODS, Method
 from evermap.demo.scenario import Scenario
 from evermap.demo.scores import Snapshot
 from evermap.demo.truth import Truth, truth_of
+from evermap.interrupts import sheltered
 from evermap.sim import BuildingSimulation
 from evermap.types import IntArray, MapChange, Recording, SlamResult, Trajectory
 
@@ -231,9 +232,14 @@ def _workers(processes: int) -> Iterator[Callable[[_Day], Future[tuple[_Evening,
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     context = multiprocessing.get_context("spawn")  # a fork would copy locks of threads that it does not copy
-    with ProcessPoolExecutor(processes, mp_context=context, initializer=_ignore_interrupts) as executor:
+    with ProcessPoolExecutor(processes, mp_context=context) as executor:
+
+        def submit(day: _Day) -> Future[tuple[_Evening, ...]]:
+            with sheltered():
+                return executor.submit(_live_through, day)
+
         try:
-            yield lambda day: executor.submit(_live_through, day)
+            yield submit
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
@@ -249,10 +255,3 @@ def _at_once(day: _Day) -> Future[tuple[_Evening, ...]]:
     done: Future[tuple[_Evening, ...]] = Future()
     done.set_result(_live_through(day))
     return done
-
-
-def _ignore_interrupts() -> None:
-    """Ctrl-C reaches every process of a terminal; the parent decides."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -42,7 +42,7 @@ def reproduce(
         out: folder; replaced if it holds an older reproduction, untouched if this one fails.
         settings: `default_settings()` where None.
         progress: told after every filter in every world.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `rows` (one a world, sensor and filter), `orderings`, `expected`, `sweep`, `settings`; plain JSON values.

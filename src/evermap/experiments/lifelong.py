@@ -104,7 +104,7 @@ def reproduce(
             this run fails.
         settings: everything where None.
         progress: told after every session.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `rows` (a dictionary a session), `expected`, `settings`, `machine`; plain JSON values.
@@ -120,7 +120,7 @@ def reproduce(
     if set(settings.parts) != {SIMULATED_PART}:
         find_dataset(Path(data), DATASET)
     kept = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts]
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         wall, cpu = time.perf_counter(), time.process_time()
         rows = [*kept, *_run_all(settings, Path(data), progress)]
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu

@@ -79,7 +79,7 @@ def reproduce(
         settings: the defaults where None.
         data: folder with the recording of rooms; None leaves the rooms out.
         progress: told as runs are done.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `moving`, `truth` and `rooms` (a dictionary a row each), `coverage` by estimator; plain JSON values.
@@ -99,7 +99,7 @@ def reproduce(
         if progress is not None:
             progress(done, total)
 
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         start = time.perf_counter()
         rooms = [] if data is None else study_rooms(Path(data))
         tracked, moving, learned = study(settings.moving, settings.moving_runs, settings.seed, tell)

@@ -102,7 +102,7 @@ def reproduce(
             older reproduction, untouched if this one fails.
         progress: told as the runs advance.
         everything: also the data sets 3, 1 and 2, of which less truth is known.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `rows` (a dictionary a robot and setting), `means` (the same over robots), `expected` (what was promised, what
@@ -116,7 +116,7 @@ def reproduce(
     from evermap.runfolder import RunFolder
 
     jobs = list(_jobs(Path(data), (MAIN, *OTHERS) if everything else (MAIN,)))
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         _warm_up(jobs[0].recording)
         ledger = _run_all(jobs, folder, progress)
         table: dict[str, Any] = {

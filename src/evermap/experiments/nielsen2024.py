@@ -11,7 +11,7 @@ import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +27,7 @@ from evermap.experiments.nielsen2024_plan import METHODS, PARTS, QUICK, Settings
 from evermap.experiments.nielsen2024_runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
 from evermap.experiments.nielsen2024_simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap.experiments.nielsen2024_table import as_markdown, verdicts
+from evermap.interrupts import sheltered, watched
 from evermap.types import SlamResult
 
 Progress = Callable[[float, float], None]
@@ -61,7 +62,7 @@ def reproduce(
             run fails; an interrupt keeps what was done.
         settings: everything where None.
         progress: told after every run.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `simulation` and `runs` (a dictionary each), `expected`, `settings`, `machine`; plain JSON values.
@@ -75,7 +76,7 @@ def reproduce(
     settings = settings or Settings()
     planned = jobs(settings, Path(data))
     earlier, paths = _earlier(Path(out))
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         wall, cpu = time.perf_counter(), time.process_time()
         simulation = earlier["simulation"]
         if "simulation" in settings.parts:
@@ -84,10 +85,12 @@ def reproduce(
         done: list[Row] = []
         interrupted = False
         try:
-            for job, row, path in _run_all(planned, Path(data), settings.processes, progress):
-                done.append(row)
-                if path is not None:
-                    paths[_path_key(job)] = path
+            with watched() as watch:
+                for job, row, path in _run_all(planned, Path(data), settings.processes, progress):
+                    done.append(row)
+                    if path is not None:
+                        paths[_path_key(job)] = path
+                    watch.stop_if_asked()
         except KeyboardInterrupt:
             if not done:
                 raise
@@ -144,14 +147,17 @@ def _serial(planned: list[Job], data: Path) -> Iterator[tuple[Job, Row, Row | No
 
 def _parallel(planned: list[Job], data: Path, processes: int) -> Iterator[tuple[Job, Row, Row | None]]:
     """In processes that are started afresh: what was compiled is read from disk, nothing is shared."""
-    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool, watched() as watch:
         try:
             sources = list(dict.fromkeys((job.dataset, job.robot) for job in planned))
-            found = {source: pool.submit(reference_of, data, *source) for source in sources}
+            with sheltered():
+                found = {source: pool.submit(reference_of, data, *source) for source in sources}
             references = {source: future.result() for source, future in found.items()}
             waiting = {pool.submit(_run, job, data, references[job.dataset, job.robot]): job for job in planned}
-            for future in as_completed(waiting):
-                yield waiting[future], *future.result()
+            while waiting:
+                for future in wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED).done:
+                    yield waiting.pop(future), *future.result()
+                watch.stop_if_asked()
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

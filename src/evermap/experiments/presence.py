@@ -83,7 +83,7 @@ def reproduce(
         out: folder; replaced if it holds an older reproduction, untouched if this one fails.
         seed: of the errors in the robot's looks at the door.
         progress: told as models are learned.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `door` and `room` (a dictionary each row), `targets`, `settings`, `processing_s`; plain JSON values.
@@ -97,7 +97,7 @@ def reproduce(
 
     if seed < 0:
         raise ConfigError(f"must not be negative, not {seed}", field="seed")
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         start = time.perf_counter()
         room, door, home = read_room(Path(data)), read_door(Path(data)), read_home(Path(data))
         steps = _Steps(

@@ -100,7 +100,7 @@ def reproduce(
         settings: those of the paper where None.
         data: folder with `rosen2016.json`, the reference numbers; None compares with nothing.
         progress: told as the settings are done.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
 
     Returns:
         `values` (a dictionary each), `verdict` (None without reference), `settings`, `processing_s`; plain JSON values.
@@ -114,7 +114,7 @@ def reproduce(
 
     settings = settings or Settings()
     reference = None if data is None else read_reference(Path(data))
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=[data]) as folder:
         start = time.perf_counter()
         values = compute(settings, progress)
         elapsed_s = time.perf_counter() - start

@@ -10,7 +10,7 @@ import numpy as np
 from evermap.errors import ConfigError
 from evermap.io.atomic import staged_folder
 from evermap.io.landmarks import labels_of, survey_columns
-from evermap.io.native import ENDINGS, SENSOR_FILE, TABLES
+from evermap.io.native import SENSOR_FILE
 from evermap.io.sensor_toml import Settings, sensor_toml
 from evermap.io.table import csv_text, parquet_bytes
 from evermap.types import UNKNOWN, Recording
@@ -20,8 +20,6 @@ def write_native(
     recording: Recording,
     folder: str | Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 (the word that callers expect)
-    *,
-    overwrite: bool = False,
 ) -> Path:
     """Writes a recording as a native folder and returns the folder.
 
@@ -30,18 +28,16 @@ def write_native(
 
     Args:
         recording: what to write.
-        folder: is created; must not exist, be empty, or with `overwrite` hold nothing but a native recording.
+        folder: is created; must not exist, or be empty.
         format: 'csv' or 'parquet'.
-        overwrite: whether an older native recording may be replaced.
 
     Raises:
         ConfigError: `format` is neither 'csv' nor 'parquet'.
-        InputError: the folder holds something else, or cannot be written; nothing is changed then.
+        InputError: the folder holds something, or cannot be written; nothing is changed then.
     """
     if format not in ("csv", "parquet"):
         raise ConfigError(f"there is no native format '{format}'", field="format", hint="csv or parquet")
-    ours = {f"{name}{ending}" for name in TABLES for ending in ENDINGS} | {SENSOR_FILE}
-    with staged_folder(folder, replaceable=(lambda child: child.name in ours) if overwrite else None) as staging:
+    with staged_folder(folder) as staging:
         (staging / SENSOR_FILE).write_text(sensor_toml(_settings(recording)), encoding="utf-8")
         for name, columns in native_tables(recording).items():
             if format == "csv":

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from time import perf_counter
@@ -35,6 +35,7 @@ def write_track(
     read_s: float | None = None,
     scene: bool = True,
     force: bool = False,
+    inputs: Iterable[str | Path | None] = (),
     progress: Callable[[float, float], None] | None = None,
 ) -> dict[str, Any]:
     """Writes the folder of a run. Returns the content of `summary.json`.
@@ -45,7 +46,8 @@ def write_track(
         command: the command line, '' if there was none.
         read_s: wall time of reading the table.
         scene: whether to write a recording for rerun; left out with a warning where rerun-sdk is missing.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
+        inputs: files that were read, beside the table.
         progress: told after each file.
 
     Raises:
@@ -60,7 +62,7 @@ def write_track(
         "spells.csv": lambda: csv_bytes(_with_names(_spells(result))),
         "lifetimes.csv": lambda: _lifetimes(result),
     }
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
         for k, (name, content) in enumerate(files.items()):
             folder.path(name).write_bytes(content())
             if progress:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -35,6 +35,7 @@ def write_persist(
     command: str = "",
     read_s: float | None = None,
     force: bool = False,
+    inputs: Iterable[str | Path | None] = (),
     progress: Callable[[float, float], None] | None = None,
 ) -> dict[str, Any]:
     """Writes the folder of a run. Returns the content of `summary.json`.
@@ -46,13 +47,14 @@ def write_persist(
         clock: of the stamps, for the figures; None guesses.
         command: the command line, '' if there was none.
         read_s: wall time of reading the table.
-        force: replace `out` whatever it holds.
+        force: write into a folder that holds other files, too; they stay.
+        inputs: files that were read, beside the table.
         progress: told after each figure.
 
     Raises:
         ConfigError: `out` must not or cannot be written.
     """
-    with RunFolder(out, force=force) as folder:
+    with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
         start = _now()
         folder.path("beliefs.csv").write_bytes(_beliefs(result))
         folder.path("forecasts.csv").write_bytes(_forecasts(result))

@@ -12,6 +12,7 @@ import numpy as np
 
 from evermap import se2
 from evermap.errors import DataError
+from evermap.interrupts import watched
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
@@ -182,20 +183,22 @@ def _feed(
     step_s: list[float] = []
     began = time.perf_counter()
     try:
-        for row, low, high in zip(frame.tolist(), first, last, strict=True):
-            passed_s = float(stamps[row] - stamps[frame[0]])
-            if realtime:
-                time.sleep(max(0.0, passed_s - (time.perf_counter() - began)))
-            start = time.perf_counter()
-            sightings = Sightings(
-                seen.landmark_id[low:high],
-                np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
-                np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
-            )
-            located.append(localizer.step(stamps[row] - recording.odometry.stamp_s[0], drive, sightings))
-            step_s.append(time.perf_counter() - start)
-            if progress is not None:
-                progress(passed_s, float(stamps[frame[-1]] - stamps[frame[0]]))
+        with watched() as watch:
+            for row, low, high in zip(frame.tolist(), first, last, strict=True):
+                passed_s = float(stamps[row] - stamps[frame[0]])
+                if realtime:
+                    watch.sleep(passed_s - (time.perf_counter() - began))
+                start = time.perf_counter()
+                sightings = Sightings(
+                    seen.landmark_id[low:high],
+                    np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
+                    np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
+                )
+                located.append(localizer.step(stamps[row] - recording.odometry.stamp_s[0], drive, sightings))
+                step_s.append(time.perf_counter() - start)
+                if progress is not None:
+                    progress(passed_s, float(stamps[frame[-1]] - stamps[frame[0]]))
+                watch.stop_if_asked()
     except KeyboardInterrupt:
         if not step_s:
             raise
