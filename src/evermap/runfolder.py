@@ -200,9 +200,7 @@ def check_replaceable(
         raise ConfigError(f"holds '{name}', {what}", path=out, field="out", hint=hint)
 
 
-def check_output_file(
-    path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = ""
-) -> None:
+def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = "") -> None:
     """Whether a single file may be written: it is nothing that is read, and no living map.
 
     Args:
