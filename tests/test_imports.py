@@ -18,7 +18,8 @@ RULES = {
     "errors": "",
     "interrupts": "",
     "compiled": "errors interrupts",
-    "types": "",
+    "types": "errors",
+    "valid": "errors types",
     "se2": "types",
     "config": "errors types",
     "survival": "errors types se2 compiled",
@@ -28,21 +29,21 @@ RULES = {
     "tracking": "errors types se2 compiled config survival sensing persistence recurrence",
     "slam": "errors interrupts types se2 compiled config survival sensing persistence recurrence",
     "maps": "errors types se2 config survival sensing persistence recurrence",
-    "io": "errors interrupts types se2",
+    "io": "errors interrupts types valid se2",
     "sim": "errors types se2 survival sensing",
     "metrics": "errors types se2 survival",
     "viz": "errors types se2 survival recurrence metrics",
     "lifelong": "errors types se2 config survival sensing persistence slam maps",
-    "pipeline": "errors interrupts types se2 config survival sensing persistence recurrence tracking slam maps "
+    "pipeline": "errors interrupts types valid se2 config survival sensing persistence recurrence tracking slam maps "
     "lifelong",
     "runsummary": "errors types",
     "runfolder": "errors interrupts types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors interrupts types se2 config survival sensing persistence recurrence tracking slam maps sim "
+    "experiments": "errors interrupts types valid se2 config survival sensing persistence recurrence tracking slam maps sim "
     "io metrics viz pipeline runsummary runfolder demo",
     "demo": "errors interrupts types se2 config survival maps lifelong sim io metrics viz pipeline runfolder",
-    "presence": "errors types survival persistence recurrence io metrics viz runsummary runfolder",
-    "objects": "errors types survival tracking io viz runsummary runfolder",
+    "presence": "errors types valid survival persistence recurrence io metrics viz runsummary runfolder",
+    "objects": "errors types valid survival tracking io viz runsummary runfolder",
     "cli": "errors interrupts types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder "
     "presence objects server experiments demo",
 }

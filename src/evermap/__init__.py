@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from evermap.io import read_recording, write_native
     from evermap.maps.living import LivingMap
     from evermap.maps.store import open_store
-    from evermap.pipeline import Session, run_localization, run_session, run_slam
+    from evermap.pipeline import Session, check_recording, run_localization, run_session, run_slam
     from evermap.presence.config import PersistConfig
     from evermap.presence.run import run_persist
     from evermap.presence.table import read_looks
@@ -37,7 +37,7 @@ _HOME = {
     "evermap.io": ("read_recording", "write_native"),
     "evermap.maps.living": ("LivingMap",),
     "evermap.maps.store": ("open_store",),
-    "evermap.pipeline": ("Session", "run_localization", "run_session", "run_slam"),
+    "evermap.pipeline": ("Session", "check_recording", "run_localization", "run_session", "run_slam"),
     "evermap.presence.config": ("PersistConfig",),
     "evermap.presence.run": ("run_persist",),
     "evermap.presence.table": ("read_looks",),
@@ -70,6 +70,7 @@ __all__ = [
     "SlamResult",
     "Trajectory",
     "__version__",
+    "check_recording",
     "load_config",
     "open_store",
     "read_looks",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from evermap.lifelong.session import Visit
     from evermap.maps.living import Evidence, LivingMap
     from evermap.slam.calibration import CalibrationPrior
+    from evermap.slam.check import Check
     from evermap.slam.method import Method
     from evermap.slam.problem import Noise
     from evermap.slam.session import Prepared
@@ -47,6 +48,7 @@ def run_slam(
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
 
     Raises:
+        InputError: no `Recording`, or one with values that cannot be, such as stamps that run backwards.
         DataError: nothing can be estimated, for example because no landmark was ever seen.
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
@@ -54,14 +56,16 @@ def run_slam(
     from threadpoolctl import threadpool_limits
 
     from evermap.slam.association.identify import identified
+    from evermap.slam.check import odd
     from evermap.slam.session import prepare
 
     config = _or_default(config)
-    recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    recording = _valid(recording, config, prior_map)
+    remarks = odd(recording, identities=not config.slam.unknown_ids)
     prior, noise = _beliefs(recording, config)
     if config.slam.unknown_ids:
         recording = identified(recording, prior, noise, prior_map=prior_map)
-    prepared = prepare(recording, prior_map)
+    prepared = prepare(recording, prior_map, remarks)
     warm_up()
     # small matrices: several threads would only wait for each other, and sum in another order on another machine
     with threadpool_limits(limits=1, user_api="blas"):
@@ -108,12 +112,15 @@ def run_session(
         progress: told after every frame.
 
     Raises:
+        InputError: no `Recording`.
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
     from evermap.maps.living import LivingMap
+    from evermap.valid import check_type
 
     config = _or_default(config)
+    check_type(recording)
     living = LivingMap(clock=recording.clock) if living is None else living
     return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
 
@@ -145,13 +152,14 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from threadpoolctl import threadpool_limits
 
     from evermap.lifelong.session import Visit, admitted
+    from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
     from evermap.slam.session import prepare
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     recording, _ = admitted(clean(recording), living)
     prior, noise = _beliefs(recording, config)
-    prepared = prepare(recording)
+    prepared = prepare(recording, remarks=odd(recording))
     warm_up()
     with threadpool_limits(limits=1, user_api="blas"):
         slam = _estimator(prepared, prior, noise, recording, config.model_copy(update={"slam": _alone(config)}))
@@ -219,17 +227,19 @@ def run_localization(
     from evermap.errors import DataError
     from evermap.lifelong.believe import predicted
     from evermap.lifelong.session import admitted
+    from evermap.slam.check import odd
     from evermap.slam.localize_recording import localize
 
     config = _or_default(config)
     if not len(living.places):
         raise DataError("the map is empty", field="--map", hint="evermap slam RECORDING --map FILE, without --localize")
-    recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
+    recording = _valid(recording, config)
+    remarks = odd(recording)
     recording, living = admitted(recording, living)
     p_site = predicted(living, config.living, float(recording.frames.stamp_s[0]))
     prior, noise = _beliefs(recording, config)
     warm_up()
-    return localize(
+    result = localize(
         recording,
         living.sighted_rows(p_site),
         prior,
@@ -238,6 +248,26 @@ def run_localization(
         realtime=realtime,
         progress=progress,
     )
+    return replace(result, warnings=(*remarks, *result.warnings))
+
+
+def check_recording(recording: Recording, config: Config | None = None) -> Check:
+    """What a recording holds, and what is odd about it: units, signs, clocks, identities, limits, gaps.
+
+    `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
+
+    Args:
+        recording: what a reader returned; its truth is not looked at.
+        config: settings; None for the defaults. Its section `sensor` may correct the sensor's limits.
+
+    Raises:
+        InputError: no `Recording`, or one with values that cannot be.
+        DataError: nothing can be estimated from it.
+    """
+    from evermap.slam.check import Check
+
+    config = _or_default(config)
+    return Check.of(_valid(recording, config), identities=not config.slam.unknown_ids)
 
 
 def warm_up() -> None:
@@ -248,6 +278,16 @@ def warm_up() -> None:
     from evermap.slam.warmup import warm_up
 
     warm_up()
+
+
+def _valid(recording: Recording, config: Config, prior_map: Landmarks | None = None) -> Recording:
+    """The recording with the sensor that the configuration states, if both are valid."""
+    from evermap.valid import check_landmarks, validate
+
+    validate(recording)
+    if prior_map is not None:
+        check_landmarks(prior_map, "prior_map")
+    return replace(recording, sensor=config.sensor.applied_to(recording.sensor))
 
 
 def _beliefs(recording: Recording, config: Config) -> tuple[CalibrationPrior, Noise]:
@@ -381,13 +421,15 @@ def _result(
     """Bridge the blind stretches, count the misses, and put all of it into plain arrays."""
     from evermap.sensing.visibility import find_misses
     from evermap.slam import session
+    from evermap.slam.check import far_off
 
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = session.trajectory(prepared, outcome, recording, frame)
     rows = np.flatnonzero(recording.frames.stamp_s <= trajectory.stamp_s[-1] + 1e-9).astype(np.int64)
     poses = trajectory.pose_world_robot[session.rows_at(trajectory, recording, rows)]
     misses = find_misses(rows, poses, recording.detections, landmarks, recording.frames.stamp_s, recording.sensor)
-    warnings = list(prepared.warnings)
+    parameters = session.parameters(outcome, prior)
+    warnings = [*prepared.warnings, *far_off(parameters)]
     if interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (trajectory.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
@@ -395,7 +437,7 @@ def _result(
         trajectory=trajectory,
         online=session.online(prepared, slam, recording, frame),
         landmarks=session.with_misses(landmarks, misses),
-        parameters=session.parameters(outcome, prior),
+        parameters=parameters,
         innovations=session.innovations(prepared, slam, outcome, recording),
         misses=misses,
         step_s=step_s,

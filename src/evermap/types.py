@@ -1,4 +1,4 @@
-"""The nouns of evermap: frozen dataclasses of arrays, one row an item. Imports nothing of ours.
+"""The nouns of evermap: frozen dataclasses of arrays, one row an item. Imports nothing of ours but the errors.
 
 Conventions that hold everywhere:
 
@@ -6,6 +6,8 @@ Conventions that hold everywhere:
 * frames stand in the name: `pose_world_robot` maps robot coordinates to world coordinates and is `(x, y, theta)`;
 * covariances of poses are in the robot's own frame (right perturbation `pose * exp(xi)`, `xi = (forward, left, turn)`);
 * every stamp says its clock; arrays are C-contiguous float64 or int64; unknown ids are `UNKNOWN` (-1);
+* columns that are given as lists, or as other kinds of numbers, become such arrays; lengths that differ are refused;
+  what the numbers may be is in `valid`;
 * what was *not* seen is data: `Frames` lists every instant at which the sensor looked, `Misses` what it missed.
 """
 
@@ -18,12 +20,61 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from evermap.errors import InputError
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
+
+
+def _shape(item: Any, n: str, *columns: str, **more: tuple[int, ...]) -> None:
+    """Make the columns of a frozen dataclass arrays of N rows each, N being those of column `n`.
+
+    Args:
+        item: the dataclass.
+        n: the column that counts.
+        columns: names of the others that hold one number a row.
+        more: names of those that hold more, with their shape after the first axis.
+
+    Raises:
+        InputError: no numbers, fractions where whole numbers are needed, or another length.
+    """
+    shapes = dict.fromkeys((n, *columns), ()) | more
+    count = -1
+    for name, rest in shapes.items():
+        given = getattr(item, name)
+        whole = name in _WHOLE
+        array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, type(item).__name__, name))
+        if array.dtype != (np.int64 if whole else np.float64):
+            array = _as_kind(array, type(item).__name__, name, whole=whole)
+        if count < 0:
+            count = len(array) if array.ndim else -1
+        if array.shape != (count, *rest):
+            wanted = f"({count}, {', '.join(map(str, rest))})" if rest else f"({max(count, 0)},), as {n}"
+            raise InputError(f"{type(item).__name__} of shape {array.shape} instead of {wanted}", field=name)
+        if array is not given:
+            object.__setattr__(item, name, array)
+
+
+_WHOLE = {"frame", "landmark_id", "class_id", "source_line", "robot_id", "n_hits", "n_misses", "detection"}
+
+
+def _numbers(given: Any, owner: str, name: str) -> Any:
+    try:
+        return np.asarray(given) if len(given) else np.zeros(0)
+    except (TypeError, ValueError):
+        raise InputError(f"{owner}: {type(given).__name__} is no array of numbers", field=name) from None
+
+
+def _as_kind(array: Any, owner: str, name: str, *, whole: bool) -> Any:
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"{owner}: an array of {array.dtype} holds no numbers", field=name)
+    if whole and array.dtype.kind == "f" and not np.all(array == np.floor(array)):
+        raise InputError(f"{owner}: fractions where whole numbers are needed", field=name, hint="-1 for unknown")
+    return array.astype(np.int64 if whole else np.float64)
 
 
 class Clock(StrEnum):
@@ -54,6 +105,9 @@ class Odometry:
     angular_radps: FloatArray
     clock: Clock = Clock.RECORDING
 
+    def __post_init__(self) -> None:
+        _shape(self, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
+
     def __len__(self) -> int:
         return len(self.stamp_s)
 
@@ -70,6 +124,9 @@ class Frames:
     stamp_s: FloatArray
     complete: bool = True
     clock: Clock = Clock.RECORDING
+
+    def __post_init__(self) -> None:
+        _shape(self, "stamp_s")
 
     def __len__(self) -> int:
         return len(self.stamp_s)
@@ -97,6 +154,19 @@ class Detections:
     sigma_range_m: FloatArray
     sigma_bearing_rad: FloatArray
     source_line: IntArray
+
+    def __post_init__(self) -> None:
+        _shape(
+            self,
+            "frame",
+            "landmark_id",
+            "range_m",
+            "bearing_rad",
+            "class_id",
+            "sigma_range_m",
+            "sigma_bearing_rad",
+            "source_line",
+        )
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -153,6 +223,9 @@ class RobotSightings:
     bearing_rad: FloatArray
     clock: Clock = Clock.RECORDING
 
+    def __post_init__(self) -> None:
+        _shape(self, "stamp_s", "robot_id", "range_m", "bearing_rad")
+
     def __len__(self) -> int:
         return len(self.stamp_s)
 
@@ -173,6 +246,9 @@ class Trajectory:
     covariance: FloatArray
     frame: str = "first_pose"
     clock: Clock = Clock.RECORDING
+
+    def __post_init__(self) -> None:
+        _shape(self, "stamp_s", pose_world_robot=(3,), covariance=(3, 3))
 
     def __len__(self) -> int:
         return len(self.stamp_s)
@@ -205,6 +281,20 @@ class Landmarks:
     class_names: tuple[str, ...] = ()
     frame: str = "first_pose"
     clock: Clock = Clock.RECORDING
+
+    def __post_init__(self) -> None:
+        _shape(
+            self,
+            "landmark_id",
+            "class_id",
+            "p_exists",
+            "n_hits",
+            "n_misses",
+            "first_seen_s",
+            "last_seen_s",
+            position_m=(2,),
+            covariance_m2=(2, 2),
+        )
 
     def __len__(self) -> int:
         return len(self.landmark_id)

@@ -12,7 +12,7 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "slam", "persist", "track", "convert", "simulate", "reproduce", "bench"]
+VERBS = ["demo", "check", "slam", "persist", "track", "convert", "simulate", "reproduce", "bench"]
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "revert", "pin", "unpin", "delete", "undelete"],
     "survival": ["fit", "learn", "plot"],

@@ -14,7 +14,7 @@ import pytest
 from evermap.errors import InputError
 from evermap.io import columns as module
 from evermap.io.columns import Columns, csv_bytes, named, read_columns
-from evermap.io.quantities import Quantity
+from evermap.valid import Quantity
 
 VALUE = Quantity("value", -1e3, 1e3)
 MAYBE = Quantity("value", -1e3, 1e3, optional=True)

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__, interrupts
-from evermap.cli import bench, convert, demo, persist, reproduce, simulate, slam, survival, track
+from evermap.cli import bench, check, convert, demo, persist, reproduce, simulate, slam, survival, track
 from evermap.cli import map as living_map
 from evermap.cli.terminal import fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
@@ -83,6 +83,7 @@ app = typer.Typer(
 )
 
 app.command("demo")(demo.demo)
+app.command("check")(check.check)
 app.command("slam")(slam.slam)
 app.command("persist")(persist.persist)
 app.command("track")(track.track)

@@ -17,13 +17,13 @@ from evermap.errors import InputError, NumericalError
 from evermap.experiments.lifetimes_truth import Value
 from evermap.experiments.presence_tasks import HOME
 from evermap.io.columns import read_columns
-from evermap.io.quantities import STAMP_S
 from evermap.survival import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.kaplan_meier import KaplanMeier, kaplan_meier
 from evermap.survival.sightings import lifetimes_of_sightings, settled_samples
 from evermap.survival.turnbull import Npmle, npmle
 from evermap.types import BoolArray, FloatArray
+from evermap.valid import STAMP_S
 
 EVERY = (2, 5, 15)
 """Minutes between two looks."""

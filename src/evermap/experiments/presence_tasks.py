@@ -10,10 +10,10 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.io.columns import read_columns
-from evermap.io.quantities import STAMP_S
 from evermap.recurrence.protocol import Instants, Looks
 from evermap.recurrence.rhythm import WEEK_S
 from evermap.types import FloatArray
+from evermap.valid import STAMP_S
 
 P_MISS = P_FALSE = 0.1
 """Of the detector of the room (so its authors simulated it) and of the robot that looks at the door."""

@@ -9,10 +9,10 @@ import numpy as np
 
 from evermap import se2
 from evermap.errors import DataError, InputError
-from evermap.io.quantities import STAMP_S
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
+from evermap.valid import STAMP_S, validate
 
 ODOMETRY_GAP_S: float = 10.0
 """Pauses of the odometry beyond this are reported, and frames farther than this from any odometry are left out."""
@@ -62,10 +62,7 @@ def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
     """
     source = recording.source
-    if len(recording.odometry) < 2:
-        raise DataError("the odometry needs at least two rows", path=source)
-    if len(recording.frames) == 0 or len(recording.detections) == 0:
-        raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections file")
+    validate(recording)
     _warn_of_gaps(recording.odometry, warnings)
     recording = _without_far_frames(recording, warnings)
     if len(recording.detections) == 0:

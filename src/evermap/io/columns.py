@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.quantities import Quantity
 from evermap.io.table import Table, parse_csv, read_parquet
 from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.valid import Quantity
 
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
 

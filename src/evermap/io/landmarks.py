@@ -13,9 +13,9 @@ import numpy as np
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
 from evermap.io.atomic import write_atomic
-from evermap.io.quantities import STAMP_S, X_M, Y_M, Quantity
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
+from evermap.valid import STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
 

@@ -17,17 +17,6 @@ import numpy as np
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, finish_recording, last_of_equal, repeats, wrap_far
 from evermap.io.files import FileSet, find_file_set
-from evermap.io.quantities import (
-    ANGULAR_RADPS,
-    BEARING_RAD,
-    FORWARD_MPS,
-    RANGE_M,
-    STAMP_S,
-    THETA_RAD,
-    X_M,
-    Y_M,
-    Quantity,
-)
 from evermap.io.rows import Rows, parse_rows
 from evermap.io.text import counted
 from evermap.types import (
@@ -43,6 +32,17 @@ from evermap.types import (
     RobotSightings,
     Sensor,
     Trajectory,
+)
+from evermap.valid import (
+    ANGULAR_RADPS,
+    BEARING_RAD,
+    FORWARD_MPS,
+    RANGE_M,
+    STAMP_S,
+    THETA_RAD,
+    X_M,
+    Y_M,
+    Quantity,
 )
 
 LAST_ROBOT_SUBJECT = 5

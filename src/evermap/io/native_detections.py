@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.io import quantities as q
+from evermap import valid as q
 from evermap.io.assemble import forward_stamps, wrap_far
 from evermap.io.landmarks import class_ids
 from evermap.io.sensor_toml import Settings

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.quantities import Quantity
 from evermap.io.text import decode_text, parse_float, quote
 from evermap.types import FloatArray, IntArray
+from evermap.valid import Quantity
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.quantities import Quantity
 from evermap.io.text import decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.valid import Quantity
 
 _LARGEST_ID = 2**53
 """Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""

@@ -9,9 +9,9 @@ import numpy as np
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, last_of_equal
 from evermap.io.atomic import write_atomic
-from evermap.io.quantities import STAMP_S, X_M, Y_M, Quantity
 from evermap.io.rows import parse_rows
 from evermap.types import Clock, Trajectory
+from evermap.valid import STAMP_S, X_M, Y_M, Quantity
 
 _QUATERNION = tuple(Quantity(f"q{axis}", -2.0, 2.0, hint="a unit quaternion, scalar last") for axis in "xyzw")
 _COLUMNS = (STAMP_S, X_M, Y_M, Quantity("z_m", -1e8, 1e8), *_QUATERNION)

@@ -9,9 +9,9 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.io.columns import read_columns
-from evermap.io.quantities import Quantity
 from evermap.io.text import quote
 from evermap.types import UNKNOWN, FloatArray
+from evermap.valid import Quantity
 
 
 def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:

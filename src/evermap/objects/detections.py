@@ -11,9 +11,9 @@ import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
-from evermap.io.quantities import STAMP_S, X_M, Quantity
 from evermap.io.text import counted
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.valid import STAMP_S, X_M, Quantity
 
 _FARTHEST_M = X_M.high
 POSITION = tuple(

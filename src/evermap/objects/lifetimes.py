@@ -10,9 +10,9 @@ import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, csv_bytes, named, read_columns
-from evermap.io.quantities import X_M, Y_M, Quantity
 from evermap.survival.censored import CensoredLifetimes
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.valid import X_M, Y_M, Quantity
 
 _LATEST_S = 1e13
 LEFT = Quantity("left", 0.0, _LATEST_S, hint="seconds; 0 where it was gone at the first look")

@@ -9,10 +9,10 @@ import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
-from evermap.io.quantities import STAMP_S, Quantity
 from evermap.io.text import counted, quote
 from evermap.recurrence.protocol import Looks
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.valid import STAMP_S, Quantity
 
 _REQUIRED = ("stamp_s", "feature_id", "detected")
 _OPTIONAL = ("p_miss", "p_false", "class_id", "present")

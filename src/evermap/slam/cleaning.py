@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap.errors import DataError
 from evermap.slam.clocks import STRAY_S, restored, running_median, set_forward
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 
@@ -93,7 +94,13 @@ def _readings(recording: Recording, remarks: list[str]) -> Detections:
     reach_m = TOO_FAR * sensor.range_max_m
     if not np.isfinite(reach_m):
         reach_m = FAR_FROM_MEDIAN * float(np.median(ranges[real])) if real.any() else 0.0
-    real &= (ranges <= reach_m) & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
+    far = real & (ranges > reach_m)
+    if np.sum(far) > 0.5 * np.sum(real):  # a mistake in the unit, not outliers
+        problem = (
+            f"{int(far.sum())} of {len(far)} ranges lie beyond {TOO_FAR:g} times range_max_m = {sensor.range_max_m:g}"
+        )
+        raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
+    real &= ~far & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
     _remark(remarks, "readings that no sensor can make left out", int(np.sum(~real)))
     if not real.all():

@@ -69,8 +69,10 @@ class Prepared:
         return GivenMap(self.prior_map.mean, covariance, given)
 
 
-def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepared:
+def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: tuple[str, ...] = ()) -> Prepared:
     """Sort out what can be used: detections of known identity, while there is odometry.
+
+    `remarks` on the recording come before those on what was left out.
 
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
@@ -79,7 +81,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None) -> Prepare
     if len(odometry) == 0:
         raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
     stamps = recording.frames.stamp_s
-    warnings = []
+    warnings = list(remarks)
     anonymous = detections.landmark_id == UNKNOWN
     if anonymous.any():
         warnings.append(f"{int(anonymous.sum())} detections without identity not used")

@@ -1,0 +1,82 @@
+"""`evermap check`: what a recording holds and what is odd about it, before anything is estimated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from evermap.cli.terminal import fail, print_json, print_table, say, warn
+
+EXIT_NOT_USABLE = 2
+
+
+def check(
+    recording_path: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.")
+    ],
+    robot: Annotated[
+        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
+    ] = None,
+    config_file: Annotated[
+        Path | None, typer.Option("--config", help="TOML file, as of evermap slam.", show_default=False)
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. sensor.range_max_m=8; repeatable."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
+) -> None:
+    """Tell whether a recording can be used, and what is odd.
+
+    Looked at are units, signs, clocks, gaps, rates, identities, limits and coverage. Exit code 0: usable, perhaps
+    with warnings; 2: it is not, in one line.
+
+    \b
+    Examples:
+      evermap check my-recording
+      evermap check MRCLAM_Dataset6.zip --robot 1 --json
+    """
+    from evermap.config import load_config
+    from evermap.io import read_recording
+    from evermap.pipeline import check_recording
+
+    config = load_config(config_file, settings or [])
+    found = check_recording(read_recording(recording_path, robot=robot), config)
+    if as_json:
+        print_json(found.as_dict())
+    else:
+        print_table(found.name, _rows(found.contents))
+    for remark in found.warnings:
+        warn(remark)
+    for finding in found.findings:
+        (warn if finding.usable else fail)(finding.message)
+    if not found.usable:
+        raise typer.Exit(EXIT_NOT_USABLE)
+    if not found.warnings and not found.findings:
+        say("nothing odd found")
+
+
+def _rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
+    """What was found, one line a table of the recording and a little more."""
+    odometry, frames = contents["odometry"], contents["frames"]
+    detections, landmarks = contents["detections"], contents["landmarks"]
+    ranges, bearings = detections["range_m"], detections["bearing_rad"]
+    rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.3g} Hz"
+    beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} bearings"
+    return [
+        ("odometry", f"{odometry['rows']:,} rows in {odometry['duration_s']:,.1f} s at {odometry['rate_hz']:.3g} Hz"),
+        ("longest gap", f"{odometry['longest_gap_s']:.3g} s"),
+        (
+            "way",
+            f"{odometry['way_m']:,.1f} m, up to {odometry['fastest_mps']:.3g} m/s; {odometry['turned_rad']:.1f} rad",
+        ),
+        ("frames", f"{frames['count']:,}{rate}, {frames['with_detections']:,} with detections"),
+        ("blind for", f"at most {frames['longest_blind_s']:.3g} s"),
+        ("detections", f"{detections['count']:,}, {detections['without_identity']:,} without identity"),
+        ("ranges", f"{ranges[0]:.3g} to {ranges[2]:.3g} m, half of them below {ranges[1]:.3g} m"),
+        ("bearings", f"{bearings[0]:.3g} to {bearings[2]:.3g} rad, half of them below {bearings[1]:.3g} rad"),
+        ("beyond limits", beyond),
+        ("landmarks", f"{landmarks['count']:,}, {landmarks['seen_once']:,} of them seen once"),
+    ]
