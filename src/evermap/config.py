@@ -225,7 +225,9 @@ def _read_toml(path: Path | None) -> dict[str, Any]:
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot be read: {error}", path=path) from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise ConfigError("not valid TOML: nested too deeply", path=path) from None
+    except ValueError as error:  # of TOML, and of numbers with thousands of digits
         raise ConfigError(f"not valid TOML: {error}", path=path, hint="text values need quotes") from None
 
 
@@ -250,7 +252,7 @@ def _toml_value(text: str) -> Any:
     """A value in TOML notation; anything that is none is a string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return text
 
 

@@ -6,7 +6,28 @@ exits with 2; anything that is not an `EvermapError` is a defect of ours and exi
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
+
+_UNSHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Control characters, line ends, marks that reverse what follows, and surrogates, which cannot be encoded."""
+_MOST = 400
+"""Characters of each part of a message: enough for a sentence and a path, not for a file that was taken for one."""
+
+
+def printable(text: str, most: int | None = None) -> str:
+    r"""Make foreign text fit to be shown: names, values and paths from files and command lines.
+
+    What would move the cursor, change colours, reverse the line or cannot be encoded is escaped as `\x1b`; all else
+    stays as it is.
+
+    Args:
+        text: from outside.
+        most: characters; of a longer text the middle is left out.
+    """
+    if most is not None and len(text) > most:
+        text = f"{text[: most * 2 // 3]} ... {text[len(text) - most // 4 :]}"
+    return _UNSHOWN.sub(lambda found: found.group().encode("unicode_escape", "surrogatepass").decode(), text)
 
 
 class EvermapError(Exception):
@@ -37,16 +58,21 @@ class EvermapError(Exception):
         super().__init__(self.one_line())
 
     def one_line(self) -> str:
-        """`file:line: field 'name': problem (try: hint)`, with the parts that are known."""
+        """`file:line: field 'name': problem (try: hint)`, with the parts that are known, each `printable` and short."""
         where = ""
         if self.path is not None:
-            where = f"{self.path}:{self.line}: " if self.line is not None else f"{self.path}: "
+            path = _short(str(self.path))
+            where = f"{path}:{self.line}: " if self.line is not None else f"{path}: "
         elif self.line is not None:
             where = f"line {self.line}: "
         if self.field is not None:
-            where += f"field '{self.field}': "
-        hint = f" (try: {self.hint})" if self.hint else ""
-        return " ".join(f"{where}{self.problem}{hint}".split())
+            where += f"field '{_short(self.field)}': "
+        hint = f" (try: {_short(self.hint)})" if self.hint else ""
+        return " ".join(f"{where}{_short(self.problem)}{hint}".split())
+
+
+def _short(text: str) -> str:
+    return printable(re.sub(r"\s+", " ", text), _MOST)
 
 
 class InputError(EvermapError):

@@ -14,7 +14,7 @@ from evermap.errors import InputError
 
 VERBS = ["demo", "check", "slam", "persist", "track", "convert", "simulate", "reproduce", "bench"]
 GROUPS = {
-    "map": ["log", "show", "diff", "export", "why", "revert", "pin", "unpin", "delete", "undelete"],
+    "map": ["log", "show", "diff", "export", "why", "verify", "revert", "pin", "unpin", "delete", "undelete"],
     "survival": ["fit", "learn", "plot"],
 }
 

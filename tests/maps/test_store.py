@@ -267,7 +267,8 @@ def test_the_cost_of_a_revision_does_not_grow_with_the_history(tmp_path: Path) -
     with open_store(path, create=True) as store:
         for number in range(91):
             stays = stays.joined(random_map(number, cliques=100).stays)
-            store.commit(replace(random_map(number, cliques=4), stays=stays), SESSION, parent=number)
+            living = replace(random_map(number, cliques=4), stays=stays, n_cliques_ever=200, n_sites_ever=400)
+            store.commit(living, SESSION, parent=number)
             sizes.append(path.stat().st_size)
     assert len(stays) > 3 * 4096
     grown = np.diff(sizes)

@@ -10,7 +10,7 @@ import typer
 
 from evermap.cli.map_edits import delete, pin, revert, undelete, unpin, verify
 from evermap.cli.picture import check_picture, write_picture
-from evermap.cli.terminal import print_json, print_rows, say
+from evermap.cli.terminal import echo, print_json, print_rows, say
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -137,9 +137,9 @@ def diff(
         print_json({"map": file, "a": a, "b": later, "changes": [*map(change_content, changes)], "edits": listed})
         return
     for change in changes:
-        typer.echo(change_line(change, new.clock))
+        echo(change_line(change, new.clock))
     for name, word in edited:
-        typer.echo(f"landmark {name} {word} by an operator")
+        echo(f"landmark {name} {word} by an operator")
     if not changes and not edited:
         say(f"no difference between revisions {a} and {later}")
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import typer
-
 from evermap.cli.picture import write_picture
-from evermap.cli.terminal import print_rows
+from evermap.cli.terminal import echo, print_rows
 
 if TYPE_CHECKING:
     from evermap.maps.why import Answer
@@ -20,11 +18,11 @@ def print_why(answer: Answer) -> None:
     from evermap.maps.stamps import stamp_text
     from evermap.maps.why import probability_text
 
-    typer.echo(answer.headline)
+    echo(answer.headline)
     for reason in answer.reasons:
-        typer.echo(f"  - {reason}")
+        echo(f"  - {reason}")
     for revision, change in answer.changes:
-        typer.echo(f"  revision {revision}: {change_line(change, answer.clock)}")
+        echo(f"  revision {revision}: {change_line(change, answer.clock)}")
     if answer.visits:
         head = ("revision", "session", "looks from", "to", "frames", "hits", "misses", "expected", "nats", "P(exists)")
         rows = [

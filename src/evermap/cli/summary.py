@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import typer
-
-from evermap.cli.terminal import print_json, print_table
+from evermap.cli.terminal import echo, print_json, print_table
 
 # (section, key, label, format); a number that the run does not have is left out
 _ROWS = (
@@ -37,4 +35,4 @@ def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool, findings: 
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(str(summary.get("recording", {}).get("name", "run")), rows)
     for finding in findings:
-        typer.echo(finding)
+        echo(finding)

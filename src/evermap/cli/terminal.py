@@ -10,30 +10,43 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from evermap.errors import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
 PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
+
+_MOST = 2000
+"""Characters of an error: of every part of a message there are fewer, so this cuts only what is not made of parts."""
 
 Progress = Callable[[float, float], None]
 """Called with what is done and the total, for most verbs in seconds of the recording."""
 
 
+def echo(line: str) -> None:
+    """A line of the result, with names as they are, but nothing in it that a terminal would obey."""
+    typer.echo(printable(line))
+
+
 def say(line: str) -> None:
     """One line for the person at the terminal."""
-    typer.echo(f"evermap: {line}", err=True)
+    typer.echo(f"evermap: {printable(line)}", err=True)
 
 
 def warn(line: str) -> None:
     """A remark that does not stop the run."""
-    typer.secho(f"evermap: warning: {line}", err=True, fg="yellow", color=_colour(sys.stderr))
+    typer.secho(f"evermap: warning: {printable(line)}", err=True, fg="yellow", color=_colour(sys.stderr))
 
 
 def fail(line: str) -> None:
     """The line with which a run ends; the caller chooses the exit code."""
-    typer.secho(f"evermap: error: {line}", err=True, fg="red", color=_colour(sys.stderr))
+    typer.secho(f"evermap: error: {printable(line, _MOST)}", err=True, fg="red", color=_colour(sys.stderr))
 
 
 def print_json(summary: Mapping[str, Any]) -> None:
@@ -45,15 +58,15 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Two columns: framed on a terminal, aligned text when piped."""
     if not sys.stdout.isatty():
         width = max((len(name) for name, _ in rows), default=0)
-        typer.echo("\n".join([title, *(f"  {name:<{width}}  {value}" for name, value in rows)]))
+        for line in [title, *(f"  {name:<{width}}  {value}" for name, value in rows)]:
+            echo(line)
         return
-    from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", show_header=False)
+    table = Table(title=printable(title), title_justify="left", show_header=False)
     for name, value in rows:
-        table.add_row(name, value)
-    Console().print(table)
+        table.add_row(printable(name), printable(value))
+    _console().print(table)
 
 
 def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Sequence[int] = ()) -> None:
@@ -65,25 +78,25 @@ def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *
         rows: cells.
         numbers: columns to align right.
     """
+    rows = [[printable(cell) for cell in line] for line in rows]
     if not sys.stdout.isatty():
         lines = [list(head), *rows]
         widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
-        typer.echo(title)
+        echo(title)
         for line in lines:
             cells = (
                 c.rjust(w) if k in numbers else c.ljust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))
             )
             typer.echo("  " + "  ".join(cells).rstrip())
         return
-    from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left")
+    table = Table(title=printable(title), title_justify="left")
     for k, name in enumerate(head):
         table.add_column(name, justify="right" if k in numbers else "left", no_wrap=k in numbers)
     for line in rows:
         table.add_row(*line)
-    Console().print(table)
+    _console().print(table)
 
 
 def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
@@ -113,19 +126,18 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
     if not sys.stderr.isatty():
         yield None
         return
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(),
         TimeRemainingColumn(),
         TextColumn("{task.fields[speed]}"),
     )
     start = time.perf_counter()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task(label, total=None, speed="")
+    with Progress(*columns, console=_console(stderr=True), transient=True) as bars:
+        task = bars.add_task(printable(label), total=None, speed="")
 
         def advance(done: float, total: float) -> None:
             elapsed = time.perf_counter() - start
@@ -138,6 +150,13 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 def command_line() -> str:
     """What was typed, for the summary."""
     return shlex.join(["evermap", *sys.argv[1:]])
+
+
+def _console(*, stderr: bool = False) -> Console:
+    """The terminal, on which text is text: no markup, no emoji names, no guessed highlights."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, markup=False, emoji=False, highlight=False)
 
 
 def _colour(stream: TextIO) -> bool:

@@ -114,7 +114,7 @@ class Columns:
         cells = self.cells[name]
         if pa.types.is_floating(cells.type):
             values = self._converted(cells, name)
-            wrong = np.flatnonzero(~np.isnan(values) & (values != np.floor(values)))
+            wrong = np.flatnonzero(~np.isnan(values) & ~((values == np.floor(values)) & (np.abs(values) < 2.0**63)))
             if wrong.size:
                 problem = f"{values[wrong[0]]:g} is no name"
                 raise self.error(problem, row=int(wrong[0]), field=name, hint="text or whole numbers")
@@ -275,5 +275,5 @@ def _coded(words: Any) -> tuple[IntArray, list[str]]:
 
 def _natural(names: list[str]) -> Any:
     """Order of the names: by size where all are whole numbers, else by alphabet."""
-    numbers = all(re.fullmatch(r"-?\d+", name) for name in names if name)
+    numbers = all(re.fullmatch(r"-?\d{1,1000}", name) for name in names if name)  # Python converts no longer ones
     return (lambda code: (int(names[code]), names[code])) if numbers else (lambda code: names[code])

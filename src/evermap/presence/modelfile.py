@@ -47,6 +47,8 @@ def load_models(path: str | Path, table: LookTable) -> ModelOfEach:
     try:
         if data.get("kind") != SEVERAL:
             return ModelOfEach((model_of(data),), ("",), np.zeros(table.n_features, dtype=np.int64))
+        if not isinstance(data["models"], dict):
+            raise InputError("is no table of models", field="models")
         names = tuple(data["models"])
         models = tuple(model_of(model) for model in data["models"].values())
     except KeyError as error:

@@ -57,6 +57,8 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
         raise InputError("is no text", path=path) from error
     except json.JSONDecodeError as error:
         raise InputError(f"is no JSON: {error.msg}", path=path, line=error.lineno) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"is no JSON of a model: {error}", path=path) from error
     if not isinstance(data, dict):
         raise InputError("holds no model of presence", path=path)
     version = data.get("schema_version")
@@ -70,20 +72,20 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
     return data
 
 
-def model_of(data: dict[str, Any]) -> PresenceModel:
+def model_of(data: Any) -> PresenceModel:
     """The model of which `to_dict` gave these plain numbers and words.
 
     Raises:
         InputError: an unknown kind, or a field that is missing or malformed.
         ConfigError: numbers that cannot be.
     """
-    kind = data.get("kind")
-    if kind not in KINDS:
+    kind = data.get("kind") if isinstance(data, dict) else None
+    if not isinstance(kind, str) or kind not in KINDS:
         raise InputError(f"{kind!r} is no kind of model", field="kind", hint=", ".join(sorted(KINDS)))
     module, name = KINDS[kind]
     try:
         return cast("PresenceModel", getattr(import_module(module), name).from_dict(data))
     except KeyError as error:
         raise InputError("is missing", field=str(error.args[0])) from error
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, IndexError, OverflowError, RecursionError) as error:
         raise InputError(f"is not what a {kind} model holds: {error}") from error

@@ -65,7 +65,7 @@ def prior_from_dict(content: Mapping[str, Any]) -> LifetimePrior:
         raise ConfigError(problem, field=name)
     try:
         prior: LifetimePrior = kind(**{name: _value(content[name]) for name in known})
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ConfigError(f"is not what is expected: {error}", field=kind.__name__) from error
     return prior
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, printable
 from evermap.types import Clock, FloatArray
 from evermap.viz.style import ALERT, ESTIMATE, LANDMARK, MUTED, SHADE, house_style, new_figure, settle
 from evermap.viz.time_axis import TimeAxis
@@ -65,7 +65,7 @@ def plot_belief(
             clock=clock,
         )
         if title:
-            axes.set_title(title)
+            axes.set_title(printable(title))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=6, columnspacing=1.4)
         settle(figure)
     return figure

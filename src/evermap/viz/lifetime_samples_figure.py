@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, printable
 from evermap.survival.censored import CensoredLifetimes
 from evermap.viz.style import ALERT, ESTIMATE, ESTIMATE_BAND, MUTED, house_style, new_figure, settle
 from evermap.viz.time_axis import unit_for
@@ -44,7 +44,7 @@ def plot_samples(data: CensoredLifetimes, names: Sequence[str]) -> Figure:
         axes.barh(row, right - since, left=since, height=0.34, color=ESTIMATE_BAND, label="the end is in here")
         axes.plot(right[data.exact], row[data.exact], "o", color=ALERT, ms=5, label="the end was watched")
         axes.plot(right[~known], row[~known], ">", color=ESTIMATE, ms=5, label="never seen gone")
-        axes.set_yticks(row, names)
+        axes.set_yticks(row, [printable(name) for name in names])
         axes.set(xlim=(0.0, 1.01 * end), xlabel=f"age [{unit.name}]")
         axes.grid(visible=False, axis="y")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)

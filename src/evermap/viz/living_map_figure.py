@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, printable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 from evermap.viz.style import (
     ALERT,
@@ -19,6 +19,7 @@ from evermap.viz.style import (
     ONLINE,
     PAPER,
     house_style,
+    legend_name,
     new_figure,
     settle,
 )
@@ -78,7 +79,7 @@ def plot_living_map(
             axes.plot(*position_m[earlier].T, ".", color=MUTED, ms=4, zorder=2, label="other known place")
         there = p_exists[shown] >= 0.5
         for k, name in enumerate(np.unique(class_id[shown])):
-            label = class_names[name] if 0 <= name < len(class_names) else "class not known"
+            label = legend_name(class_names[name]) if 0 <= name < len(class_names) else "class not known"
             colour = INK if name == UNKNOWN else _COLOURS[k % len(_COLOURS)]
             mine = (class_id[shown] == name) & there
             if mine.any():
@@ -103,7 +104,7 @@ def plot_living_map(
             aspect="equal",
             xlabel="x [m]",
             ylabel="y [m]",
-            title=title,
+            title=printable(title),
         )
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
         settle(figure)

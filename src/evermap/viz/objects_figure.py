@@ -19,6 +19,7 @@ from evermap.viz.style import (
     ODOMETRY,
     ONLINE,
     house_style,
+    legend_name,
     new_figure,
     settle,
 )
@@ -85,7 +86,7 @@ def plot_objects(
                 above.plot(*path.T, color=colour, lw=0.9, alpha=0.7, zorder=2)
             mine = rests.class_id == k
             above.plot(*rests.position_m[mine].T, ls="none", marker="s", ms=4.0, mfc="none", mec=colour, zorder=3)
-            above.plot([], [], color=colour, lw=2.0, label=name or "objects")
+            above.plot([], [], color=colour, lw=2.0, label=legend_name(name) or "objects")
         above.set(xlabel="x [m]", ylabel="y [m]")
         above.set_aspect("equal", adjustable="datalim")
         above.set_title("paths, and places of rest")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.errors import printable
 from evermap.recurrence.protocol import Instants, Looks, PresenceModel
 from evermap.recurrence.rhythm import MONDAY_S
 from evermap.types import FloatArray
@@ -87,7 +88,7 @@ def _after_a_look(axes: Axes, model: PresenceModel, name: str, *, last: bool, le
     axes.set_xticks([value for _, value in ticks], [text for text, _ in ticks])
     axes.minorticks_off()
     if name:
-        axes.set_title(name)
+        axes.set_title(printable(name))
     if legend:
         axes.legend(loc="center left")
     if last:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, printable
 from evermap.types import Clock
 from evermap.viz.style import ALERT, ESTIMATE, GRID, INK, PAPER, SHADE, house_style, new_figure, settle
 from evermap.viz.time_axis import TimeAxis
@@ -111,7 +111,7 @@ def _mark_size(row_in: float, changes: Sequence[tuple[int, float, bool]]) -> flo
 def _label_rows(axes: Axes, names: Sequence[str]) -> None:
     step = 1 + (len(names) - 1) // _MOST_LABELS
     shown = range(0, len(names), step)
-    axes.set_yticks(list(shown), [names[k] if len(names[k]) <= 18 else f"{names[k][:17]}…" for k in shown])
+    axes.set_yticks(list(shown), [printable(names[k] if len(names[k]) <= 18 else f"{names[k][:17]}…") for k in shown])
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_ylabel("feature")
     axes.tick_params(axis="y", length=0)

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
+
+from evermap.errors import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,6 +86,7 @@ _RC: Any = {
     "svg.hashsalt": "evermap",
     "path.simplify": True,
     "path.simplify_threshold": 0.3,
+    "text.parse_math": False,  # names of landmarks and classes are shown as they are
 }
 
 
@@ -100,8 +105,19 @@ def house_style() -> Iterator[None]:
     """Matplotlib settings of this module while drawing, and only then."""
     import matplotlib as mpl
 
-    with mpl.rc_context(_RC):
+    with mpl.rc_context(_RC), warnings.catch_warnings():
+        # a name may have letters of any script; those that the font lacks are boxes
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from", UserWarning)
         yield
+
+
+def legend_name(name: str) -> str:
+    """A name for a legend or a title: as it is, on one line, and also where it begins with an underscore.
+
+    Matplotlib leaves what is labelled with a leading underscore out of legends.
+    """
+    text = printable(name, 60)
+    return f"\N{ZERO WIDTH SPACE}{text}" if text.startswith("_") else text
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -116,18 +132,57 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 def settle(figure: Figure) -> None:
     """Computes the layout once, so that saving in several formats does not repeat it."""
+    _write_powers(figure)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
 
 
+def _write_powers(figure: Figure) -> None:
+    """Have logarithmic axes say 10⁻³ in plain text: mathematics is off, so that names need no escapes."""
+    from matplotlib.ticker import LogFormatterMathtext
+
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            major, minor = axis.get_major_formatter(), axis.get_minor_formatter()
+            if isinstance(major, LogFormatterMathtext) and not isinstance(major, _powers()):
+                axis.set_major_formatter(_powers().like(major))
+            if isinstance(minor, LogFormatterMathtext) and not isinstance(minor, _powers()):
+                axis.set_minor_formatter(_powers().like(minor))
+
+
+@cache
+def _powers() -> Any:
+    """Matplotlib's formatter of logarithmic axes, in Unicode."""
+    from matplotlib.ticker import LogFormatterSciNotation
+
+    class Powers(LogFormatterSciNotation):
+        @classmethod
+        def like(cls, other: LogFormatterSciNotation) -> Powers:
+            one = cls()
+            vars(one).update(vars(other))
+            return one
+
+        def __call__(self, x: float, pos: Any = None) -> str:
+            text = str(super().__call__(x, pos)).removeprefix(r"$\mathdefault{").removesuffix("}$")
+            text = text.replace(r"\times", "×").replace("\N{MINUS SIGN}", "-")
+            return re.sub(r"\^\{(.*?)\}", lambda found: found[1].translate(_RAISED), text)
+
+    return Powers
+
+
+_RAISED = str.maketrans("0123456789-.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻·")
+
+
 def save_png(figure: Figure, path: Path | BinaryIO, *, dpi: int = 160) -> None:
     """Writes a PNG on white paper; the same figure gives the same bytes."""
+    _write_powers(figure)
     with house_style():
         figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
 
 
 def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
     """Writes a stand-alone SVG on white paper; the same figure gives the same bytes."""
+    _write_powers(figure)
     with house_style():
         figure.savefig(path, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
 
@@ -141,6 +196,7 @@ def save_all(figures: Mapping[str, Figure], path: Callable[[str], Path]) -> None
 
 def inline_svg(figure: Figure, name: str) -> str:
     """The figure as an `<svg>` element for an HTML page: no prolog, no address, ids prefixed by `name`, themed."""
+    _write_powers(figure)
     buffer = io.StringIO()
     with house_style():
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})

@@ -15,7 +15,19 @@ from evermap.survival.parametric_fit import ParametricFit
 from evermap.survival.protocol import LifetimePrior
 from evermap.survival.turnbull import Npmle
 from evermap.types import FloatArray
-from evermap.viz.style import ALERT, ESTIMATE, GROUP, INK, LANDMARK, MUTED, ODOMETRY, house_style, new_figure, settle
+from evermap.viz.style import (
+    ALERT,
+    ESTIMATE,
+    GROUP,
+    INK,
+    LANDMARK,
+    MUTED,
+    ODOMETRY,
+    house_style,
+    legend_name,
+    new_figure,
+    settle,
+)
 from evermap.viz.time_axis import DURATIONS, TimeUnit, label_durations, unit_for
 
 if TYPE_CHECKING:
@@ -70,7 +82,13 @@ def plot_survival(
         axes = figure.subplots()
         for k, (name, one) in enumerate(estimates.items()):
             _draw(
-                axes, one, name, time_s, unit, _COLOURS[k % len(_COLOURS)], _DASHES[k // len(_COLOURS) % len(_DASHES)]
+                axes,
+                one,
+                legend_name(name),
+                time_s,
+                unit,
+                _COLOURS[k % len(_COLOURS)],
+                _DASHES[k // len(_COLOURS) % len(_DASHES)],
             )
         _name_boxes_once(axes)
         if truth is not None:

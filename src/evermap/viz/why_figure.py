@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, printable
 from evermap.types import Clock, FloatArray, IntArray
 from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, house_style, new_figure, settle
 from evermap.viz.time_axis import TimeAxis
@@ -68,7 +68,7 @@ def plot_why(
         _draw_belief(rows[0], axis, stamp_s, p_exists, session, now_s)
         _draw_evidence(rows[1], axis, stamp_s, n_hits, n_misses, log_odds, session)
         _draw_stays(rows[2], axis, stays, sites, last)
-        rows[0].set_title(title)
+        rows[0].set_title(printable(title))
         rows[2].set_xlim(axis.coordinates(first - margin), axis.coordinates(last + margin))
         axis.label(rows[2])
         known_labels = {

@@ -207,13 +207,20 @@ def flaw(living: LivingMap) -> str:
     ):
         if not np.isin(ids, known).all():
             return f"'{column}' names one that is not there"
-    for column, least in (
-        ("members.class_id", members.class_id),
-        ("stays.class_id", stays.class_id),
-        ("lives.class_id", lives.class_id),
+    for column, numbers, least in (
+        ("members.class_id", members.class_id, UNKNOWN),
+        ("stays.class_id", stays.class_id, UNKNOWN),
+        ("lives.class_id", lives.class_id, UNKNOWN),
+        ("members.clique_id", members.clique_id, 0),
+        ("sites.clique_id", sites.clique_id, 0),
+        ("stays.clique_id", stays.clique_id, 0),
+        ("sites.site_id", sites.site_id, 0),
+        ("stays.site_id", stays.site_id, 0),
+        ("places.n_hits", places.n_hits, 0),
+        ("places.n_misses", places.n_misses, 0),
     ):
-        if np.any(least < UNKNOWN):
-            return f"'{column}' has a number below {UNKNOWN}"
+        if np.any(numbers < least):
+            return f"'{column}' has a number below {least}"
     for column, values in (
         ("places.position_m", places.position_m),
         ("stays.position_m", stays.position_m),
@@ -232,7 +239,9 @@ def flaw(living: LivingMap) -> str:
         return "'sites.p_here' is not a probability"
     for column, ids, ever in (
         ("sites.site_id", sites.site_id, living.n_sites_ever),
+        ("stays.site_id", stays.site_id, living.n_sites_ever),
         ("sites.clique_id", sites.clique_id, living.n_cliques_ever),
+        ("stays.clique_id", stays.clique_id, living.n_cliques_ever),
         ("members.clique_id", members.clique_id, living.n_cliques_ever),
     ):
         if len(ids) and ids.max() >= ever:

@@ -314,7 +314,7 @@ def _problems(path: Path) -> Iterator[str]:
 
 def _finish_transactions(path: Path) -> None:
     """Let the database take back what was not committed, if it still can."""
-    with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(path)) as database:
+    with suppress(sqlite3.DatabaseError, UnicodeDecodeError), closing(sqlite3.connect(path)) as database:
         database.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 

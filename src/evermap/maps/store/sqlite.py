@@ -43,7 +43,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
 def _compact(engine: Engine) -> None:
     """Give back the pages that a migration has left; without room to do that they stay."""
     connection = engine.raw_connection()
-    with suppress(sqlite3.OperationalError):
+    with suppress(sqlite3.DatabaseError):
         connection.cursor().execute("VACUUM")
     connection.close()
 
