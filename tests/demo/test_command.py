@@ -21,22 +21,25 @@ def outcome(what: str, *, holds: bool) -> dict[str, Any]:
 
 
 def fake_summary() -> dict[str, Any]:
-    week = {
+    whole = {
         "pose_rmse_m": 0.1234,
         "precision": 0.75,
         "recall": 0.5,
-        "existence_brier": 0.125,
-        "forecast_skill_over_as_is": None,
+        "forecast_skill_over_base_rate": None,
+        "changes": {"told": 20, "false": 8, "false_certain": 3},
     }
-    worse = {"weeks": [{**week, "precision": 1.0}, week], "sessions": [{"places": 60}, {"places": 77}]}
     return {
         "demo": {
-            "methods": {"static": {"label": "static SLAM", **worse}},
+            "scenario": {"days": 28},
+            "methods": {
+                "static": {"label": "static SLAM", "whole": whole},
+                "oracle": {"label": "oracle", "whole": {**whole, "changes": None}},
+            },
             "expected": {"recall": outcome("recall of the map", holds=False)},
         },
         "timing": {
             "demo": {
-                "session_cpu_s": {"static": [0.9, 0.25, 0.1]},
+                "cpu_s_per_minute": {"static": [0.9, 0.25, 0.1], "oracle": [1.0]},
                 "expected": {"flat_cost": outcome("cost of a session", holds=True)},
             }
         },
@@ -58,7 +61,7 @@ def called(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return seen
 
 
-def test_prints_the_last_week_of_every_method(called, tmp_path: Path) -> None:
+def test_prints_what_every_method_tells_and_what_of_it_is_false(called, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = CliRunner().invoke(app, ["demo", "--out", str(out), "--seed", "9", "--days", "3", "--processes", "64"])
     assert result.exit_code == 0, result.stderr
@@ -67,7 +70,9 @@ def test_prints_the_last_week_of_every_method(called, tmp_path: Path) -> None:
     assert called["scenario"] == evermap.demo.Scenario(days=3)
     assert called["processes"] == os.cpu_count()
     line = next(line for line in result.stdout.splitlines() if "static SLAM" in line)
-    assert line.split()[-9:] == ["12.3", "cm", "0.750", "0.500", "0.125", "–", "77", "250", "ms"]
+    assert line.split()[-10:] == ["12.3", "cm", "0.750", "0.500", "20", "8", "3", "–", "250", "ms"]
+    line = next(line for line in result.stdout.splitlines() if "oracle" in line)
+    assert line.split()[-10:] == ["12.3", "cm", "0.750", "0.500", "–", "–", "–", "–", "1000", "ms"]
     assert "recall of the map" in result.stdout
     assert "cost of a session" not in result.stdout
     assert result.stderr == ""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.demo.numbers import ratios
-from evermap.demo.scores import Counts, Snapshot, alignment_of, map_counts, pose_errors
+from evermap.demo.scores import Counts, Snapshot, alignment_of, map_counts, pose_counts, pose_errors
 from evermap.demo.truth import Truth
 from evermap.types import Landmarks, Trajectory
 
@@ -25,13 +25,17 @@ def in_map(points: object) -> np.ndarray:
 
 @pytest.fixture
 def truth() -> Truth:
-    """Two sessions: 0 stays, 1 is moved, 2 has gone before the first and comes back, 3 was never met, 4 leaves."""
+    """Two sessions: 0 stays, 1 is moved, 2 has gone before the first and comes back, 3 was never seen, 4 leaves.
+
+    All but 0 were looked at.
+    """
     position = np.array(
         [[[0, 0], [1, 0], NAN, [9, 9], [5, 5]], [[0, 0], [1, 2], [2, 0], [9, 9], NAN]], dtype=np.float64
     )
-    last = np.array([[[0, 0], [1, 0], [2, 0], [9, 9], [5, 5]], [[0, 0], [1, 2], [2, 0], [9, 9], [5, 5]]], np.float64)
-    met = np.array([[True, True, True, False, True]] * 2)
-    return Truth(position, last, met, changed=np.zeros((2, 5), np.bool_))
+    seen = np.array([[[0, 0], [1, 0], [2, 0], NAN, [5, 5]], [[0, 0], [1, 2], [2, 0], NAN, [5, 5]]], np.float64)
+    known = np.isfinite(position[:, :, 0]) & (np.arange(5) > 0)
+    nothing = np.zeros((2, 5), np.bool_)
+    return Truth(position, seen, detected=nothing, changed=nothing, known=known, knowable=np.zeros((0, 4), np.int64))
 
 
 def snapshot(places: list[tuple[int, object, float, float]]) -> Snapshot:
@@ -57,10 +61,13 @@ def test_claims_are_right_where_the_landmark_stands(truth: Truth) -> None:
               (3, [9, 9], 0.4, 0.4)]  # fmt: skip
     scores = ratios(map_counts(snapshot(places), truth, 0, TURN))
     assert scores["precision"] == 0.25
-    assert scores["recall"] == 0.25
+    assert scores["precision_sure"] == pytest.approx(1 / 3)
+    assert scores["recall"] == 0.0  # 0, the only right one, was not looked at
+    scores = ratios(map_counts(snapshot([*places, (4, [5, 5], 0.9, 0.9)]), truth, 0, TURN))
+    assert scores["recall"] == pytest.approx(1 / 3)  # of 1, 3 and 4
 
 
-def test_existence_is_asked_of_all_that_were_met_at_their_last_place(truth: Truth) -> None:
+def test_existence_is_asked_of_all_that_were_seen_at_their_last_place(truth: Truth) -> None:
     """Two places near the last one add up; one elsewhere says nothing of it; who is not in the map has zero."""
     places = [(0, [0, 0], 0.5, 0.5), (0, [0.1, 0], 0.3, 0.3), (0, [4, 4], 0.2, 0.2), (1, [3, 3], 0.9, 0.9),
               (2, [2, 0.1], 0.25, 0.5), (3, [9, 9], 0.0, 0.0)]  # fmt: skip
@@ -86,6 +93,7 @@ def test_the_truth_itself_is_perfect(truth: Truth) -> None:
         places = [(int(n), truth.position_m[k, n], 1.0, 1.0) for n in np.flatnonzero(truth.there[k])]
         scores = ratios(map_counts(snapshot(places), truth, k, TURN))
         assert (scores["precision"], scores["recall"], scores["existence_brier"]) == (1.0, 1.0, 0.0)
+        assert scores["precision_sure"] == 1.0
 
 
 def path(poses: np.ndarray) -> Trajectory:
@@ -110,5 +118,8 @@ def test_counts_add_up(truth: Truth) -> None:
     both = ratios(Counts(1, 4.0, 0.0) + one + two + Counts(3, 0.0, 0.0))
     assert both["pose_rmse_m"] == pytest.approx(1.0)
     assert both["precision"] == 0.5
-    assert both["recall"] == pytest.approx(2 / 8)
-    assert set(ratios(Counts()).values()) == {None}
+    assert both["recall"] == 0.0
+    lost = pose_counts(path(np.zeros((3, 3))), path(np.zeros((3, 3))), TURN, found=False)
+    assert ratios(Counts(1, 4.0, 0.0) + lost)["pose_rmse_m"] == pytest.approx(2.0)
+    assert ratios(lost)["lost"] == 1
+    assert set(ratios(Counts()).values()) == {None, 0}

@@ -14,6 +14,7 @@ CLASS_LOOKS = (
     ("#0072b2", "o"),
     ("#cc79a7", "v"),
     ("#56b4e9", "P"),
+    ("#882255", "h"),
 )
 """Colour and marker by class; shapes tell them apart where colours don't."""
 

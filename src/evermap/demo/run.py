@@ -38,7 +38,7 @@ def run_demo(
         out: folder to write.
         seed: of the simulation; same seed, same numbers.
         progress: told seconds of recordings done and in all.
-        scenario: how much is simulated; default: 56 patrols of 110 s on 28 days.
+        scenario: how much is simulated; default: 56 patrols of 30 to 150 s on 28 days.
         processes: methods at a time; above 1 the calling script needs its `__main__` guard.
         command: what was typed, for the summary.
         force: write into a folder that holds other files, too; they stay.
@@ -46,12 +46,14 @@ def run_demo(
     Raises:
         ConfigError: `out` must not be replaced, or the scenario is out of range.
     """
+    from evermap.demo.claims_figure import draw_claims
     from evermap.demo.hero import draw_hero
     from evermap.demo.lifetime_figure import draw_lifetimes
     from evermap.demo.lifetimes import learned_lives
     from evermap.demo.numbers import cost, demo_dict, lines_of
     from evermap.demo.score_figure import draw_scores
     from evermap.demo.story import demo_sections
+    from evermap.demo.weeks_figure import draw_weeks
     from evermap.viz.style import save_png, save_svg
 
     scenario = scenario or Scenario()
@@ -61,7 +63,13 @@ def run_demo(
         study = run_study(scenario, seed, store=folder.path(MAP), processes=processes, progress=progress)
         lines, lives = lines_of(study), learned_lives(study)
         numbers, costs = demo_dict(study, lines, lives, seed), cost(study)
-        figures = (draw_hero(study, lines), draw_scores(study, lines), draw_lifetimes(lives))
+        figures = (
+            draw_weeks(study, lines),
+            draw_hero(study, lines),
+            draw_claims(study, lines),
+            draw_scores(study, lines),
+            draw_lifetimes(lives),
+        )
         info = RunInfo(
             command=command, seeds={"simulation": seed, "slam": config.slam.seed}, total_s=time.perf_counter() - start
         )

@@ -1,13 +1,22 @@
-"""The building of the demonstration: four weeks in which everything but its walls is moved, and a robot's patrols."""
+"""The building of the demonstration: four weeks in which everything but its walls is moved, seen in parts."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from evermap.sim import BuildingConfig, BuildingSimulation, Duration, ObjectClass, SensorConfig, simulate_building
+from evermap.sim import (
+    CLUTTER,
+    ROOM_DOORS,
+    BuildingConfig,
+    BuildingSimulation,
+    Duration,
+    ObjectClass,
+    SensorConfig,
+    simulate_building,
+)
 
-CLASSES: tuple[ObjectClass, ...] = (
+FURNITURE: tuple[ObjectClass, ...] = (
     ObjectClass("marker", "wall", count=10, landmarks=(1, 1)),
     ObjectClass("door", "hinge", count=4, landmarks=(2, 2), size_m=(0.95, 0.05), stay=Duration(1.0)),
     ObjectClass(
@@ -28,6 +37,8 @@ CLASSES: tuple[ObjectClass, ...] = (
     ),
 )  # fmt: skip
 """Markers stay for ever, shelves for about a month, pallets a week, chairs half a week, carts two days, doors one."""
+CLASSES: tuple[ObjectClass, ...] = (*FURNITURE, CLUTTER)
+"""What the building of the demonstration holds: furniture, and crates that stay some hours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,14 +48,16 @@ class Scenario:
     Attributes:
         days: length of the whole.
         sessions_per_day: patrols a day, between 8 and 18 o'clock.
-        patrol_s: length of a patrol; the default is one lap through all four rooms.
+        patrol_lengths_s: every patrol draws one of these, and its own route through some of the rooms.
+        wing_opens_day: day, from 0, on which the robot gets into the eastern wing.
         change_rate: factor on how often things move, come and go.
         sensor_hz: how often the robot looks.
     """
 
     days: int = 28
     sessions_per_day: int = 2
-    patrol_s: float = 110.0
+    patrol_lengths_s: tuple[float, ...] = (30.0, 60.0, 90.0, 150.0)
+    wing_opens_day: int = 14
     change_rate: float = 1.0
     sensor_hz: float = 2.0
 
@@ -62,12 +75,14 @@ class Scenario:
         config = BuildingConfig(
             days=self.days,
             sessions_per_day=self.sessions_per_day,
-            patrol_s=self.patrol_s,
             change_rate=self.change_rate,
-            length_m=20.0,
+            length_m=25.0,
             depth_m=14.5,
-            rooms_per_side=2,
+            rooms_per_side=3,
             classes=CLASSES,
+            patrol_lengths_s=self.patrol_lengths_s,
+            doors=ROOM_DOORS,
+            wing_opens_day=self.wing_opens_day,
             # without a length standard no estimator can tell the size of a building: 1 % of slope would put 0.1 m of
             # error into every map and hide what is to be shown
             sensor=SensorConfig(range_slope=0.0, rate_hz=self.sensor_hz),

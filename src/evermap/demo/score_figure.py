@@ -1,4 +1,4 @@
-"""Every score of every method over the sessions: how right the maps are, how sure, how large, how dear."""
+"""Every score of every method over the sessions: accuracy, calibration, map size, cost."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.demo.hero import days_of
 from evermap.demo.looks import METHOD_LOOKS
-from evermap.demo.numbers import EXISTENCE_BOUND, Line, ratios
+from evermap.demo.numbers import EXISTENCE_BOUND, Line, lengths_of, ratios
 from evermap.demo.study import Study
 from evermap.types import FloatArray
 from evermap.viz.style import MUTED, NamedFigure, house_style, new_figure, settle
@@ -25,8 +25,8 @@ def draw_scores(study: Study, lines: dict[str, Line]) -> NamedFigure:
         day = days_of(study)
         series = {name: [ratios(counts) for counts in line.counts] for name, line in lines.items()}
         for axes, key, title in (
-            (panels[0, 0], "precision", "Precision: what it claims is so"),
-            (panels[0, 1], "recall", "Recall: what there is, it claims"),
+            (panels[0, 0], "precision_sure", "Precision of claims with p ≥ .9"),
+            (panels[0, 1], "recall", "Recall of what was looked at"),
             (panels[1, 0], "existence_brier", "Existence: Brier score"),
             (panels[1, 1], "forecast_brier", "Next session: Brier score"),
         ):
@@ -34,14 +34,14 @@ def draw_scores(study: Study, lines: dict[str, Line]) -> NamedFigure:
                 _line(axes, name, day, np.array([np.nan if s[key] is None else s[key] for s in scores]))
             axes.set_title(title)
         _as_is(panels[1, 1], day, lines)
+        panels[0, 0].axhline(EXISTENCE_BOUND, color=MUTED, lw=0.8, ls=(0, (2, 2)), zorder=1)
         for axes in panels[0]:
-            axes.axhline(EXISTENCE_BOUND, color=MUTED, lw=0.8, ls=(0, (2, 2)), zorder=1)
             axes.set_ylim(top=1.01)
         for name, visits in study.visits.items():
             _line(panels[2, 0], name, day, np.array([float(len(visit.snapshot.place_id)) for visit in visits]))
-            _line(panels[2, 1], name, day, np.array([1e3 * visit.cpu_s for visit in visits]))
+            _line(panels[2, 1], name, day, np.array([60e3 * visit.cpu_s for visit in visits]) / lengths_of(study))
         panels[2, 0].set_title("Size of the map: places")
-        panels[2, 1].set_title("Time of a session [ms]")
+        panels[2, 1].set_title("Time for a minute of recording [ms]")
         for axes in panels[1:].ravel():
             axes.set_ylim(bottom=0.0)
         for axes in panels[2]:
@@ -50,15 +50,16 @@ def draw_scores(study: Study, lines: dict[str, Line]) -> NamedFigure:
         handles, labels = panels[1, 1].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=4)
         settle(figure)
-    return NamedFigure("demo_scores", figure, "Right, sure, small and fast", _caption())
+    return NamedFigure("demo_scores", figure, "Accuracy, calibration, map size, cost", _caption())
 
 
 def _caption() -> str:
     return (
-        "Precision and recall count claims (p_exists of 0.5 or more) within 0.25 m; dashed is what was expected. The"
-        " Brier score of existence is that of the statements 'it stands where it stood last', about all landmarks that"
-        " were ever detected; the forecast's is that of the same statements about the next session, lower is better."
-        " Dotted: the forecast that all stays as it truly is. Time is that of one processor."
+        "A claim is right within 0.25 m; dashed is what was expected of precision. Recall is over the landmarks that"
+        " stand where they were really looked at. The Brier score of existence is that of the statements 'it stands"
+        " where it was last detected', about all landmarks that were ever detected; the forecast's is that of the same"
+        " statements about the next session, lower is better. Dotted: the forecast that all stays as it truly is. Time"
+        " is that of one processor; compiling is not in it."
     )
 
 

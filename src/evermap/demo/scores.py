@@ -1,9 +1,9 @@
-"""How right a map is after a session: its poses, what it says is there, how sure it is, and what it expects next.
+"""Accuracy of a map after a session: poses, claims of what is there, their probabilities, and the forecast.
 
 Poses are compared with the true path in the map's frame, which one SE(2) alignment on the path of the first session
 ties to the truth for good; a map that creeps away is wrong. A second number aligns every path by itself. The rest is
-counted as in `metrics.existence`: claims, and the statements 'the landmark stands where it stood last', about now, and
-as a forecast about the next session.
+counted as in `metrics.existence`: claims, and the statements 'the landmark stands where it was last detected', about
+now, and as a forecast about the next session.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from evermap.metrics.trajectory import scored_stamps
 from evermap.types import FloatArray, IntArray, Landmarks, Trajectory
 
 SCORED_HZ = 2.0
+SURE = 0.9
+"""Claims from this probability on are counted a second time, by themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +51,10 @@ class Counts:
     Attributes:
         n_poses, pose_error2_m2, own_error2_m2: scored poses, sum of their squared errors in the map's frame, and after
             an alignment of their own.
+        n_lost: sessions that were not found in the map; their poses are not counted.
         existence: what the map says is there now.
+        sure: its claims with a probability of at least `SURE`.
+        known: the same claims against what stands where it was really looked at.
         forecast: what it says of the next session.
         as_is: the same of the forecast that all stays as it truly is.
         n_come_true: statements that are so in the next session.
@@ -58,7 +63,10 @@ class Counts:
     n_poses: int = 0
     pose_error2_m2: float = 0.0
     own_error2_m2: float = 0.0
+    n_lost: int = 0
     existence: Existence = field(default_factory=Existence)
+    sure: Existence = field(default_factory=Existence)
+    known: Existence = field(default_factory=Existence)
     forecast: Existence = field(default_factory=Existence)
     as_is: Existence = field(default_factory=Existence)
     n_come_true: int = 0
@@ -89,8 +97,10 @@ def _at_same_stamps(path: Trajectory, truth: Trajectory) -> tuple[FloatArray, Fl
     return poses, truth.pose_world_robot[rows]
 
 
-def pose_counts(path: Trajectory, truth: Trajectory, pose_truth_map: FloatArray) -> Counts:
-    """Where the map had the robot during a session."""
+def pose_counts(path: Trajectory, truth: Trajectory, pose_truth_map: FloatArray, *, found: bool = True) -> Counts:
+    """Where the map had the robot during a session; `found` is False where the session was not found in the map."""
+    if not found:
+        return Counts(n_lost=1)
     fixed, own = pose_errors(path, truth, pose_truth_map)
     return Counts(len(fixed), float(fixed @ fixed), float(own @ own))
 
@@ -104,7 +114,11 @@ def map_counts(snapshot: Snapshot, truth: Truth, session: int, pose_truth_map: F
         return statement_score(asked, when, *places, pose_truth_map=pose_truth_map)
 
     claims = existence_score(snapshot.landmarks, now, pose_truth_map=pose_truth_map)
-    counts = Counts(existence=claims + said(snapshot.p_now, now))
+    counts = Counts(
+        existence=claims + said(snapshot.p_now, now),
+        sure=existence_score(snapshot.landmarks, now, pose_truth_map=pose_truth_map, p_least=SURE),
+        known=existence_score(snapshot.landmarks, truth.landmarks(session, known=True), pose_truth_map=pose_truth_map),
+    )
     if session + 1 == len(truth):
         return counts
     then = truth.landmarks(session + 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -36,12 +37,14 @@ class Visit:
 
     Attributes:
         path: where the robot was, in the frame of the method's map.
+        found: whether the session was found in the map; else the path is in a frame of its own.
         snapshot: what the map said afterwards.
         changes: what it says has changed.
         cpu_s: time of the processor.
     """
 
     path: Trajectory
+    found: bool
     snapshot: Snapshot
     changes: tuple[MapChange, ...]
     cpu_s: float
@@ -116,7 +119,8 @@ def run_study(
     truth = truth_of(building)
     visits: dict[str, list[Visit]] = {method.name: [] for method in METHODS}
     evening: dict[str, _Evening] = {}
-    total_s = scenario.patrol_s * scenario.sessions * len(METHODS)
+    length_s = [float(np.ptp(session.frames.stamp_s)) for session in building.sessions]
+    total_s = sum(length_s) * len(METHODS)
     done_s = 0.0
 
     def next_day(methods: tuple[Method, ...]) -> _Day:
@@ -141,7 +145,8 @@ def run_study(
                 for method, answer in zip(methods, future.result(), strict=True):
                     evening[method.name] = answer
                     visits[method.name] += answer.visits
-                done_s += scenario.patrol_s * scenario.sessions_per_day * len(methods)
+                now = len(visits[methods[0].name])
+                done_s += sum(length_s[now - scenario.sessions_per_day : now]) * len(methods)
                 if progress is not None:
                     progress(done_s, total_s)
                 if len(visits[methods[0].name]) < scenario.sessions:
@@ -156,12 +161,26 @@ def run_study(
     )
 
 
+@functools.cache
+def _compile() -> None:
+    """Live through a few short patrols with every method, so that no session that is timed compiles kernels.
+
+    Once in a process; afterwards all that sessions call is compiled or loaded.
+    """
+    building = Scenario(days=3, patrol_lengths_s=(30.0,), change_rate=8.0, wing_opens_day=1).simulate(0)
+    _live(_Day(building.sessions, (np.zeros(0, np.int64),) * 6, (np.nan,) * 6, METHODS, (None,) * len(METHODS), None))
+
+
 def _live_through(day: _Day) -> tuple[_Evening, ...]:
     """A day of some methods; the same in a worker and here."""
-    from evermap.maps.living import LivingMap
-    from evermap.pipeline import bring_in, solve_alone, warm_up
+    _compile()
+    return _live(day)
 
-    warm_up()  # compiling is no part of the first session
+
+def _live(day: _Day) -> tuple[_Evening, ...]:
+    from evermap.maps.living import LivingMap
+    from evermap.pipeline import bring_in, solve_alone
+
     config = [method.config() for method in day.methods]
     living = [LivingMap() if one is None else one for one in day.living]
     visits: list[list[Visit]] = [[] for _ in day.methods]
@@ -179,7 +198,7 @@ def _live_through(day: _Day) -> tuple[_Evening, ...]:
             cpu_s = alone_s + time.process_time() - begin_s
             living[row], results[row] = session.living, session.slam
             said = snapshot_of(session.living, config[row].living, until_s)
-            visits[row].append(Visit(session.slam.trajectory, said, session.changes, cpu_s))
+            visits[row].append(Visit(session.slam.trajectory, session.found, said, session.changes, cpu_s))
             if day.store is not None and method.name == "evermap":
                 _keep(day.store, recording, session, config[row], cpu_s)
     return tuple(_Evening(tuple(visits[row]), living[row], results[row]) for row in range(len(day.methods)))

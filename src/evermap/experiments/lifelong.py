@@ -84,7 +84,7 @@ class Job:
 
     @property
     def is_simulated(self) -> bool:
-        """In the building of the demonstration."""
+        """In a simulated building."""
         return self.part == SIMULATED_PART
 
 

@@ -125,7 +125,7 @@ CLUTTER: ObjectClass = ObjectClass(
 )  # fmt: skip
 """Crates that are put down for a few hours, taken away and reused: rarely in one place on two patrols."""
 
-ROOM_DOORS: tuple[Duration, Duration] = (Duration(1.0), Duration(0.4))
+ROOM_DOORS: tuple[Duration, Duration] = (Duration(2.0), Duration(0.4))
 """How long the door to a room stays open, and then shut."""
 
 

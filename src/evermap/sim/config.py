@@ -179,8 +179,8 @@ class BuildingConfig:
         classes: what stands in the building.
         drive, odometry, sensor: the robot.
         patrol_lengths_s: where given, every patrol draws its length from these instead of `patrol_s`, and its own
-            route: a random subset of the rooms, a random direction, starting anywhere along it. Empty: every patrol
-            is the lap from the dock.
+            route: a random subset of the rooms, a random direction, starting anywhere along it. The first one is the
+            longest, from the dock, through all rooms that are open. Empty: every patrol is the lap from the dock.
         doors: how long the door to a room stays open, and then shut; None leaves all doorways open. The sensor does
             not see through a shut door and the robot does not enter. Independent of `change_rate`.
         wing_opens_day: before this day a partition closes the eastern wing (the last room on either side and the

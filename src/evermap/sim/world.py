@@ -183,12 +183,12 @@ class _Patrol:
 
 
 def _patrols(config: BuildingConfig, plan: FloorPlan, seed: int) -> list[_Patrol]:
-    """Full laps from the dock, in alternating directions; with `patrol_lengths_s` each patrol its own."""
+    """Full laps from the dock, in alternating directions; with `patrol_lengths_s` each but the first has its own."""
     count = config.days * config.sessions_per_day
     if not config.patrol_lengths_s:
         return [_Patrol(config.patrol_s, row % 2 == 1) for row in range(count)]
-    patrols = []
-    for row in range(count):
+    patrols = [_Patrol(config.longest_patrol_s, reverse=False)]
+    for row in range(1, count):
         rng = _rng(seed, _Stream.PATROLS, row)
         length_s = float(rng.choice(config.patrol_lengths_s))
         reverse, start = bool(rng.random() < 0.5), float(rng.random())
@@ -207,7 +207,8 @@ def _shut_rooms(
     if config.doors is not None:
         for row in range(len(plan.rooms)):
             rng = _rng(seed, _Stream.DOORS, row)
-            is_shut, since_s = bool(rng.random() < 0.5), timeline.start_s
+            share_shut = config.doors[1].mean_days / (config.doors[0].mean_days + config.doors[1].mean_days)
+            is_shut, since_s = bool(rng.random() < share_shut), timeline.start_s
             while since_s < timeline.end_s:
                 end_s = since_s + config.doors[is_shut].sample_s(rng)
                 shut[(starts >= since_s) & (starts < end_s), row] = is_shut

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReportSection:
-    """A part of the report that somebody else tells, placed right after the headline numbers.
+    """A part of the report that the caller adds. A page with such parts opens with them.
 
     Attributes:
         title: plain text.
@@ -55,9 +55,13 @@ def render_report(
         figures: `draw_figures(...)`, may be empty.
         sections: what the caller adds.
     """
-    parts = [headline_cards(summary), _interrupted(summary), _changes(result)]
-    parts += [_section(section, number) for number, section in enumerate(sections)]
+    parts = [_section(section, number) for number, section in enumerate(sections)]
+    if sections:  # the page is about more than this recording
+        parts.append(f'<h2>{escape(recording.name)}</h2><p class="lead">{_lead(summary)}</p>')
     parts += [
+        headline_cards(summary),
+        _interrupted(summary),
+        _changes(result),
         _warnings(summary),
         _figures("Where it was", figures, ("map", "errors"), _frames(summary)),
         _figures("What the sensors are like", figures, ("calibration",), _calibration(result)),
@@ -68,10 +72,10 @@ def render_report(
     ]
     return PAGE.substitute(
         version=escape(str(summary["evermap"])),
-        title=escape(f"{recording.name}: evermap run"),
+        title=escape(f"{sections[0].title if sections else recording.name}: evermap run"),
         style=STYLE,
-        heading=escape(recording.name),
-        lead=_lead(summary),
+        heading=escape(sections[0].title if sections else recording.name),
+        lead="" if sections else _lead(summary),
         body="\n".join(part for part in parts if part),
         footer=_footer(summary),
     )
@@ -134,7 +138,8 @@ def _figure(named: NamedFigure) -> str:
 
 
 def _section(section: ReportSection, number: int) -> str:
-    parts = [f"<h2>{escape(section.title)}</h2>", section.html]
+    # the first one has the heading of the page
+    parts = [f"<h2>{escape(section.title)}</h2>" if number else "", section.html]
     for index, item in enumerate(section.figures):
         if isinstance(item, NamedFigure):
             parts.append(_figure(item))
