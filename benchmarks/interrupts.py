@@ -39,7 +39,7 @@ VERBS: dict[str, list[str]] = {
     "survival fit": ["survival", "fit", "out/track/lifetimes.csv", "--out", "priors.json"],
     "map show": ["map", "show", "site.evermap", "--figure", "map.png"],
 }
-SHARES = {"slam": 8, "slam --map": 3, "demo": 3}
+SHARES = {"slam": 8, "slam --map": 3}
 """How often a verb is interrupted; 1 for the others."""
 
 
@@ -91,7 +91,7 @@ def interrupt(folder: Path, count: int, *, seed: int, verbs: list[str], first_s:
     """Run the verbs in a folder, first to their ends, then interrupted."""
     prepare(folder)
     chance = random.Random(seed)
-    lasts_s = {verb: _duration_s(folder, VERBS[verb]) for verb in VERBS}
+    lasts_s = {verb: _duration_s(folder, VERBS[verb]) for verb in verbs}
     endings: list[Ending] = []
     while len(endings) < count:
         verb = chance.choices(verbs, [SHARES.get(verb, 1) for verb in verbs])[0]
@@ -111,6 +111,7 @@ def prepare(folder: Path) -> None:
     _run(folder, ["slam", "rec", "--map", "site.evermap", "--out", "out/living"])
     _run(folder, ["persist", "--init", "looks.csv"])
     _run(folder, ["track", "--init", "detections.csv"])
+    _run(folder, VERBS["track"])
 
 
 def _duration_s(folder: Path, command: list[str]) -> float:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import stat
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -11,6 +15,7 @@ from typing import Any
 import pytest
 from numba.core.caching import IndexDataCacheFile
 
+SOURCES = Path(__file__).parents[1] / "src"
 SOURCE = """
 from evermap.compiled import kept
 
@@ -60,3 +65,85 @@ def test_two_that_compile_at_the_same_moment_keep_the_code_of_both(
     assert (later(2), later(0.5)) == (4, 1.0)
     assert not later.stats.cache_misses
     assert len(later.stats.cache_hits) == 2
+
+
+def reader_of_a_shipped_package(folder: Path) -> Any:
+    """A module in a package that nobody may write to, as a function that runs code beside it without a home.
+
+    The tests may run as root, whom no permission stops: what is asked for is a place that is a file and not a folder.
+    """
+    package = folder / "shipped"
+    package.mkdir()
+    (package / "module.py").write_text(SOURCE)
+    (package / "__pycache__").write_text("no folder: nothing can be kept here")
+    (folder / "temporary").mkdir()
+
+    def run(code: str) -> subprocess.CompletedProcess[str]:
+        environment = {
+            **{name: value for name, value in os.environ.items() if name not in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")},
+            "HOME": str(package / "module.py"),
+            "TMPDIR": str(folder / "temporary"),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONPATH": f"{package}{os.pathsep}{SOURCES}",
+        }
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+        )
+
+    return run
+
+
+def test_without_a_place_to_keep_code_a_temporary_one_is_used_and_told_once(tmp_path: Path) -> None:
+    run = reader_of_a_shipped_package(tmp_path)
+    code = """
+import warnings
+warnings.simplefilter("always")
+warnings.showwarning = lambda message, category, *_: print(category.__name__, message)
+from module import twice
+import evermap.slam.frame_kernels
+print(twice(2), *(sum(twice.stats[k].values()) for k in (1, 2)))
+"""
+    first, second = run(code), run(code)
+    for done, hits in ((first, "0 1"), (second, "1 0")):
+        assert done.stderr == ""
+        said, result = done.stdout.splitlines()
+        assert said.startswith("EvermapWarning compiled kernels are kept in a temporary folder")
+        assert str(tmp_path / "temporary") in said
+        assert result == f"4 {hits}"
+    (kept_in,) = (tmp_path / "temporary").iterdir()
+    assert stat.S_IMODE(kept_in.stat().st_mode) == 0o700
+
+
+def test_code_is_not_loaded_from_a_folder_that_others_may_write_to(tmp_path: Path) -> None:
+    run = reader_of_a_shipped_package(tmp_path)
+    planted = tmp_path / "temporary" / f"evermap-kernels-{os.getuid()}"
+    for plant in (lambda: planted.mkdir(mode=0o777), lambda: planted.symlink_to(tmp_path)):
+        plant()
+        planted.is_symlink() or planted.chmod(0o777)
+        done = run("from evermap.compiled import temporary_folder; print(temporary_folder())")
+        place = Path(done.stdout.strip())
+        assert place.parent == tmp_path / "temporary"
+        assert place != planted
+        assert stat.S_IMODE(place.stat().st_mode) == 0o700
+        planted.unlink() if planted.is_symlink() else planted.rmdir()
+
+
+def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
+    run = reader_of_a_shipped_package(tmp_path)
+    code = """
+import sys
+sys.argv = ["evermap", "survival", "fit", "nothing.csv"]
+import evermap.objects.lifetimes
+def read(*_):
+    from module import twice
+    twice(2)
+    raise evermap.errors.InputError("no such file", path="nothing.csv")
+evermap.objects.lifetimes.read_lifetimes = read
+from evermap.__main__ import run
+run()
+"""
+    done = run(code)
+    assert done.returncode == 2
+    said, ended = done.stderr.splitlines()
+    assert said.startswith("evermap: warning: compiled kernels are kept in a temporary folder")
+    assert ended == "evermap: error: nothing.csv: no such file"

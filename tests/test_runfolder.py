@@ -16,7 +16,7 @@ from evermap.config import load_config
 from evermap.errors import ConfigError, MissingExtraError
 from evermap.io.landmarks import read_prior_map
 from evermap.io.tum import read_tum
-from evermap.runfolder import MANIFEST, RunFolder, RunInfo, check_replaceable, write_run
+from evermap.runfolder import MANIFEST, RunFolder, RunInfo, check_output_file, check_replaceable, write_run
 from evermap.runsummary import summary_dict, timing_dict
 
 sys.path.insert(0, str(Path(__file__).parent / "metrics"))
@@ -294,3 +294,214 @@ def test_summary_of_an_interrupted_run_counts_what_was_done(run):
     assert summary["counts"]["frames_processed"] == 101
     expected = online.stamp_s[100] - online.stamp_s[0]
     assert summary["timing"]["real_time_factor"] == pytest.approx(expected)
+
+
+# what belongs to the user
+
+
+def snapshot(folder):
+    """Names and contents of everything in a folder, links as what they say."""
+    return {
+        path.relative_to(folder).as_posix(): str(path.readlink()) if path.is_symlink() else path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_symlink() or not path.is_dir()
+    }
+
+
+def write(out, names, **options):
+    with RunFolder(out, **options) as folder:
+        for name, text in names.items():
+            folder.path(name).write_text(text)
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize(
+    ("out", "read"),
+    [
+        ("rec", "rec"),
+        (".", "rec"),
+        ("parent", "parent/rec"),
+        ("parent", "parent/rec/odometry.csv"),
+        ("rec", "parent/../rec"),
+        ("parent/../rec", "rec"),
+        ("link", "rec"),
+        ("rec", "link"),
+        ("rec", "linked/odometry.csv"),
+        ("rec", "linked"),
+        ("holds_link", "holds_link/rec"),
+        ("new", "new/site.evermap"),
+        ("hidden/../new", "new/site.evermap"),
+    ],
+)
+def test_what_is_read_is_never_in_the_way(out, read, force, tmp_path, monkeypatch):
+    base = tmp_path / "user"
+    for folder in ("rec", "parent/rec", "holds_link", "linked"):
+        (base / folder).mkdir(parents=True)
+    for folder in ("rec", "parent/rec"):
+        (base / folder / "odometry.csv").write_text("mine")
+    (base / "link").symlink_to(base / "rec")
+    (base / "holds_link" / "rec").symlink_to(base / "rec")
+    (base / "linked" / "odometry.csv").symlink_to(base / "rec" / "odometry.csv")
+    before = snapshot(base)
+    monkeypatch.chdir(tmp_path)
+    for name in (Path("user") / out, base / out):
+        for source in (Path("user") / read, base / read):
+            with pytest.raises(ConfigError, match="which this command reads"):
+                write(name, {"map.csv": "new"}, force=force, inputs=[None, "", source])
+    assert snapshot(base) == before
+
+
+def test_an_output_of_evermap_that_is_read_is_not_replaced_either(tmp_path):
+    write(tmp_path / "out", {"model.json": "learned"})
+    with pytest.raises(ConfigError, match=r"model\.json.*reads"):
+        check_replaceable(tmp_path / "out", inputs=[tmp_path / "out" / "model.json"])
+    (tmp_path / "second").mkdir()
+    (tmp_path / "second" / "model.json").hardlink_to(tmp_path / "out" / "model.json")
+    write(tmp_path / "out", {"model.json": "again"}, inputs=[tmp_path / "second" / "model.json"])
+    assert (tmp_path / "second" / "model.json").read_text() == "learned"
+
+
+def test_files_of_the_user_stay_beside_a_forced_run(tmp_path):
+    out = tmp_path / "out"
+    write(out, {"summary.json": "1", "map.csv": "1", "figures/a.png": "1", "figures/b.png": "1"})
+    mine = {"notes.txt": "mine", "figures/mine.png": "mine", "deep/er/x": "mine"}
+    for name, text in mine.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text(text)
+    (out / "dangling").symlink_to("nowhere")
+    (out / "empty").mkdir()
+    inode = out.stat().st_ino
+    with pytest.raises(ConfigError, match="--force to write beside it"):
+        write(out, {"map.csv": "2"})
+    new = {"summary.json": "2", "map.csv": "2", "figures/b.png": "2"}
+    write(out, new, force=True)
+    there = snapshot(out)
+    there.pop(MANIFEST)
+    assert there == {name: text.encode() for name, text in (mine | new).items()} | {"dangling": "nowhere"}
+    assert out.stat().st_ino == inode  # the user's folder itself stays, too
+    assert (out / "empty").is_dir()
+    assert leftovers(tmp_path) == leftovers(out) == []
+    for name in mine:
+        (out / name).unlink()
+    (out / "dangling").unlink()
+    write(out, {"map.csv": "3"})
+    assert sorted(snapshot(out)) == [MANIFEST, "map.csv"]
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_that_was_changed_since_is_the_user_s(force, tmp_path):
+    out = tmp_path / "out"
+    write(out, {"map.evermap": "one session", "summary.json": "1"})
+    (out / "map.evermap").write_text("forty sessions")
+    with pytest.raises(ConfigError, match=r"map\.evermap', which was changed since"):
+        write(out, {"map.evermap": "one session"}, force=force)
+    assert (out / "map.evermap").read_text() == "forty sessions"
+
+
+@pytest.mark.parametrize("theirs", ["map.csv", "figures", "figures/a.png/x", "summary.json"])
+def test_a_file_in_the_way_stays_and_the_new_run_is_put_beside(theirs, tmp_path):
+    out = tmp_path / "out"
+    (out / theirs).parent.mkdir(parents=True)
+    (out / theirs).write_text("mine")
+    new = {"map.csv": "new", "figures/a.png": "new", "summary.json": "new"}
+    with pytest.raises(ConfigError, match="holds '") as refused:
+        write(out, new, force=True)
+    assert snapshot(out) == {theirs: b"mine"}
+    if theirs != "summary.json":  # that one is known before the run
+        assert str(tmp_path / "out-2") in refused.value.one_line()
+        assert snapshot(tmp_path / "out-2").keys() - {MANIFEST} == new.keys()
+    assert leftovers(tmp_path) == []
+
+
+def test_what_appears_during_a_run_is_not_lost_nor_is_the_run(tmp_path):
+    out = tmp_path / "out"
+    write(out, {"map.csv": "1"})
+
+    def run():
+        with RunFolder(out) as folder:
+            folder.path("map.csv").write_text("2")
+            (out / "notes.txt").write_text("written meanwhile")
+
+    with pytest.raises(ConfigError, match="new results are in"):
+        run()
+    assert (out / "notes.txt").read_text() == "written meanwhile"
+    assert (out / "map.csv").read_text() == "1"
+    assert (tmp_path / "out-2" / "map.csv").read_text() == "2"
+
+
+@pytest.mark.parametrize("crash_at", range(1, 8))
+def test_a_crash_between_any_two_steps_loses_nothing(crash_at, tmp_path, monkeypatch):
+    """Beside files of the user each file is old or new, whole, and known as evermap's to the next run."""
+    out = tmp_path / "out"
+    old = {"summary.json": "old", "a.csv": "old", "gone.csv": "old"}
+    write(out, old)
+    (out / "notes.txt").write_text("mine")
+    calls = []
+    replace = Path.replace
+
+    def crashing(self, target):
+        calls.append(target)
+        if len(calls) == crash_at:
+            raise RuntimeError("power cut")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", crashing)
+    new = {"summary.json": "new", "a.csv": "new", "b.csv": "new"}
+    try:
+        write(out, new, force=True)
+        assert len(calls) < crash_at
+    except RuntimeError:
+        pass
+    monkeypatch.undo()
+    assert (out / "notes.txt").read_text() == "mine"
+    for name in old.keys() | new.keys():
+        if (out / name).exists():
+            assert (out / name).read_text() in {old.get(name), new.get(name)}
+    (out / "notes.txt").unlink()
+    write(out, new)  # nothing but evermap's is left
+    assert snapshot(out).keys() - {MANIFEST} == new.keys()
+
+
+def test_an_older_evermap_s_run_is_replaced_but_not_its_map(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "map.csv").write_text("1")
+    listed = {"evermap": "0.1.0", "schema_version": "1", "outputs": ["map.csv", "summary.json", "map.evermap"]}
+    (out / "summary.json").write_text(json.dumps(listed))
+    check_replaceable(out)
+    (out / "map.evermap").write_text("forty sessions")
+    with pytest.raises(ConfigError, match=r"map\.evermap"):
+        check_replaceable(out)
+
+
+def test_outputs_that_are_no_runs_are_replaced_on_request_only(tmp_path):
+    out = tmp_path / "recordings"
+    write(out, {"day0/odometry.csv": "1"}, renew=False)
+    with pytest.raises(ConfigError, match="is not empty"):
+        write(out, {"day0/odometry.csv": "2"}, renew=False)
+    write(out, {"day1/odometry.csv": "2"}, renew=False, force=True)
+    assert snapshot(out).keys() == {MANIFEST, "day1/odometry.csv"}
+
+
+def test_a_folder_beside_which_nothing_can_be_written_is_filled_in_place(tmp_path, monkeypatch):
+    out = tmp_path / "mounted"
+    out.mkdir()
+    monkeypatch.setattr(Path, "is_mount", lambda self: self == out)
+    for text in ("1", "2"):
+        write(out, {"map.csv": text, f"only_{text}.csv": text})
+    assert snapshot(out).keys() == {MANIFEST, "map.csv", "only_2.csv"}
+    assert [path.name for path in tmp_path.iterdir()] == ["mounted"]
+
+
+def test_a_single_output_file_is_no_input_and_no_map(tmp_path):
+    (tmp_path / "looks.csv").write_text("mine")
+    (tmp_path / "link.csv").symlink_to(tmp_path / "looks.csv")
+    for path in ("looks.csv", "link.csv"):
+        with pytest.raises(ConfigError, match="is what this command reads"):
+            check_output_file(tmp_path / path, inputs=[tmp_path / "looks.csv"])
+    (tmp_path / "site.png").write_bytes(b"SQLite format 3\0...")
+    with pytest.raises(ConfigError, match="living map"):
+        check_output_file(tmp_path / "site.png")
+    with pytest.raises(ConfigError, match=r"no \.json"):
+        check_output_file(tmp_path / "looks.csv", ending=".json")
+    check_output_file(tmp_path / "new.csv", inputs=[tmp_path / "looks.csv"], ending=".json")

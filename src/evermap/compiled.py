@@ -84,6 +84,11 @@ def _keeper() -> Callable[[Any], Any]:
     return keeper
 
 
+def find_place() -> None:
+    """Find out where machine code is kept, before several processes find it out and each of them says so."""
+    _keeper()(find_place)
+
+
 @functools.cache
 def temporary_folder() -> str:
     """Where machine code goes if it can go nowhere else, said once by a warning.
@@ -104,6 +109,7 @@ def temporary_folder() -> str:
     problem = "compiled kernels are kept in a temporary folder: neither the installation nor a home folder is writable"
     warnings.warn(f"{problem} ({folder}; try: NUMBA_CACHE_DIR=FOLDER)", EvermapWarning, stacklevel=2)
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))  # processes that this one starts need not say it again
+    os.environ.setdefault("MPLCONFIGDIR", str(folder / "matplotlib"))  # which would say the same of its fonts
     return str(folder)
 
 

@@ -247,9 +247,12 @@ def _workers(processes: int) -> Iterator[Callable[[_Day], Future[tuple[_Evening,
     import multiprocessing
     import os
 
+    from evermap.compiled import find_place
+
     # one thread each: the linear algebra of two processes would fight over two cores. Read when a worker starts.
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
+    find_place()
     context = multiprocessing.get_context("spawn")  # a fork would copy locks of threads that it does not copy
     with ProcessPoolExecutor(processes, mp_context=context) as executor:
 

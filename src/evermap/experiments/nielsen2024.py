@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
+from evermap.compiled import find_place
 from evermap.errors import EvermapError
 from evermap.experiments.mrclam import machine
 from evermap.experiments.nielsen2024_figures import draw_all
@@ -147,6 +148,7 @@ def _serial(planned: list[Job], data: Path) -> Iterator[tuple[Job, Row, Row | No
 
 def _parallel(planned: list[Job], data: Path, processes: int) -> Iterator[tuple[Job, Row, Row | None]]:
     """In processes that are started afresh: what was compiled is read from disk, nothing is shared."""
+    find_place()
     with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool, watched() as watch:
         try:
             sources = list(dict.fromkeys((job.dataset, job.robot) for job in planned))
