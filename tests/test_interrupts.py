@@ -272,7 +272,7 @@ def test_what_is_temporary_is_removed_once(stop: type[BaseException] | None) -> 
 def test_interrupts_at_random_instants_end_with_one_line(tmp_path: Path) -> None:
     """A sample; the whole is `python -m benchmarks.interrupts`."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
-    from benchmarks.interrupts import BEFORE_PYTHON, interrupt
+    from benchmarks.interrupts import BEFORE_OURS, interrupt
 
     endings = interrupt(tmp_path, 20, seed=1, verbs=["slam", "persist", "convert"])
-    assert [ending for ending in endings if ending.wrong not in ("", BEFORE_PYTHON)] == []
+    assert [ending for ending in endings if ending.wrong not in ("", BEFORE_OURS)] == []
