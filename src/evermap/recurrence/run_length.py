@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from evermap.recurrence.run_length_kernels import First, Law
 
 ABSENT, PRESENT = 0, 1
+_MOST_HYPOTHESES = 10_000
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class RunLength:
         hypotheses: how many are kept of each feature.
 
     Raises:
-        ConfigError: a step that is not positive, or fewer than 8 hypotheses.
+        ConfigError: a step that is not positive, or fewer than 8 hypotheses or more than 10,000.
     """
 
     stay: LifetimePrior
@@ -60,6 +61,9 @@ class RunLength:
             raise ConfigError(f"{self.step_s} s is no step of time", field="step_s", hint="a positive number")
         if self.hypotheses < 8:
             raise ConfigError(f"{self.hypotheses} hypotheses are too few", field="hypotheses", hint="8 or more")
+        if self.hypotheses > _MOST_HYPOTHESES:
+            problem = f"{self.hypotheses} hypotheses are too many"
+            raise ConfigError(problem, field="hypotheses", hint=f"at most {_MOST_HYPOTHESES}")
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks; asked at the looks themselves where `instants` is None.

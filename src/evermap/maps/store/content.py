@@ -228,9 +228,22 @@ def flaw(living: LivingMap) -> str:
         ("log_size_variance", np.array(living.log_size_variance)),
         ("lives.chunk_m", np.array(lives.chunk_m)),
         ("sightlines.cell_m", np.array(lines.cell_m)),
+        ("stays.first_s", stays.first_s),
+        ("stays.last_s", stays.last_s),
+        ("sites.since_s", sites.since_s),
+        ("sites.seen_s", sites.seen_s),
     ):
         if not np.isfinite(values).all():
             return f"'{column}' is not finite"
+    for column, values in (
+        ("stays.elsewhere_s", stays.elsewhere_s),
+        ("stays.gone_s", stays.gone_s),
+        ("lives.looks_s", lives.looks_s),
+        ("stamp_s", np.array(living.stamp_s)),
+        *((f"sightlines.{item.name}", np.asarray(getattr(lines, item.name))) for item in fields(lines)),
+    ):
+        if np.isnan(values).any():
+            return f"'{column}' is not a number"
     if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0:
         return "a cell without size"
     if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):

@@ -1,0 +1,31 @@
+"""A slice of the fuzz of all readers; `python -m benchmarks.fuzz` runs the whole of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from benchmarks import fuzz
+
+FILES = 40
+KINDS = [
+    "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
+    "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
+    "tum", "priors",
+]  # fmt: skip
+
+
+def test_the_slice_has_every_kind(tmp_path: Path) -> None:
+    assert list(fuzz.kinds(tmp_path)) == KINDS
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_mutated_files_give_a_line_or_what_was_written(name: str, tmp_path: Path) -> None:
+    kind = fuzz.kinds(tmp_path)[name]()
+    folder = tmp_path / "files"
+    folder.mkdir()
+    counts = fuzz.run(kind, FILES, 1, folder)
+    assert sum(counts.values()) == FILES
+    assert counts["line"] > FILES / 4
+    assert not counts.keys() - {"same", "other", "line"}, counts
