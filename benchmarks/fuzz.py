@@ -24,6 +24,7 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from copy import deepcopy
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -170,11 +171,11 @@ def edit_json(data: bytes, dice: random.Random) -> bytes:
                 else:
                     holder.pop(key)
             case 1 if isinstance(holder, list):
-                holder.append(dice.choice(NASTY_VALUES))
+                holder.append(deepcopy(dice.choice(NASTY_VALUES)))
             case 2 if isinstance(holder[key], int | float) and not isinstance(holder[key], bool):
                 holder[key] = dice.choice(NASTY_NUMBERS)
             case _:
-                holder[key] = dice.choice(NASTY_VALUES)
+                holder[key] = deepcopy(dice.choice(NASTY_VALUES))
     text = json.dumps(document)
     if dice.random() < 0.05:
         text = text.replace("1", "1" * 5000, 1)
@@ -347,7 +348,7 @@ def _forge(database: sqlite3.Connection, dice: random.Random) -> None:
             )
         elif kind == 2:
             manifest["columns"][column][3] = dice.choice((names[:-1], names + names, ["zz"], [None], "x", [names]))
-        elif names and dtype in ("<f8", "<i8"):
+        elif names and dtype in ("<f8", "<i8") and column != "lives.chunk":  # any whole number is a chunk
             count = int(np.prod(shape))
             bad = np.full(count, np.nan if dtype == "<f8" else -(2**62), dtype)
             manifest["columns"][column] = [dtype, shape, False, [_store(database, dtype, bad.tobytes()).hex()]]
@@ -375,7 +376,7 @@ def _spoil(document: dict[str, Any], dice: random.Random, keep: tuple[str, ...])
     else:
         numbers = (int, float) if old is None or isinstance(old, float) else ()
         kinds = [value for value in NASTY_VALUES if type(value) not in (type(old), *numbers)]
-        document[key] = dice.choice(kinds)
+        document[key] = deepcopy(dice.choice(kinds))
 
 
 def _chunk(database: sqlite3.Connection, name: bytes) -> bytes:

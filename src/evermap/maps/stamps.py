@@ -15,7 +15,10 @@ def stamp_text(stamp_s: float, clock: Clock) -> str:
     if not math.isfinite(stamp_s):
         return "-"
     if clock is not Clock.RECORDING:
-        return datetime.fromtimestamp(round(stamp_s), UTC).strftime("%Y-%m-%d %H:%M:%S")
+        try:
+            return datetime.fromtimestamp(round(stamp_s), UTC).strftime("%Y-%m-%d %H:%M:%S")
+        except (OverflowError, ValueError, OSError):  # no date of the calendar
+            return f"{stamp_s:g} s"
     days, seconds = divmod(round(stamp_s), _DAY_S)
     time = f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
     return f"day {days} {time}" if days else time
