@@ -191,7 +191,9 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         after, changes = lifelong.decided(entry.before, now, looks, visit, config.living)
         after = lifelong.learned(after, now, looks, config.living)
         frame = "first_pose" if where is None else "prior_map"
-        landmarks = replace(after.landmarks(p_least=0.5), frame=frame)
+        names = visit.recording.landmark_names
+        landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)
+        changes = tuple(change.named(names) for change in changes)
         result = _result(
             visit, slam, alone.prior, alone.step_s, frame, landmarks=landmarks, interrupted=alone.interrupted
         )

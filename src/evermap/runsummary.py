@@ -111,6 +111,7 @@ def change_dict(change: MapChange) -> dict[str, Any]:
         "probability": _number(change.probability),
         "hits": change.n_hits,
         "misses": change.n_misses,
+        "names": list(change.names) or None,
     }
 
 

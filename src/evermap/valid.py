@@ -27,6 +27,7 @@ class Quantity:
         positive: whether values must be greater than zero.
         optional: whether a cell may be empty (nan then).
         hint: what to try when a value is out of its limits.
+        dates: whether a cell may be a date (ISO 8601) instead of seconds.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Quantity:
     positive: bool = False
     optional: bool = False
     hint: str = ""
+    dates: bool = False
 
     def check(self, values: FloatArray, *, path: Path, line: IntArray) -> None:
         """Raises InputError at the first value that is not finite (or not given, if needed) or out of limits."""
@@ -65,7 +67,7 @@ class Quantity:
         return f"{value:g} is outside [{self.low:g}, {self.high:g}]"
 
 
-STAMP_S = Quantity("stamp_s", -1e11, 1e11, hint="stamps in seconds, not in milli- or nanoseconds")
+STAMP_S = Quantity("stamp_s", -1e11, 1e11, hint="stamps in seconds, not in milli- or nanoseconds", dates=True)
 FORWARD_MPS = Quantity("forward_mps", -1e3, 1e3, hint="metres per second")
 LATERAL_MPS = Quantity("lateral_mps", -1e3, 1e3, hint="metres per second")
 ANGULAR_RADPS = Quantity("angular_radps", -1e3, 1e3, hint="radians per second")

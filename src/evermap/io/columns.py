@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.table import Table, parse_csv, read_parquet
+from evermap.io.table import Table, dates_as_text, parse_csv, read_parquet
 from evermap.io.text import quote, reason
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
 
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
@@ -74,6 +74,14 @@ class Columns:
             values = self._converted(cells, quantity.name)
         quantity.check(values, path=self.path, line=self.line)
         return values
+
+    def clock(self, name: str = "stamp_s") -> Clock | None:
+        """What the stamps of a column count, where they are dates; else None."""
+        import pyarrow as pa
+
+        cells = self.cells[name][:1]
+        text = dates_as_text(cells) if pa.types.is_timestamp(cells.type) else cells.to_pylist()
+        return self._table({name: text}).clock(name) if _is_text(cells.type) or text != cells.to_pylist() else None
 
     def flags(self, name: str, *, hint: str) -> FloatArray:
         """A column of 1 or true, 0 or false; nan where it is empty. Shape (R,).
@@ -139,6 +147,8 @@ class Columns:
         import pyarrow as pa
 
         kind = cells.type
+        if pa.types.is_timestamp(kind):
+            return self._table({name: dates_as_text(cells)}).numbers(Quantity(name, optional=True, dates=True))
         fits = (pa.types.is_integer, pa.types.is_floating, pa.types.is_boolean, pa.types.is_null)
         if not any(is_kind(kind) for is_kind in fits):
             raise self.error(f"holds {kind}, not numbers", row=None, field=name, hint="cast the column to float64")

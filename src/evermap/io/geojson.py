@@ -107,7 +107,7 @@ def _properties(feature: dict[str, Any], path: Path, number: int) -> dict[str, A
 
 
 def _column(cells: list[Any], name: str) -> list[str] | FloatArray:
-    if name != "class_id" and all(_is_number(c) for c in cells):
+    if name not in ("class_id", "name") and all(_is_number(c) for c in cells):
         try:
             return np.array([np.nan if c is None else float(c) for c in cells], dtype=np.float64)
         except OverflowError:

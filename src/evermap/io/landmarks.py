@@ -23,6 +23,7 @@ COVARIANCE_COLUMNS = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
 _REQUIRED = ("landmark_id", "x_m", "y_m")
 _OPTIONAL = (
     "sigma_m", *COVARIANCE_COLUMNS, "class_id", "p_exists", "n_hits", "n_misses", "first_seen_s", "last_seen_s",
+    "name",
 )  # fmt: skip
 _MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "map.geojson")
 
@@ -90,6 +91,7 @@ def landmarks_from_table(
     class_names: tuple[str, ...] | None = None,
     frame: str = "truth",
     clock: Clock = Clock.RECORDING,
+    names: dict[int, str] | None = None,
 ) -> Landmarks:
     """Landmarks of a table with the columns of `docs/formats.md`, sorted by id.
 
@@ -97,11 +99,16 @@ def landmarks_from_table(
         InputError: a column or value is not what it must be, or an id appears twice.
     """
     table.expect(_REQUIRED, _OPTIONAL)
-    ids = table.ids("landmark_id", optional=False)
+    names = {} if names is None else names
+    ids = table.ids("landmark_id", optional=False, names=names)
+    if "name" in table:
+        names |= {int(ids[row]): name for row, name in enumerate(table.labels("name")) if name}
     again = repeats(ids)
     if len(again):
         row = int(again[0])
-        raise table.error(f"landmark {ids[row]} is listed twice", row=row, field="landmark_id")
+        raise table.error(
+            f"landmark {names.get(int(ids[row]), ids[row])} is listed twice", row=row, field="landmark_id"
+        )
     count = len(ids)
     if class_names is None:
         class_names = distinct_labels(table)
@@ -120,6 +127,7 @@ def landmarks_from_table(
         class_names=class_names,
         frame=frame,
         clock=clock,
+        names=names,
     )
     return sort_landmarks(landmarks, order)
 
@@ -151,7 +159,14 @@ def map_columns(landmarks: Landmarks) -> dict[str, Any]:
         "n_misses": landmarks.n_misses,
         "first_seen_s": landmarks.first_seen_s,
         "last_seen_s": landmarks.last_seen_s,
+        **names_column(landmarks),
     }
+
+
+def names_column(landmarks: Landmarks) -> dict[str, list[str]]:
+    """`name`, the texts that the landmarks are called by, '' for those with a number; none if all have numbers."""
+    names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
+    return {"name": names} if any(names) else {}
 
 
 def survey_columns(landmarks: Landmarks) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,12 +67,16 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
             raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=f"{name}.csv or .parquet")
     assert odometry_table is not None
     assert detection_table is not None
-    clock = settings.clock
+    clock = _clock(settings, tables, files)
+    settings = replace(settings, clock=clock)
+    names: dict[int, str] = {}
     class_names = settings.class_names
     if class_names is None:
         class_names = distinct_labels(detection_table, tables["landmarks"])
     odometry = _odometry(odometry_table, clock, warnings)
-    frames, detections = frames_and_detections(detection_table, tables["frames"], class_names, settings, warnings)
+    frames, detections = frames_and_detections(
+        detection_table, tables["frames"], class_names, settings, warnings, names
+    )
     landmarks = tables["landmarks"]
     recording = Recording(
         name=settings.name or files.title,
@@ -82,12 +87,13 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         truth=_truth(tables["truth"], clock, warnings),
         true_landmarks=None
         if landmarks is None or not len(landmarks)
-        else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock),
+        else landmarks_from_table(landmarks, sigma_m=0.0, class_names=class_names, clock=clock, names=names),
         robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
-        objects=_objects(tables["objects"]),
+        objects=_objects(tables["objects"], names),
         class_names=class_names,
         source=str(path),
         clock=clock,
+        landmark_names=names,
     )
     return finish_recording(recording, warnings=warnings)
 
@@ -199,18 +205,39 @@ def _robot_sightings(table: Table | None, clock: Clock) -> RobotSightings | None
     return RobotSightings(forward_stamps(table), table.ids("robot_id", optional=False), range_m, bearing_rad, clock)
 
 
-def _objects(table: Table | None) -> IntArray:
+def _clock(settings: Settings, tables: dict[str, Table | None], files: FileSet) -> Clock:
+    """What the recording's stamps count: what its dates say, and else what `sensor.toml` says."""
+    said = {table.clock(): table for table in tables.values() if table is not None and table.clock() is not None}
+    if len(said) > 1:
+        problem = "some tables have dates with a zone, others without"
+        raise InputError(problem, path=files.root / files.folder, field="stamp_s", hint="a zone everywhere, or nowhere")
+    for clock, table in said.items():
+        assert clock is not None
+        if settings.clock not in (Clock.RECORDING, clock):
+            problem = (
+                f'dates that count {clock.value} seconds where {SENSOR_FILE} says clock = "{settings.clock.value}"'
+            )
+            hint = "dates with a zone are unix, dates without one local_wall"
+            raise table.error(problem, row=0, field="stamp_s", hint=hint)
+        return clock
+    return settings.clock
+
+
+def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
     """(K, 2) landmarks and the objects that they are on, sorted by landmark."""
     if table is None:
         return np.zeros((0, 2), dtype=np.int64)
     table.expect(("landmark_id", "object_id"))
-    pairs = np.column_stack([table.ids(name, optional=False) for name in ("landmark_id", "object_id")])
+    landmark_id = table.ids("landmark_id", optional=False, names=names)
+    pairs = np.column_stack([landmark_id, table.ids("object_id", optional=False, names={})])
     pairs = np.unique(pairs, axis=0)
     twice = np.flatnonzero(np.diff(pairs[:, 0]) == 0)
     if len(twice):
         name = int(pairs[twice[0], 0])
-        row = int(np.flatnonzero(table.ids("landmark_id", optional=False) == name)[-1])
-        raise table.error(f"landmark {name} is on two objects", row=row, field="object_id", hint="one object each")
+        row = int(np.flatnonzero(landmark_id == name)[-1])
+        raise table.error(
+            f"landmark {names.get(name, name)} is on two objects", row=row, field="object_id", hint="one object each"
+        )
     return pairs
 
 

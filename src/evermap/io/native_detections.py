@@ -24,7 +24,12 @@ _ROUND_SIGMAS = ("sigma_m", "sigma")
 
 
 def frames_and_detections(
-    table: Table, frame_table: Table | None, class_names: tuple[str, ...], settings: Settings, warnings: list[str]
+    table: Table,
+    frame_table: Table | None,
+    class_names: tuple[str, ...],
+    settings: Settings,
+    warnings: list[str],
+    names: dict[int, str],
 ) -> tuple[Frames, Detections]:
     """Frames of a native recording and the detections in them.
 
@@ -34,6 +39,7 @@ def frames_and_detections(
         class_names: all class labels.
         settings: clock, and whether the frames are complete.
         warnings: gets a remark on repeated frames.
+        names: gets the texts behind landmark ids that are texts.
 
     Raises:
         InputError: a value is malformed, or a detection lies in no frame.
@@ -55,7 +61,7 @@ def frames_and_detections(
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
         frame=frame_of_look[_nearest_look(stamp_s, looked_s, table, frame_table)],
-        landmark_id=table.ids("landmark_id", optional=True),
+        landmark_id=table.ids("landmark_id", optional=True, names=names),
         range_m=range_m,
         bearing_rad=bearing_rad,
         class_id=class_ids(table, class_names),

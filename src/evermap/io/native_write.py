@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +14,7 @@ from evermap.io.landmarks import labels_of, survey_columns
 from evermap.io.native import SENSOR_FILE
 from evermap.io.sensor_toml import Settings, sensor_toml
 from evermap.io.table import csv_text, parquet_bytes
-from evermap.types import UNKNOWN, Recording
+from evermap.types import UNKNOWN, IntArray, Recording
 
 
 def write_native(
@@ -59,7 +60,7 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
         },
         "detections": {
             "stamp_s": recording.frames.stamp_s[detections.frame],
-            "landmark_id": detections.landmark_id,
+            "landmark_id": _called(detections.landmark_id, recording.landmark_names),
             "range_m": detections.range_m,
             "bearing_rad": detections.bearing_rad,
         },
@@ -82,6 +83,9 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
     if recording.true_landmarks is not None:
         landmarks = recording.true_landmarks
         tables["landmarks"] = survey_columns(landmarks)
+        tables["landmarks"]["landmark_id"] = _called(
+            landmarks.landmark_id, {**recording.landmark_names, **landmarks.names}
+        )
         if np.any(landmarks.class_id != UNKNOWN):
             tables["landmarks"]["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or names)
     if recording.robot_sightings is not None:
@@ -93,8 +97,16 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
             "bearing_rad": sightings.bearing_rad,
         }
     if len(recording.objects):
-        tables["objects"] = {"landmark_id": recording.objects[:, 0], "object_id": recording.objects[:, 1]}
+        landmark_id = _called(recording.objects[:, 0], recording.landmark_names)
+        tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}
     return tables
+
+
+def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
+    """A column of ids: as they are, or as text where some have a text behind them."""
+    if not names.keys() & set(landmark_id.tolist()):
+        return landmark_id
+    return ["" if number == UNKNOWN else names.get(number, str(number)) for number in landmark_id.tolist()]
 
 
 def _settings(recording: Recording) -> Settings:

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.text import decode_text, parse_float, quote, reason
-from evermap.types import UNKNOWN, FloatArray, IntArray
-from evermap.valid import Quantity
+from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quote, reason
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, landmark_id_of
+from evermap.valid import STAMP_S, Quantity
 
 _LARGEST_ID = 2**53
 """Whole numbers beyond this lose digits as float64, in which Parquet tables made by others often hold ids."""
@@ -81,12 +81,19 @@ class Table:
         quantity.check(values, path=self.path, line=self.line)
         return values
 
-    def ids(self, name: str, *, optional: bool) -> IntArray:
+    def ids(self, name: str, *, optional: bool, names: dict[int, str] | None = None) -> IntArray:
         """Whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
 
+        Args:
+            name: of the column.
+            optional: whether a cell may be empty.
+            names: takes up the texts of cells that are no numbers, by their id (`landmark_id_of`); None refuses them.
+
         Raises:
-            InputError: a fraction, a negative number, or nothing where an id is needed.
+            InputError: a fraction, a negative number, or nothing where an id is needed; two texts with one id.
         """
+        if names is not None and not isinstance(self.columns[name], np.ndarray):
+            return self._named_ids(name, optional, names)
         values = self.numbers(Quantity(name, UNKNOWN, _LARGEST_ID, optional=True, hint="whole numbers from 0"))
         absent = np.isnan(values) | (values == UNKNOWN)
         whole = np.where(absent, float(UNKNOWN), values)
@@ -96,6 +103,18 @@ class Table:
             problem = "is empty" if absent[row] else f"{values[row]:g} is not a whole number"
             raise self.error(problem, row=row, field=name, hint="an id is a whole number from 0")
         return whole.astype(np.int64)
+
+    def _named_ids(self, name: str, optional: bool, names: dict[int, str]) -> IntArray:
+        """Ids of a column in which some may be texts."""
+        cells = self.labels(name)
+        texts = {cell for cell in set(cells) if cell and not _is_number(cell)}
+        for text in sorted(texts):
+            if names.setdefault(landmark_id_of(text), text) != text:
+                other = names[landmark_id_of(text)]
+                problem = f"{quote(text)} and {quote(other)} have the same hash"
+                raise self.error(problem, row=cells.index(text), field=name, hint="call one of them otherwise")
+        plain = [str(landmark_id_of(cell)) if cell in texts else cell for cell in cells]
+        return Table(self.path, {name: plain}, self.line, self.header_line).ids(name, optional=optional)
 
     def labels(self, name: str) -> list[str]:
         """A column of names, '' where empty. Whole numbers stand for themselves as text."""
@@ -107,7 +126,15 @@ class Table:
             return [cell.strip() for cell in cells]
         return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
 
+    def clock(self, name: str = STAMP_S.name) -> Clock | None:
+        """What the stamps of a column count, where they are dates (ISO 8601): with a zone, or without; else None."""
+        cells = self.columns.get(name, ())
+        first = "" if isinstance(cells, np.ndarray) else next((cell for cell in cells if cell.strip()), "")
+        return None if not first or _is_number(first) else clock_of_date(first)
+
     def _parse(self, quantity: Quantity, cells: Sequence[str]) -> FloatArray:
+        if quantity.dates and self.clock(quantity.name) is not None:
+            return self._parse_dates(quantity, cells)
         if not any("_" in cell for cell in cells):
             try:
                 if quantity.optional:
@@ -124,6 +151,23 @@ class Table:
                 problem = f"{quote(cell)} is not a number" if cell.strip() else "is empty"
                 raise self.error(problem, row=row, field=quantity.name) from None
         raise AssertionError("one of the cells failed to parse a moment ago")
+
+    def _parse_dates(self, quantity: Quantity, cells: Sequence[str]) -> FloatArray:
+        seconds, clock = np.full(len(cells), np.nan), self.clock(quantity.name)
+        for row, cell in enumerate(cells):
+            try:
+                if cell.strip() or not quantity.optional:
+                    seconds[row] = date_s(cell)
+                    other = clock_of_date(cell)
+                else:
+                    continue
+            except (ValueError, OverflowError):
+                hint = "2026-03-01T12:00:00.5, with or without a zone such as +01:00 or Z; or seconds throughout"
+                raise self.error(f"{quote(cell)} is no date", row=row, field=quantity.name, hint=hint) from None
+            if other is not clock:
+                problem = f"{quote(cell)} has {'a' if other is Clock.UNIX else 'no'} zone, unlike the dates above"
+                raise self.error(problem, row=row, field=quantity.name, hint="a zone everywhere, or nowhere")
+        return seconds
 
 
 def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
@@ -273,12 +317,22 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
     try:
         if pa.types.is_string(kind) or pa.types.is_large_string(kind):
             return [cell or "" for cell in column.to_pylist()]
+        if pa.types.is_timestamp(kind):
+            return dates_as_text(column)
         if pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind):
             values = column.cast(pa.float64(), safe=False).to_numpy()
             return np.array(values, dtype=np.float64)
     except (pa.ArrowException, ValueError) as error:
         raise InputError(f"damaged column: {reason(error)}", path=path, field=name) from error
     raise InputError(f"holds {kind}, not numbers", path=path, field=name, hint="cast the column to float64")
+
+
+def dates_as_text(column: Any) -> list[str]:
+    """Timestamps of a Parquet column, with or without a zone, as ISO 8601; '' where null."""
+    import pyarrow as pa
+
+    dates = column.cast(pa.timestamp("us", tz=column.type.tz), safe=False).to_pylist()
+    return ["" if date is None else date.isoformat() for date in dates]
 
 
 def _nearest(name: str, unused: list[str], known: list[str]) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 from evermap.errors import InputError
+from evermap.types import Clock
 
 
 def decode_text(data: bytes, path: Path) -> str:
@@ -34,6 +36,24 @@ def parse_float(cell: str) -> float:
     if "_" in cell:
         raise ValueError(f"could not convert string to float: {cell!r}")
     return float(cell)
+
+
+def date_s(cell: str) -> float:
+    """Seconds since 1970-01-01 of an ISO 8601 date: UTC if it has a zone, else as the clocks on the wall show them.
+
+    Raises:
+        ValueError, OverflowError: it is none.
+    """
+    date = datetime.fromisoformat(cell.strip())
+    return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+
+
+def clock_of_date(cell: str) -> Clock | None:
+    """`unix` for a date with a zone, `local_wall` for one without, None for other text."""
+    try:
+        return Clock.UNIX if datetime.fromisoformat(cell.strip()).tzinfo else Clock.LOCAL_WALL
+    except ValueError:
+        return None
 
 
 def counted(count: int, noun: str) -> str:

@@ -35,7 +35,7 @@ def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None)
         figures: how many features get a figure of their own.
         clock: of the stamps; None guesses.
     """
-    clock = clock or guess_clock(result.table.stamp_s)
+    clock = clock or result.table.clock or guess_clock(result.table.stamp_s)
     yield _overview(result, clock)
     if result.scores is not None and result.reliability is not None:
         yield _calibration(result)

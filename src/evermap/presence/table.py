@@ -11,7 +11,7 @@ from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
 from evermap.io.text import counted, quote
 from evermap.recurrence.protocol import Looks
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import STAMP_S, Quantity
 
 _REQUIRED = ("stamp_s", "feature_id", "detected")
@@ -38,6 +38,7 @@ class LookTable:
         source: file it came from, '' if none.
         line: (R,) line of each row in that file.
         warnings: remarks of the reader.
+        clock: what stamps count, where they were dates; None where the table does not say.
 
     Raises:
         InputError: columns of different lengths, a value that the reader would refuse, or error rates under which a
@@ -56,6 +57,7 @@ class LookTable:
     source: str
     line: IntArray
     warnings: tuple[str, ...] = ()
+    clock: Clock | None = None
 
     def __post_init__(self) -> None:
         if self.class_of_feature.shape != (self.n_features,):
@@ -207,6 +209,7 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         source=str(path),
         line=table.line,
         warnings=tuple(warnings),
+        clock=table.clock(),
     )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,6 +50,7 @@ class Prepared:
         landmark_id: (L,) ids behind the problem's landmark rows.
         prior_map: the map to localise in, in those rows.
         warnings: what was left out, counted.
+        names: texts behind landmark ids.
     """
 
     problem: Problem
@@ -58,6 +60,7 @@ class Prepared:
     landmark_id: IntArray
     prior_map: PriorMap | None
     warnings: tuple[str, ...]
+    names: Mapping[int, str] = field(default_factory=dict)
 
     def given_map(self) -> GivenMap | None:
         """The prior map as the joint search compares with it: landmark by landmark, with covariances."""
@@ -114,7 +117,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
         landmark_information=np.zeros((2 * len(landmark_id), 2 * len(landmark_id))),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings))
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
 
 
 def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Trajectory:
@@ -196,6 +199,7 @@ def _records(
         class_names=recording.class_names,
         frame=frame,
         clock=recording.clock,
+        names=recording.landmark_names,
     )
 
 
@@ -208,7 +212,7 @@ def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) 
             stamp_from_s=change.stamp_from_s + prepared.start_s,
             stamp_to_s=change.stamp_to_s + prepared.start_s,
             displacement_m=(change.displacement_m[0] * outcome.scale, change.displacement_m[1] * outcome.scale),
-        )
+        ).named(prepared.names)
         for change in moved
     )
 

@@ -66,7 +66,7 @@ def probability(value: float) -> str:
 
 
 def _group(change: MapChange) -> str:
-    ids = [str(identity) for identity in change.landmark_ids]
+    ids = list(change.labels)
     shown = ", ".join(ids[:_MAX_IDS]) + (f" and {len(ids) - _MAX_IDS} more" if len(ids) > _MAX_IDS else "")
     return f"landmark{'s' if len(ids) != 1 else ''} {shown}"
 

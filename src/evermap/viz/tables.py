@@ -71,7 +71,7 @@ def change_table(result: SlamResult) -> str:
         return ""
     rows = [
         (
-            ", ".join(map(str, change.landmark_ids)),
+            ", ".join(change.labels),
             change.kind.value,
             _stamp(change.stamp_from_s),
             _stamp(change.stamp_to_s),
@@ -104,7 +104,7 @@ def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
         nees = nees_of.get(name, math.nan)
         rows.append(
             (
-                str(name),
+                escape(landmarks.names.get(name, str(name))),
                 escape(landmarks.class_names[kind]) if UNKNOWN < kind < len(landmarks.class_names) else "–",
                 f"{landmarks.n_hits[i]:,}",
                 f"{landmarks.n_misses[i]:,}",
