@@ -410,7 +410,10 @@ def _likeliest(pairs: _Pairs, undone: Mistake, told: set[str]) -> Mistake | None
             for loss, mistake in scored
             if mistake in _UNITS and abs(log(mistake.lengths / best.lengths)) < 0.3 and loss < least + 0.1 * gain
         ]
-        best = named[0] if named else best
+        if named:
+            return named[0]
+        near = [_longer(best.lengths * 10.0 ** (0.01 * step)) for step in range(-10, 11)]
+        return min(near, key=lambda mistake: _loss(pairs.residual(mistake.after(undone))))
     return best
 
 
