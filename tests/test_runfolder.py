@@ -261,6 +261,7 @@ def test_changes_and_alternatives_are_kept_in_every_form(run, tmp_path):
         "probability": 0.97,
         "hits": 0,
         "misses": 0,
+        "names": None,
     }
     assert (second["kind"], second["stamp_from_s"], second["rotation_rad"]) == ("rotated", 150.0, 0.35)
     lines = (tmp_path / "run" / "changes.jsonl").read_text().splitlines()
