@@ -18,6 +18,7 @@ from evermap.experiments.rosen2016_reference import Reference, compare, key_of, 
 from evermap.experiments.rosen2016_scores import Estimate, Stretches, empirical, filtered, l1_error, removal
 from evermap.experiments.rosen2016_table import verdict
 from evermap.persistence.one import PersistenceFilter
+from evermap.runfolder import MANIFEST
 from evermap.sim.revisits import RevisitConfig, Revisits, simulate_revisits
 from evermap.survival import GeneralPurpose, LifetimePrior, Uniform, never_leaves
 
@@ -219,7 +220,7 @@ def test_command_works_without_reference_and_says_so(tmp_path: Path, monkeypatch
     assert table == json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert (table["settings"]["seed"], table["settings"]["sequences"], table["verdict"]) == (7, 3, None)
     figures = ["fig1-belief", "fig2-priors", "fig3-error", "fig4-removal"]
-    names = {f"{name}.{kind}" for name in figures for kind in ("png", "svg")} | {"table.md", "summary.json"}
+    names = {f"{name}.{kind}" for name in figures for kind in ("png", "svg")} | {"table.md", "summary.json", MANIFEST}
     assert set(table["outputs"]) == names == {path.name for path in (tmp_path / "out").iterdir()}
     assert "Compared with nothing" in (tmp_path / "out" / "table.md").read_text(encoding="utf-8")
 
