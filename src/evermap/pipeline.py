@@ -178,18 +178,20 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
     _, living = lifelong.admitted(visit.recording, living)
     with threadpool_limits(limits=1, user_api="blas"):
         # over the map as it is believed to be by now, and solved again with the map as its prior
-        expected = believe.predicted(living, config.living, visit.start_s)
+        aged = believe.aged(living, config.living, visit.start_s)
+        expected = aged.p_here
         where = lifelong.laid(living, expected, visit, config.living)
         if where is None and len(living.places):
             return _lost(visit, slam, alone.prior, alone.step_s, living, interrupted=alone.interrupted)
         if where is not None:
             living, visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
+        living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
         # what was found goes into the map, then hits and misses into beliefs, and those into decisions
         entry = lifelong.entered(living, expected, where, visit, config.living)
-        looks = lifelong.looks(entry, visit)
+        looks, eye = lifelong.looks(entry, visit, config.living)
         now = lifelong.believed(entry, looks, visit, config.living)
-        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living)
-        after = lifelong.learned(after, now, looks, config.living)
+        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living, eye)
+        after = lifelong.learned(after, looks, replace(entry, living=now.living), eye, config.living)
         frame = "first_pose" if where is None else "prior_map"
         names = visit.recording.landmark_names
         landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)

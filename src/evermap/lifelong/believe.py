@@ -11,10 +11,10 @@ from evermap.config import LivingConfig
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
-from evermap.sensing.sightlines import Lines, SightLines, nominal_lines
+from evermap.sensing.sightlines import Lines, nominal_lines
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.named import never_leaves
-from evermap.types import BoolArray, FloatArray, IntArray, Sensor
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
 WORTH_A_LOOK = 0.3
 """Share of the sensor's detection probability from which on a place counts as looked at."""
@@ -41,20 +41,23 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class Looks:
-    """Places that were looked at: rows by clique, then by time.
+    """Places in the nominal field of view: rows by clique, then by time.
 
     Attributes:
-        rows: as the chain wants them.
+        rows: as the chain wants them; `rows.key` are rows of `lines`.
         place: (N,) row of the map's places.
-        key: (N,) line of sight.
-        sight_key: (K,) different lines; `rows.key` are rows of these.
-        p_nominal: (K,) mean nominal probability of a detection along each.
+        cell: (N,) cell of the sensor, see `SightLines.cells`.
+        lines: (K,) what is known of the different lines of sight.
+        counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
+        settled: (N,) whether the place was seen shortly before or after.
     """
 
     rows: SiteLooks
     place: IntArray
-    sight_key: IntArray
-    p_nominal: FloatArray
+    cell: IntArray
+    lines: Lines
+    counts: BoolArray
+    settled: BoolArray
 
 
 def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
@@ -96,17 +99,35 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
 
 def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
     """(S,) probability of every site to be where its clique stands, at a later instant."""
+    return aged(living, config, until_s).p_here
+
+
+def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
+    """The sites of a map as they are believed in at a later instant, at which nobody has looked again."""
     if not config.existence or len(living.sites) == 0:
-        return living.sites.p_here
+        return living.sites
     none = np.zeros(0, dtype=np.int64)
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
-    return _followed(
-        living, living.sites.p_here, nothing, nominal_lines(np.zeros(0)), config, living.stamp_s, until_s, 0.01
-    ).p_here
+    lines = nominal_lines(np.zeros(0))
+    after = _followed(living, living.sites.p_here, nothing, lines, config, living.stamp_s, until_s, 0.01)
+    return with_beliefs(living.sites, living.sites.p_here, after)
 
 
-def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, sightlines: SightLines) -> Looks:
-    """Which places of a map were looked at, frame by frame, and which of them were seen."""
+def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
+    """Sites (S,) with what is believed after a while, and how much of it is the stay that was seen last."""
+    never_left = np.divide(sites.p_kept, p_start, out=np.zeros(len(sites)), where=p_start > 0.0)
+    return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
+
+
+def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, *, learn_sight: bool) -> Looks:
+    """Which places of a map were looked at, frame by frame, and which of them were seen.
+
+    Args:
+        living: the map, with the sites that the session found.
+        sighting: what the session saw of it.
+        sensor: its nominal field of view.
+        learn_sight: False takes that for the truth, whatever is in the way.
+    """
     places = living.places
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
     in_view: list[IntArray] = []
@@ -129,15 +150,26 @@ def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, sightlines:
     order = np.lexsort((place, site, frame, clique_rows(living.sites)[1][site]))
     place, frame, signed, site = place[order], frame[order], signed[order], site[order]
     clique = clique_rows(living.sites)[1][site]
-    eye = se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor))[:, :2]
-    key = sightlines.rows(eye[frame], places.position_m[place])
-    sight_key, number = np.unique(key, return_inverse=True)
-    number = number.ravel().astype(np.int64)
-    p_nominal = np.bincount(number, np.abs(signed), minlength=len(sight_key)) / np.maximum(
-        np.bincount(number, minlength=len(sight_key)), 1
+    cell = living.sightlines.cells(sensor_poses(sighting, sensor)[frame, :2], places.position_m[place])
+    line, key = np.unique(np.column_stack([place, cell]), axis=0, return_inverse=True)
+    key = key.ravel().astype(np.int64)
+    p_nominal = np.bincount(key, np.abs(signed), minlength=len(line)) / np.maximum(
+        np.bincount(key, minlength=len(line)), 1
     )
-    rows = SiteLooks(sighting.stamp_s[frame], clique, site, number, signed > 0.0)
-    return Looks(rows, place, sight_key, p_nominal)
+    rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, signed > 0.0)
+    settled = surely_there(rows)
+    if not learn_sight:
+        everything = np.ones(len(rows), dtype=np.bool_)
+        return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled)
+    names = places.site_id, places.landmark_id
+    now = living.sightlines.learned(names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum())))
+    lines, clear = now.lines(names, line[:, 0], line[:, 1], p_nominal)
+    return Looks(rows, place, cell, lines, rows.hit | clear[key], settled)
+
+
+def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
+    """(F, 3) poses of the sensor in the map."""
+    return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
 
 
 def believed(
@@ -160,12 +192,8 @@ def believed(
         start_s: beginning of the session.
         until_s: its end.
     """
-    lines = nominal_lines(looks.p_nominal)
-    if config.learn_sight:
-        stood = surely_there(looks.rows)
-        key, hit = looks.sight_key[looks.rows.key[stood]], looks.rows.hit[stood]
-        lines = living.sightlines.learned(key, hit, np.ones(len(hit))).lines(looks.sight_key, looks.p_nominal)
-    return _followed(living, p_start, looks.rows, lines, config, start_s, until_s, p_false_of(sensor, living))
+    p_false = p_false_of(sensor, living)
+    return _followed(living, p_start, rows_of(looks.rows, looks.counts), looks.lines, config, start_s, until_s, p_false)
 
 
 def surely_there(rows: SiteLooks) -> BoolArray:

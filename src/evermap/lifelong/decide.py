@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.lifelong.arrive import Arrivals
 from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
 from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap, Stays
@@ -16,8 +17,8 @@ EXISTS = 0.5
 """A clique is said to stand at a site that is more probable than this, and to be away where that is more probable."""
 SAME_PLACE_M = 0.3
 """Cliques that stand this close to where another stood have taken its place."""
-NEAR_M = 3.0
-"""Who looks at something sees what else stands this close to it."""
+LEAST_EVIDENCE = 1.5
+"""What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
 SURELY_AWAY = 0.02
 FORGOTTEN_P = 0.05
 """Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
@@ -48,57 +49,163 @@ def standing(living: LivingMap) -> Standing:
     return Standing(cliques, site)
 
 
-def with_stays(before: LivingMap, after: LivingMap, looks: Looks, start_s: float) -> LivingMap:
-    """The map with its stays up to date: sightings prolong them, misses and moves end them, new sites begin them.
+def decided(
+    before: LivingMap, after: LivingMap, looks: Looks, log_evidence: FloatArray, arrivals: Arrivals, start_s: float
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """The map with its stays up to date, and what changed since it was told last, by clique.
+
+    A stay goes on until looks end it: age alone lowers a belief, and is never told as a change. A clique that was away
+    and is seen again has returned only if it had really left.
 
     Args:
         before: the map as the session found it.
         after: with the session's beliefs, and sites with their sightings.
         looks: of the session, at places of `after`.
+        log_evidence: (C,) what they say for 'it stands somewhere' against 'it is away', by clique.
+        arrivals: what earlier looks said of the places of new sites.
         start_s: beginning of the session.
     """
-    now = standing(after)
-    middle = site_middles(after)
-    open_row = {
-        int(name): k for k, (name, gone) in enumerate(zip(after.stays.clique_id, after.stays.gone_s, strict=True))
-        if gone == np.inf
-    }  # fmt: skip
-    last, gone = after.stays.last_s.copy(), after.stays.gone_s.copy()
+    hits, misses = _counted(looks, len(after.sites))
+    middle, sites = site_middles(after), after.sites
+    cliques, row_of = clique_rows(sites)
+    told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
+    last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
+    p_kept = sites.p_kept.copy()
     begun: list[tuple[int, int, float, float, float]] = []
-    for clique, site in zip(now.clique_id.tolist(), now.site.tolist(), strict=True):
-        row = open_row.get(clique)
-        staying = row is not None and site >= 0 and after.stays.site_id[row] == after.sites.site_id[site]
-        if row is not None and staying:
-            last[row] = max(last[row], after.sites.seen_s[site])
+    found: list[MapChange] = []
+    for c, clique in enumerate(cliques.tolist()):
+        mine = np.flatnonzero(row_of == c)
+        site = int(mine[np.argmax(sites.p_here[mine])])
+        stands, here = sites.p_here[site] >= EXISTS, int(hits[site]) > 0
+        p_away = min(max(1.0 - float(sites.p_here[mine].sum()), 0.0), 1.0)
+        old, stay = told.get(clique, (-1, -1))
+        newest = stay if stay >= 0 else _newest_stay(after, clique)
+        if old >= 0:
+            if stands and site == old:
+                if stay >= 0:
+                    last[stay] = max(last[stay], sites.seen_s[site])
+                else:  # a body that was taken apart: its part goes on
+                    begun.append((clique, site, -np.inf, float(sites.since_s[site]), float(sites.seen_s[site])))
+                if here:
+                    p_kept[site] = sites.p_here[site]
+                continue
+            looked_away = not stands and misses[old] > 0 and log_evidence[c] <= -LEAST_EVIDENCE and p_away >= EXISTS
+            if not (stands and here) and not looked_away:
+                continue
+            left_s = float(sites.seen_s[old])
+            if stay >= 0:
+                left_s = last[stay] = max(last[stay], left_s)
+                gone[stay], p_gone[stay] = _first_miss(looks, old, left_s, start_s), 1.0
+            if looked_away:
+                p_gone[stay if stay >= 0 else slice(0, 0)] = p_away
+                to_s = _first_miss(looks, old, left_s, start_s)
+                found.append(_change(after, ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(misses[old])))
+                continue
+            since = max(float(sites.since_s[site]), np.nextafter(left_s, np.inf))
+            begun.append((clique, site, left_s, since, max(float(sites.seen_s[site]), since)))
+            p_kept[site] = sites.p_here[site]
+            p_moved = float(sites.p_here[site])
+            n_hits, n_misses = int(hits[site]), int(misses[old])
+            found.append(_change(after, ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses))
             continue
-        elsewhere_s = _looked_before(before, middle[site]) if site >= 0 else -np.inf
-        if row is not None:
-            at = _row(after, int(after.stays.site_id[row]))
-            if at >= 0:  # who left during the session may have been seen in it
-                last[row] = max(last[row], after.sites.seen_s[at])
-            gone[row] = _first_miss(looks, at, float(last[row]), start_s)
-            elsewhere_s = float(last[row])
-        if site >= 0:
-            since = max(float(after.sites.since_s[site]), np.nextafter(elsewhere_s, np.inf))
-            begun.append((clique, site, elsewhere_s, since, max(float(after.sites.seen_s[site]), since)))
-    stays = replace(after.stays, last_s=last, gone_s=gone)
+        if not (stands and here):
+            if newest >= 0 and np.isfinite(gone[newest]):
+                at = _row(after, int(after.stays.site_id[newest]))
+                p_gone[newest] = min(max(1.0 - p_kept[at], 0.0), 1.0) if at >= 0 else p_gone[newest]
+            continue
+        seen_s = float(sites.seen_s[site])
+        share = min(p_kept[site] / sites.p_here[site], 1.0)
+        p_kept[site] = sites.p_here[site]
+        same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
+        if same and share >= 1.0 - EXISTS:  # it had never left
+            last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
+            continue
+        elsewhere_s, probability = -np.inf, 1.0 - share if same else 1.0
+        kind, left = ChangeKind.RETURNED, _last_site(before, after, clique)
+        if newest >= 0:
+            elsewhere_s = float(gone[newest])
+            p_gone[newest] = max(p_gone[newest], probability)
+        elif site in arrival:
+            k = arrival[site]
+            kind, elsewhere_s, probability = ChangeKind.APPEARED, arrivals.looked_s[k], arrivals.p_appeared[k]
+            if probability < EXISTS:
+                elsewhere_s = -np.inf
+        else:
+            probability = 0.0
+        since = max(float(sites.since_s[site]), np.nextafter(elsewhere_s, np.inf))
+        begun.append((clique, site, elsewhere_s, since, max(seen_s, since)))
+        if probability >= EXISTS and len(before.places):
+            p = probability * float(sites.p_here[site])
+            n_misses = int(misses[left]) if left >= 0 else 0
+            found.append(_change(after, kind, left, site, elsewhere_s, since, p, int(hits[site]), n_misses))
+    stays = replace(after.stays, last_s=last, gone_s=gone, p_gone=p_gone)
     if begun:
         clique_id, rows, elsewhere, first, until = (np.array(column) for column in zip(*begun, strict=True))
-        kind = class_of(after, clique_id)
-        stays = stays.joined(
-            Stays(
-                clique_id,
-                after.sites.site_id[rows],
-                kind,
-                middle[rows],
-                elsewhere,
-                first,
-                until,
-                np.full(len(rows), np.inf),
-            )
+        fresh = Stays(
+            clique_id,
+            sites.site_id[rows],
+            class_of(after, clique_id),
+            middle[rows],
+            elsewhere,
+            first,
+            until,
+            np.full(len(rows), np.inf),
+            np.zeros(len(rows)),
         )
+        stays = stays.joined(fresh)
         stays = stays[np.argsort(stays.first_s, kind="stable")]
-    return replace(after, stays=stays)
+    after = replace(after, stays=stays, sites=replace(sites, p_kept=p_kept))
+    return after, _swaps(found, before, after)
+
+
+def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
+    """For every clique that is said to stand somewhere the row of its site, and of its stay (-1 for none)."""
+    told: dict[int, tuple[int, int]] = {}
+    stays = after.stays
+    for row in np.flatnonzero(stays.gone_s == np.inf).tolist():
+        site = _row(after, int(stays.site_id[row]))
+        if site >= 0:
+            told[int(stays.clique_id[row])] = (site, row)
+    known = set(stays.clique_id.tolist())
+    then = standing(before)
+    for clique, at in zip(then.clique_id.tolist(), then.site.tolist(), strict=True):
+        if clique not in known and at >= 0:  # part of a body that stood there
+            site = _row(after, int(before.sites.site_id[at]))
+            if site >= 0:
+                told[clique] = (site, -1)
+    return told
+
+
+def _newest_stay(living: LivingMap, clique: int) -> int:
+    """Row of the last stay of a clique, -1 for none."""
+    mine = np.flatnonzero(living.stays.clique_id == clique)
+    return int(mine[-1]) if len(mine) else -1
+
+
+def _change(
+    living: LivingMap,
+    kind: ChangeKind,
+    left: int,
+    site: int,
+    from_s: float,
+    to_s: float,
+    probability: float,
+    n_hits: int,
+    n_misses: int,
+) -> MapChange:
+    """A change of the clique that left one site (row, -1 for none), and stands at another."""
+    step, turn = _motion(living, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
+    return MapChange(
+        landmark_ids=_members_at(living, site if site >= 0 else left),
+        kind=kind,
+        stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
+        stamp_to_s=to_s,
+        displacement_m=(float(step[0]), float(step[1])),
+        rotation_rad=turn,
+        probability=min(max(probability, 0.0), 1.0),
+        n_hits=n_hits,
+        n_misses=n_misses,
+    )
 
 
 def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
@@ -152,50 +259,6 @@ def _gone_for_good(living: LivingMap) -> IntArray:
     most = MOST_AWAY + len(cliques) - len(away)
     too_many = waiting[np.argsort(seen[waiting], kind="stable")][: max(len(waiting) - most, 0)]
     return np.asarray(cliques[np.concatenate([hopeless, too_many])])
-
-
-def changes_between(before: LivingMap, after: LivingMap, looks: Looks) -> tuple[MapChange, ...]:
-    """What is different after a session, by clique.
-
-    Args:
-        before: the map as the session found it.
-        after: the map that it leaves, stays up to date.
-        looks: of the session, at places of `after`.
-    """
-    then, now = standing(before), standing(after)
-    hits, misses = _counted(looks, len(after.sites))
-    found: list[MapChange] = []
-    for clique, site in zip(now.clique_id.tolist(), now.site.tolist(), strict=True):
-        earlier = then.of(clique)
-        old = -1 if earlier < 0 else _row(after, int(before.sites.site_id[earlier]))
-        if old == site:
-            continue
-        known = bool(np.any(before.sites.clique_id == clique))
-        left = old if old >= 0 else _last_site(before, after, clique)
-        kind = ChangeKind.VANISHED if site < 0 else ChangeKind.MOVED if old >= 0 else (
-            ChangeKind.RETURNED if known else ChangeKind.APPEARED
-        )  # fmt: skip
-        p_here = after.sites.p_here
-        mine = after.sites.clique_id == clique
-        probability = 1.0 - float(p_here[mine].sum()) if site < 0 else float(p_here[site])
-        step, turn = _motion(after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
-        from_s, to_s = _when(after, clique, site)
-        if kind is ChangeKind.APPEARED and np.isnan(from_s):
-            continue  # nobody had ever looked there: the map grew, the world did not change
-        found.append(
-            MapChange(
-                landmark_ids=_members_at(after, site if site >= 0 else left),
-                kind=kind,
-                stamp_from_s=from_s,
-                stamp_to_s=to_s,
-                displacement_m=(float(step[0]), float(step[1])),
-                rotation_rad=turn,
-                probability=min(max(probability, 0.0), 1.0),
-                n_hits=int(hits[site]) if site >= 0 else 0,
-                n_misses=int(misses[left]) if left >= 0 else 0,
-            )
-        )
-    return _swaps(found, before, after)
 
 
 def _swaps(found: list[MapChange], before: LivingMap, after: LivingMap) -> tuple[MapChange, ...]:
@@ -257,40 +320,16 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     return shift, float(rigid(was, now)[2])
 
 
-def _when(living: LivingMap, clique: int, site: int) -> tuple[float, float]:
-    """Between which two looks it happened: from the stays that ended or began."""
-    mine = np.flatnonzero(living.stays.clique_id == clique)
-    newest = mine[-1] if len(mine) else -1
-    if newest < 0:
-        return float("nan"), living.stamp_s
-    if site < 0:
-        return float(living.stays.last_s[newest]), float(living.stays.gone_s[newest])
-    since = float(living.stays.elsewhere_s[newest])
-    return (since if np.isfinite(since) else float("nan")), float(living.stays.first_s[newest])
-
-
-def _looked_before(before: LivingMap, middle: FloatArray) -> float:
-    """The last look at a spot before this session: something near it was seen, or missed; -inf where there was none."""
-
-    def near(at: FloatArray) -> BoolArray:
-        return np.asarray(np.all(np.abs(at - middle) < NEAR_M, axis=1))
-
-    seen = before.places.site_id[near(before.places.position_m)]
-    seen_s = before.sites.seen_s[np.isin(before.sites.site_id, seen)]
-    missed_s = before.stays.gone_s[near(before.stays.position_m) & np.isfinite(before.stays.gone_s)]
-    return float(np.concatenate([seen_s, missed_s]).max(initial=-np.inf))
-
-
 def _first_miss(looks: Looks, site: int, last_s: float, start_s: float) -> float:
     """The first look of a session at which a clique was missed at its site after its last sighting there."""
-    rows = (looks.rows.site == site) & ~looks.rows.hit & (looks.rows.stamp_s > last_s)
+    rows = (looks.rows.site == site) & ~looks.rows.hit & looks.counts & (looks.rows.stamp_s > last_s)
     return float(looks.rows.stamp_s[rows].min()) if rows.any() else max(start_s, float(np.nextafter(last_s, np.inf)))
 
 
 def _counted(looks: Looks, count: int) -> tuple[IntArray, IntArray]:
     hit: BoolArray = looks.rows.hit
     hits = np.bincount(looks.rows.site[hit], minlength=count)
-    return hits, np.bincount(looks.rows.site[~hit], minlength=count)
+    return hits, np.bincount(looks.rows.site[~hit & looks.counts], minlength=count)
 
 
 def _row(living: LivingMap, site_id: int) -> int:

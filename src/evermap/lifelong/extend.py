@@ -269,5 +269,5 @@ def _with_sites(
         old = np.flatnonzero(living.sites.clique_id == name)
         p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else NEW_CLIQUE_P
         p_start[old] *= 1.0 - p_new[k]
-    sites = living.sites.joined(Sites(new_ids, fresh, p_new, first, last))
+    sites = living.sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))
     return sites, np.append(p_start, p_new), np.arange(len(sites)) >= len(living.sites)

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.errors import DataError
-from evermap.lifelong import believe, decide
+from evermap.lifelong import arrive, believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import anchored, drifted, of_places, resized
@@ -54,12 +54,13 @@ class Believed:
 
     Attributes:
         living: all but stays and what is learned.
-        weight: (N,) probability of every look that its clique stood there.
+        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', by
+            clique, in the order of `believe.clique_rows`.
         evidence: of every clique and frame.
     """
 
     living: LivingMap
-    weight: FloatArray
+    log_evidence: FloatArray
     evidence: Evidence
 
 
@@ -174,8 +175,8 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Vi
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
-def looks(entry: Extended, visit: Visit) -> Looks:
-    """Which places of the map were looked at in the session, and which of them were seen."""
+def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, FloatArray]:
+    """Which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor poses."""
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = of_slam.trajectory(prepared, outcome, recording, "")
     stamps = recording.frames.stamp_s
@@ -188,56 +189,71 @@ def looks(entry: Extended, visit: Visit) -> Looks:
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-    return believe.looked_at(entry.living, sighting, recording.sensor, entry.living.sightlines)
+    seen = believe.looked_at(entry.living, sighting, recording.sensor, learn_sight=config.learn_sight)
+    return seen, believe.sensor_poses(sighting, recording.sensor)
 
 
 def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -> Believed:
     """The map with the beliefs and the counts of the session."""
     living, rows = entry.living, seen.rows
-    hit = rows.hit
+    hit, missed = rows.hit, seen.counts & ~rows.hit
     places = replace(
         living.places,
         n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
-        n_misses=living.places.n_misses + np.bincount(seen.place[~hit], minlength=len(living.places)),
+        n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
     )
     count = len(living.sites)
     first, last = np.full(count, np.inf), np.full(count, -np.inf)
     np.minimum.at(first, rows.site[hit], rows.stamp_s[hit])
     np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
+    sites = living.sites
     if config.existence:
         beliefs = believe.believed(
             living, entry.p_start, seen, visit.recording.sensor, config, visit.start_s, visit.end_s
         )
-        p_here, weight, evidence = beliefs.p_here, beliefs.weight, believe.evidence(living, beliefs)
+        sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), beliefs.log_evidence
+        evidence = believe.evidence(living, beliefs)
     else:
-        p_here, weight, evidence = _as_seen(living, rows.site[hit], last), np.ones(len(hit)), Evidence.empty()
+        sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
+        log_evidence, evidence = np.zeros(len(np.unique(sites.clique_id))), Evidence.empty()
     stood = (entry.p_start >= decide.EXISTS) & ~entry.is_new
-    arrived = np.isfinite(first) & ~stood & (p_here >= decide.EXISTS)
+    arrived = np.isfinite(first) & ~stood & (sites.p_here >= decide.EXISTS)
     sites = replace(
-        living.sites,
-        p_here=p_here,
+        sites,
         since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
         seen_s=np.maximum(living.sites.seen_s, last),
     )
-    return Believed(replace(living, stamp_s=visit.end_s, places=places, sites=sites), weight, evidence)
+    return Believed(replace(living, stamp_s=visit.end_s, places=places, sites=sites), log_evidence, evidence)
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig
+    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig, eye: FloatArray
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """The map with its stays up to date and without what is forgotten, and what changed since the session before."""
-    after = decide.with_stays(before, now.living, seen, visit.start_s)
-    changes = decide.changes_between(before, after, seen) if len(before.places) else ()
+    """The map with its stays up to date and without what is forgotten, and what changed since the session before.
+
+    Args:
+        before: the map as the session found it.
+        now: with the session's beliefs.
+        seen: looks of the session.
+        visit: the session.
+        config: which parts of the engine are on.
+        eye: (F, 3) sensor poses.
+    """
+    arrivals = arrive.arrivals(before, now.living, seen, eye, visit.recording.sensor)
+    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s)
     if config.cliques and config.existence and config.misses:
         after = without_missed(before, after)
     return decide.without_forgotten(after, config.most_sites), changes
 
 
-def learned(after: LivingMap, now: Believed, seen: Looks, config: LivingConfig) -> LivingMap:
-    """The map with what the session taught of lifetimes, and of from where to where the sensor sees."""
+def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, config: LivingConfig) -> LivingMap:
+    """The map with what the session taught of lifetimes, and of from where places are seen."""
     if config.learn_sight and config.existence:
-        lines = after.sightlines.learned(seen.sight_key[seen.rows.key], seen.rows.hit, now.weight)
-        after = replace(after, sightlines=lines)
+        names = entry.living.places.site_id, entry.living.places.landmark_id
+        p_there = entry.living.sites.p_here[seen.rows.site]
+        weight = np.where(seen.settled, 1.0, p_there)
+        lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight)
+        after = replace(after, sightlines=lines, views=after.views.seen_from(eye, after.stamp_s))
     if config.learn_lifetimes:
         after = replace(after, lives=learned_lives(after.stays, after.lives, after.stamp_s))
     return after

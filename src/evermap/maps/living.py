@@ -20,7 +20,7 @@ import numpy as np
 
 from evermap import se2
 from evermap.maps.lives import Lives
-from evermap.sensing.sightlines import SightLines
+from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
 
 
@@ -74,6 +74,7 @@ class Sites(_Rows):
         site_id: unique, never used again.
         clique_id: whose.
         p_here: probability that the clique stands there at `LivingMap.stamp_s`; the rest to 1 of a clique is 'away'.
+        p_kept: part of it: that it has stood there ever since it was seen there last.
         since_s: first sighting of the newest stay there.
         seen_s: last sighting there.
     """
@@ -81,6 +82,7 @@ class Sites(_Rows):
     site_id: IntArray
     clique_id: IntArray
     p_here: FloatArray
+    p_kept: FloatArray
     since_s: FloatArray
     seen_s: FloatArray
 
@@ -90,7 +92,7 @@ class Sites(_Rows):
     @classmethod
     def empty(cls) -> Sites:
         """No site."""
-        return cls(*np.zeros((2, 0), dtype=np.int64), *np.zeros((3, 0)))
+        return cls(*np.zeros((2, 0), dtype=np.int64), *np.zeros((4, 0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +130,8 @@ class Stays(_Rows):
         position_m: (K, 2) middle of the clique there.
         elsewhere_s: last look before `first_s` at which it was not there; -inf where its place was never looked at.
         first_s, last_s: first and last sighting.
-        gone_s: first look after `last_s` at which it was not there; inf while it is believed to stand there.
+        gone_s: first look after `last_s` at which it was not there; inf while it is said to stand there.
+        p_gone: (K,) probability that it ended then; 0 while it goes on.
     """
 
     clique_id: IntArray
@@ -139,6 +142,7 @@ class Stays(_Rows):
     first_s: FloatArray
     last_s: FloatArray
     gone_s: FloatArray
+    p_gone: FloatArray
 
     def __len__(self) -> int:
         return len(self.clique_id)
@@ -147,7 +151,7 @@ class Stays(_Rows):
     def empty(cls) -> Stays:
         """No stay."""
         names, stamp_s = np.zeros(0, dtype=np.int64), np.zeros(0)
-        return cls(names, names, names, np.zeros((0, 2)), stamp_s, stamp_s, stamp_s, stamp_s)
+        return cls(names, names, names, np.zeros((0, 2)), stamp_s, stamp_s, stamp_s, stamp_s, stamp_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +195,8 @@ class LivingMap:
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         lives: how long things of a class stay, stay away, and where they turn up again.
-        sightlines: from where to where the sensor sees.
+        sightlines: from where each place can be seen.
+        views: from where the robot looked, and when.
         class_names: names of the classes.
         clock: of all stamps.
         n_cliques_ever, n_sites_ever: next free ids.
@@ -206,6 +211,7 @@ class LivingMap:
     log_size_variance: float = 0.0
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
+    views: Views = field(default_factory=Views.empty)
     class_names: tuple[str, ...] = ()
     clock: Clock = Clock.RECORDING
     n_cliques_ever: int = 0

@@ -35,17 +35,18 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     new_id[~keeps] = living.n_sites_ever + np.arange(np.count_nonzero(~keeps))
     into = _united(owner, sites.clique_id[site], sites.p_here[site])
 
-    p_here = np.full(len(site), np.inf)
+    p_here, p_kept = np.full((2, len(site)), np.inf)
     np.minimum.at(p_here, into, sites.p_here[site])
+    np.minimum.at(p_kept, into, sites.p_kept[site])
     stands = np.flatnonzero(into == np.arange(len(into)))
     stands = stands[np.argsort(new_id[stands], kind="stable")]
     since = np.full(len(site), -np.inf)
     np.maximum.at(since, into, sites.since_s[site])
     seen = np.full(len(site), -np.inf)
     np.maximum.at(seen, into, sites.seen_s[site])
-    parted = Sites(
-        new_id[stands], owner[stands], _of_sum_one(owner[stands], p_here[stands]), since[stands], seen[stands]
-    )
+    p_here = _of_sum_one(owner[stands], p_here[stands])
+    p_kept = np.minimum(p_kept[stands], p_here)
+    parted = Sites(new_id[stands], owner[stands], p_here, p_kept, since[stands], seen[stands])
     moved = replace(places, site_id=new_id[into[part.ravel()]])
     order = np.lexsort((moved.landmark_id, moved.site_id))
     rank = np.empty(len(order), dtype=np.int64)

@@ -1,10 +1,12 @@
-"""From where to where the sensor sees: detection rates between cells of the floor, learned from hits and misses.
+"""From where each place can be seen: lines of sight, learned from hits and misses.
 
-Nobody gives a map of the walls, but whoever has looked from here to there a few times knows whether one is between.
-A *line of sight* is a pair of cells, the sensor's and the landmark's. It is free or blocked; each kind has a Beta
-distribution of the detection probability, that of the free ones depends on their length. How many are free and how
-often one detects along either kind is learned from all lines together (empirical Bayes), so that something is known of
-a line that nobody has looked along before.
+Nobody gives a map of the walls. A *line of sight* leads from a cell of the floor to one place; cells are counted from
+the place, so that a map whose landmarks move by centimetres keeps its lines. A line is unknown until something was
+seen along it or along its neighbours; then it is clear, with a detection rate of its own (Beta distribution), or it is
+blocked. Misses along lines that are not known to be clear say nothing: nobody has looked at that place.
+
+`Views` remember the cells and headings from which the robot looked, and when: where a landmark turns up that the map
+did not know, they say whether its place had been seen empty.
 """
 
 from __future__ import annotations
@@ -19,30 +21,39 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_LOOKS = 200.0
 """Along one line: with more, old ones fade. So a wall that is moved is learned, and misses by chance are not."""
-STRENGTH = 8.0
-"""Looks along one line that the rate of its kind is worth."""
+STRENGTH = 4.0
+"""Looks along one line that the rate of all clear lines of its length is worth."""
 NOMINAL_LOOKS = 20.0
 """Looks that the nominal rate is worth against those along all lines of a length; one line counts no more than that."""
 BLOCKED = 0.03
-"""Rate along blocked lines to begin with: round corners, through glass, and because places are not quite known."""
+"""Detection rate along blocked lines to begin with: round corners, and because places are not quite known."""
 RATES = (0.002, 0.98)
 """No kind of line has a rate outside: nothing is certain."""
-LONGEST = 40
+NEIGHBOUR = 0.35
+"""What looks along a line say of those from the eight cells around, in looks along these."""
+CLEAR = 0.9
+"""A line is known to be clear from this probability on."""
+P_HIDDEN = 0.03
+"""That a place cannot be seen for a whole session along lines that were clear before: a closed door, a parked truck."""
+LONGEST = 80
 """Cells; lines longer than this are taken together."""
 ROUNDS = 10
 KNOWN = 1e9
 """Looks that are worth certainty."""
-_SENSOR_CELLS = 1 << 20
-_REACH = 1 << 10
+HEADINGS = 24
+"""Headings that views distinguish."""
+_REACH = 1 << 12
+_SPAN = 1 << 24
+_AROUND = tuple((dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1))
 
 
 class Lines(NamedTuple):
     """What is known of N lines of sight.
 
     Attributes:
-        p_free: (N,) probability that they are free.
-        hits, misses: (N,) parameters of the Beta distribution of the detection probability along them if they are.
-        p_blocked: detection probability along them if they are not.
+        p_free: (N,) probability that nothing hides what is at their ends.
+        hits, misses: (N,) parameters of the Beta distribution of the detection probability along them if so.
+        p_blocked: detection probability along them if not.
     """
 
     p_free: FloatArray
@@ -56,132 +67,212 @@ class Lines(NamedTuple):
         return self.p_free * self.hits / (self.hits + self.misses) + (1.0 - self.p_free) * self.p_blocked
 
 
-class _Kinds(NamedTuple):
-    """The two kinds of lines.
-
-    Attributes:
-        p_free: (LONGEST + 1,) share of the free ones, by length.
-        free: (LONGEST + 1,) rate along these.
-        blocked: rate along the others.
-    """
-
-    p_free: FloatArray
-    free: FloatArray
-    blocked: float
-
-
 @dataclass(frozen=True, slots=True)
 class SightLines:
-    """Hits and looks between cells, sorted by key.
+    """Hits and looks along lines of sight: (K,) rows sorted by site, landmark and cell.
 
     Attributes:
-        key: (K,) of a pair of cells: the sensor's and the landmark's.
+        site_id, landmark_id: (K,) the place that was looked at.
+        cell: (K,) the sensor's cell, counted from the place.
         hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
         cell_m: side of a cell.
     """
 
-    key: IntArray
+    site_id: IntArray
+    landmark_id: IntArray
+    cell: IntArray
     hits: FloatArray
     looks: FloatArray
-    cell_m: float = 1.0
+    cell_m: float = 0.5
 
     def __len__(self) -> int:
-        return len(self.key)
+        return len(self.cell)
 
     @classmethod
-    def empty(cls, cell_m: float = 1.0) -> SightLines:
+    def empty(cls, cell_m: float = 0.5) -> SightLines:
         """Nothing learned yet."""
-        return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), cell_m)
+        none = np.zeros(0, dtype=np.int64)
+        return cls(none, none, none, np.zeros(0), np.zeros(0), cell_m)
 
-    def rows(self, sensor_m: FloatArray, landmark_m: FloatArray) -> IntArray:
-        """(N,) keys of the lines of sight from sensors (N, 2) to landmarks (N, 2).
+    def cells(self, sensor_m: FloatArray, place_m: FloatArray) -> IntArray:
+        """(N,) cells of sensors (N, 2), counted from places (N, 2).
 
         Raises:
-            InputError: a place that is not finite, or out of reach: 500,000 cells from the origin, 1,000 from the
-                sensor.
+            InputError: a position that is not finite, or 1,000 m and more from the sensor.
         """
-        sensor, landmark = np.asarray(sensor_m, dtype=np.float64), np.asarray(landmark_m, dtype=np.float64)
-        own = np.floor(sensor / self.cell_m)
-        away = np.floor(landmark / self.cell_m) - own
-        fine = ((np.abs(own) < _SENSOR_CELLS / 2) & (np.abs(away) < _REACH)).all(axis=1)  # False for nan
+        sensor, place = np.asarray(sensor_m, dtype=np.float64), np.asarray(place_m, dtype=np.float64)
+        offset = np.floor((sensor - place) / self.cell_m)
+        fine = (np.abs(offset) < _REACH / 2).all(axis=1)  # False for nan
         if not fine.all():
             row = int(np.argmin(fine))
-            problem = f"row {row}: nobody sees from {sensor[row]} to {landmark[row]}"
-            raise InputError(problem, field="landmark_m", hint="finite metres, both in one frame")
-        x, y = (own.astype(np.int64) + _SENSOR_CELLS // 2).T
-        dx, dy = (away.astype(np.int64) + _REACH).T
-        return np.asarray(((x * _SENSOR_CELLS + y) * (2 * _REACH) + dx) * (2 * _REACH) + dy, dtype=np.int64)
+            problem = f"row {row}: no line of sight from {sensor[row]} to {place[row]}"
+            raise InputError(problem, field="place_m", hint="finite metres, both in one frame")
+        dx, dy = offset.astype(np.int64).T + _REACH // 2
+        return np.asarray(dx * _REACH + dy, dtype=np.int64)
 
-    def lines(self, keys: IntArray, p_detect: FloatArray) -> Lines:
+    def lines(
+        self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray, p_detect: FloatArray
+    ) -> tuple[Lines, BoolArray]:
         """What is known of lines of sight.
 
         Args:
-            keys: (N,) which.
-            p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along free
-                lines that is started from, and by how much it is less at the field's edge.
+            places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
+            place, cell: (N,) lines: row of the place, and cell of the sensor.
+            p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along
+                clear lines that is started from, and by how much it is less at the field's edge.
+
+        Returns:
+            The lines, and (N,) which of them are known to be clear.
         """
         nominal = np.asarray(p_detect, dtype=np.float64)
         middle = float(np.max(nominal, initial=0.0)) or 1.0
-        kinds, length, (hits, looks) = self._kinds(middle), _length(keys), self._counts(keys)
-        free, blocked = np.clip(kinds.free[length] * nominal / middle, *RATES), np.full(len(length), kinds.blocked)
-        p_free = _p_free(hits, looks, kinds.p_free[length], free, blocked)
+        rate, blocked, share = self._kinds(middle)
+        length = _length(cell)
+        hits, looks = self._around(places, place, cell)
+        free = np.clip(rate[length] * nominal / middle, *RATES)
+        p_clear = _p_clear(hits, looks, share, free, np.full(len(length), blocked))
+        hidden = np.full(len(length), 1.0 - P_HIDDEN)
         misses = np.maximum(looks - hits, 0.0)
-        return Lines(p_free, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), kinds.blocked)
+        return Lines(hidden, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
+            (p_clear >= CLEAR) & (hits > 0.0)
+        )
 
-    def learned(self, keys: IntArray, hit: BoolArray, weight: FloatArray) -> SightLines:
-        """The table after looks at what was there with some probability.
+    def learned(
+        self,
+        places: tuple[IntArray, IntArray],
+        place: IntArray,
+        cell: IntArray,
+        hit: BoolArray,
+        weight: FloatArray,
+    ) -> SightLines:
+        """The table after looks at what was there with some probability; lines to places that are no more are left out.
 
         Args:
-            keys: (N,) lines of sight, in any order.
+            places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
+            place, cell: (N,) lines, in any order.
             hit: (N,) whether it was detected.
             weight: (N,) probability that it was there.
         """
-        every, row = np.unique(np.append(self.key, keys), return_inverse=True)
-        old, new, n = row[: len(self.key)], row[len(self.key) :], len(every)
-        looks = np.bincount(old, self.looks, n) + np.bincount(new, weight, n)
-        hits = np.bincount(old, self.hits, n) + np.bincount(new, weight * hit, n)
-        kept = looks > 0.0
-        scale = MOST_LOOKS / np.maximum(looks[kept], MOST_LOOKS)
-        return SightLines(every[kept], hits[kept] * scale, looks[kept] * scale, self.cell_m)
+        mine = self._rows(places)
+        kept = mine >= 0
+        key = np.append(mine[kept] * _SPAN + self.cell[kept], place * _SPAN + cell)
+        every, row = np.unique(key, return_inverse=True)
+        n_old, n = int(kept.sum()), len(every)
+        old, new = row.ravel()[:n_old], row.ravel()[n_old:]
+        looks = np.bincount(old, self.looks[kept], n) + np.bincount(new, weight, n)
+        hits = np.bincount(old, self.hits[kept], n) + np.bincount(new, weight * hit, n)
+        used = looks > 1e-3
+        every, looks, hits = every[used], looks[used], hits[used]
+        scale = MOST_LOOKS / np.maximum(looks, MOST_LOOKS)
+        at = every // _SPAN
+        return SightLines(places[0][at], places[1][at], every % _SPAN, hits * scale, looks * scale, self.cell_m)
 
-    def _counts(self, keys: IntArray) -> tuple[FloatArray, FloatArray]:
-        """(N,) hits and looks along lines, 0 along unknown ones."""
-        if not len(self.key):
-            return np.zeros(len(keys)), np.zeros(len(keys))
-        at = np.minimum(np.searchsorted(self.key, keys), len(self.key) - 1)
-        known = self.key[at] == keys
-        return np.where(known, self.hits[at], 0.0), np.where(known, self.looks[at], 0.0)
+    def _rows(self, places: tuple[IntArray, IntArray]) -> IntArray:
+        """(K,) row of the place of each line, -1 where the map has it no more."""
+        site, landmark = (np.concatenate([known, own]) for known, own in zip(
+            places, (self.site_id, self.landmark_id), strict=True))  # fmt: skip
+        _, number = np.unique(np.stack([site, landmark], axis=1), axis=0, return_inverse=True)
+        number = number.ravel()
+        row = np.full(int(number.max(initial=-1)) + 1, -1, dtype=np.int64)
+        row[number[: len(places[0])]] = np.arange(len(places[0]))
+        return np.asarray(row[number[len(places[0]) :]])
 
-    def _kinds(self, nominal: float) -> _Kinds:
-        """The two kinds of lines, by expectation maximisation; what few lines say gives way to what is nominal."""
-        length, n = _length(self.key), LONGEST + 1
-        lines = np.bincount(length, minlength=n)
+    def _around(
+        self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """(N,) hits and looks along lines, and along those from the cells around as far as they count."""
+        hits, looks = np.zeros(len(cell)), np.zeros(len(cell))
+        mine = self._rows(places)
+        order = np.argsort(mine * _SPAN + self.cell, kind="stable")
+        order = order[mine[order] >= 0]
+        if not len(order):
+            return hits, looks
+        key = mine[order] * _SPAN + self.cell[order]
+        for dx, dy in _AROUND:
+            wanted = place * _SPAN + cell + dx * _REACH + dy
+            at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
+            counts = (key[at] == wanted) * (1.0 if dx == dy == 0 else NEIGHBOUR)
+            hits += counts * self.hits[order[at]]
+            looks += counts * self.looks[order[at]]
+        return hits, looks
+
+    def _kinds(self, nominal: float) -> tuple[FloatArray, float, float]:
+        """Rates along clear lines by length, and along blocked ones, and the share of clear ones.
+
+        By expectation maximisation; what few lines say gives way to what is nominal.
+        """
+        length, n = _length(self.cell), LONGEST + 1
         voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))
         hits, looks = voice * self.hits, voice * self.looks
-        kinds = _Kinds(np.full(n, 0.5), np.full(n, np.clip(nominal, *RATES)), BLOCKED)
-        for _ in range(ROUNDS if len(self.key) else 0):
-            blocked = np.full(len(length), kinds.blocked)
-            p_free = _p_free(self.hits, self.looks, kinds.p_free[length], kinds.free[length], blocked)
-            own = np.bincount(length, p_free * hits, n), np.bincount(length, p_free * looks, n)
-            rest = np.sum((1.0 - p_free) * hits), np.sum((1.0 - p_free) * looks)
-            kinds = _Kinds(
-                (np.bincount(length, p_free, n) + 2.0) / (lines + 4.0),
-                np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES),
-                float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES)),
-            )
-        return kinds
+        free, blocked, share = np.full(n, np.clip(nominal, *RATES)), BLOCKED, 0.5
+        for _ in range(ROUNDS if len(self) else 0):
+            p_clear = _p_clear(self.hits, self.looks, share, free[length], np.full(len(length), blocked))
+            own = np.bincount(length, p_clear * hits, n), np.bincount(length, p_clear * looks, n)
+            rest = np.sum((1.0 - p_clear) * hits), np.sum((1.0 - p_clear) * looks)
+            share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
+            free = np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES)
+            blocked = float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES))
+        return free, blocked, share
+
+
+def offsets(cell: IntArray, cell_m: float) -> FloatArray:
+    """(N, 2) middles of cells (`SightLines.cells`), counted from the place."""
+    return (np.column_stack([cell // _REACH, cell % _REACH]) - _REACH // 2 + 0.5) * cell_m
 
 
 def nominal_lines(p_detect: FloatArray) -> Lines:
-    """For who takes the sensor's nominal field of view (N,) for the truth, whatever is looked at."""
+    """Lines of a sensor whose nominal field of view (N,) is taken for the truth."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
     return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), BLOCKED)
 
 
-def _p_free(
-    hits: FloatArray, looks: FloatArray, prior: FloatArray, free: FloatArray, blocked: FloatArray
+@dataclass(frozen=True, slots=True)
+class Views:
+    """From where the robot looked last: (V,) rows sorted by cell and heading.
+
+    Attributes:
+        cell: (V, 2) cell of the sensor on the floor.
+        heading: (V,) number of the heading, of `HEADINGS`.
+        stamp_s: (V,) end of the last session with a frame from there.
+        frames: (V,) frames in that session.
+        cell_m: side of a cell.
+    """
+
+    cell: IntArray
+    heading: IntArray
+    stamp_s: FloatArray
+    frames: FloatArray
+    cell_m: float = 0.5
+
+    def __len__(self) -> int:
+        return len(self.heading)
+
+    @classmethod
+    def empty(cls, cell_m: float = 0.5) -> Views:
+        """Nobody looked yet."""
+        none = np.zeros(0, dtype=np.int64)
+        return cls(np.zeros((0, 2), dtype=np.int64), none, np.zeros(0), np.zeros(0), cell_m)
+
+    @property
+    def pose(self) -> FloatArray:
+        """(V, 3) middles of the cells, and of the headings."""
+        return np.column_stack([(self.cell + 0.5) * self.cell_m, (self.heading + 0.5) * (2.0 * np.pi / HEADINGS)])
+
+    def seen_from(self, pose_map_sensor: FloatArray, stamp_s: float) -> Views:
+        """The table after a session that ended at `stamp_s`, with sensor poses (F, 3)."""
+        cell = np.floor(pose_map_sensor[:, :2] / self.cell_m).astype(np.int64)
+        turn = np.floor(np.mod(pose_map_sensor[:, 2], 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
+        own, frames = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)
+        both = np.concatenate([own, np.column_stack([self.cell, self.heading])])
+        every, first = np.unique(both, axis=0, return_index=True)  # the first of equal rows: those of this session
+        stamps = np.append(np.full(len(own), stamp_s), self.stamp_s)[first]
+        return Views(every[:, :2], every[:, 2], stamps, np.append(frames, self.frames)[first], self.cell_m)
+
+
+def _p_clear(
+    hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, blocked: FloatArray
 ) -> FloatArray:
-    """(N,) probability that lines are free, given hits and looks along them (beta-binomial)."""
+    """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
     from scipy.special import expit, gammaln
 
     def log_likelihood(rate: FloatArray) -> FloatArray:
@@ -191,7 +282,7 @@ def _p_free(
     return np.asarray(expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(blocked)))
 
 
-def _length(key: IntArray) -> IntArray:
+def _length(cell: IntArray) -> IntArray:
     """(N,) lengths of lines of sight in cells, at most `LONGEST`."""
-    dx, dy = key // (2 * _REACH) % (2 * _REACH) - _REACH, key % (2 * _REACH) - _REACH
-    return np.minimum(np.rint(np.hypot(dx, dy)).astype(np.int64), LONGEST)
+    dx, dy = cell // _REACH - _REACH // 2, cell % _REACH - _REACH // 2
+    return np.minimum(np.rint(np.hypot(dx + 0.5, dy + 0.5)).astype(np.int64), LONGEST)

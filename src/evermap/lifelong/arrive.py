@@ -1,0 +1,110 @@
+"""Whether a landmark that the map did not know has appeared, or had only not been seen yet.
+
+It has appeared if its place was seen empty: an earlier session looked at it from where it is seen now. Of a landmark
+that is found, the age is that of a stay that one comes upon, `P(age < t) = int_0^t S / mean`; so
+
+    odds(appeared) = P(age < t) / P(age >= t) * 1 / P(all looks missed it | it was there)
+
+with `t` the time since that look. Without a look the map grew, and nothing has changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
+from evermap.maps.living import LivingMap
+from evermap.sensing.sightlines import HEADINGS, P_HIDDEN, Views, offsets
+from evermap.sensing.visibility import detection_probability
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import FloatArray, IntArray, Sensor
+
+NEAR_M = 0.6
+"""Who stands this close to where a place is seen from sees it, too."""
+LEAST_EXPECTED = 2.0
+"""Detections that earlier looks must have been expected to give to count as looks."""
+STICKY = 2.0
+"""Frames in a row that say as much as one that is independent of all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrivals:
+    """Where cliques were seen that had no site there before: (A,) rows.
+
+    Attributes:
+        site: (A,) row of the new site.
+        looked_s: (A,) last time before this session at which its place was looked at; -inf for never.
+        p_appeared: (A,) probability that it came after that; 0 without a look.
+    """
+
+    site: IntArray
+    looked_s: FloatArray
+    p_appeared: FloatArray
+
+
+def arrivals(before: LivingMap, after: LivingMap, looks: Looks, eye: FloatArray, sensor: Sensor) -> Arrivals:
+    """What earlier sessions saw of the places of new sites.
+
+    Args:
+        before: the map as the session found it.
+        after: with the sites that it found.
+        looks: of the session, at places of `after`.
+        eye: (F, 3) poses of the sensor at its frames.
+        sensor: of the session.
+    """
+    new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
+    looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
+    if not len(before.views) or not len(new):
+        return Arrivals(new, looked, p_appeared)
+    at_eye = replace(sensor, mount_robot_sensor=(0.0, 0.0, 0.0))
+    cliques, row = clique_rows(after.sites)
+    kinds, middle = class_of(after, cliques), site_middles(after)
+    site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
+    cells = after.sightlines.cell_m
+    for k, site in enumerate(new.tolist()):
+        expected: dict[float, float] = {}
+        log_missed: dict[float, float] = {}
+        for place in np.flatnonzero(site_of_place == site).tolist():
+            mine = looks.rows.hit & (looks.place == place)
+            seen_from = after.places.position_m[place] + offsets(np.unique(looks.cell[mine]), cells)
+            frames, rate, stamps = _empty_looks(before.views, seen_from, after.places.position_m[place], at_eye)
+            for stamp in np.unique(stamps):
+                then = stamps == stamp
+                expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
+                log_missed[stamp] = log_missed.get(stamp, 0.0) + float(frames[then] @ np.log1p(-rate[then])) / STICKY
+        enough = [stamp for stamp, number in expected.items() if number >= LEAST_EXPECTED]
+        if not enough:
+            continue
+        looked[k] = max(enough)
+        missed = P_HIDDEN + (1.0 - P_HIDDEN) * np.exp(log_missed[looked[k]])
+        stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
+        young = p_younger(stay, after.stamp_s - looked[k])
+        p_appeared[k] = young / (young + (1.0 - young) * missed)
+    return Arrivals(new, looked, p_appeared)
+
+
+def p_younger(stay: LifetimePrior, age_s: float) -> float:
+    """Probability that a stay that one comes upon began less than `age_s` before (the equilibrium age)."""
+    ages = np.append(0.0, np.geomspace(60.0, 3e9, 400))
+    survival = np.exp(stay.log_survival(ages))
+    total = np.append(0.0, np.cumsum(0.5 * (survival[1:] + survival[:-1]) * np.diff(ages)))
+    return float(np.interp(age_s, ages, total) / total[-1])
+
+
+def _empty_looks(
+    views: Views, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
+    pose = views.pose
+    near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf) <= NEAR_M
+    pose = pose[near]
+    half = np.pi / HEADINGS
+    rate = np.min(
+        [detection_probability(pose + np.array([0.0, 0.0, turn]), place_m[None], sensor)[:, 0] for turn in (-half, half)],
+        axis=0,
+        initial=1.0,
+    )
+    good = rate >= 0.3 * sensor.p_detect
+    return views.frames[near][good], rate[good], views.stamp_s[near][good]
