@@ -74,7 +74,7 @@ def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
-def resized(living: LivingMap, factor: float, log_size_variance: float) -> LivingMap:
+def resized(living: LivingMap, factor: float, log_size_variance: float, log_size_information: float) -> LivingMap:
     """The map longer by a factor, about its middle; how well its metre is known goes with it."""
     position = living.places.position_m
     middle = position.mean(axis=0)
@@ -83,6 +83,7 @@ def resized(living: LivingMap, factor: float, log_size_variance: float) -> Livin
         places=replace(living.places, position_m=middle + factor * (position - middle)),
         covariance_m2=factor**2 * living.covariance_m2,
         log_size_variance=log_size_variance,
+        log_size_information=log_size_information,
     )
 
 

@@ -124,8 +124,9 @@ def refit(
             living.places.position_m[places[theirs]],
             covariance,
         )
-        found = settled(*shown, (0.0, outcome.log_scale_sigma), living.log_size_variance)
-        living = resized(living, found.map_factor, found.variance)
+        known = living.log_size_variance, living.log_size_information
+        found = settled(*shown, (0.0, outcome.log_scale_sigma), *known)
+        living = resized(living, found.map_factor, found.variance, found.information)
         size *= found.session_factor
     position = living.places.position_m[places]
     motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
@@ -146,7 +147,9 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Vi
     """The map with the places and sites that the session found."""
     in_place = None
     if where is None:
-        living = replace(living, log_size_variance=visit.outcome.log_scale_sigma**2)
+        variance = visit.outcome.log_scale_sigma**2
+        information = 1.0 / variance if variance > 0.0 else np.inf
+        living = replace(living, log_size_variance=variance, log_size_information=information)
     else:
         in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
     own = own_landmarks(visit.outcome, in_place)

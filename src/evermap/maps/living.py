@@ -194,6 +194,7 @@ class LivingMap:
         members, sites, places, stays: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
+        log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
@@ -209,6 +210,7 @@ class LivingMap:
     stays: Stays = field(default_factory=Stays.empty)
     covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     log_size_variance: float = 0.0
+    log_size_information: float = np.inf
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)
@@ -258,12 +260,11 @@ class LivingMap:
         p_exists = self.p_exists()
         kept = np.flatnonzero((row >= 0) & ~self.members.deleted & (p_exists >= p_least))
         row = row[kept]
-        corner = 2 * row[:, None] + np.arange(2)
         site = np.searchsorted(self.sites.site_id, self.places.site_id[row])
         return Landmarks(
             landmark_id=self.members.landmark_id[kept],
             position_m=self.places.position_m[row],
-            covariance_m2=self.covariance_m2[corner[:, :, None], corner[:, None, :]],
+            covariance_m2=self.place_covariance_m2(row),
             class_id=self.members.class_id[kept],
             p_exists=p_exists[kept],
             n_hits=self.places.n_hits[row],
@@ -274,6 +275,13 @@ class LivingMap:
             frame="prior_map",
             clock=self.clock,
         )
+
+    def place_covariance_m2(self, row: IntArray) -> FloatArray:
+        """(K, 2, 2) covariance of places (K,) by themselves, with what is not known of the map's size, about its middle."""
+        corner = 2 * row[:, None] + np.arange(2)
+        arm = self.places.position_m[row] - self.places.position_m.mean(axis=0)
+        size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
+        return np.asarray(self.covariance_m2[corner[:, :, None], corner[:, None, :]] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
         """Every place as a record of its own, in the order of `places`: what a robot may meet.

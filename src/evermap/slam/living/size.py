@@ -28,31 +28,40 @@ class Size:
         map_factor: by which the map should be longer.
         session_factor: metres of that map for one of the session's own.
         variance: of the log of the map's metre, after the session.
+        information: sum of the inverse variances of all sessions that the map's metre is the mean of.
     """
 
     map_factor: float
     session_factor: float
     variance: float
+    information: float
 
 
-def settled(log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float) -> Size:
+def settled(
+    log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float
+) -> Size:
     """Both sizes after they were compared.
+
+    The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
+    every session, so errors are taken as fully correlated: more sessions do not make the metre surer.
 
     Args:
         log_ratio: of the map's size over that of the session, as its landmarks show it.
         ratio_variance: of it.
         session: log of the true metre over the session's, by its own priors, and the standard deviation of that.
         map_variance: of the log of the map's metre over the true one.
+        information: of the map so far, see `Size`.
     """
     own, sigma = session
-    before = map_variance + WALK**2
+    before = 1.0 / (1.0 / information + WALK**2)
+    after = 1.0 / (sigma**2 + ratio_variance)
+    gain = after / (before + after)
     innovation = log_ratio - own
-    total = sigma**2 + before + ratio_variance
-    gain = before / total
     return Size(
         map_factor=float(np.exp(-gain * innovation)),
-        session_factor=float(np.exp(own + sigma**2 / total * innovation)),
-        variance=before * (1.0 - gain),
+        session_factor=float(np.exp(own + (1.0 - gain) * innovation)),
+        variance=((1.0 - gain) * np.sqrt(map_variance) + gain * sigma) ** 2 + gain**2 * min(ratio_variance, 1.0),
+        information=before + after,
     )
 
 
