@@ -6,12 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap import se2
 from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap
+from evermap.slam.align import consensus
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.types import FloatArray, IntArray
 
 SMALLEST_P = 1e-6
+BENT_M = 0.15
+BENT_CLIQUES = 3
+"""So many bodies that moved by one rigid motion, to this distance, have not moved: the session is bent."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +93,38 @@ def laid_over(
     probability = np.ones(len(landmark_id))
     probability[seen] = found.probability
     return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m)
+
+
+def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray) -> Laid:
+    """Where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid motion.
+
+    One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
+    by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
+    the session is straightened when it is solved with the map.
+
+    Args:
+        living: the map.
+        p_site: (S,) belief in its sites.
+        where: as most landmarks have it.
+        position_m: (K, 2) landmarks of `where` in the session's frame.
+    """
+    members, places = living.members, living.places
+    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
+    at = np.minimum(np.searchsorted(members.landmark_id, where.landmark_id), max(len(members) - 1, 0))
+    known = members.landmark_id[at] == where.landmark_id
+    home = np.where(known, living.place_row(where.landmark_id, site[at]), -1)
+    moved = np.flatnonzero((where.place < 0) & (home >= 0))
+    place, probability = where.place.copy(), where.probability.copy()
+    while len(moved):
+        motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
+        rest = places.position_m[home[moved]] - se2.transform(motion, position_m[moved])
+        agree &= np.hypot(*rest.T) < BENT_M
+        fits = moved[agree]
+        if len(np.unique(members.clique_id[at[fits]])) < BENT_CLIQUES:
+            break
+        place[fits], probability[fits] = home[fits], 1.0
+        moved = moved[~agree]
+    return replace(where, place=place, probability=probability)
 
 
 def with_glimpsed(living: LivingMap, p_site: FloatArray, where: Laid, landmark_id: IntArray) -> Laid:

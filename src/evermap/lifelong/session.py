@@ -12,7 +12,7 @@ from evermap.lifelong import arrive, believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import anchored, drifted, of_places, resized
-from evermap.lifelong.overlaying import Laid, laid_over, with_glimpsed
+from evermap.lifelong.overlaying import Laid, laid_over, unbent, with_glimpsed
 from evermap.maps.learning import learned_lives
 from evermap.maps.living import Evidence, LivingMap
 from evermap.maps.missed import without_missed
@@ -101,6 +101,8 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
     where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config.search)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
+    if config.search == "joint":
+        where = unbent(living, p_site, where, own.position_m)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, p_site, where, glimpsed)
 
