@@ -190,7 +190,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         entry = lifelong.entered(living, expected, where, visit, config.living)
         looks, eye = lifelong.looks(entry, visit, config.living)
         now = lifelong.believed(entry, looks, visit, config.living)
-        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living, eye)
+        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living)
         after = lifelong.learned(after, looks, replace(entry, living=now.living), eye, config.living)
         frame = "first_pose" if where is None else "prior_map"
         names = visit.recording.landmark_names

@@ -16,7 +16,7 @@ import numpy as np
 
 from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
 from evermap.maps.living import LivingMap
-from evermap.sensing.sightlines import HEADINGS, P_HIDDEN, Views, offsets
+from evermap.sensing.sightlines import HEADINGS, Views, offsets
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import FloatArray, IntArray, Sensor
@@ -44,14 +44,13 @@ class Arrivals:
     p_appeared: FloatArray
 
 
-def arrivals(before: LivingMap, after: LivingMap, looks: Looks, eye: FloatArray, sensor: Sensor) -> Arrivals:
+def arrivals(before: LivingMap, after: LivingMap, looks: Looks, sensor: Sensor) -> Arrivals:
     """What earlier sessions saw of the places of new sites.
 
     Args:
         before: the map as the session found it.
         after: with the sites that it found.
         looks: of the session, at places of `after`.
-        eye: (F, 3) poses of the sensor at its frames.
         sensor: of the session.
     """
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
@@ -62,7 +61,7 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, eye: FloatArray,
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells = after.sightlines.cell_m
+    cells, p_hidden = after.sightlines.cell_m, before.sightlines.p_hidden
     for k, site in enumerate(new.tolist()):
         expected: dict[float, float] = {}
         log_missed: dict[float, float] = {}
@@ -78,7 +77,7 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, eye: FloatArray,
         if not enough:
             continue
         looked[k] = max(enough)
-        missed = P_HIDDEN + (1.0 - P_HIDDEN) * np.exp(log_missed[looked[k]])
+        missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
         young = p_younger(stay, after.stamp_s - looked[k])
         p_appeared[k] = young / (young + (1.0 - young) * missed)

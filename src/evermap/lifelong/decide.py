@@ -70,7 +70,7 @@ def decided(
     cliques, row_of = clique_rows(sites)
     told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
     last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
-    p_kept = sites.p_kept.copy()
+    p_kept, hidden, shown = sites.p_kept.copy(), 0.0, 0.0
     begun: list[tuple[int, int, float, float, float]] = []
     found: list[MapChange] = []
     for c, clique in enumerate(cliques.tolist()):
@@ -84,6 +84,11 @@ def decided(
             if stands and site == old:
                 if stay >= 0:
                     last[stay] = max(last[stay], sites.seen_s[site])
+                    if here:  # missed before, but there all the time
+                        hidden += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
+                        shown, p_gone[stay] = shown + 1.0, 0.0
+                    elif log_evidence[c] <= -LEAST_EVIDENCE:
+                        p_gone[stay] = p_away
                 else:  # a body that was taken apart: its part goes on
                     begun.append((clique, site, -np.inf, float(sites.since_s[site]), float(sites.seen_s[site])))
                 if here:
@@ -91,6 +96,8 @@ def decided(
                 continue
             looked_away = not stands and misses[old] > 0 and log_evidence[c] <= -LEAST_EVIDENCE and p_away >= EXISTS
             if not (stands and here) and not looked_away:
+                if stay >= 0 and log_evidence[c] <= -LEAST_EVIDENCE:
+                    p_gone[stay] = p_away
                 continue
             left_s = float(sites.seen_s[old])
             if stay >= 0:
@@ -117,6 +124,7 @@ def decided(
         share = min(p_kept[site] / sites.p_here[site], 1.0)
         p_kept[site] = sites.p_here[site]
         same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
+        hidden += share if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
             continue
@@ -154,7 +162,8 @@ def decided(
         )
         stays = stays.joined(fresh)
         stays = stays[np.argsort(stays.first_s, kind="stable")]
-    after = replace(after, stays=stays, sites=replace(sites, p_kept=p_kept))
+    sightlines = after.sightlines.after_session(hidden, shown)
+    after = replace(after, stays=stays, sites=replace(sites, p_kept=p_kept), sightlines=sightlines)
     return after, _swaps(found, before, after)
 
 

@@ -232,7 +232,7 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig, eye: FloatArray
+    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date and without what is forgotten, and what changed since the session before.
 
@@ -242,9 +242,8 @@ def decided(
         seen: looks of the session.
         visit: the session.
         config: which parts of the engine are on.
-        eye: (F, 3) sensor poses.
     """
-    arrivals = arrive.arrivals(before, now.living, seen, eye, visit.recording.sensor)
+    arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
     after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s)
     if config.cliques and config.existence and config.misses:
         after = without_missed(before, after)

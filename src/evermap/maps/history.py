@@ -108,16 +108,17 @@ class History:
 
     def shares(self, event: BoolArray, chance: BoolArray) -> FloatArray:
         """(C + 1,) probability of an event for each class, and for one never seen; classes lean on their average."""
-        chances, events = (self.counts(self.recent & rows) for rows in (chance, event & chance))
+        chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
         # classes differ: every one counts for one event at most, however often it was seen
         weight = 1.0 / (chances[:-1] + STRENGTH)
         average = (0.5 + events[:-1] @ weight) / (1.0 + chances[:-1] @ weight)
         of_classes = (events[:-1] + STRENGTH * average) / (chances[:-1] + STRENGTH)
         return np.append(of_classes, average)
 
-    def counts(self, rows: BoolArray) -> IntArray:
-        """(C + 1,) how many of some rows (K,) are of each class, and of all together."""
-        return np.append(np.bincount(self.kind[rows], minlength=len(self.class_ids)), rows.sum())
+    def counts(self, rows: BoolArray, weight: FloatArray | None = None) -> FloatArray:
+        """(C + 1,) how many of some rows (K,), or what they weigh, are of each class, and of all together."""
+        each = np.ones(len(rows)) if weight is None else weight
+        return np.append(np.bincount(self.kind[rows], each[rows], minlength=len(self.class_ids)), each[rows].sum())
 
     @property
     def gap_s(self) -> float:

@@ -22,10 +22,12 @@ from evermap.survival.class_lifetimes import (
     stay_posterior,
 )
 from evermap.survival.piecewise import PiecewiseConstantHazard
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, FloatArray, IntArray, rows_of
 
 LEAST_ENDED = 5
 """Ends in a chunk before it has lifetimes of its own."""
+SURE = 0.999
+"""Ends of stays that are more probable than this count as ends."""
 _FIRMNESS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 """Ends that the lifetimes of a class may count for in those of a chunk; how many is learned."""
 
@@ -108,6 +110,7 @@ def _learned(history: History) -> _Learned:
     log_likelihood = absence_log_likelihood(
         stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
     )
+    log_likelihood *= stays.p_gone[away, None, None]
     absence = absence_posterior(_by_class(log_likelihood, history.kind[away], n_classes))
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
@@ -117,10 +120,17 @@ def _learned(history: History) -> _Learned:
     back = [-absence.curve(row).log_conditional_survival(gap_s, 2.0 * gap_s) / gap_s for row in range(n_classes + 1)]
     back_rate = (1.0 - p_hop) * here_again * np.array(back)
     kind = history.kind[history.recent]
-    log_likelihood = stay_log_likelihood(history.sightings(back_by_hop[kind], back_rate[kind]))
+    seen = history.sightings(back_by_hop[kind], back_rate[kind])
+    log_likelihood = stay_log_likelihood(seen)
+    doubted = ended[history.recent] & (stays.p_gone[history.recent] < SURE)
+    if doubted.any():  # expected log likelihood: perhaps it goes on
+        p_gone = stays.p_gone[history.recent][doubted, None, None]
+        going_on = rows_of(seen, doubted)
+        going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
+        log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
     log_likelihood = _by_class(log_likelihood, kind, n_classes)
     p_known = history.shares(history.to_known, history.had_choice)
-    counts = (history.counts(mask) for mask in (history.recent, history.recent & ended))
+    counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
     return _Learned(stay_posterior(log_likelihood), absence, p_hop, p_known, *counts)
 
 
@@ -143,7 +153,7 @@ def _of_chunks(history: History, row: int, life: Life, chunk_m: float) -> list[t
     came_s = np.where(np.isfinite(stays.elsewhere_s), 0.5 * (stays.elsewhere_s + stays.first_s), stays.first_s)
     left_s = np.where(ended, 0.5 * (stays.last_s + stays.gone_s), stays.last_s)
     expected = -life.stay.log_conditional_survival(stays.first_s - came_s, left_s - came_s)
-    n_ended = np.bincount(which.ravel(), ended)
+    n_ended = np.bincount(which.ravel(), ended * stays.p_gone)
     n_expected = np.bincount(which.ravel(), expected)
     n_expected *= max(n_ended.sum(), 1.0) / n_expected.sum()  # ends that nobody saw are missing everywhere
     firm = _FIRMNESS[:, None]
@@ -159,7 +169,7 @@ def _of_chunks(history: History, row: int, life: Life, chunk_m: float) -> list[t
         rates = tuple(float(factor[k]) * rate for rate in life.stay.rates)
         stay = PiecewiseConstantHazard(life.stay.edges_s, rates)
         n_stays = int(np.sum(which.ravel() == k))
-        here = replace(life, stay=stay, n_stays=n_stays, n_ended=int(n_ended[k]))
+        here = replace(life, stay=stay, n_stays=n_stays, n_ended=round(n_ended[k]))
         own.append(((int(chunks[k, 0]), int(chunks[k, 1])), here))
     return own
 

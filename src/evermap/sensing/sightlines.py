@@ -11,7 +11,7 @@ did not know, they say whether its place had been seen empty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,8 +33,11 @@ NEIGHBOUR = 0.35
 """What looks along a line say of those from the eight cells around, in looks along these."""
 CLEAR = 0.9
 """A line is known to be clear from this probability on."""
-P_HIDDEN = 0.03
-"""That a place cannot be seen for a whole session along lines that were clear before: a closed door, a parked truck."""
+P_HIDDEN, HIDDEN_LOOKS = 0.03, 20.0
+"""That a place cannot be seen for a whole session along lines that were clear before (a closed door, a parked truck),
+to begin with; and sessions that this is worth against those that were seen."""
+MOST_SESSIONS = 2000.0
+"""Sessions, of all cliques, after which old ones fade from what is learned of hidden places."""
 LONGEST = 80
 """Cells; lines longer than this are taken together."""
 ROUNDS = 10
@@ -75,6 +78,7 @@ class SightLines:
         site_id, landmark_id: (K,) the place that was looked at.
         cell: (K,) the sensor's cell, counted from the place.
         hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
+        hidden, shown: sessions of cliques that were looked at and stood there: how many could not be seen, and were.
         cell_m: side of a cell.
     """
 
@@ -83,16 +87,29 @@ class SightLines:
     cell: IntArray
     hits: FloatArray
     looks: FloatArray
+    hidden: float = 0.0
+    shown: float = 0.0
     cell_m: float = 0.5
 
     def __len__(self) -> int:
         return len(self.cell)
 
+    @property
+    def p_hidden(self) -> float:
+        """Probability that a place cannot be seen, a whole session long, along lines that were clear before."""
+        return (P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown)
+
+    def after_session(self, hidden: float, shown: float) -> SightLines:
+        """With expected numbers of cliques that were hidden, or shown, along clear lines."""
+        hidden, shown = self.hidden + hidden, self.shown + shown
+        fade = min(1.0, MOST_SESSIONS / max(hidden + shown, 1.0))
+        return replace(self, hidden=fade * hidden, shown=fade * shown)
+
     @classmethod
     def empty(cls, cell_m: float = 0.5) -> SightLines:
         """Nothing learned yet."""
         none = np.zeros(0, dtype=np.int64)
-        return cls(none, none, none, np.zeros(0), np.zeros(0), cell_m)
+        return cls(none, none, none, np.zeros(0), np.zeros(0), cell_m=cell_m)
 
     def cells(self, sensor_m: FloatArray, place_m: FloatArray) -> IntArray:
         """(N,) cells of sensors (N, 2), counted from places (N, 2).
@@ -131,9 +148,9 @@ class SightLines:
         hits, looks = self._around(places, place, cell)
         free = np.clip(rate[length] * nominal / middle, *RATES)
         p_clear = _p_clear(hits, looks, share, free, np.full(len(length), blocked))
-        hidden = np.full(len(length), 1.0 - P_HIDDEN)
+        shown = np.full(len(length), 1.0 - self.p_hidden)
         misses = np.maximum(looks - hits, 0.0)
-        return Lines(hidden, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
+        return Lines(shown, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
             (p_clear >= CLEAR) & (hits > 0.0)
         )
 
@@ -165,7 +182,8 @@ class SightLines:
         every, looks, hits = every[used], looks[used], hits[used]
         scale = MOST_LOOKS / np.maximum(looks, MOST_LOOKS)
         at = every // _SPAN
-        return SightLines(places[0][at], places[1][at], every % _SPAN, hits * scale, looks * scale, self.cell_m)
+        rows = places[0][at], places[1][at], every % _SPAN
+        return SightLines(*rows, hits * scale, looks * scale, self.hidden, self.shown, self.cell_m)
 
     def _rows(self, places: tuple[IntArray, IntArray]) -> IntArray:
         """(K,) row of the place of each line, -1 where the map has it no more."""
