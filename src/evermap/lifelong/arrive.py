@@ -61,7 +61,7 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, sensor: Sensor) 
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells, p_hidden = after.sightlines.cell_m, before.sightlines.p_hidden
+    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[1])
     for k, site in enumerate(new.tolist()):
         expected: dict[float, float] = {}
         log_missed: dict[float, float] = {}

@@ -20,6 +20,12 @@ WORTH_A_LOOK = 0.3
 """Share of the sensor's detection probability from which on a place counts as looked at."""
 SETTLED_S = 300.0
 """What is seen within this time of a look was there at that look."""
+BESIDE_M, BESIDE_RAD = 1.0, 0.15
+"""What is seen this close to a place, or behind it at this angle, is seen along its line of sight."""
+WITNESSES = 3
+"""Frames in which something else must be seen along the lines to a clique to know that they are clear."""
+TOGETHER_M = 2.0
+"""Cliques that are missed from places this close to each other may be hidden by the same thing."""
 AT_ONCE = 2_000_000
 
 
@@ -50,6 +56,7 @@ class Looks:
         lines: (K,) what is known of the different lines of sight.
         counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
         settled: (N,) whether the place was seen shortly before or after.
+        witnessed: (C,) whether something else was seen along the clear lines to a clique, in this session.
     """
 
     rows: SiteLooks
@@ -58,6 +65,7 @@ class Looks:
     lines: Lines
     counts: BoolArray
     settled: BoolArray
+    witnessed: BoolArray
 
 
 def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
@@ -119,11 +127,14 @@ def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites
     return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
 
 
-def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, *, learn_sight: bool) -> Looks:
+def looked_at(
+    living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, *, learn_sight: bool
+) -> Looks:
     """Which places of a map were looked at, frame by frame, and which of them were seen.
 
     Args:
         living: the map, with the sites that the session found.
+        p_start: (S,) beliefs in these when it began.
         sighting: what the session saw of it.
         sensor: its nominal field of view.
         learn_sight: False takes that for the truth, whatever is in the way.
@@ -150,7 +161,8 @@ def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, *, learn_si
     order = np.lexsort((place, site, frame, clique_rows(living.sites)[1][site]))
     place, frame, signed, site = place[order], frame[order], signed[order], site[order]
     clique = clique_rows(living.sites)[1][site]
-    cell = living.sightlines.cells(sensor_poses(sighting, sensor)[frame, :2], places.position_m[place])
+    eye = sensor_poses(sighting, sensor)
+    cell = living.sightlines.cells(eye[frame, :2], places.position_m[place])
     line, key = np.unique(np.column_stack([place, cell]), axis=0, return_inverse=True)
     key = key.ravel().astype(np.int64)
     p_nominal = np.bincount(key, np.abs(signed), minlength=len(line)) / np.maximum(
@@ -159,12 +171,70 @@ def looked_at(living: LivingMap, sighting: Sighting, sensor: Sensor, *, learn_si
     rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, signed > 0.0)
     settled = surely_there(rows)
     if not learn_sight:
-        everything = np.ones(len(rows), dtype=np.bool_)
-        return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled)
+        everything, nothing = np.ones(len(rows), dtype=np.bool_), np.zeros(len(np.unique(living.sites.clique_id)), bool)
+        return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled, nothing)
     names = places.site_id, places.landmark_id
     now = living.sightlines.learned(names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum())))
     lines, clear = now.lines(names, line[:, 0], line[:, 1], p_nominal)
-    return Looks(rows, place, cell, lines, rows.hit | clear[key], settled)
+    clear = clear[key]
+    beside = _beside(rows, frame, places.position_m[place], eye[frame], clear)
+    counts, witnessed, p_hidden = _hidden(living, p_start, rows, clear, beside, eye[frame])
+    lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
+        np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
+    return Looks(rows, place, cell, lines, counts, settled, witnessed)
+
+
+def _beside(
+    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray, clear: BoolArray
+) -> BoolArray:
+    """(N,) looks along clear lines in whose frame another clique was seen beside or behind the place."""
+    beside = np.zeros(len(rows), dtype=np.bool_)
+    hit = np.flatnonzero(rows.hit)
+    order = hit[np.argsort(frame[hit], kind="stable")]
+    mine = np.flatnonzero(clear)
+    low, high = (np.searchsorted(frame[order], frame[mine], side=side) for side in ("left", "right"))
+    one = np.repeat(mine, high - low)
+    other = order[np.repeat(low - np.append(0, np.cumsum(high - low)[:-1]), high - low) + np.arange(len(one))]
+    away, there = place_m[one] - eye[one, :2], place_m[other] - eye[other, :2]
+    range_m, beyond_m = np.hypot(*away.T), np.hypot(*there.T)
+    angle = np.abs(se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(there[:, 1], there[:, 0])))
+    near = np.hypot(*(place_m[one] - place_m[other]).T) < BESIDE_M
+    behind = (angle < BESIDE_RAD) & (beyond_m > range_m - 0.5 * BESIDE_M)
+    beside[one[(near | behind) & (rows.clique[one] != rows.clique[other])]] = True
+    return beside
+
+
+def _hidden(
+    living: LivingMap, p_start: FloatArray, rows: SiteLooks, clear: BoolArray, beside: BoolArray, eye: FloatArray
+) -> tuple[BoolArray, BoolArray, FloatArray]:
+    """Looks that count, (C,) cliques with a witness, and (C,) probability that a clique cannot be seen at all.
+
+    A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
+    closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
+    while they would leave one by one.
+    """
+    cliques, row = clique_rows(living.sites)
+    n, p_hidden = len(cliques), living.sightlines.p_hidden
+    hits = np.bincount(rows.clique[rows.hit], minlength=n)
+    witnessed = np.bincount(rows.clique[beside], minlength=n) >= WITNESSES
+    known = np.bincount(row, p_start, minlength=n) >= 0.5
+    shown = (hits > 0) & known & (np.bincount(rows.clique[clear], minlength=n) >= WITNESSES)
+    counted = np.array([np.sum(shown & ~witnessed), np.sum(shown & witnessed)])
+    p_hidden = living.sightlines.after_session(np.zeros(2), counted).p_hidden
+    counts = rows.hit | np.where(witnessed[rows.clique], beside, clear)
+    of_clique = p_hidden[witnessed.astype(np.int64)]
+    alone = np.flatnonzero((hits == 0) & ~witnessed & (np.bincount(rows.clique[clear], minlength=n) > 0))
+    p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
+    looks = clear & np.isin(rows.clique, alone)
+    middle = np.column_stack(
+        [np.bincount(rows.clique[looks], eye[looks, k], minlength=n) for k in (0, 1)]
+    ) / np.maximum(np.bincount(rows.clique[looks], minlength=n), 1)[:, None]  # fmt: skip
+    for clique in alone:
+        others = alone[(alone != clique) & known[alone]]
+        others = others[np.hypot(*(middle[others] - middle[clique]).T) < TOGETHER_M]
+        together = float(np.prod(p_gone[others]))
+        of_clique[clique] = p_hidden[0] / (p_hidden[0] + (1.0 - p_hidden[0]) * together)
+    return counts, witnessed, of_clique
 
 
 def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:

@@ -17,6 +17,8 @@ EXISTS = 0.5
 """A clique is said to stand at a site that is more probable than this, and to be away where that is more probable."""
 SAME_PLACE_M = 0.3
 """Cliques that stand this close to where another stood have taken its place."""
+SAME_SPOT_M = 0.1
+"""Cliques that stand this close to where they stood have not moved."""
 LEAST_EVIDENCE = 1.5
 """What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
 SURELY_AWAY = 0.02
@@ -70,7 +72,7 @@ def decided(
     cliques, row_of = clique_rows(sites)
     told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
     last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
-    p_kept, hidden, shown = sites.p_kept.copy(), 0.0, 0.0
+    p_kept, hidden, shown = sites.p_kept.copy(), np.zeros(2), np.zeros(2)
     begun: list[tuple[int, int, float, float, float]] = []
     found: list[MapChange] = []
     for c, clique in enumerate(cliques.tolist()):
@@ -78,6 +80,7 @@ def decided(
         site = int(mine[np.argmax(sites.p_here[mine])])
         stands, here = sites.p_here[site] >= EXISTS, int(hits[site]) > 0
         p_away = min(max(1.0 - float(sites.p_here[mine].sum()), 0.0), 1.0)
+        kind_of_line = int(looks.witnessed[c])
         old, stay = told.get(clique, (-1, -1))
         newest = stay if stay >= 0 else _newest_stay(after, clique)
         if old >= 0:
@@ -85,8 +88,9 @@ def decided(
                 if stay >= 0:
                     last[stay] = max(last[stay], sites.seen_s[site])
                     if here:  # missed before, but there all the time
-                        hidden += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
-                        shown, p_gone[stay] = shown + 1.0, 0.0
+                        hidden[kind_of_line] += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
+                        p_gone[stay] = 0.0
+                        shown[kind_of_line] += 1.0
                     elif log_evidence[c] <= -LEAST_EVIDENCE:
                         p_gone[stay] = p_away
                 else:  # a body that was taken apart: its part goes on
@@ -111,6 +115,8 @@ def decided(
             since = max(float(sites.since_s[site]), np.nextafter(left_s, np.inf))
             begun.append((clique, site, left_s, since, max(float(sites.seen_s[site]), since)))
             p_kept[site] = sites.p_here[site]
+            if np.hypot(*_motion(after, old, site)[0]) < SAME_SPOT_M:
+                continue
             p_moved = float(sites.p_here[site])
             n_hits, n_misses = int(hits[site]), int(misses[old])
             found.append(_change(after, ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses))
@@ -124,7 +130,7 @@ def decided(
         share = min(p_kept[site] / sites.p_here[site], 1.0)
         p_kept[site] = sites.p_here[site]
         same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
-        hidden += share if same else 0.0
+        hidden[kind_of_line] += share if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
             continue

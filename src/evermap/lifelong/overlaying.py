@@ -9,13 +9,14 @@ import numpy as np
 from evermap import se2
 from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap
-from evermap.slam.align import consensus
+from evermap.slam.align import consensus, rigid
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.types import FloatArray, IntArray
 
 SMALLEST_P = 1e-6
 BENT_M = 0.15
 BENT_CLIQUES = 3
+BENT_ROUNDS = 5
 """So many bodies that moved by one rigid motion, to this distance, have not moved: the session is bent."""
 
 
@@ -117,8 +118,15 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
         motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
-        rest = places.position_m[home[moved]] - se2.transform(motion, position_m[moved])
-        agree &= np.hypot(*rest.T) < BENT_M
+        gap = np.full(len(moved), np.inf)
+        for _ in range(BENT_ROUNDS):
+            if np.count_nonzero(agree) < 2:
+                break
+            motion = rigid(position_m[moved[agree]], places.position_m[home[moved[agree]]])
+            rest = places.position_m[home[moved]] - se2.transform(motion, position_m[moved])
+            gap = np.hypot(*rest.T)
+            agree = gap < max(BENT_M, float(np.median(gap[agree])))
+        agree &= gap < BENT_M
         fits = moved[agree]
         if len(np.unique(members.clique_id[at[fits]])) < BENT_CLIQUES:
             break

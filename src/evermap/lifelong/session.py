@@ -194,7 +194,7 @@ def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, F
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-    seen = believe.looked_at(entry.living, sighting, recording.sensor, learn_sight=config.learn_sight)
+    seen = believe.looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
     return seen, believe.sensor_poses(sighting, recording.sensor)
 
 

@@ -11,7 +11,7 @@ did not know, they say whether its place had been seen empty.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,9 +33,11 @@ NEIGHBOUR = 0.35
 """What looks along a line say of those from the eight cells around, in looks along these."""
 CLEAR = 0.9
 """A line is known to be clear from this probability on."""
-P_HIDDEN, HIDDEN_LOOKS = 0.03, 20.0
+P_HIDDEN = np.array([0.1, 0.03])
 """That a place cannot be seen for a whole session along lines that were clear before (a closed door, a parked truck),
-to begin with; and sessions that this is worth against those that were seen."""
+to begin with: where nothing else is seen along them in that session, and where something is."""
+HIDDEN_LOOKS = 5.0
+"""Sessions that this is worth against those that were seen."""
 MOST_SESSIONS = 2000.0
 """Sessions, of all cliques, after which old ones fade from what is learned of hidden places."""
 LONGEST = 80
@@ -78,7 +80,8 @@ class SightLines:
         site_id, landmark_id: (K,) the place that was looked at.
         cell: (K,) the sensor's cell, counted from the place.
         hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
-        hidden, shown: sessions of cliques that were looked at and stood there: how many could not be seen, and were.
+        hidden, shown: (2,) sessions of cliques that were looked at and stood there: how many could not be seen, and
+            were; where nothing else was seen along their lines, and where something was.
         cell_m: side of a cell.
     """
 
@@ -87,22 +90,22 @@ class SightLines:
     cell: IntArray
     hits: FloatArray
     looks: FloatArray
-    hidden: float = 0.0
-    shown: float = 0.0
+    hidden: FloatArray = field(default_factory=lambda: np.zeros(2))
+    shown: FloatArray = field(default_factory=lambda: np.zeros(2))
     cell_m: float = 0.5
 
     def __len__(self) -> int:
         return len(self.cell)
 
     @property
-    def p_hidden(self) -> float:
-        """Probability that a place cannot be seen, a whole session long, along lines that were clear before."""
-        return (P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown)
+    def p_hidden(self) -> FloatArray:
+        """(2,) probability that a place cannot be seen, a whole session long, along lines that were clear before."""
+        return np.asarray((P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown))
 
-    def after_session(self, hidden: float, shown: float) -> SightLines:
-        """With expected numbers of cliques that were hidden, or shown, along clear lines."""
+    def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
+        """With expected numbers (2,) of cliques that were hidden, or shown, along clear lines."""
         hidden, shown = self.hidden + hidden, self.shown + shown
-        fade = min(1.0, MOST_SESSIONS / max(hidden + shown, 1.0))
+        fade = np.minimum(1.0, MOST_SESSIONS / np.maximum(hidden + shown, 1.0))
         return replace(self, hidden=fade * hidden, shown=fade * shown)
 
     @classmethod
@@ -148,9 +151,8 @@ class SightLines:
         hits, looks = self._around(places, place, cell)
         free = np.clip(rate[length] * nominal / middle, *RATES)
         p_clear = _p_clear(hits, looks, share, free, np.full(len(length), blocked))
-        shown = np.full(len(length), 1.0 - self.p_hidden)
         misses = np.maximum(looks - hits, 0.0)
-        return Lines(shown, hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
+        return Lines(np.ones(len(length)), hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
             (p_clear >= CLEAR) & (hits > 0.0)
         )
 
