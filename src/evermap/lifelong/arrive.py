@@ -1,6 +1,7 @@
 """Whether a landmark that the map did not know has appeared, or had only not been seen yet.
 
-It has appeared if its place was seen empty: an earlier session looked at it from where it is seen now. Of a landmark
+It has appeared if its place was seen empty: an earlier session looked at it from where it is seen now, or past it at
+something behind. Of a landmark
 that is found, the age is that of a stay that one comes upon, `P(age < t) = int_0^t S / mean`; so
 
     odds(appeared) = P(age < t) / P(age >= t) * 1 / P(all looks missed it | it was there)
@@ -14,12 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
+from evermap.lifelong.believe import ALONG_M, Looks, class_of, clique_rows, site_middles
 from evermap.maps.living import LivingMap
 from evermap.sensing.sightlines import HEADINGS, Views, offsets
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.protocol import LifetimePrior
-from evermap.types import FloatArray, IntArray, Sensor
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 NEAR_M = 0.6
 """Who stands this close to where a place is seen from sees it, too."""
@@ -62,13 +63,15 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, sensor: Sensor) 
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
     cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[1])
+    rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
         expected: dict[float, float] = {}
         log_missed: dict[float, float] = {}
         for place in np.flatnonzero(site_of_place == site).tolist():
             mine = looks.rows.hit & (looks.place == place)
-            seen_from = after.places.position_m[place] + offsets(np.unique(looks.cell[mine]), cells)
-            frames, rate, stamps = _empty_looks(before.views, seen_from, after.places.position_m[place], at_eye)
+            place_m = after.places.position_m[place]
+            seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
+            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye)
             for stamp in np.unique(stamps):
                 then = stamps == stamp
                 expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
@@ -92,16 +95,44 @@ def p_younger(stay: LifetimePrior, age_s: float) -> float:
     return float(np.interp(age_s, ages, total) / total[-1])
 
 
+@dataclass(frozen=True, slots=True)
+class _Rays:
+    """Lines along which a place was seen: (K, 2) from, (K, 2) to."""
+
+    from_m: FloatArray
+    to_m: FloatArray
+
+    @classmethod
+    def of(cls, living: LivingMap) -> _Rays:
+        lines = living.sightlines
+        row = living.place_row(lines.landmark_id, lines.site_id)
+        used = (row >= 0) & (lines.hits >= 0.5)
+        to_m = living.places.position_m[row[used]]
+        return cls(to_m + offsets(lines.cell[used], lines.cell_m), to_m)
+
+    def pass_by(self, eye_m: FloatArray, place_m: FloatArray) -> BoolArray:
+        """(V,) whether something behind a place (2,) was seen from eyes (V, 2), past the place."""
+        away = place_m - self.from_m
+        ahead = self.to_m - self.from_m
+        length = np.maximum(np.hypot(*ahead.T), 1e-9)
+        along = (away * ahead).sum(axis=1) / length
+        across = np.abs(away[:, 0] * ahead[:, 1] - away[:, 1] * ahead[:, 0]) / length
+        past = self.from_m[(across < ALONG_M) & (along > 0.0) & (length > along + ALONG_M)]
+        gap = np.linalg.norm(eye_m[:, None] - past[None], axis=2).min(axis=1, initial=np.inf)
+        return np.asarray(gap <= NEAR_M)
+
+
 def _empty_looks(
-    views: Views, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor
+    views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
     pose = views.pose
     near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf) <= NEAR_M
+    near |= rays.pass_by(pose[:, :2], place_m)
     pose = pose[near]
     half = np.pi / HEADINGS
     rate = np.min(
-        [detection_probability(pose + np.array([0.0, 0.0, turn]), place_m[None], sensor)[:, 0] for turn in (-half, half)],
+        [detection_probability(pose + np.array([0, 0, turn]), place_m[None], sensor)[:, 0] for turn in (-half, half)],
         axis=0,
         initial=1.0,
     )

@@ -11,7 +11,7 @@ from evermap.config import LivingConfig
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
-from evermap.sensing.sightlines import Lines, nominal_lines
+from evermap.sensing.sightlines import BLOCKED_P, CLEAR, Lines, nominal_lines
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.named import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
@@ -22,6 +22,8 @@ SETTLED_S = 300.0
 """What is seen within this time of a look was there at that look."""
 BESIDE_M, BESIDE_RAD = 1.0, 0.15
 """What is seen this close to a place, or behind it at this angle, is seen along its line of sight."""
+ALONG_M = 0.3
+"""What is seen farther away, and at this distance from a line of sight, tells that this line is clear."""
 WITNESSES = 3
 """Frames in which something else must be seen along the lines to a clique to know that they are clear."""
 TOGETHER_M = 2.0
@@ -56,7 +58,8 @@ class Looks:
         lines: (K,) what is known of the different lines of sight.
         counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
         settled: (N,) whether the place was seen shortly before or after.
-        witnessed: (C,) whether something else was seen along the clear lines to a clique, in this session.
+        sight: (C,) what is known of the lines to each clique, as a row of `sightlines.P_HIDDEN`.
+        unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
     """
 
     rows: SiteLooks
@@ -65,7 +68,8 @@ class Looks:
     lines: Lines
     counts: BoolArray
     settled: BoolArray
-    witnessed: BoolArray
+    sight: IntArray
+    unwitnessed: FloatArray
 
 
 def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
@@ -171,27 +175,35 @@ def looked_at(
     rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, signed > 0.0)
     settled = surely_there(rows)
     if not learn_sight:
-        everything, nothing = np.ones(len(rows), dtype=np.bool_), np.zeros(len(np.unique(living.sites.clique_id)), bool)
-        return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled, nothing)
+        everything = np.ones(len(rows), dtype=np.bool_)
+        sight = np.zeros(len(np.unique(living.sites.clique_id)), dtype=np.int64)
+        return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled, sight, np.zeros(2))
     names = places.site_id, places.landmark_id
     now = living.sightlines.learned(names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum())))
-    lines, clear = now.lines(names, line[:, 0], line[:, 1], p_nominal)
-    clear = clear[key]
-    beside = _beside(rows, frame, places.position_m[place], eye[frame], clear)
-    counts, witnessed, p_hidden = _hidden(living, p_start, rows, clear, beside, eye[frame])
+    lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
+    _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
+    clear = ((p_clear >= CLEAR) & seen)[key]
+    beside, behind = _beside(rows, frame, places.position_m[place], eye[frame])
+    unknown = behind & ~clear & (p_clear > BLOCKED_P)[key]
+    was_unknown = behind & ~((p_before >= CLEAR) & seen_before)[key] & (p_before > BLOCKED_P)[key]
+    tried, found = (np.bincount(rows.clique[was_unknown & some], minlength=len(np.unique(living.sites.clique_id)))
+                    for some in (np.ones(len(rows), dtype=np.bool_), rows.hit))  # fmt: skip
+    there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= WITNESSES)
+    unwitnessed = np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
+    counts, sight, p_hidden = _hidden(living, p_start, rows, clear, beside & clear, unknown, eye[frame])
     lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
         np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
-    return Looks(rows, place, cell, lines, counts, settled, witnessed)
+    return Looks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
 
 
 def _beside(
-    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray, clear: BoolArray
-) -> BoolArray:
-    """(N,) looks along clear lines in whose frame another clique was seen beside or behind the place."""
-    beside = np.zeros(len(rows), dtype=np.bool_)
+    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray
+) -> tuple[BoolArray, BoolArray]:
+    """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
+    beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
     hit = np.flatnonzero(rows.hit)
     order = hit[np.argsort(frame[hit], kind="stable")]
-    mine = np.flatnonzero(clear)
+    mine = np.arange(len(rows))
     low, high = (np.searchsorted(frame[order], frame[mine], side=side) for side in ("left", "right"))
     one = np.repeat(mine, high - low)
     other = order[np.repeat(low - np.append(0, np.cumsum(high - low)[:-1]), high - low) + np.arange(len(one))]
@@ -200,30 +212,41 @@ def _beside(
     angle = np.abs(se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(there[:, 1], there[:, 0])))
     near = np.hypot(*(place_m[one] - place_m[other]).T) < BESIDE_M
     behind = (angle < BESIDE_RAD) & (beyond_m > range_m - 0.5 * BESIDE_M)
-    beside[one[(near | behind) & (rows.clique[one] != rows.clique[other])]] = True
-    return beside
+    others = rows.clique[one] != rows.clique[other]
+    beside[one[(near | behind) & others]] = True
+    close = (angle * range_m < ALONG_M) & (angle < np.pi / 4.0) & (beyond_m > range_m + ALONG_M)
+    along[one[close & others]] = True
+    return beside, along
 
 
 def _hidden(
-    living: LivingMap, p_start: FloatArray, rows: SiteLooks, clear: BoolArray, beside: BoolArray, eye: FloatArray
-) -> tuple[BoolArray, BoolArray, FloatArray]:
-    """Looks that count, (C,) cliques with a witness, and (C,) probability that a clique cannot be seen at all.
+    living: LivingMap,
+    p_start: FloatArray,
+    rows: SiteLooks,
+    clear: BoolArray,
+    beside: BoolArray,
+    unknown: BoolArray,
+    eye: FloatArray,
+) -> tuple[BoolArray, IntArray, FloatArray]:
+    """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
 
     A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
     closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
     while they would leave one by one.
     """
     cliques, row = clique_rows(living.sites)
-    n, p_hidden = len(cliques), living.sightlines.p_hidden
-    hits = np.bincount(rows.clique[rows.hit], minlength=n)
-    witnessed = np.bincount(rows.clique[beside], minlength=n) >= WITNESSES
+    n = len(cliques)
+    hits, n_clear, n_beside, n_unknown = (
+        np.bincount(rows.clique[some], minlength=n) for some in (rows.hit, clear, beside, unknown)
+    )
+    sight = np.select([n_beside >= WITNESSES, n_unknown >= WITNESSES], [1, 2], 0).astype(np.int64)
     known = np.bincount(row, p_start, minlength=n) >= 0.5
-    shown = (hits > 0) & known & (np.bincount(rows.clique[clear], minlength=n) >= WITNESSES)
-    counted = np.array([np.sum(shown & ~witnessed), np.sum(shown & witnessed)])
-    p_hidden = living.sightlines.after_session(np.zeros(2), counted).p_hidden
-    counts = rows.hit | np.where(witnessed[rows.clique], beside, clear)
-    of_clique = p_hidden[witnessed.astype(np.int64)]
-    alone = np.flatnonzero((hits == 0) & ~witnessed & (np.bincount(rows.clique[clear], minlength=n) > 0))
+    shown = (hits > 0) & known & (n_clear >= WITNESSES)
+    counted = np.array([np.sum(shown & (sight == 0)), np.sum(shown & (sight == 1)), 0.0])
+    p_hidden = living.sightlines.after_session(np.zeros(3), counted).p_hidden
+    counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
+    of_clique = p_hidden[sight]
+    alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
     looks = clear & np.isin(rows.clique, alone)
     middle = np.column_stack(
@@ -234,7 +257,7 @@ def _hidden(
         others = others[np.hypot(*(middle[others] - middle[clique]).T) < TOGETHER_M]
         together = float(np.prod(p_gone[others]))
         of_clique[clique] = p_hidden[0] / (p_hidden[0] + (1.0 - p_hidden[0]) * together)
-    return counts, witnessed, of_clique
+    return counts, sight, of_clique
 
 
 def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
@@ -291,6 +314,16 @@ def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
     return Evidence(
         cliques[told.clique], told.stamp_s, told.n_hits, told.n_misses, told.expected, told.log_odds, told.p_exists
     )
+
+
+def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
+    """(C,) log likelihood ratio of a session's looks, for 'it stands somewhere' against 'it is away'."""
+    cliques, row = clique_rows(living.sites)
+    before, after = (
+        np.clip(np.bincount(row, p, minlength=len(cliques)), 1e-12, 1.0 - 1e-12)
+        for p in (beliefs.p_before, beliefs.p_here)
+    )
+    return np.asarray(np.log(after / (1.0 - after)) - np.log(before / (1.0 - before)))
 
 
 def p_false_of(sensor: Sensor, living: LivingMap) -> float:

@@ -72,7 +72,7 @@ def decided(
     cliques, row_of = clique_rows(sites)
     told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
     last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
-    p_kept, hidden, shown = sites.p_kept.copy(), np.zeros(2), np.zeros(2)
+    p_kept, hidden, shown = sites.p_kept.copy(), np.zeros(3), np.zeros(3)
     begun: list[tuple[int, int, float, float, float]] = []
     found: list[MapChange] = []
     for c, clique in enumerate(cliques.tolist()):
@@ -80,7 +80,7 @@ def decided(
         site = int(mine[np.argmax(sites.p_here[mine])])
         stands, here = sites.p_here[site] >= EXISTS, int(hits[site]) > 0
         p_away = min(max(1.0 - float(sites.p_here[mine].sum()), 0.0), 1.0)
-        kind_of_line = int(looks.witnessed[c])
+        sight = int(looks.sight[c])
         old, stay = told.get(clique, (-1, -1))
         newest = stay if stay >= 0 else _newest_stay(after, clique)
         if old >= 0:
@@ -88,9 +88,9 @@ def decided(
                 if stay >= 0:
                     last[stay] = max(last[stay], sites.seen_s[site])
                     if here:  # missed before, but there all the time
-                        hidden[kind_of_line] += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
+                        hidden[sight % 2] += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
                         p_gone[stay] = 0.0
-                        shown[kind_of_line] += 1.0
+                        shown[sight % 2] += 1.0
                     elif log_evidence[c] <= -LEAST_EVIDENCE:
                         p_gone[stay] = p_away
                 else:  # a body that was taken apart: its part goes on
@@ -130,7 +130,7 @@ def decided(
         share = min(p_kept[site] / sites.p_here[site], 1.0)
         p_kept[site] = sites.p_here[site]
         same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
-        hidden[kind_of_line] += share if same else 0.0
+        hidden[sight % 2] += share if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
             continue
@@ -168,6 +168,7 @@ def decided(
         )
         stays = stays.joined(fresh)
         stays = stays[np.argsort(stays.first_s, kind="stable")]
+    hidden[2], shown[2] = looks.unwitnessed
     sightlines = after.sightlines.after_session(hidden, shown)
     after = replace(after, stays=stays, sites=replace(sites, p_kept=p_kept), sightlines=sightlines)
     return after, _swaps(found, before, after)

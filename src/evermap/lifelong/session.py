@@ -54,8 +54,8 @@ class Believed:
 
     Attributes:
         living: all but stays and what is learned.
-        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', by
-            clique, in the order of `believe.clique_rows`.
+        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
+            log likelihood ratio, by clique, in the order of `believe.clique_rows`.
         evidence: of every clique and frame.
     """
 
@@ -216,7 +216,7 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
         beliefs = believe.believed(
             living, entry.p_start, seen, visit.recording.sensor, config, visit.start_s, visit.end_s
         )
-        sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), beliefs.log_evidence
+        sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), believe.said(living, beliefs)
         evidence = believe.evidence(living, beliefs)
     else:
         sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))

@@ -31,11 +31,12 @@ RATES = (0.002, 0.98)
 """No kind of line has a rate outside: nothing is certain."""
 NEIGHBOUR = 0.35
 """What looks along a line say of those from the eight cells around, in looks along these."""
-CLEAR = 0.9
-"""A line is known to be clear from this probability on."""
-P_HIDDEN = np.array([0.1, 0.03])
-"""That a place cannot be seen for a whole session along lines that were clear before (a closed door, a parked truck),
-to begin with: where nothing else is seen along them in that session, and where something is."""
+CLEAR, BLOCKED_P = 0.9, 0.25
+"""A line is known to be clear from this probability on, and to be blocked up to that one."""
+P_HIDDEN = np.array([0.1, 0.03, 0.2])
+"""That a place cannot be seen for a whole session (a closed door, a parked truck), to begin with, by what is known of
+the lines to it: clear before, but nothing else is seen along them in this session; clear before, and something is;
+unknown before, but something is seen close to them and behind the place."""
 HIDDEN_LOOKS = 5.0
 """Sessions that this is worth against those that were seen."""
 MOST_SESSIONS = 2000.0
@@ -80,8 +81,8 @@ class SightLines:
         site_id, landmark_id: (K,) the place that was looked at.
         cell: (K,) the sensor's cell, counted from the place.
         hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
-        hidden, shown: (2,) sessions of cliques that were looked at and stood there: how many could not be seen, and
-            were; where nothing else was seen along their lines, and where something was.
+        hidden, shown: (3,) sessions of cliques that were looked at and stood there: how many could not be seen, and
+            were; by what was known of the lines, see `P_HIDDEN`.
         cell_m: side of a cell.
     """
 
@@ -90,8 +91,8 @@ class SightLines:
     cell: IntArray
     hits: FloatArray
     looks: FloatArray
-    hidden: FloatArray = field(default_factory=lambda: np.zeros(2))
-    shown: FloatArray = field(default_factory=lambda: np.zeros(2))
+    hidden: FloatArray = field(default_factory=lambda: np.zeros(3))
+    shown: FloatArray = field(default_factory=lambda: np.zeros(3))
     cell_m: float = 0.5
 
     def __len__(self) -> int:
@@ -99,11 +100,11 @@ class SightLines:
 
     @property
     def p_hidden(self) -> FloatArray:
-        """(2,) probability that a place cannot be seen, a whole session long, along lines that were clear before."""
+        """(3,) probability that a place cannot be seen, a whole session long, by what is known of the lines to it."""
         return np.asarray((P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown))
 
     def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
-        """With expected numbers (2,) of cliques that were hidden, or shown, along clear lines."""
+        """With expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""
         hidden, shown = self.hidden + hidden, self.shown + shown
         fade = np.minimum(1.0, MOST_SESSIONS / np.maximum(hidden + shown, 1.0))
         return replace(self, hidden=fade * hidden, shown=fade * shown)
@@ -132,7 +133,7 @@ class SightLines:
 
     def lines(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray, p_detect: FloatArray
-    ) -> tuple[Lines, BoolArray]:
+    ) -> tuple[Lines, FloatArray, BoolArray]:
         """What is known of lines of sight.
 
         Args:
@@ -142,7 +143,8 @@ class SightLines:
                 clear lines that is started from, and by how much it is less at the field's edge.
 
         Returns:
-            The lines, and (N,) which of them are known to be clear.
+            The lines, with nothing hidden; (N,) probability that they are clear; and (N,) whether something was ever
+            seen along them.
         """
         nominal = np.asarray(p_detect, dtype=np.float64)
         middle = float(np.max(nominal, initial=0.0)) or 1.0
@@ -152,9 +154,8 @@ class SightLines:
         free = np.clip(rate[length] * nominal / middle, *RATES)
         p_clear = _p_clear(hits, looks, share, free, np.full(len(length), blocked))
         misses = np.maximum(looks - hits, 0.0)
-        return Lines(np.ones(len(length)), hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0), (
-            (p_clear >= CLEAR) & (hits > 0.0)
-        )
+        lines = Lines(np.ones(len(length)), hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0)
+        return lines, p_clear, hits > 0.0
 
     def learned(
         self,
