@@ -47,7 +47,8 @@ HARD = 0
 """Stands for the length of patrols in a harder world."""
 HARD_LENGTHS_S = (20.0, 40.0, 60.0, 90.0, 165.0)
 OUTLIER_M = 0.5
-"""Landmarks that lie farther off are wrong, and are left out of errors and of their consistency."""
+"""Landmarks that stand where they were seen last, but farther off than this, are wrong: they are counted, and left out
+of errors and of their consistency."""
 SCORING = (
     "every change that is told, counted by landmark; it is true where the landmark came, left or moved within the "
     "interval that is told, and 'never' where it stood still in all sessions; a true change was really looked at where "
@@ -226,10 +227,17 @@ class _Truth:
         from evermap.slam.align import consensus
 
         claimed = living.landmarks(p_least=0.5)
+        still = self._still(claimed, session)
         at = self.position_m[session, claimed.landmark_id]
-        there = np.isfinite(at[:, 0])
-        pose, agree = consensus(claimed.position_m[there], at[there])
+        pose, agree = consensus(claimed.position_m[still], at[still])
         return pose if agree.any() else np.zeros(3)
+
+    def _still(self, claimed: Landmarks, session: int) -> BoolArray:
+        """(C,) which landmarks of a map stand where they stood when it saw them last."""
+        seen = np.clip(np.searchsorted(self.start_s, claimed.last_seen_s, side="right") - 1, 0, session)
+        then = self.position_m[seen, claimed.landmark_id]
+        now = self.position_m[session, claimed.landmark_id]
+        return np.asarray(np.isfinite(now[:, 0]) & _same(then, now))
 
     def map_scores(self, living: LivingMap, session: int, pose: FloatArray) -> Row:
         """Claims that are made with 0.9 or more, and errors of what stands about where the map has it."""
@@ -238,7 +246,8 @@ class _Truth:
         there = np.flatnonzero(np.isfinite(self.position_m[session, :, 0]))
         now = Landmarks.at(there, self.position_m[session, there])
         error = se2.transform(pose, claimed.position_m) - self.position_m[session, claimed.landmark_id]
-        right = np.hypot(*error.T) < OUTLIER_M  # False for nan
+        still = self._still(claimed, session)
+        right = still & (np.hypot(*error.T) < OUTLIER_M)  # False for nan
         turn = se2.rotation(float(pose[2]))
         covariance = turn @ claimed.covariance_m2[right] @ turn.T
         squared = np.einsum("ni,ni->n", error[right], np.linalg.solve(covariance, error[right][..., None])[..., 0])
@@ -251,6 +260,7 @@ class _Truth:
             "n_sure": int(sure.sum()),
             "n_sure_right": int((sure & stands_at(claimed, now, pose, 0.5)).sum()),
             "n_errors": int(right.sum()),
+            "n_wrong": int((still & ~right).sum()),
             "squared_error_m2": float((error[right] ** 2).sum()),
             "squared_shape_error_m2": float((rest**2).sum()),
             "size_error": size,

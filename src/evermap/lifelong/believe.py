@@ -11,7 +11,7 @@ from evermap.config import LivingConfig
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.persistence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
-from evermap.sensing.sightlines import BLOCKED_P, CLEAR, Lines, nominal_lines
+from evermap.sensing.sightlines import BLOCKED_P, CLEAR, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import detection_probability
 from evermap.survival.named import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
@@ -28,6 +28,7 @@ WITNESSES = 3
 """Frames in which something else must be seen along the lines to a clique to know that they are clear."""
 TOGETHER_M = 2.0
 """Cliques that are missed from places this close to each other may be hidden by the same thing."""
+ROUNDS = 5
 AT_ONCE = 2_000_000
 
 
@@ -241,13 +242,11 @@ def _hidden(
     )
     sight = np.select([n_beside >= WITNESSES, n_unknown >= WITNESSES], [1, 2], 0).astype(np.int64)
     known = np.bincount(row, p_start, minlength=n) >= 0.5
-    shown = (hits > 0) & known & (n_clear >= WITNESSES)
-    counted = np.array([np.sum(shown & (sight == 0)), np.sum(shown & (sight == 1)), 0.0])
-    p_hidden = living.sightlines.after_session(np.zeros(3), counted).p_hidden
+    p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
+    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= WITNESSES), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
     of_clique = p_hidden[sight]
     alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
-    p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
     looks = clear & np.isin(rows.clique, alone)
     middle = np.column_stack(
         [np.bincount(rows.clique[looks], eye[looks, k], minlength=n) for k in (0, 1)]
@@ -258,6 +257,21 @@ def _hidden(
         together = float(np.prod(p_gone[others]))
         of_clique[clique] = p_hidden[0] / (p_hidden[0] + (1.0 - p_hidden[0]) * together)
     return counts, sight, of_clique
+
+
+def _p_hidden(
+    lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray
+) -> FloatArray:
+    """(3,) probability of being hidden in this session, with what it says itself: more is missed than should be gone."""
+    p_hidden = lines.p_hidden
+    for _ in range(ROUNDS):
+        missed = looked & ~seen
+        by_sight = p_hidden[sight]
+        share = by_sight * (1.0 - p_gone) / (by_sight * (1.0 - p_gone) + p_gone)
+        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, (looked & seen).astype(float)))
+        hidden[2] = shown[2] = 0.0
+        p_hidden = lines.after_session(hidden, shown).p_hidden
+    return p_hidden
 
 
 def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:

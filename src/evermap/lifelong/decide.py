@@ -82,13 +82,15 @@ def decided(
         p_away = min(max(1.0 - float(sites.p_here[mine].sum()), 0.0), 1.0)
         sight = int(looks.sight[c])
         old, stay = told.get(clique, (-1, -1))
+        if log_evidence[c] <= -LEAST_EVIDENCE and not hits[mine].any():
+            hidden[sight % 2] += 1.0 - p_away
         newest = stay if stay >= 0 else _newest_stay(after, clique)
         if old >= 0:
             if stands and site == old:
                 if stay >= 0:
                     last[stay] = max(last[stay], sites.seen_s[site])
-                    if here:  # missed before, but there all the time
-                        hidden[sight % 2] += min(p_kept[site] / sites.p_here[site], 1.0) if p_gone[stay] > 0.0 else 0.0
+                    if here:  # if it was missed before, it was hidden then
+                        hidden[sight % 2] += min(p_kept[site] / sites.p_here[site], 1.0) * p_gone[stay]
                         p_gone[stay] = 0.0
                         shown[sight % 2] += 1.0
                     elif log_evidence[c] <= -LEAST_EVIDENCE:
@@ -130,14 +132,15 @@ def decided(
         share = min(p_kept[site] / sites.p_here[site], 1.0)
         p_kept[site] = sites.p_here[site]
         same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
-        hidden[sight % 2] += share if same else 0.0
+        hidden[sight % 2] += share * p_gone[newest] if same else 0.0
         if same and share >= 1.0 - EXISTS:  # it had never left
             last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
             continue
         elsewhere_s, probability = -np.inf, 1.0 - share if same else 1.0
         kind, left = ChangeKind.RETURNED, _last_site(before, after, clique)
         if newest >= 0:
-            elsewhere_s = float(gone[newest])
+            # where it was last it was found missing; elsewhere it may have come when it left
+            elsewhere_s = float(gone[newest] if same else last[newest])
             p_gone[newest] = max(p_gone[newest], probability)
         elif site in arrival:
             k = arrival[site]

@@ -11,7 +11,7 @@ from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap
 from evermap.slam.align import consensus, rigid
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
-from evermap.types import FloatArray, IntArray
+from evermap.types import UNKNOWN, FloatArray, IntArray
 
 SMALLEST_P = 1e-6
 BENT_M = 0.15
@@ -135,32 +135,23 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
     return replace(where, place=place, probability=probability)
 
 
-def with_glimpsed(living: LivingMap, p_site: FloatArray, where: Laid, landmark_id: IntArray) -> Laid:
-    """Landmarks that were seen too rarely to say where they are, laid where their cliques stand.
+def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
+    """Landmarks that were seen too rarely to say where they are, laid at the sites at which others of their body stand.
 
     Whether their sightings fit there is seen when the session is solved with the map.
 
     Args:
         living: the map.
-        p_site: (S,) belief in its sites.
         where: where all others lie.
         landmark_id: (K,) those.
     """
-    members, places, sites = living.members, living.places, living.sites
+    members, places = living.members, living.places
     names = np.intersect1d(landmark_id, members.landmark_id)
-    clique = members.clique_id[np.searchsorted(members.landmark_id, names)]
-    expected = replace(living, sites=replace(sites, p_here=p_site)).site_of()
-    site = expected[np.searchsorted(members.landmark_id, names)]
     laid = where.place >= 0
-    stands = dict(
-        zip(
-            members.clique_id[np.searchsorted(members.landmark_id, where.landmark_id[laid])].tolist(),
-            places.site_id[where.place[laid]].tolist(),
-            strict=True,
-        )
-    )
-    site = np.array([stands.get(int(c), int(s)) for c, s in zip(clique, site, strict=True)], dtype=np.int64)
-    place = living.place_row(names, site)
+    body = members.clique_id[np.searchsorted(members.landmark_id, where.landmark_id[laid])]
+    stands = dict(zip(body.tolist(), places.site_id[where.place[laid]].tolist(), strict=True))
+    clique = members.clique_id[np.searchsorted(members.landmark_id, names)]
+    place = living.place_row(names, np.array([stands.get(c, UNKNOWN) for c in clique.tolist()], dtype=np.int64))
     names, place = names[place >= 0], place[place >= 0]
     order = np.argsort(np.concatenate([where.landmark_id, names]), kind="stable")
     return replace(

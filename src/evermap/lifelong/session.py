@@ -27,6 +27,8 @@ from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
 
 INLIER = 0.5
+GLIMPSE_M = 0.4
+"""A landmark that was seen once, this close to its place, was seen there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +106,7 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
     if config.search == "joint":
         where = unbent(living, p_site, where, own.position_m)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
-    return with_glimpsed(living, p_site, where, glimpsed)
+    return with_glimpsed(living, where, glimpsed)
 
 
 def refit(
@@ -191,11 +193,24 @@ def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, F
     place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
     _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
     place_of[rows] = entry.place[found]
+    _place_glimpsed(place_of, entry, visit)
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
     seen = believe.looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
     return seen, believe.sensor_poses(sighting, recording.sensor)
+
+
+def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Visit) -> None:
+    """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
+    living, estimate = entry.living, visit.outcome.estimate
+    names = visit.prepared.landmark_id
+    row = np.flatnonzero((place_of < 0) & estimate.known & np.isin(names, living.members.landmark_id))
+    member = np.searchsorted(living.members.landmark_id, names[row])
+    place = living.place_row(names[row], living.site_of()[member])
+    row, place = row[place >= 0], place[place >= 0]
+    near = np.hypot(*(estimate.landmark[row] - living.places.position_m[place]).T) < GLIMPSE_M
+    place_of[row[near]] = place[near]
 
 
 def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -> Believed:
