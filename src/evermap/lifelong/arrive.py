@@ -1,12 +1,12 @@
 """Whether a landmark that the map did not know has appeared, or had only not been seen yet.
 
 It has appeared if its place was seen empty: an earlier session looked at it from where it is seen now, or past it at
-something behind. Of a landmark
-that is found, the age is that of a stay that one comes upon, `P(age < t) = int_0^t S / mean`; so
+something behind. With `t` the time since that look and `S` the survival of its class in this place,
 
-    odds(appeared) = P(age < t) / P(age >= t) * 1 / P(all looks missed it | it was there)
+    odds(appeared) = (1 - S(t)) / S(t) / P(all looks missed it | it was there)
 
-with `t` the time since that look. Without a look the map grew, and nothing has changed.
+since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
+known of a class). Without a look the map grew, and nothing has changed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from evermap.lifelong.believe import ALONG_M, Looks, class_of, clique_rows, site
 from evermap.maps.living import LivingMap
 from evermap.sensing.sightlines import HEADINGS, Views, offsets
 from evermap.sensing.visibility import detection_probability
-from evermap.survival.protocol import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 NEAR_M = 0.6
@@ -62,7 +61,7 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, sensor: Sensor) 
     cliques, row = clique_rows(after.sites)
     kinds, middle = class_of(after, cliques), site_middles(after)
     site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
-    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[1])
+    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
     rays = _Rays.of(before)
     for k, site in enumerate(new.tolist()):
         expected: dict[float, float] = {}
@@ -82,17 +81,9 @@ def arrivals(before: LivingMap, after: LivingMap, looks: Looks, sensor: Sensor) 
         looked[k] = max(enough)
         missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
-        young = p_younger(stay, after.stamp_s - looked[k])
+        young = -float(np.expm1(stay.log_survival(after.stamp_s - looked[k])))
         p_appeared[k] = young / (young + (1.0 - young) * missed)
     return Arrivals(new, looked, p_appeared)
-
-
-def p_younger(stay: LifetimePrior, age_s: float) -> float:
-    """Probability that a stay that one comes upon began less than `age_s` before (the equilibrium age)."""
-    ages = np.append(0.0, np.geomspace(60.0, 3e9, 400))
-    survival = np.exp(stay.log_survival(ages))
-    total = np.append(0.0, np.cumsum(0.5 * (survival[1:] + survival[:-1]) * np.diff(ages)))
-    return float(np.interp(age_s, ages, total) / total[-1])
 
 
 @dataclass(frozen=True, slots=True)
