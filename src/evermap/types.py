@@ -18,12 +18,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from hashlib import blake2b
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import InputError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -531,7 +534,7 @@ class SlamResult:
     alternatives: tuple[Alternative, ...] = ()
 
 
-_Table = TypeVar("_Table", Odometry, Frames, Detections)
+_Table = TypeVar("_Table", bound="DataclassInstance")
 
 
 def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:

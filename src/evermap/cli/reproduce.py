@@ -24,6 +24,7 @@ class Experiment(StrEnum):
     BATEMAN2020 = "bateman2020"
     LIFETIMES = "lifetimes"
     LIFELONG = "lifelong"
+    PARTIAL_VIEWS = "partial-views"
 
 
 DATA = {
@@ -34,8 +35,8 @@ DATA = {
     Experiment.LIFETIMES: Path("../shared/data/presence"),
     Experiment.LIFELONG: Path("../shared/data/mrclam"),
 }
-"""Where the data of each experiment are looked for; bateman2020 has none."""
-COUNTED = (Experiment.PRESENCE, Experiment.LIFELONG)
+"""Where the data of each experiment are looked for; bateman2020 and partial-views have none."""
+COUNTED = (Experiment.PRESENCE, Experiment.LIFELONG, Experiment.PARTIAL_VIEWS)
 """Experiments whose progress is not counted in seconds of recordings."""
 
 
@@ -74,17 +75,20 @@ def reproduce(
     ] = None,
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="nielsen2024, lifelong: a little of everything, minutes instead of hours."),
+        typer.Option(
+            "--quick", help="nielsen2024, lifelong, partial-views: a little of everything, minutes instead of hours."
+        ),
     ] = False,
     jobs: Annotated[
-        int | None, typer.Option(help="nielsen2024: runs at a time; 1 for timings that mean something.", min=1)
+        int | None,
+        typer.Option(help="nielsen2024, partial-views: runs at a time; 1 for timings that mean something.", min=1),
     ] = None,
     runs: Annotated[
         int | None,
         typer.Option(
             help="bateman2020: simulated for every world and sensor. lifetimes: months of patrols that are simulated. "
-            "lifelong: scripts of changes.",
-            show_default="100; lifetimes 10; lifelong 5",
+            "lifelong: scripts of changes. partial-views: buildings.",
+            show_default="100; lifetimes 10; lifelong 5; partial-views 20",
         ),
     ] = None,
     world: Annotated[
@@ -115,6 +119,7 @@ def reproduce(
     bateman2020: landmarks on rigid bodies seen in space, by filters of single landmarks and of whole bodies. lifetimes:
     how long things stay, learned from tracks, from months of patrols and from looks at rooms, against the truth.
     lifelong: sessions of the UTIAS robots into one map, while landmarks move, leave and come back between them.
+    partial-views: what is told as changed where patrols see only part of a building, against the truth.
     Runs follow one another on one core, so that the timings mean something.
 
     \b
@@ -125,6 +130,7 @@ def reproduce(
       evermap reproduce nielsen2024 --part recordings --dataset 6 --method joint
       evermap reproduce lifetimes --runs 3
       evermap reproduce lifelong --part five
+      evermap reproduce partial-views --quick
       evermap reproduce bateman2020 --runs 20 --world nominal --world occlusion --filters jcf+suppression,oracle
     """
     _one_core()
@@ -197,6 +203,14 @@ def reproduce(
             lives = replace(base, **{name: value for name, value in these.items() if value is not None})
             table = lifelong.reproduce(data or DATA[experiment], target, lives, progress=progress, force=force)
             as_text = lifelong.as_markdown
+        elif experiment is Experiment.PARTIAL_VIEWS:
+            from evermap.experiments import partial_views
+
+            first = partial_views.QUICK if quick else partial_views.Settings()
+            views: dict[str, Any] = {"seed": seed, "buildings": runs, "processes": jobs}
+            seen = replace(first, **{name: value for name, value in views.items() if value is not None})
+            table = partial_views.reproduce(target, seen, progress=progress, force=force)
+            as_text = partial_views.as_markdown
         else:
             from evermap.experiments import rosen2016
 
@@ -227,6 +241,7 @@ def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
         Experiment.BATEMAN2020: {"--seed", "--runs", "--world", "--filters"},
         Experiment.LIFETIMES: {"--data", "--seed", "--runs"},
         Experiment.LIFELONG: {"--data", "--seed", "--part", "--quick", "--runs"},
+        Experiment.PARTIAL_VIEWS: {"--seed", "--quick", "--jobs", "--runs"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))

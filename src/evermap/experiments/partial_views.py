@@ -9,6 +9,7 @@ for the next session, and how consistent the map's covariances are.
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -90,40 +91,52 @@ QUICK = Settings(buildings=2, sessions=6)
 
 
 def reproduce(
-    out: Path, settings: Settings | None = None, *, progress: Progress | None = None, force: bool = False
+    out: str | Path, settings: Settings | None = None, *, progress: Progress | None = None, force: bool = False
 ) -> dict[str, Any]:
-    """Run everything, and write `partial-views.json`, the table and the figures.
+    """Run everything, and write `summary.json`, `table.md` and the figures.
 
     Args:
-        out: folder for the results.
+        out: folder for the results; untouched if this run fails.
         settings: what to run; None for everything.
         progress: told after every world.
-        force: replace results of another kind.
+        force: write into a folder that holds other files, too; they stay.
+
+    Returns:
+        `worlds` (a dictionary a world), `settings`, `machine`; plain JSON values.
+
+    Raises:
+        ConfigError: `out` must not be replaced.
     """
-    from evermap.experiments.partial_views_figures import draw
-    from evermap.runfolder import replacing
+    from evermap.experiments.partial_views_figures import draw_false_changes, draw_reliability
+    from evermap.runfolder import RunFolder
+    from evermap.viz.style import save_all
 
     settings = settings or Settings()
     worlds = [(settings.seed + k, patrol) for patrol in settings.patrols_s for k in range(settings.buildings)]
-    total = len(worlds) * settings.sessions
-    rows: list[Row] = []
-    for k, found in enumerate(_each_world(settings, worlds)):
-        rows.append(found)
-        if progress is not None:
-            progress(float((k + 1) * settings.sessions), float(total))
-    content = {
-        "experiment": EXPERIMENT,
-        "schema_version": SCHEMA_VERSION,
-        "evermap_version": __version__,
-        "settings": asdict(replace(settings, processes=1)),
-        "scoring": SCORING,
-        "machine": machine(),
-        "worlds": rows,
-    }
-    with replacing(out, force=force) as folder:
-        (folder / f"{EXPERIMENT}.json").write_text(json.dumps(content, indent=1))
-        (folder / f"{EXPERIMENT}.md").write_text(as_markdown(content) + "\n")
-        draw(content, folder)
+    total = float(len(worlds) * settings.sessions)
+    with RunFolder(out, force=force) as folder:
+        wall, cpu = time.perf_counter(), time.process_time()
+        rows: list[Row] = []
+        for found in _each_world(settings, worlds):
+            rows.append(found)
+            if progress is not None:
+                progress(float(len(rows) * settings.sessions), total)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+        content: dict[str, Any] = {
+            "schema_version": SCHEMA_VERSION,
+            "evermap": __version__,
+            "experiment": EXPERIMENT,
+            "scoring": SCORING,
+            "settings": json.loads(json.dumps(asdict(settings))),
+            "machine": machine(cpu / wall),
+            "processing_s": wall,
+            "worlds": rows,
+        }
+        save_all({"reliability": draw_reliability(content), "false-changes": draw_false_changes(content)}, folder.path)
+        folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
+        content["outputs"] = sorted([*folder.files(), "summary.json"])
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+        folder.path("summary.json").write_text(text, encoding="utf-8")
     return content
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from evermap.experiments.markdown import markdown_table, number
 
 Row = Mapping[str, Any]
+PLAIN = "all but hard"
 EDGES = np.linspace(0.0, 1.0, 11)
 
 
@@ -24,7 +25,7 @@ def by_patrol(content: Mapping[str, Any]) -> dict[str, list[Row]]:
     for world in content["worlds"]:
         groups.setdefault(patrol_name(world["patrol_s"]), []).append(world)
     plain = [world for world in content["worlds"] if world["patrol_s"]]
-    return groups | ({"all but hard": plain} if len(plain) > 0 else {})
+    return groups | ({PLAIN: plain} if len(plain) > 0 else {})
 
 
 def summary(worlds: Sequence[Row]) -> dict[str, Any]:
@@ -69,10 +70,10 @@ def reliability(told: Iterable[Row]) -> list[tuple[float, float, int]]:
     ]
 
 
-def as_markdown(content: Mapping[str, Any]) -> str:
+def as_markdown(table: Mapping[str, Any]) -> str:
     """All tables."""
     lines = []
-    for name, worlds in by_patrol(content).items():
+    for name, worlds in by_patrol(table).items():
         s = summary(worlds)
         share = 100.0 / max(s["told"], 1)
         lines.append([
@@ -89,12 +90,15 @@ def as_markdown(content: Mapping[str, Any]) -> str:
         "shape [m]",
     )  # fmt: skip
     bins = []
-    for name, worlds in by_patrol(content).items():
-        if name in ("hard", "all but hard"):
+    for name, worlds in by_patrol(table).items():
+        if name in (patrol_name(0), PLAIN):
             for p, share_true, count in reliability(row for world in worlds for row in world["told"]):
                 bins.append([name, f"{p:.3f}", f"{share_true:.3f}", f"{count}"])
-    table = markdown_table(header, lines)
-    return table + "\n\n" + markdown_table(("patrols", "mean p told", "share true", "changes"), bins)
+    return (
+        markdown_table(header, lines)
+        + "\n\n"
+        + markdown_table(("patrols", "mean p told", "share true", "changes"), bins)
+    )
 
 
 def _mean(values: Any) -> float | None:

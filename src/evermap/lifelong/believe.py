@@ -180,7 +180,9 @@ def looked_at(
         sight = np.zeros(len(np.unique(living.sites.clique_id)), dtype=np.int64)
         return Looks(rows, place, cell, nominal_lines(p_nominal), everything, settled, sight, np.zeros(2))
     names = places.site_id, places.landmark_id
-    now = living.sightlines.learned(names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum())))
+    now = living.sightlines.learned(
+        names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum()))
+    )
     lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
     _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
     clear = ((p_clear >= CLEAR) & seen)[key]
@@ -197,9 +199,7 @@ def looked_at(
     return Looks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
 
 
-def _beside(
-    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray
-) -> tuple[BoolArray, BoolArray]:
+def _beside(rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray) -> tuple[BoolArray, BoolArray]:
     """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
     beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
     hit = np.flatnonzero(rows.hit)
@@ -259,18 +259,16 @@ def _hidden(
     return counts, sight, of_clique
 
 
-def _p_hidden(
-    lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray
-) -> FloatArray:
-    """(3,) probability of being hidden in this session, with what it says itself: more is missed than should be gone."""
+def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
+    """(3,) probability of being hidden, with what this session says: more is missed than should be gone."""
     p_hidden = lines.p_hidden
     for _ in range(ROUNDS):
         missed = looked & ~seen
         by_sight = p_hidden[sight]
         share = by_sight * (1.0 - p_gone) / (by_sight * (1.0 - p_gone) + p_gone)
-        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, (looked & seen).astype(float)))
-        hidden[2] = shown[2] = 0.0
-        p_hidden = lines.after_session(hidden, shown).p_hidden
+        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, looked & seen))
+        known = np.array([1.0, 1.0, 0.0])  # lines that were unknown are counted where a clique is known to stand
+        p_hidden = lines.after_session(known * hidden, known * shown).p_hidden
     return p_hidden
 
 

@@ -277,7 +277,7 @@ class LivingMap:
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
-        """(K, 2, 2) covariance of places (K,) by themselves, with what is not known of the map's size, about its middle."""
+        """(K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
         corner = 2 * row[:, None] + np.arange(2)
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(2)
         arm = self.places.position_m[row] - middle

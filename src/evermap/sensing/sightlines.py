@@ -138,7 +138,8 @@ class SightLines:
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
-            place, cell: (N,) lines: row of the place, and cell of the sensor.
+            place: (N,) row of the place of each line.
+            cell: (N,) cell of the sensor.
             p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along
                 clear lines that is started from, and by how much it is less at the field's edge.
 
@@ -169,7 +170,8 @@ class SightLines:
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
-            place, cell: (N,) lines, in any order.
+            place: (N,) row of the place of each line, in any order.
+            cell: (N,) cell of the sensor.
             hit: (N,) whether it was detected.
             weight: (N,) probability that it was there.
         """
@@ -233,7 +235,8 @@ class SightLines:
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
             free = np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES)
             blocked = float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES))
-        return free, blocked, share
+        rates: FloatArray = free.astype(np.float64)
+        return rates, blocked, share
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:
@@ -283,16 +286,15 @@ class Views:
         """The table after a session that ended at `stamp_s`, with sensor poses (F, 3)."""
         cell = np.floor(pose_map_sensor[:, :2] / self.cell_m).astype(np.int64)
         turn = np.floor(np.mod(pose_map_sensor[:, 2], 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
-        own, frames = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)
+        own, counts = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)
+        frames = np.append(counts.astype(np.float64), self.frames)
         both = np.concatenate([own, np.column_stack([self.cell, self.heading])])
         every, first = np.unique(both, axis=0, return_index=True)  # the first of equal rows: those of this session
         stamps = np.append(np.full(len(own), stamp_s), self.stamp_s)[first]
-        return Views(every[:, :2], every[:, 2], stamps, np.append(frames, self.frames)[first], self.cell_m)
+        return Views(every[:, :2], every[:, 2], stamps, frames[first], self.cell_m)
 
 
-def _p_clear(
-    hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, blocked: FloatArray
-) -> FloatArray:
+def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, blocked: FloatArray) -> FloatArray:
     """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
     from scipy.special import expit, gammaln
 
@@ -306,4 +308,4 @@ def _p_clear(
 def _length(cell: IntArray) -> IntArray:
     """(N,) lengths of lines of sight in cells, at most `LONGEST`."""
     dx, dy = cell // _REACH - _REACH // 2, cell % _REACH - _REACH // 2
-    return np.minimum(np.rint(np.hypot(dx + 0.5, dy + 0.5)).astype(np.int64), LONGEST)
+    return np.asarray(np.minimum(np.rint(np.hypot(dx + 0.5, dy + 0.5)).astype(np.int64), LONGEST))

@@ -23,12 +23,13 @@ from numpy.typing import NDArray
 from evermap.errors import EvermapError
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap
+from evermap.sensing.sightlines import P_HIDDEN
 from evermap.survival.plain import prior_from_dict, prior_to_dict
 from evermap.survival.protocol import LifetimePrior
 from evermap.types import UNKNOWN, FloatArray
 
-FORMAT = 1
-"""Of manifests; how columns are named and cut."""
+FORMAT = 2
+"""Of manifests; how columns are named and cut. Format 1 is read, see `_of_format_1`."""
 _CHUNK = 4096
 """Values a chunk: some 30 kB, so that one changed row costs little and a large map has some hundred chunks."""
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
@@ -151,6 +152,8 @@ def unpack(name: bytes, fetch: Fetch) -> LivingMap:
     """
     manifest = _manifest(name, fetch)
     parts = {**manifest["values"], **_arrays(manifest["columns"], fetch)}
+    if manifest["format"] == 1:
+        _of_format_1(parts)
     living: LivingMap = _build(LivingMap(), "", parts)
     if parts:
         raise DamagedError(f"it holds '{min(parts)}', which this evermap does not know; a newer one wrote it")
@@ -158,6 +161,19 @@ def unpack(name: bytes, fetch: Fetch) -> LivingMap:
     if problem:
         raise DamagedError(problem)
     return living
+
+
+def _of_format_1(parts: dict[str, Any]) -> None:
+    """What format 1 did not know of a map; its lines of sight, between cells of the floor, are learned again."""
+    for column in ("key", "hits", "looks", "cell_m"):
+        parts.pop(f"sightlines.{column}", None)
+    if isinstance(parts.get("sites.p_here"), np.ndarray):
+        parts["sites.p_kept"] = parts["sites.p_here"]
+    if isinstance(parts.get("stays.gone_s"), np.ndarray):
+        parts["stays.p_gone"] = np.isfinite(parts["stays.gone_s"]).astype(np.float64)
+    variance = parts.get("log_size_variance")
+    if isinstance(variance, float) and variance > 0.0:
+        parts["log_size_information"] = 1.0 / variance
 
 
 def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[str, NDArray[Any]]:
@@ -188,9 +204,12 @@ def flaw(living: LivingMap) -> str:
             return f"columns of different lengths in '{table}'"
     if len({len(lives.class_id), len(lives.chunk), len(lives.life)}) > 1:
         return "columns of different lengths in 'lives'"
-    in_lines = (getattr(lines, item.name) for item in fields(lines))
-    if len({len(part) for part in in_lines if isinstance(part, np.ndarray)}) > 1:
+    if len({len(getattr(lines, name)) for name in ("site_id", "landmark_id", "cell", "hits", "looks")}) > 1:
         return "columns of different lengths in 'sightlines'"
+    if len({len(getattr(living.views, name)) for name in ("cell", "heading", "stamp_s", "frames")}) > 1:
+        return "columns of different lengths in 'views'"
+    if len(lines.hidden) != len(P_HIDDEN) or len(lines.shown) != len(P_HIDDEN):
+        return "'sightlines.hidden' of another length"
     if living.covariance_m2.shape != (2 * len(places), 2 * len(places)):
         return f"a covariance of shape {living.covariance_m2.shape} for {len(places)} places"
     for column, ids in (("members.landmark_id", members.landmark_id), ("sites.site_id", sites.site_id)):
@@ -199,8 +218,6 @@ def flaw(living: LivingMap) -> str:
     site, name = places.site_id, places.landmark_id
     if np.any((site[1:] < site[:-1]) | ((site[1:] == site[:-1]) & (name[1:] <= name[:-1]))):
         return "'places' are not sorted by site and landmark, or not unique"
-    if np.any(lines.key[1:] <= lines.key[:-1]):
-        return "'sightlines.key' is not sorted, or not unique"
     for column, ids, known in (
         ("places.site_id", places.site_id, sites.site_id),
         ("places.landmark_id", places.landmark_id, members.landmark_id),
@@ -228,6 +245,13 @@ def flaw(living: LivingMap) -> str:
         ("log_size_variance", np.array(living.log_size_variance)),
         ("lives.chunk_m", np.array(lives.chunk_m)),
         ("sightlines.cell_m", np.array(lines.cell_m)),
+        ("sightlines.hits", lines.hits),
+        ("sightlines.looks", lines.looks),
+        ("sightlines.hidden", lines.hidden),
+        ("sightlines.shown", lines.shown),
+        ("views.cell_m", np.array(living.views.cell_m)),
+        ("views.stamp_s", living.views.stamp_s),
+        ("views.frames", living.views.frames),
         ("stays.first_s", stays.first_s),
         ("stays.last_s", stays.last_s),
         ("sites.since_s", sites.since_s),
@@ -240,16 +264,25 @@ def flaw(living: LivingMap) -> str:
         ("stays.gone_s", stays.gone_s),
         ("lives.looks_s", lives.looks_s),
         ("stamp_s", np.array(living.stamp_s)),
-        *((f"sightlines.{item.name}", np.asarray(getattr(lines, item.name))) for item in fields(lines)),
     ):
         if np.isnan(values).any():
             return f"'{column}' is not a number"
-    if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0:
+    if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
         return "a cell without size"
     if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):
         return "a negative variance"
-    if not np.all((sites.p_here >= 0.0) & (sites.p_here <= 1.0 + 1e-6)):
-        return "'sites.p_here' is not a probability"
+    for column, values in (
+        ("sites.p_here", sites.p_here),
+        ("sites.p_kept", sites.p_kept),
+        ("stays.p_gone", stays.p_gone),
+    ):
+        if not np.all((values >= 0.0) & (values <= 1.0 + 1e-6)):
+            return f"'{column}' is not a probability"
+    if not living.log_size_information > 0.0:
+        return "'log_size_information' is not positive"
+    counts = (lines.hits, lines.looks, lines.hidden, lines.shown, living.views.frames)
+    if any(np.any(values < 0.0) for values in counts):
+        return "a negative count in 'sightlines' or 'views'"
     for column, ids, ever in (
         ("sites.site_id", sites.site_id, living.n_sites_ever),
         ("stays.site_id", stays.site_id, living.n_sites_ever),
@@ -281,7 +314,7 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
     """A dataclass of the type of `default`, of parts that are taken out.
 
     What an older evermap did not write is as in `default`. A new column of a table has no such default: that needs
-    another `FORMAT`, and who reads the old one.
+    another `FORMAT`, and a reader of the old one.
     """
     content: dict[str, Any] = {}
     for item in fields(default):
@@ -361,8 +394,8 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
 def _manifest(name: bytes, fetch: Fetch) -> Any:
     """The values and the columns of a map, of the types that they have to have."""
     content = json_object(read_text(name, fetch([name])[name]))
-    if content.get("format") != FORMAT:
-        raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads {FORMAT}")
+    if content.get("format") not in (1, FORMAT):
+        raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 and {FORMAT}")
     columns = content.get("columns")
     if not isinstance(content.get("values"), dict) or not isinstance(columns, dict):
         raise DamagedError("a list of columns is missing")
