@@ -36,6 +36,7 @@ RULES = {
     "lifelong": "errors types se2 config survival sensing persistence slam maps",
     "pipeline": "errors interrupts types valid se2 config survival sensing persistence recurrence tracking slam maps "
     "lifelong",
+    "sessions": "errors types valid config maps pipeline",
     "runsummary": "errors types",
     "runfolder": "errors interrupts types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
@@ -44,8 +45,8 @@ RULES = {
     "demo": "errors interrupts types se2 compiled config survival maps lifelong sim io metrics viz pipeline runfolder",
     "presence": "errors types valid survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types valid survival tracking io viz runsummary runfolder",
-    "cli": "errors interrupts types config survival recurrence io sim metrics viz maps lifelong pipeline runfolder "
-    "presence objects server experiments demo",
+    "cli": "errors interrupts types config survival recurrence io sim metrics viz maps lifelong pipeline sessions "
+    "runfolder presence objects server experiments demo",
 }
 
 # loaded by the functions that need them, never by starting up

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from evermap.presence.run import run_persist
     from evermap.presence.table import read_looks
     from evermap.runfolder import write_run
+    from evermap.sessions import Entered, enter_session
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
 _HOME = {
@@ -42,6 +43,7 @@ _HOME = {
     "evermap.presence.run": ("run_persist",),
     "evermap.presence.table": ("read_looks",),
     "evermap.runfolder": ("write_run",),
+    "evermap.sessions": ("Entered", "enter_session"),
     "evermap.types": (
         "Detections",
         "Frames",
@@ -58,6 +60,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "Config",
     "Detections",
+    "Entered",
     "EvermapError",
     "Frames",
     "Landmarks",
@@ -71,6 +74,7 @@ __all__ = [
     "Trajectory",
     "__version__",
     "check_recording",
+    "enter_session",
     "load_config",
     "open_store",
     "read_looks",

@@ -204,6 +204,17 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
     return _validate(_overridden(_validate(_read_toml(source), source), overrides), None)
 
 
+def parse_config(text: str) -> Config:
+    """The configuration that `to_toml` wrote; '' for the defaults. Keys that are no more known are left out."""
+    values = tomllib.loads(text)
+    known = {
+        section: {name: value for name, value in table.items() if name in type(getattr(Config(), section)).model_fields}
+        for section, table in values.items()
+        if section in Config.model_fields and isinstance(table, dict)
+    }
+    return _validate(known, None)
+
+
 def with_overrides(config: Config, overrides: Iterable[str]) -> Config:
     """`config` with `section.key=value` overrides; errors as `load_config`."""
     return _validate(_overridden(config, overrides), None)

@@ -106,7 +106,8 @@ def run_session(
     """One session of a living map: localise in it from an unknown pose, find what changed, extend it (MATH.md 5).
 
     Args:
-        recording: the session; its truth is not looked at. Its stamps are later than all that the map has seen.
+        recording: the session; its truth is not looked at. It begins after the newest session of the map; one that is
+            late is entered by `sessions.enter_session`.
         living: the map; None begins one, in the frame of the first pose.
         config: settings; None for the defaults.
         progress: told after every frame.
@@ -116,12 +117,14 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
+    from evermap.lifelong.session import check_in_order
     from evermap.maps.living import LivingMap
     from evermap.valid import check_type
 
     config = _or_default(config)
     check_type(recording)
     living = LivingMap(clock=recording.clock) if living is None else living
+    check_in_order(recording, living)
     return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from evermap.cli.summary import show_run
-from evermap.cli.terminal import command_line, progress_bar, warm_up, warn
+from evermap.cli.terminal import command_line, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import held, kept
 
@@ -32,7 +33,8 @@ def run_in_map(
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
     from evermap.config import to_toml
     from evermap.maps.store import Provenance, RevisionKind, open_store
-    from evermap.pipeline import run_localization, run_session
+    from evermap.pipeline import run_localization
+    from evermap.sessions import at_time, enter_session
 
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
@@ -43,15 +45,18 @@ def run_in_map(
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} stays as it was")
     with opened as store:
-        parent = store.head()
-        living = store.load(parent)
         start = time.perf_counter()
         with progress_bar(recording.name) as progress:
             if localize:
+                stamps = recording.frames.stamp_s
+                living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
-                session = run_session(recording, living, config, progress=progress)
+                entered = enter_session(store, recording, config, progress=progress)
+                session = entered.session
                 result, recording = session.slam, session.recording
+                if entered.replayed:
+                    result = replace(result, changes=entered.changes)
         elapsed_s = time.perf_counter() - start
         _write(
             recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force, inputs=inputs
@@ -73,8 +78,18 @@ def run_in_map(
             wall_s=elapsed_s,
         )
         with held():
-            revision = store.commit(session.living, provenance, session.changes, session.evidence, parent=parent)
+            revision = store.commit(
+                entered.living,
+                provenance,
+                entered.changes,
+                session.evidence,
+                parent=entered.parent,
+                attachments=entered.attachments,
+            )
             kept(map_file, f"the session is revision {revision} of {map_file}")
+        if entered.replayed:
+            again = ", ".join(entered.replayed)
+            say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
 
 
 def _write(

@@ -119,6 +119,7 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     """The sites of a map as they are believed in at a later instant, at which nobody has looked again."""
     if not config.existence or len(living.sites) == 0:
         return living.sites
+    until_s = max(until_s, living.stamp_s)
     none = np.zeros(0, dtype=np.int64)
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
     lines = nominal_lines(np.zeros(0))
@@ -298,7 +299,11 @@ def believed(
         until_s: its end.
     """
     p_false = p_false_of(sensor, living)
-    return _followed(living, p_start, rows_of(looks.rows, looks.counts), looks.lines, config, start_s, until_s, p_false)
+    rows = rows_of(looks.rows, looks.counts)
+    # what another robot's session saw until its end is in the beliefs: looks before that count as at that instant
+    start_s, until_s = max(start_s, living.stamp_s), max(until_s, living.stamp_s)
+    rows = replace(rows, stamp_s=np.maximum(rows.stamp_s, start_s))
+    return _followed(living, p_start, rows, looks.lines, config, start_s, until_s, p_false)
 
 
 def surely_there(rows: SiteLooks) -> BoolArray:

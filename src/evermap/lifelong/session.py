@@ -70,20 +70,13 @@ def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, Living
     """The recording without landmarks that an operator deleted, and with the map's class numbers.
 
     Raises:
-        DataError: another clock than the map's, or a session that is earlier than what the map has seen.
+        DataError: another clock than the map's.
     """
-    stamps = recording.frames.stamp_s
     if len(living.places) and recording.clock != living.clock:
         raise DataError(
             f"{recording.name}: its stamps count '{recording.clock}', the map's '{living.clock}'",
             field="stamp_s",
             hint="sessions of one map need one clock, best seconds since 1970",
-        )
-    if len(stamps) and stamps[0] < living.stamp_s:
-        raise DataError(
-            f"{recording.name}: begins at {stamps[0]:.1f} s, but the map has seen {living.stamp_s:.1f} s already",
-            field="stamp_s",
-            hint="feed sessions in their order in time",
         )
     names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
     number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
@@ -93,6 +86,18 @@ def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, Living
     return replace(recording, detections=detections, class_names=names), replace(
         living, class_names=names, clock=recording.clock
     )
+
+
+def check_in_order(recording: Recording, living: LivingMap) -> None:
+    """Raise `DataError` for a session that begins before the newest one of the map."""
+    stamps = recording.frames.stamp_s
+    if len(stamps) and stamps[0] < living.session_start_s:
+        raise DataError(
+            f"{recording.name}: begins at {stamps[0]:.1f} s, before the newest session of the map, "
+            f"{living.session_start_s:.1f} s",
+            field="stamp_s",
+            hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it where it belongs",
+        )
 
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConfig) -> Laid | None:
@@ -243,7 +248,9 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
         since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
         seen_s=np.maximum(living.sites.seen_s, last),
     )
-    return Believed(replace(living, stamp_s=visit.end_s, places=places, sites=sites), log_evidence, evidence)
+    until_s = max(visit.end_s, living.stamp_s)
+    living = replace(living, stamp_s=until_s, session_start_s=visit.start_s, places=places, sites=sites)
+    return Believed(living, log_evidence, evidence)
 
 
 def decided(

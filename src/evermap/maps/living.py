@@ -191,6 +191,7 @@ class LivingMap:
 
     Attributes:
         stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
+        session_start_s: begin of the newest session; one that begins earlier is late.
         members, sites, places, stays: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
@@ -204,6 +205,7 @@ class LivingMap:
     """
 
     stamp_s: float = -np.inf
+    session_start_s: float = -np.inf
     members: Members = field(default_factory=Members.empty)
     sites: Sites = field(default_factory=Sites.empty)
     places: Places = field(default_factory=Places.empty)

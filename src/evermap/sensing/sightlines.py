@@ -227,7 +227,8 @@ class SightLines:
         length, n = _length(self.cell), LONGEST + 1
         voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))
         hits, looks = voice * self.hits, voice * self.looks
-        free, blocked, share = np.full(n, np.clip(nominal, *RATES)), BLOCKED, 0.5
+        free: FloatArray = np.full(n, np.clip(nominal, *RATES), dtype=np.float64)
+        blocked, share = BLOCKED, 0.5
         for _ in range(ROUNDS if len(self) else 0):
             p_clear = _p_clear(self.hits, self.looks, share, free[length], np.full(len(length), blocked))
             own = np.bincount(length, p_clear * hits, n), np.bincount(length, p_clear * looks, n)
@@ -235,8 +236,7 @@ class SightLines:
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
             free = np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES)
             blocked = float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES))
-        rates: FloatArray = free.astype(np.float64)
-        return rates, blocked, share
+        return np.asarray(free, dtype=np.float64), blocked, share
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:

@@ -171,6 +171,8 @@ def _of_format_1(parts: dict[str, Any]) -> None:
         parts["sites.p_kept"] = parts["sites.p_here"]
     if isinstance(parts.get("stays.gone_s"), np.ndarray):
         parts["stays.p_gone"] = np.isfinite(parts["stays.gone_s"]).astype(np.float64)
+    if "stamp_s" in parts:
+        parts["session_start_s"] = parts["stamp_s"]
     variance = parts.get("log_size_variance")
     if isinstance(variance, float) and variance > 0.0:
         parts["log_size_information"] = 1.0 / variance

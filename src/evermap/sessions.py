@@ -1,0 +1,183 @@
+"""Sessions of a stored map, in order of time, whenever they arrive.
+
+A session that begins before the newest one of the map is late: it is entered where it belongs. The map is taken back to
+the last revision before it, and it and all later sessions and edits are brought in again, from the recordings that are
+kept with their revisions. So the map is the one that the right order would have given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import DataError, InputError
+from evermap.maps.store import Attachment, MapStore, Revision, RevisionKind
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.maps.living import LivingMap
+    from evermap.pipeline import Session
+    from evermap.types import MapChange, Recording
+
+Progress = Callable[[float, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Entered:
+    """What a session made of a stored map; nothing is committed yet.
+
+    Attributes:
+        session: the session itself, in the map as it was at its time.
+        living: the map after it, and after all later sessions.
+        changes: between the newest revision and that map.
+        replayed: names of the later sessions that were brought in again.
+        parent: revision that it was made from.
+        attachments: to commit with it.
+    """
+
+    session: Session
+    living: LivingMap
+    changes: tuple[MapChange, ...]
+    replayed: tuple[str, ...]
+    parent: int
+    attachments: dict[str, bytes]
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """A session (with its recording), or an edit, of a map's history."""
+
+    start_s: float
+    revision: Revision
+    recording: Attachment | None
+
+
+def enter_session(
+    store: MapStore, recording: Recording, config: Config | None = None, *, progress: Progress | None = None
+) -> Entered:
+    """Bring a session into the newest map of a store, at its place in time.
+
+    Args:
+        store: the map.
+        recording: the session.
+        config: settings of this session; the others are brought in again with their own.
+        progress: told after every frame of this session.
+
+    Raises:
+        InputError: it is in the map already, or it is late and a later session kept no recording.
+        DataError, NumericalError: as `pipeline.run_session`.
+    """
+    from evermap.maps.diff import diff
+    from evermap.maps.store.recorded import RECORDING, pack_recording
+    from evermap.pipeline import run_session
+    from evermap.valid import check_type
+
+    check_type(recording)
+    head = store.head()
+    newest = store.load(head)
+    data = pack_recording(recording)
+    kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+    _refuse_twice(store, kept, data, recording)
+    stamps = recording.frames.stamp_s
+    start_s = float(stamps[0]) if len(stamps) else np.inf
+    if not start_s < newest.session_start_s:
+        session = run_session(recording, newest, config, progress=progress)
+        return Entered(session, session.living, session.changes, (), head, {RECORDING: data})
+    steps = _history(store, kept)
+    first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
+    base = store.load(steps[first].revision.parent)
+    later = sorted(steps[first:], key=lambda step: step.start_s)
+    # ids that were given since are not given again
+    living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
+    if not len(living.places):
+        living = replace(living, clock=recording.clock)
+    for step in (step for step in later if step.start_s <= start_s):
+        living = _again(store, step, living)
+    session = run_session(recording, living, config, progress=progress)
+    if not session.found:
+        return Entered(session, newest, (), (), head, {})
+    living = session.living
+    replayed = [step for step in later if step.start_s > start_s]
+    for step in replayed:
+        living = _again(store, step, living)
+    names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
+    return Entered(session, living, diff(newest, living), names, head, {RECORDING: data})
+
+
+def at_time(store: MapStore, stamp_s: float) -> LivingMap:
+    """The map of a store as it was at a time: of the last revision whose sessions had all begun; the first for earlier.
+
+    Args:
+        store: the map.
+        stamp_s: seconds of its clock.
+    """
+    living = store.load()
+    if not stamp_s < living.session_start_s:
+        return living
+    for number in reversed(store.lineage()):
+        older = store.load(number)
+        if len(older.places):
+            living = older
+            if not stamp_s < older.session_start_s:
+                break
+    return living
+
+
+def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: Recording) -> None:
+    for number, item in kept.items():
+        if item.n_bytes == len(data) and store.attached(item) == data:
+            raise InputError(
+                f"{recording.name}: is in the map already, as revision {number}",
+                path=store.where,
+                hint="a session is evidence once; the map stays as it was",
+            )
+
+
+def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
+    """Sessions and edits of the newest map, in the order in which they were committed."""
+    lineage = set(store.lineage())
+    steps: list[_Step] = []
+    start_s = -np.inf
+    for revision in store.log():
+        if revision.number not in lineage or revision.provenance.kind is RevisionKind.REVERT:
+            continue
+        if revision.provenance.kind is RevisionKind.SESSION:
+            if revision.number not in kept:
+                raise InputError(
+                    f"revision {revision.number} keeps no recording, so that no session can be entered before it",
+                    path=store.where,
+                    hint=f"evermap map revert {store.where} {revision.parent}, then the sessions in order of time",
+                )
+            steps.append(_Step(revision.provenance.stamp_from_s, revision, kept[revision.number]))
+            start_s = max(start_s, revision.provenance.stamp_from_s)
+        else:  # an operator's word holds from the newest session on that he knew
+            steps.append(_Step(start_s, revision, None))
+    return steps
+
+
+def _again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
+    """The map after a session or an edit that it has had before."""
+    from evermap.maps.diff import edits
+
+    if step.recording is None:
+        number = step.revision.number
+        words: dict[str, dict[str, Any]] = {
+            "pinned": {"pinned": True}, "unpinned": {"pinned": False},
+            "deleted": {"deleted": True}, "undeleted": {"deleted": False},
+        }  # fmt: skip
+        for landmark, word in edits(store.load(step.revision.parent), store.load(number)):
+            if landmark in living.members.landmark_id:
+                living = living.edited(landmark, **words[word])
+        return living
+    from evermap.config import parse_config
+    from evermap.maps.store.recorded import unpack_recording
+    from evermap.pipeline import run_session
+
+    recording = unpack_recording(store.attached(step.recording))
+    try:
+        return run_session(recording, living, parse_config(step.revision.provenance.config)).living
+    except DataError as error:
+        raise DataError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
