@@ -41,7 +41,7 @@ RULES = {
     "runfolder": "errors interrupts types se2 config io metrics viz runsummary",
     "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
     "experiments": "errors interrupts types valid se2 compiled config survival sensing persistence recurrence tracking "
-    "slam maps sim io metrics viz pipeline runsummary runfolder demo",
+    "slam maps lifelong sim io metrics viz pipeline runsummary runfolder demo",
     "demo": "errors interrupts types se2 compiled config survival maps lifelong sim io metrics viz pipeline runfolder",
     "presence": "errors types valid survival persistence recurrence io metrics viz runsummary runfolder",
     "objects": "errors types valid survival tracking io viz runsummary runfolder",

@@ -241,7 +241,8 @@ class SightLines:
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:
     """(N, 2) middles of cells (`SightLines.cells`), counted from the place."""
-    return (np.column_stack([cell // _REACH, cell % _REACH]) - _REACH // 2 + 0.5) * cell_m
+    middle = np.column_stack([cell // _REACH, cell % _REACH]) - _REACH // 2 + 0.5
+    return np.asarray(middle * cell_m, dtype=np.float64)
 
 
 def nominal_lines(p_detect: FloatArray) -> Lines:
