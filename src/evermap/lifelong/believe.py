@@ -26,6 +26,8 @@ ALONG_M = 0.3
 """What is seen farther away, and at this distance from a line of sight, tells that this line is clear."""
 WITNESSES = 3
 """Frames in which something else must be seen along the lines to a clique to know that they are clear."""
+SIDES, MOST_SIDES = 6, 3
+"""Sectors around a place that are sides of it, and how many of them count for being seen all around."""
 TOGETHER_M = 2.0
 """Cliques that are missed from places this close to each other may be hidden by the same thing."""
 ROUNDS = 5
@@ -194,7 +196,9 @@ def looked_at(
                     for some in (np.ones(len(rows), dtype=np.bool_), rows.hit))  # fmt: skip
     there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= WITNESSES)
     unwitnessed = np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
-    counts, sight, p_hidden = _hidden(living, p_start, rows, clear, beside & clear, unknown, eye[frame])
+    counts, sight, p_hidden = _hidden(
+        living, p_start, rows, clear, beside & clear, unknown, eye[frame], eye[frame, :2] - places.position_m[place]
+    )
     lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
         np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
     return Looks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
@@ -229,6 +233,7 @@ def _hidden(
     beside: BoolArray,
     unknown: BoolArray,
     eye: FloatArray,
+    away: FloatArray,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
     """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
 
@@ -246,7 +251,7 @@ def _hidden(
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
     p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= WITNESSES), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    of_clique = p_hidden[sight]
+    of_clique = p_hidden[sight] ** _sides(rows, counts & ~rows.hit, away, n)
     alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
     looks = clear & np.isin(rows.clique, alone)
     middle = np.column_stack(
@@ -256,8 +261,22 @@ def _hidden(
         others = alone[(alone != clique) & known[alone]]
         others = others[np.hypot(*(middle[others] - middle[clique]).T) < TOGETHER_M]
         together = float(np.prod(p_gone[others]))
-        of_clique[clique] = p_hidden[0] / (p_hidden[0] + (1.0 - p_hidden[0]) * together)
+        of_clique[clique] /= of_clique[clique] + (1.0 - of_clique[clique]) * together
     return counts, sight, of_clique
+
+
+def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int) -> IntArray:
+    """(C,) from how many sides each clique was looked at, one at least: what hides it from one need not from others.
+
+    Args:
+        rows: (N,) looks.
+        missed: (N,) those that count, and missed.
+        away: (N, 2) from the places to the sensor.
+        n: number of cliques.
+    """
+    side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (SIDES / (2.0 * np.pi))).astype(np.int64)
+    count = np.bincount(rows.clique[missed] * SIDES + side[missed] % SIDES, minlength=n * SIDES).reshape(n, SIDES)
+    return np.clip(np.sum(count >= WITNESSES, axis=1), 1, MOST_SIDES)
 
 
 def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:

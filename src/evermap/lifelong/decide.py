@@ -221,7 +221,7 @@ def _change(
         stamp_to_s=to_s,
         displacement_m=(float(step[0]), float(step[1])),
         rotation_rad=turn,
-        probability=min(max(probability, 0.0), 1.0),
+        probability=float(min(max(probability, 0.0), 1.0)),
         n_hits=n_hits,
         n_misses=n_misses,
     )

@@ -9,8 +9,6 @@ import numpy as np
 from evermap.maps.living import LivingMap, Stays
 from evermap.types import UNKNOWN, BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
-EXISTS = 0.5
-"""What exists with at least this probability is in the map."""
 _GATE = 9.21
 """99 % quantile of chi-square with two degrees of freedom: places that are nearer to each other may be the same."""
 _FLOOR_M2 = 0.01**2
@@ -24,6 +22,7 @@ class _Standing:
 
     clique_id: IntArray
     site_id: IntArray
+    told: BoolArray
     p_exists: FloatArray
     p_here: FloatArray
     position_m: FloatArray
@@ -37,13 +36,16 @@ class _Standing:
 
     @property
     def exists(self) -> BoolArray:
-        """Landmarks that are in the map, by belief."""
-        there: BoolArray = self.known & (self.p_exists >= EXISTS)
+        """Landmarks that are said to stand somewhere."""
+        there: BoolArray = self.known & self.told
         return there
 
 
 def diff(a: LivingMap, b: LivingMap) -> tuple[MapChange, ...]:
     """The changes from one map to a later one, by clique; what an operator deleted in either is left out.
+
+    A clique stands where its stay goes on (`LivingMap.told_site`): a belief that age alone has lowered is no change, and
+    what came to be known without its place having been seen empty is no arrival.
 
     Probabilities are of both beliefs together: that it stood there in `a`, and that it does not, or stands elsewhere,
     in `b`. Hits are detections at the new place, misses expected ones at the old place, both since `a`. The interval is
@@ -60,7 +62,7 @@ def diff(a: LivingMap, b: LivingMap) -> tuple[MapChange, ...]:
     old, new = _standing(a, ids), _standing(b, ids)
     moved = old.exists & new.exists & (old.site_id != new.site_id) & _apart(old, new)
     kinds = (
-        (ChangeKind.APPEARED, ~old.known & new.exists),
+        (ChangeKind.APPEARED, ~old.known & new.exists & _seen_empty(b, new)),
         (ChangeKind.RETURNED, old.known & ~old.exists & new.exists),
         (ChangeKind.VANISHED, old.exists & ~new.exists),
         (ChangeKind.MOVED, moved),
@@ -91,8 +93,10 @@ def edits(a: LivingMap, b: LivingMap) -> tuple[tuple[int, str], ...]:
 def _standing(living: LivingMap, ids: IntArray) -> _Standing:
     _, row, at = np.intersect1d(ids, living.members.landmark_id, return_indices=True)
     clique = np.full(len(ids), UNKNOWN, dtype=np.int64)
-    site, p_exists = clique.copy(), np.zeros(len(ids))
-    clique[row], site[row] = living.members.clique_id[at], living.site_of()[at]
+    site, p_exists, exists = clique.copy(), np.zeros(len(ids)), np.zeros(len(ids), dtype=np.bool_)
+    told, best = living.told_site()[at], living.site_of()[at]
+    clique[row], site[row] = living.members.clique_id[at], np.where(told == UNKNOWN, best, told)
+    exists[row] = told != UNKNOWN
     p_exists[row] = living.p_exists()[at]
     place = living.place_row(ids, site)
     site[place < 0] = UNKNOWN
@@ -102,7 +106,14 @@ def _standing(living: LivingMap, ids: IntArray) -> _Standing:
     corner = 2 * place[has][:, None] + np.arange(2)
     covariance[has] = living.covariance_m2[corner[:, :, None], corner[:, None, :]]
     p_here[has] = living.sites.p_here[np.searchsorted(living.sites.site_id, site[has])]
-    return _Standing(clique, site, p_exists, p_here, position, covariance)
+    return _Standing(clique, site, exists, p_exists, p_here, position, covariance)
+
+
+def _seen_empty(living: LivingMap, standing: _Standing) -> BoolArray:
+    """Landmarks whose place was looked at before they stood there; of a map without stays all."""
+    stays = living.stays
+    grown = stays.clique_id[(stays.gone_s == np.inf) & ~np.isfinite(stays.elsewhere_s)]
+    return np.asarray(~np.isin(standing.clique_id, grown))
 
 
 def _apart(old: _Standing, new: _Standing) -> BoolArray:

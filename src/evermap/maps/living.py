@@ -24,6 +24,10 @@ from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
 
 
+EXISTS = 0.5
+"""What exists with at least this probability is in the map."""
+
+
 class _Rows:
     """Columns of equal length that are taken and joined together."""
 
@@ -241,6 +245,21 @@ class LivingMap:
         site = np.full(len(self.members), UNKNOWN, dtype=np.int64)
         site[ok] = self.sites.site_id[best[at[ok]]]
         return site
+
+    def told_site(self) -> IntArray:
+        """(L,) `site_id` at which each landmark's clique is said to stand: where its stay goes on; `UNKNOWN` if away.
+
+        Of a clique without a stay, as in maps made by hand, its most probable site, if it more probably stands.
+        """
+        site = np.where(self.p_exists() >= EXISTS, self.site_of(), UNKNOWN)
+        known = np.isin(self.members.clique_id, self.stays.clique_id)
+        goes_on = np.flatnonzero(self.stays.gone_s == np.inf)
+        order = goes_on[np.argsort(self.stays.clique_id[goes_on], kind="stable")]
+        clique = self.stays.clique_id[order]
+        at = np.minimum(np.searchsorted(clique, self.members.clique_id), max(len(order) - 1, 0))
+        stands = clique[at] == self.members.clique_id if len(order) else np.zeros(len(site), dtype=np.bool_)
+        told = self.stays.site_id[order][at] if len(order) else site
+        return np.asarray(np.where(stands, told, np.where(known, UNKNOWN, site)))
 
     def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
         """(K,) rows of `places` for pairs of landmark and site, -1 where there is none."""

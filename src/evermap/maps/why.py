@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.maps.diff import EXISTS, edits
+from evermap.maps.diff import edits
 from evermap.maps.living import Evidence, LivingMap, Stays
 from evermap.maps.stamps import stamp_text
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind

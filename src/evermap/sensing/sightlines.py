@@ -26,7 +26,7 @@ STRENGTH = 4.0
 NOMINAL_LOOKS = 20.0
 """Looks that the nominal rate is worth against those along all lines of a length; one line counts no more than that."""
 BLOCKED = 0.03
-"""Detection rate along blocked lines to begin with: round corners, and because places are not quite known."""
+"""Detection rate along blocked lines: round corners, and because places are not quite known."""
 RATES = (0.002, 0.98)
 """No kind of line has a rate outside: nothing is certain."""
 NEIGHBOUR = 0.35
@@ -149,11 +149,11 @@ class SightLines:
         """
         nominal = np.asarray(p_detect, dtype=np.float64)
         middle = float(np.max(nominal, initial=0.0)) or 1.0
-        rate, blocked, share = self._kinds(middle)
+        rate, share = self._kinds(middle)
         length = _length(cell)
         hits, looks = self._around(places, place, cell)
         free = np.clip(rate[length] * nominal / middle, *RATES)
-        p_clear = _p_clear(hits, looks, share, free, np.full(len(length), blocked))
+        p_clear = _p_clear(hits, looks, share, free)
         misses = np.maximum(looks - hits, 0.0)
         lines = Lines(np.ones(len(length)), hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0)
         return lines, p_clear, hits > 0.0
@@ -219,24 +219,22 @@ class SightLines:
             looks += counts * self.looks[order[at]]
         return hits, looks
 
-    def _kinds(self, nominal: float) -> tuple[FloatArray, float, float]:
-        """Rates along clear lines by length, and along blocked ones, and the share of clear ones.
+    def _kinds(self, nominal: float) -> tuple[FloatArray, float]:
+        """Rates along clear lines by length, and the share of clear ones, by expectation maximisation.
 
-        By expectation maximisation; what few lines say gives way to what is nominal.
+        What few lines say gives way to what is nominal.
         """
         length, n = _length(self.cell), LONGEST + 1
         voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))
         hits, looks = voice * self.hits, voice * self.looks
         free: FloatArray = np.full(n, np.clip(nominal, *RATES), dtype=np.float64)
-        blocked, share = BLOCKED, 0.5
+        share = 0.5
         for _ in range(ROUNDS if len(self) else 0):
-            p_clear = _p_clear(self.hits, self.looks, share, free[length], np.full(len(length), blocked))
+            p_clear = _p_clear(self.hits, self.looks, share, free[length])
             own = np.bincount(length, p_clear * hits, n), np.bincount(length, p_clear * looks, n)
-            rest = np.sum((1.0 - p_clear) * hits), np.sum((1.0 - p_clear) * looks)
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
             free = np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES)
-            blocked = float(np.clip((rest[0] + NOMINAL_LOOKS * BLOCKED) / (rest[1] + NOMINAL_LOOKS), *RATES))
-        return np.asarray(free, dtype=np.float64), blocked, share
+        return np.asarray(free, dtype=np.float64), share
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:
@@ -295,15 +293,15 @@ class Views:
         return Views(every[:, :2], every[:, 2], stamps, frames[first], self.cell_m)
 
 
-def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, blocked: FloatArray) -> FloatArray:
+def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray) -> FloatArray:
     """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
     from scipy.special import expit, gammaln
 
-    def log_likelihood(rate: FloatArray) -> FloatArray:
-        a, b = STRENGTH * rate, STRENGTH * (1.0 - rate)
+    def log_likelihood(rate: FloatArray | float) -> FloatArray:
+        a, b = STRENGTH * np.asarray(rate), STRENGTH * (1.0 - np.asarray(rate))
         return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + np.maximum(looks - hits, 0.0)) - gammaln(b))
 
-    return np.asarray(expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(blocked)))
+    return np.asarray(expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(BLOCKED)))
 
 
 def _length(cell: IntArray) -> IntArray:
