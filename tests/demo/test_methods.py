@@ -41,10 +41,10 @@ def living() -> LivingMap:
         n_misses=np.zeros(5, dtype=np.int64),
     )
     factor = np.random.default_rng(1).normal(size=(10, 10))
-    stays = Stays(np.array([0, 1, 0]), np.array([0, 2, 1]), np.zeros(3, np.int64), np.zeros((3, 2)), *np.zeros((4, 3)))
+    stays = Stays(np.array([0, 1, 0]), np.array([0, 2, 1]), np.zeros(3, np.int64), np.zeros((3, 2)), *np.zeros((5, 3)))
     return LivingMap(
         members=Members(np.array([3, 5, 7]), np.zeros(3, np.int64), np.array([0, 0, 1]), off, off),
-        sites=Sites(np.arange(3), np.array([0, 0, 1]), np.array([0.2, 0.7, 0.9]), np.zeros(3), np.ones(3)),
+        sites=Sites(np.arange(3), np.array([0, 0, 1]), *np.tile([0.2, 0.7, 0.9], (2, 1)), np.zeros(3), np.ones(3)),
         places=places,
         stays=stays,
         covariance_m2=factor @ factor.T,

@@ -158,7 +158,7 @@ def made_map(places: list[tuple[int, int, float, float, float]]) -> LivingMap:
     return LivingMap(
         stamp_s=0.0,
         members=Members(ids, np.full(len(ids), -1), ids, off, off),
-        sites=Sites(site, landmark, p, np.zeros(len(site)), np.zeros(len(site))),
+        sites=Sites(site, landmark, p, p, np.zeros(len(site)), np.zeros(len(site))),
         places=Places(site, landmark, np.column_stack([x, y]), none, none),
         covariance_m2=np.eye(2 * len(site)),
     )

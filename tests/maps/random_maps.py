@@ -9,15 +9,22 @@ import numpy as np
 
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
-from evermap.sensing.sightlines import SightLines
+from evermap.sensing.sightlines import HEADINGS, P_HIDDEN, SightLines, Views
 from evermap.survival import Exponential, GeneralPurpose, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange
 
 HOUR_S = 3600.0
 
 
-def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None) -> LivingMap:
-    """A consistent map: every clique has one to three landmarks and one or two sites, each with its stays."""
+def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, format_1: bool = False) -> LivingMap:
+    """A consistent map: every clique has one to three landmarks and one or two sites, each with its stays.
+
+    Args:
+        seed: of everything in it.
+        cliques: how many.
+        stamp_s: of the map; None for any.
+        format_1: as it is read where format 1 wrote it, which `data/schema_2.evermap` holds.
+    """
     random = np.random.default_rng(seed)
     now_s = float(random.uniform(50, 100) * HOUR_S) if stamp_s is None else stamp_s
     clique = np.repeat(np.arange(cliques), random.integers(1, 4, cliques))
@@ -46,8 +53,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None) -> 
             ),
         ),
     )
-    sight = replace(SightLines.empty())
-    return LivingMap(
+    living = LivingMap(
         stamp_s=now_s,
         members=Members(
             landmark,
@@ -59,6 +65,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None) -> 
         sites=Sites(
             np.arange(len(site_clique)),
             site_clique.astype(np.int64),
+            p_here,
             p_here,
             since_s,
             since_s + random.uniform(0, 9, len(site_clique)) * HOUR_S,
@@ -79,15 +86,43 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None) -> 
             since_s[order],
             since_s[order] + HOUR_S,
             np.where(random.random(len(order)) < 0.5, np.inf, since_s[order] + 2 * HOUR_S),
+            np.zeros(len(order)),
         ),
         covariance_m2=factor @ factor.T,
         lives=lives,
-        sightlines=sight,
         class_names=("pallet", "cart"),
         clock=Clock.RECORDING,
         n_cliques_ever=cliques + seed % 7,
         n_sites_ever=len(site_clique) + seed % 5,
     )
+    ended = np.isfinite(living.stays.gone_s)
+    if format_1:
+        return replace(living, stays=replace(living.stays, p_gone=ended.astype(np.float64)))
+    random = np.random.default_rng([seed, 2])
+    return replace(
+        living,
+        sites=replace(living.sites, p_kept=p_here * random.random(len(p_here))),
+        stays=replace(living.stays, p_gone=ended * random.uniform(0.5, 1.0, len(ended))),
+        sightlines=random_lines(random, living.places),
+        views=Views(
+            random.integers(-40, 40, (30, 2)),
+            random.integers(0, HEADINGS, 30),
+            random.uniform(0, 1, 30) * now_s,
+            random.integers(1, 9, 30).astype(np.float64),
+        ),
+    )
+
+
+def random_lines(random: np.random.Generator, places: Places) -> SightLines:
+    """Some lines of sight to each place."""
+    place = np.repeat(np.arange(len(places)), 4)
+    sensor = places.position_m[place] + random.uniform(-8, 8, (len(place), 2))
+    cell = SightLines.empty().cells(sensor, places.position_m[place])
+    hit = random.random(len(place)) < 0.5
+    lines = SightLines.empty().learned(
+        (places.site_id, places.landmark_id), place, cell, hit, random.random(len(place)) + 0.1
+    )
+    return replace(lines, hidden=random.uniform(0, 9, len(P_HIDDEN)), shown=random.uniform(0, 99, len(P_HIDDEN)))
 
 
 def random_evidence(seed: int, living: LivingMap, *, looks: int = 40) -> Evidence:

@@ -78,7 +78,8 @@ def as_seen(true: Sequence[TrueStay], looks_s: FloatArray, position_m: FloatArra
     table = np.array(sorted(rows, key=lambda row: row[4])).reshape(-1, 7)
     names = table[:, :3].astype(np.int64)
     places = np.zeros((len(table), 2)) if position_m is None else position_m[names[:, 0]]
-    return Stays(names[:, 0], names[:, 1], names[:, 2], places, *table[:, 3:].T)
+    p_gone = np.isfinite(table[:, 6]).astype(np.float64)
+    return Stays(names[:, 0], names[:, 1], names[:, 2], places, *table[:, 3:].T, p_gone)
 
 
 def looked(looks_s: FloatArray) -> Lives:

@@ -46,7 +46,7 @@ def a_map(
             np.isin(ids, pinned),
             np.isin(ids, deleted),
         ),
-        sites=Sites(site, clique, p.astype(float), np.zeros(len(site)), np.full(len(site), stamp_s)),
+        sites=Sites(site, clique, *np.tile(p.astype(float), (2, 1)), np.zeros(len(site)), np.full(len(site), stamp_s)),
         places=Places(at, name, np.column_stack([x, y]).astype(float), counts[:, 0], counts[:, 1]),
         stays=Stays(
             rows[:, 0].astype(np.int64),
@@ -54,6 +54,7 @@ def a_map(
             np.full(len(rows), -1),
             np.zeros((len(rows), 2)),
             *rows[:, 2:].T.copy(),
+            np.isfinite(rows[:, 5]).astype(np.float64),
         ),
         covariance_m2=sigma_m**2 * np.eye(2 * len(places)),
         n_cliques_ever=100,

@@ -20,7 +20,9 @@ def body(hits: int = 60, misses: int = 40) -> LivingMap:
     return LivingMap(
         stamp_s=100.0,
         members=Members(LANDMARKS, np.zeros(4, np.int64), np.full(4, 3), OFF, OFF),
-        sites=Sites(np.arange(2), np.full(2, 3), np.array([0.1, 0.8]), np.zeros(2), np.full(2, 50.0)),
+        sites=Sites(
+            np.arange(2), np.full(2, 3), np.array([0.1, 0.8]), np.array([0.0, 0.7]), np.zeros(2), np.full(2, 50.0)
+        ),
         places=Places(site, np.tile(LANDMARKS, 2), np.random.default_rng(0).normal(size=(8, 2)), *counts),
         covariance_m2=1e-3 * np.eye(16),
         n_cliques_ever=10,

@@ -20,8 +20,8 @@ def a_map() -> LivingMap:
         stamp_s=10.0,
         members=Members(np.array([1, 2, 3, 7]), np.array([0, 0, 0, 1]), np.array([0, 0, 0, 1]), off, off),
         sites=Sites(
-            np.array([0, 1, 2]), np.array([0, 0, 1]), np.array([0.2, 0.7, 0.9]), np.array([0.0, 5.0, 1.0]),
-            np.array([4.0, 9.0, 9.5]),
+            np.array([0, 1, 2]), np.array([0, 0, 1]), np.array([0.2, 0.7, 0.9]), np.array([0.1, 0.6, 0.9]),
+            np.array([0.0, 5.0, 1.0]), np.array([4.0, 9.0, 9.5]),
         ),
         places=Places(
             np.array([0, 0, 0, 1, 1, 1, 2]), np.array([1, 2, 3, 1, 2, 3, 7]), rng.uniform(0, 9, (7, 2)),
@@ -29,7 +29,7 @@ def a_map() -> LivingMap:
         ),
         stays=Stays(
             np.array([0, 1]), np.array([1, 2]), np.array([0, 1]), np.zeros((2, 2)), np.array([-np.inf, -np.inf]),
-            np.array([5.0, 1.0]), np.array([9.0, 9.5]), np.array([np.inf, np.inf]),
+            np.array([5.0, 1.0]), np.array([9.0, 9.5]), np.array([np.inf, np.inf]), np.zeros(2),
         ),
         covariance_m2=root @ root.T,
         n_cliques_ever=2,

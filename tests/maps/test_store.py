@@ -302,7 +302,7 @@ def test_what_an_older_evermap_did_not_write_has_its_default() -> None:
             lambda m: m["values"].update(colour="red"),
             "it holds 'colour', which this evermap does not know",
         ),
-        (lambda m: m.update(format=2), "columns of format 2, this evermap reads 1"),
+        (lambda m: m.update(format=3), "columns of format 3, this evermap reads 1 and 2"),
     ],
 )
 def test_what_this_evermap_does_not_know_is_not_dropped(change: Callable[[dict[str, Any]], None], line: str) -> None:

@@ -83,7 +83,7 @@ def test_an_old_schema_becomes_that_of_today(tmp_path: Path, make: Callable[[Pat
         assert store.head() == 4
         seen = 0
         for seed in range(3):
-            living = random_map(seed, cliques=3)
+            living = random_map(seed, cliques=3, format_1=True)
             assert_same(store.load(seed + 1), living)
             for mine, theirs in zip(store.changes(seed + 1), random_changes(seed, living), strict=True):
                 assert_same(mine, theirs)
@@ -119,7 +119,7 @@ def test_a_migration_that_fails_leaves_the_old_store(tmp_path: Path, monkeypatch
             open_store(path)
     assert tables(path) == before
     with open_store(path) as store:
-        assert_same(store.load(3), random_map(2, cliques=3))
+        assert_same(store.load(3), random_map(2, cliques=3, format_1=True))
 
 
 def test_there_is_a_step_from_every_schema_to_the_next() -> None:

@@ -31,13 +31,13 @@ def the_map(
         members=Members(
             np.array([5, 6, 9]), np.array([0, 0, -1]), np.array([1, 1, 2]), np.zeros(3, bool), np.zeros(3, bool)
         ),
-        sites=Sites(np.array([1, 2]), np.array([1, 2]), np.array(p), np.zeros(2), np.full(2, stamp_s)),
+        sites=Sites(np.array([1, 2]), np.array([1, 2]), *np.array([p, p]), np.zeros(2), np.full(2, stamp_s)),
         places=Places(
             np.array([1, 1, 2]), np.array([5, 6, 9]), np.array([[0.0, 0], [1, 0], [5, 5]]), *np.ones((2, 3), int)
         ),
         stays=Stays(
             rows[:, 0].astype(int), rows[:, 1].astype(int), np.zeros(len(rows), int), np.zeros((len(rows), 2)),
-            *rows[:, 2:].T.copy(),
+            *rows[:, 2:].T.copy(), np.isfinite(rows[:, 5]).astype(float),
         ),
         covariance_m2=1e-4 * np.eye(6),
         lives=Lives(np.array([0]), np.array([[EVERYWHERE, EVERYWHERE]]), (life,)),
