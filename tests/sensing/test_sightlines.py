@@ -12,7 +12,6 @@ from scipy.stats import betabinom
 
 from evermap import se2
 from evermap.errors import InputError
-from evermap.sensing import sightlines
 from evermap.sensing.sightlines import (
     HEADINGS,
     HIDDEN_LOOKS,
