@@ -62,11 +62,26 @@ def test_a_body_taken_apart_keeps_its_sites_in_both_parts() -> None:
     for clique, names in ((0, {1, 2}), (2, {3})):
         mine = after.sites.clique_id == clique
         np.testing.assert_allclose(np.sort(after.sites.p_here[mine]), [0.2, 0.7])
+        np.testing.assert_allclose(np.sort(after.sites.p_kept[mine]), [0.1, 0.6])
         for site in after.sites.site_id[mine]:
             assert set(after.places.landmark_id[after.places.site_id == site].tolist()) == names
     assert set(before.sites.site_id.tolist()) <= set(after.sites.site_id.tolist())
     assert after.n_sites_ever == 5
     assert np.all(np.diff(after.sites.site_id) > 0)
+
+
+def test_stays_are_of_the_part_that_keeps_the_site() -> None:
+    """Landmark 3 turned out to have moved alone: what it did at site 1 is not the history of the others."""
+    whole = a_map()
+    alone = whole.places.site_id != 1
+    alone |= whole.places.landmark_id == 3
+    corner = (2 * np.flatnonzero(alone)[:, None] + np.arange(2)).ravel()
+    before = replace(whole, places=whole.places[alone], covariance_m2=whole.covariance_m2[np.ix_(corner, corner)])
+    after, _ = relabelled(before, np.array([0, 0, 2, 1]))
+    owner = dict(zip(after.sites.site_id.tolist(), after.sites.clique_id.tolist(), strict=True))
+    assert owner[1] == 2
+    assert after.stays.site_id.tolist() == [1, 2]
+    assert after.stays.clique_id.tolist() == [2, 1]
 
 
 def test_bodies_put_together_stand_where_both_stood() -> None:
@@ -78,6 +93,8 @@ def test_bodies_put_together_stand_where_both_stood() -> None:
     assert set(after.places.landmark_id[after.places.site_id == together].tolist()) == {1, 2, 3, 7}
     row = int(np.searchsorted(after.sites.site_id, together))
     assert after.sites.p_here[row] == 0.7  # both stand there no more surely than each
+    assert after.sites.p_kept[row] == 0.6
+    assert (after.sites.p_kept <= after.sites.p_here).all()
     assert after.sites.p_here.sum() <= 1.0
     assert after.stays.clique_id.tolist() == [0]  # the stay of the one that is no more goes on in the other
 

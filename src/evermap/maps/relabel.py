@@ -14,9 +14,10 @@ from evermap.types import BoolArray, FloatArray, IntArray
 def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
     """The map after its landmarks were given to other cliques.
 
-    A site of a clique that is taken apart becomes one for each part. Where cliques are put together, the sites at which
-    they most probably stood become one; their other sites hold places of some landmarks only. Stays that went on of a
-    clique that is no more are left out: they go on in the one that it is part of now.
+    A site of a clique that is taken apart becomes one for each part; its stays are those of the part that keeps the
+    site. Where cliques are put together, the sites at which they most probably stood become one; their other sites hold
+    places of some landmarks only. Stays that went on of a clique that is no more are left out: they go on in the one
+    that it is part of now.
 
     Args:
         living: the map.
@@ -53,6 +54,10 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     rank[order] = np.arange(len(order))
     corner = se2.xy_rows(order)
     no_more = np.setdiff1d(sites.clique_id, owner)
+    lost, owners = set(no_more.tolist()), dict(zip(parted.site_id.tolist(), parted.clique_id.tolist(), strict=True))
+    whose = zip(stays.clique_id.tolist(), stays.site_id.tolist(), strict=True)
+    kept = [clique if clique in lost else owners.get(at, clique) for clique, at in whose]
+    stays = replace(stays, clique_id=np.array(kept, dtype=np.int64))
     return replace(
         living,
         members=replace(members, clique_id=clique_id),
