@@ -267,6 +267,8 @@ def decided(
     """
     arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
     after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s)
+    if not config.learn_sight:
+        after = replace(after, sightlines=before.sightlines)
     if config.cliques and config.existence and config.misses:
         after = without_missed(before, after)
     return decide.without_forgotten(after, config.most_sites), changes
