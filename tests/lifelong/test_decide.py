@@ -1,4 +1,4 @@
-"""Stays and changes of hand-made sessions: what is said, of what, and between which two looks it happened."""
+"""Stays and changes of hand-made sessions: what is told, of what, and between which two looks it happened."""
 
 from __future__ import annotations
 
@@ -6,16 +6,20 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from evermap.lifelong import decide
+from evermap.lifelong.arrive import Arrivals
 from evermap.lifelong.believe import Looks
 from evermap.lifelong.extend import Extended
 from evermap.maps.lives import Life, Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.persistence.sites import SiteLooks
+from evermap.sensing.sightlines import nominal_lines
 from evermap.survival import Exponential, Mixture
 from evermap.survival.named import never_leaves
-from evermap.types import UNKNOWN, ChangeKind, MapChange
+from evermap.types import UNKNOWN, ChangeKind, FloatArray, MapChange, rows_of
 
 from .scenes import assert_consistent, begun, found, next_map
 
@@ -25,12 +29,16 @@ AT = {1: (0.0, 0.0), 2: (0.6, 0.0), 8: (5.0, 0.0), 9: (9.0, 9.0)}
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """At a landmark's place in the map after the session: when, and whether it was seen there."""
+    """At a landmark's place in the map after the session: when, and whether it was seen there.
+
+    A miss counts where the line of sight is known to be clear.
+    """
 
     landmark: int
     stamp_s: float
     hit: bool
     at: tuple[float, float] | None = None
+    counts: bool = True
 
 
 @dataclass(slots=True)
@@ -51,10 +59,27 @@ class Story:
         *,
         away: tuple[int, ...] = (),
         p_away: float = 0.99,
+        log_evidence: dict[int, float] | None = None,
+        kept: dict[int, float] | None = None,
+        arrived: dict[int, tuple[float, float]] | None = None,
+        anew: tuple[int, ...] = (),
     ) -> tuple[MapChange, ...]:
-        """One more session; `stands` are the landmarks it saw, `away` those it no longer believes in."""
+        """One more session.
+
+        Args:
+            start_s: when it began.
+            stands: the landmarks that it saw, and where.
+            looks: at their places, and at those of others.
+            away: those it no longer believes in, with `p_away`.
+            p_away: in these.
+            log_evidence: what looks said for a landmark's body; -5 for those that are away, 5 for the others.
+            kept: the probability that a landmark which is seen has never left since, as a share of that of its site;
+                0 for those of which the last stay ended, 1 for all others.
+            arrived: when earlier looks found the place of a new landmark empty, and how probably it came since.
+            anew: landmarks that have a new place, however near to their old one.
+        """
         names = sorted(stands)
-        place = [self._place_at(name, stands[name]) for name in names]
+        place = [-1 if name in anew else self._place_at(name, stands[name]) for name in names]
         of = {n: [look.stamp_s for look in looks if look.landmark == n and look.hit] for n in names}
         entry_of = found(names, [stands[n] for n in names], place=place)
         entry_of = replace(
@@ -65,6 +90,7 @@ class Story:
         entry = begun(entry_of) if not len(self.living.places) else next_map(self.living, entry_of)
         before = entry.before
         after = self._believed(entry, {*names}, away, p_away)
+        after = replace(after, sites=replace(after.sites, p_kept=self._kept(before, after, kept or {})))
         seen = self._looks(after, looks)
         hit = seen.rows.hit
         last = after.sites.seen_s.copy()
@@ -75,9 +101,35 @@ class Story:
             since[site] = seen.rows.stamp_s[hit & (seen.rows.site == site)].min()
         end_s = max([start_s, *(look.stamp_s for look in looks)])
         after = replace(after, stamp_s=end_s, sites=replace(after.sites, since_s=since, seen_s=last))
-        self.living = decide.with_stays(before, after, seen, start_s)
+        said = np.full(len(np.unique(after.sites.clique_id)), 5.0)
+        for name in (*away, *(log_evidence or {})):
+            said[self._row_of(after, name)] = (log_evidence or {}).get(name, -5.0)
+        self.living, changes = decide.decided(before, after, seen, said, self._arrivals(after, arrived or {}), start_s)
         assert_consistent(self.living)
-        return decide.changes_between(before, self.living, seen) if len(before.places) else ()
+        assert (self.living.sites.p_kept <= self.living.sites.p_here).all()
+        return changes
+
+    @staticmethod
+    def _row_of(living: LivingMap, landmark: int) -> int:
+        """Of its body."""
+        body = living.members.clique_id[living.members.landmark_id == landmark]
+        return int(np.searchsorted(np.unique(living.sites.clique_id), body)[0])
+
+    @staticmethod
+    def _kept(before: LivingMap, after: LivingMap, kept: dict[int, float]) -> FloatArray:
+        share = np.ones(len(after.sites))
+        for clique in np.unique(before.stays.clique_id):
+            if np.isfinite(before.stays.gone_s[before.stays.clique_id == clique]).all():
+                share[after.sites.clique_id == clique] = 0.0
+        for name, value in kept.items():
+            share[after.sites.clique_id == after.members.clique_id[after.members.landmark_id == name]] = value
+        return share * after.sites.p_here
+
+    @staticmethod
+    def _arrivals(after: LivingMap, arrived: dict[int, tuple[float, float]]) -> Arrivals:
+        site = [int(after.places.site_id[after.places.landmark_id == name][-1]) for name in arrived]
+        looked, p_appeared = np.array([*arrived.values()]).reshape(-1, 2).T
+        return Arrivals(np.searchsorted(after.sites.site_id, site), looked, p_appeared)
 
     def stays_of(self, landmark: int) -> Stays:
         return self.living.stays[self.living.stays.clique_id == self.body(landmark)]
@@ -117,7 +169,10 @@ class Story:
         order = np.lexsort((stamp, clique))
         key = np.zeros(len(place), dtype=np.int64)
         table = SiteLooks(stamp[order], clique[order], site[order], key, hit[order])
-        return Looks(table, place[order], np.zeros(1, dtype=np.int64), np.ones(1))
+        counts = np.array([look.counts for look in looks], dtype=np.bool_)
+        lines = nominal_lines(np.ones(1))
+        sight = np.zeros(len(cliques), dtype=np.int64)
+        return Looks(table, place[order], key, lines, (hit | counts)[order], hit[order], sight, np.zeros(2))
 
 
 def told() -> Story:
@@ -236,26 +291,181 @@ def test_who_comes_back_elsewhere_is_told_with_where_it_had_been() -> None:
     assert change.displacement_m == pytest.approx((0.0, 3.0))
 
 
-def test_who_was_never_seen_appears_and_came_since_its_place_was_looked_at() -> None:
+def test_who_is_new_has_appeared_only_if_its_place_was_seen_empty() -> None:
+    """Of the others nobody knows that they came: the map grew, the world did not change."""
     story = told()
-    new = {4: (5.0, 2.8), 5: (40.0, 40.0)}  # beside 8, and where nobody ever was
-    changes = story.session(1000.0, AT | new, seen(*AT, *new, since_s=1000.0))
-    (near,) = changes  # of the other nobody knows that it came: the map grew, the world did not change
-    assert (near.kind, near.landmark_ids) == (ChangeKind.APPEARED, (4,))
-    assert np.isnan(near.displacement_m).all()
-    assert 98.0 <= near.stamp_from_s <= 99.0
-    assert near.stamp_to_s == 1004.0
-    assert story.stays_of(5).elsewhere_s.tolist() == [-np.inf]
+    new = {4: (5.0, 2.8), 5: (40.0, 40.0), 6: (-9.0, 3.0)}
+    (change,) = story.session(
+        1000.0, AT | new, seen(*AT, *new, since_s=1000.0), arrived={4: (98.5, 0.9), 6: (98.5, 0.4)}
+    )
+    assert (change.kind, change.landmark_ids) == (ChangeKind.APPEARED, (4,))
+    assert change.probability == pytest.approx(0.9 * 0.98)
+    assert np.isnan(change.displacement_m).all()
+    assert (change.stamp_from_s, change.stamp_to_s) == (98.5, 1004.0)
+    assert (change.n_hits, change.n_misses) == (2, 0)
+    assert story.stays_of(4).elsewhere_s.tolist() == [98.5]
+    for name in (5, 6):
+        assert story.stays_of(name).elsewhere_s.tolist() == [-np.inf]
+        assert story.stays_of(name).first_s.tolist() == [1000.0 + name]
 
 
-def test_a_place_that_was_not_visited_for_long_may_have_had_a_visitor_for_long() -> None:
-    """The session in between was in another room: it is no look at the place."""
+@pytest.mark.parametrize("later_s", [1e3, 1e8])
+def test_age_alone_is_never_told(later_s: float) -> None:
+    """Nobody looked at 8 for years: hardly anybody believes in it, and nothing is said of it."""
     story = told()
-    story.session(1000.0, {9: AT[9]}, seen(9, since_s=1000.0))
-    (change,) = story.session(2000.0, AT | {4: (5.0, 2.8)}, seen(*AT, 4, since_s=2000.0))
-    assert change.kind is ChangeKind.APPEARED
-    assert change.stamp_from_s <= 99.0
-    assert story.stays_of(4).elsewhere_s[0] <= 99.0
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looks = seen(1, 2, 9, since_s=later_s)
+    assert story.session(later_s, rest, looks, away=(8,), log_evidence={8: 0.0}) == ()
+    assert story.stays_of(8).gone_s.tolist() == [np.inf]
+    assert story.stays_of(8).p_gone.tolist() == [0.0]
+    # and seen again it has never left
+    assert story.session(2.0 * later_s, AT, seen(*AT, since_s=2.0 * later_s), kept={8: 0.01}) == ()
+    assert story.stays_of(8).first_s.tolist() == [18.0]
+    assert story.stays_of(8).gone_s.tolist() == [np.inf]
+
+
+def test_misses_along_lines_that_are_not_known_to_be_clear_are_no_looks() -> None:
+    story = told()
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looks = [*seen(1, 2, 9, since_s=1000.0), *(Look(8, 1010.0 + k, hit=False, counts=False) for k in range(9))]
+    assert story.session(1000.0, rest, looks, away=(8,)) == ()
+    assert story.stays_of(8).gone_s.tolist() == [np.inf]
+
+
+@pytest.mark.parametrize(("log_evidence", "tells"), [(-1.4, False), (-1.6, True)])
+def test_looks_that_say_little_against_a_body_end_no_stay(log_evidence: float, tells: bool) -> None:
+    story = told()
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looks = [*seen(1, 2, 9, since_s=1000.0), Look(8, 1012.0, hit=False)]
+    changes = story.session(1000.0, rest, looks, away=(8,), log_evidence={8: log_evidence})
+    assert [change.kind for change in changes] == [ChangeKind.VANISHED] * tells
+    assert np.isinf(story.stays_of(8).gone_s[0]) != tells
+    assert story.stays_of(8).p_gone[0] == pytest.approx((1.0 - 0.01 / 4) if tells else 0.0)
+
+
+def test_a_doubt_is_kept_with_the_stay_until_it_is_seen_again() -> None:
+    story = told()
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looks = [*seen(1, 2, 9, since_s=1000.0), Look(8, 1012.0, hit=False)]
+    story.living = replace(story.living, sites=replace(story.living.sites, p_here=np.full(3, 0.7)))
+    assert story.session(1000.0, rest, looks, log_evidence={8: -2.0}) == ()
+    assert story.stays_of(8).p_gone.tolist() == pytest.approx([0.3])
+    assert story.stays_of(8).gone_s.tolist() == [np.inf]
+    hidden = story.living.sightlines.hidden.copy()
+    assert story.session(2000.0, AT, seen(*AT, since_s=2000.0), kept={8: 0.5}) == ()
+    assert story.stays_of(8).p_gone.tolist() == [0.0]
+    # if it had not left it was hidden; and now it was shown
+    assert story.living.sightlines.hidden[0] - hidden[0] == pytest.approx(0.5 * 0.3)
+
+
+def vanished() -> Story:
+    """Of which 8 was told to have vanished, after 98 s, before 1012 s."""
+    story = told()
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    (change,) = story.session(1000.0, rest, [*seen(1, 2, 9, since_s=1000.0), Look(8, 1012.0, hit=False)], away=(8,))
+    assert change.kind is ChangeKind.VANISHED
+    return story
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 0.49, 0.51, 0.9, 1.0])
+def test_who_was_told_to_have_vanished_and_is_seen_where_it_was_has_returned_only_if_it_had_left(share: float) -> None:
+    """Otherwise it was hidden: its stay goes on, nothing is told, and places are known to be hidden more often."""
+    story = vanished()
+    p_gone = float(story.stays_of(8).p_gone[0])
+    hidden = story.living.sightlines.hidden[0]
+    changes = story.session(2000.0, AT, seen(*AT, since_s=2000.0), kept={8: share})
+    assert story.living.sightlines.hidden[0] - hidden == pytest.approx(share * p_gone)
+    stays = story.stays_of(8)
+    if share > 0.5:
+        assert changes == ()
+        assert (stays.first_s.tolist(), stays.last_s.tolist(), stays.gone_s.tolist()) == ([18.0], [2048.0], [np.inf])
+        assert stays.p_gone.tolist() == [0.0]
+    else:
+        (change,) = changes
+        assert change.kind is ChangeKind.RETURNED
+        assert change.probability == pytest.approx(0.98 * (1.0 - share))
+        assert stays.gone_s.tolist() == [1012.0, np.inf]
+        assert stays.p_gone.tolist() == [pytest.approx(max(p_gone, 1.0 - share)), 0.0]
+
+
+def test_what_is_shown_and_what_is_hidden_is_counted_by_expectation() -> None:
+    """Of a body that is missed, as much as it is still believed in was hidden."""
+    story = told()
+    np.testing.assert_array_equal(story.living.sightlines.shown, 0.0)  # nobody knew of any
+    rest = {n: AT[n] for n in (1, 2, 9)}
+    looks = [*seen(1, 2, 9, since_s=1000.0), Look(8, 1012.0, hit=False)]
+    story.session(1000.0, rest, looks, away=(8,), p_away=0.9)
+    assert story.living.sightlines.hidden.tolist() == pytest.approx([0.1 / 4, 0.0, 0.0])
+    assert story.living.sightlines.shown.tolist() == [2.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("step_m", "tells"), [(0.05, False), (0.5, True)])
+def test_who_stands_a_hands_breadth_from_where_it_stood_has_not_moved(step_m: float, tells: bool) -> None:
+    story = told()
+    looks = [*seen(1, 2, 9, since_s=1000.0), Look(8, 1008.0, hit=True, at=(5.0 + step_m, 0.0))]
+    changes = story.session(1000.0, AT | {8: (5.0 + step_m, 0.0)}, looks, anew=(8,))
+    assert [change.kind for change in changes] == [ChangeKind.MOVED] * tells
+    assert story.stays_of(8).gone_s.tolist() == [1000.0, np.inf]  # the site is another one all the same
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
+    """Random beliefs, evidence and looks at a map that stands and has some that are away, again and again."""
+    rng = np.random.default_rng(seed)
+    story = vanished()
+    for k, at in enumerate([(9.0, 5.0), (3.0, 3.0)]):  # bodies have several sites
+        story.session(1200.0 + 200.0 * k, {1: AT[1], 2: AT[2], 9: at}, seen(1, 2, 9, since_s=1200.0 + 200.0 * k))
+    living = story.living
+    assert len(living.sites) == 5
+    cliques, row = np.unique(living.sites.clique_id, return_inverse=True)
+    for k in range(4):
+        start_s = 2000.0 + 1000.0 * k
+        p_here = rng.beta(0.4, 0.4, len(living.sites))
+        n = int(rng.integers(0, 6))
+        place = np.sort(rng.integers(0, len(living.places), n))
+        site = np.searchsorted(living.sites.site_id, living.places.site_id[place])
+        hit, counts = rng.random((2, n)) < 0.5
+        stamp = np.sort(start_s + rng.uniform(0.0, 99.0, n))
+        order = np.lexsort((stamp, row[site]))
+        rows = rows_of(SiteLooks(stamp, row[site], site, np.zeros(n, np.int64), hit), order)
+        looks = Looks(
+            rows, place[order], np.zeros(n, np.int64), nominal_lines(np.ones(1)), (hit | counts)[order], hit[order],
+            rng.integers(0, 3, len(cliques)), np.zeros(2),
+        )  # fmt: skip
+        seen_s = living.sites.seen_s.copy()
+        np.maximum.at(seen_s, rows.site[rows.hit], rows.stamp_s[rows.hit])
+        sites = replace(living.sites, p_here=p_here, p_kept=p_here * rng.random(len(p_here)), seen_s=seen_s)
+        said = rng.normal(0.0, 3.0, len(cliques))
+        none = Arrivals(np.zeros(0, np.int64), np.zeros(0), np.zeros(0))
+        stays = living.stays
+        now = replace(living, sites=sites, stamp_s=start_s + 99.0)
+        after, changes = decide.decided(living, now, looks, said, none, start_s)
+        looked = {int(cliques[c]) for c, tells in zip(looks.rows.clique, looks.counts, strict=True) if tells}
+        body = dict(zip(after.members.landmark_id.tolist(), after.members.clique_id.tolist(), strict=True))
+        for change in changes:
+            (clique,) = {body[name] for name in change.landmark_ids}
+            assert clique in looked
+            assert change.kind is not ChangeKind.APPEARED
+            assert change.n_hits + change.n_misses > 0
+            assert 0.5 <= change.probability * (1.0 + 1e-9) <= 1.0 + 1e-9 or change.kind is ChangeKind.RETURNED
+            if change.kind is ChangeKind.VANISHED:
+                assert change.n_misses > 0
+                assert said[np.searchsorted(cliques, clique)] <= -decide.LEAST_EVIDENCE
+        for clique in set(cliques.tolist()) - looked:  # stays as they were
+            mine, then = after.stays.clique_id == clique, stays.clique_id == clique
+            np.testing.assert_array_equal(after.stays.gone_s[mine], stays.gone_s[then])
+        # at most one stay of a body goes on
+        goes_on = after.stays.clique_id[np.isinf(after.stays.gone_s)]
+        assert len(np.unique(goes_on)) == len(goes_on)
+        assert ((after.stays.p_gone >= 0.0) & (after.stays.p_gone <= 1.0)).all()
+        # told once: without a further look there is nothing to say
+        nothing = rows_of(looks.rows, np.zeros(0, np.int64))
+        empty = np.zeros(0, np.int64)
+        blind = replace(looks, rows=nothing, place=empty, cell=empty, counts=empty > 0, settled=empty > 0)
+        _, again = decide.decided(after, after, blind, np.zeros(len(cliques)), none, start_s + 99.0)
+        assert again == ()
+        living = after
 
 
 def test_two_that_stand_at_each_others_place_are_exchanged() -> None:
@@ -368,7 +578,7 @@ def test_of_old_stays_the_newest_are_kept() -> None:
     count = decide.MOST_STAYS + 7
     last = np.random.default_rng(0).permutation(count).astype(np.float64)
     name = np.zeros(count, dtype=np.int64)
-    many = Stays(name, name, name, np.zeros((count, 2)), last - 2, np.sort(last) - 2, last, last + 1)
+    many = Stays(name, name, name, np.zeros((count, 2)), last - 2, np.sort(last) - 2, last, last + 1, np.ones(count))
     kept = decide.without_forgotten(replace(living, stays=many), 3).stays
     assert len(kept) == decide.MOST_STAYS
     assert kept.last_s.min() == 7.0

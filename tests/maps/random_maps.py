@@ -55,6 +55,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
     )
     living = LivingMap(
         stamp_s=now_s,
+        session_start_s=now_s,
         members=Members(
             landmark,
             classes[clique],
@@ -101,6 +102,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
     random = np.random.default_rng([seed, 2])
     return replace(
         living,
+        session_start_s=now_s - 0.5 * HOUR_S,
         sites=replace(living.sites, p_kept=p_here * random.random(len(p_here))),
         stays=replace(living.stays, p_gone=ended * random.uniform(0.5, 1.0, len(ended))),
         sightlines=random_lines(random, living.places),
