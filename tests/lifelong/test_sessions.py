@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
@@ -13,7 +14,8 @@ from evermap.lifelong.believe import predicted
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap
 from evermap.pipeline import Session, run_session
-from evermap.sim import BuildingSimulation
+from evermap.sim import BuildingSimulation, looked_at
+from evermap.sim.world import positions_at
 from evermap.slam.align import rigid
 from evermap.types import ChangeKind, Clock, FloatArray, Recording
 
@@ -44,18 +46,40 @@ def in_map(world: BuildingSimulation, first: LivingMap) -> tuple[FloatArray, np.
     return se2.transform(motion, truth.position_m), truth.seen
 
 
+def looked_at_places(world: BuildingSimulation) -> Callable[[int, int, int], bool]:
+    """Whether a session really looked at the place where a landmark stands in another session."""
+    looks = looked_at(world)
+    position_m = [positions_at(world.objects, world.stays, told.start_s) for told in world.truths]
+
+    def looked(session: int, name: int, when: int) -> bool:
+        rows = np.flatnonzero(looks.landmark_id == name)
+        gap = np.hypot(*(looks.position_m[rows] - position_m[when][name]).T)
+        return bool(np.any(looks.looked_at[session, rows[gap < 1e-6]]))
+
+    return looked
+
+
 def test_changes_are_those_that_happened(changing: dict[int, tuple[BuildingSimulation, list[Session]]]) -> None:
-    """By landmark: all that was seen to move or to come, hardly anything else, and most of what is gone."""
+    """By landmark: all that was looked at before and after, hardly anything else.
+
+    What was never met has come only if its place had been looked at before; a step of a hand's breadth is no change.
+    Landmarks that the map takes for one body though they are several things are not counted as missed: it tells of the
+    part that it saw, which is the whole for it.
+
+    Measured: 88 right, 1 wrong, 6 missed (4 that came where nothing had been seen behind their place until then, 2 that
+    left and came back within a day) and 13 of several things that were taken for one.
+    """
     right = wrong = missed = 0
     for world, sessions in changing.values():
+        thing = {name: k for k, one in enumerate(world.objects) for name in one.landmark_ids}
         position, seen = in_map(world, sessions[0].living)
-        told = np.where(
-            seen[0][:, None], position[0], np.nan
-        )  # where each landmark was last told to be, nan for nowhere
+        looked = looked_at_places(world)
+        # where each landmark was last told to be, nan for nowhere, and in which session it stood there
+        told, then = np.where(seen[0][:, None], position[0], np.nan), np.zeros(world.n_landmarks, dtype=np.int64)
         met = seen[0].copy()
         for k, session in enumerate(sessions[1:], start=1):
             now = position[k]
-            same = np.all(np.abs(now - told) < 1e-9, axis=1) | (np.isnan(now) & np.isnan(told)).all(axis=1)
+            same = (np.hypot(*(now - told).T) < 0.1) | (np.isnan(now) & np.isnan(told)).all(axis=1)
             said = np.zeros(len(same), dtype=np.bool_)
             for change in session.changes:
                 names = list(change.landmark_ids)
@@ -71,12 +95,19 @@ def test_changes_are_those_that_happened(changing: dict[int, tuple[BuildingSimul
                 assert not change.stamp_from_s > change.stamp_to_s
             right += int((said & ~same).sum())
             wrong += int((said & same).sum())
-            missed += int((~said & ~same & (seen[k] | met)).sum())
-            told[said | seen[k]] = now[said | seen[k]]
+            for name in np.flatnonzero(~said & ~same & (seen[k] | met)).tolist():
+                members = session.living.members.landmark_id
+                if len({thing[other] for other in (body_of(session.living, name) if name in members else [name])}) > 1:
+                    continue
+                if met[name]:
+                    missed += bool(seen[k][name] or looked(k, name, then[name]))
+                else:
+                    missed += any(looked(j, name, k) for j in range(k))
+            told[said | seen[k]], then[said | seen[k]] = now[said | seen[k]], k
             met |= seen[k]
     assert right > 80
     assert right / (right + wrong) >= 0.97, (right, wrong, missed)
-    assert right / (right + missed) >= 0.85, (right, wrong, missed)
+    assert right / (right + missed) >= 0.9, (right, wrong, missed)
 
 
 def test_the_map_is_where_things_are(changing: dict[int, tuple[BuildingSimulation, list[Session]]]) -> None:
@@ -273,7 +304,7 @@ def _on_its_own_clock(recording: Recording) -> Recording:
 
 def test_sessions_come_in_their_order_and_on_one_clock(still: tuple[BuildingSimulation, list[Session]]) -> None:
     world, sessions = still
-    with pytest.raises(DataError, match="has seen") as earlier:
+    with pytest.raises(DataError, match="before the newest session") as earlier:
         run_session(world.sessions[0], sessions[1].living, settings())
     with pytest.raises(DataError, match="count") as clocks:
         run_session(_on_its_own_clock(world.sessions[1]), sessions[0].living, settings())
