@@ -266,6 +266,7 @@ def flaw(living: LivingMap) -> str:
         ("stays.gone_s", stays.gone_s),
         ("lives.looks_s", lives.looks_s),
         ("stamp_s", np.array(living.stamp_s)),
+        ("session_start_s", np.array(living.session_start_s)),
     ):
         if np.isnan(values).any():
             return f"'{column}' is not a number"
