@@ -9,12 +9,10 @@ import numpy as np
 from evermap.lifelong.arrive import Arrivals
 from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
 from evermap.lifelong.geometry import of_places
-from evermap.maps.living import LivingMap, Stays
+from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.slam.align import rigid
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
-EXISTS = 0.5
-"""A clique is said to stand at a site that is more probable than this, and to be away where that is more probable."""
 SAME_PLACE_M = 0.3
 """Cliques that stand this close to where another stood have taken its place."""
 SAME_SPOT_M = 0.1

@@ -14,7 +14,7 @@ from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import anchored, drifted, of_places, resized
 from evermap.lifelong.overlaying import Laid, laid_over, unbent, with_glimpsed
 from evermap.maps.learning import learned_lives
-from evermap.maps.living import Evidence, LivingMap
+from evermap.maps.living import EXISTS, Evidence, LivingMap
 from evermap.maps.missed import without_missed
 from evermap.slam import session as of_slam
 from evermap.slam.align import rigid
@@ -241,8 +241,8 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
     else:
         sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
         log_evidence, evidence = np.zeros(len(np.unique(sites.clique_id))), Evidence.empty()
-    stood = (entry.p_start >= decide.EXISTS) & ~entry.is_new
-    arrived = np.isfinite(first) & ~stood & (sites.p_here >= decide.EXISTS)
+    stood = (entry.p_start >= EXISTS) & ~entry.is_new
+    arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
     sites = replace(
         sites,
         since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),

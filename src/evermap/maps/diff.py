@@ -44,8 +44,8 @@ class _Standing:
 def diff(a: LivingMap, b: LivingMap) -> tuple[MapChange, ...]:
     """The changes from one map to a later one, by clique; what an operator deleted in either is left out.
 
-    A clique stands where its stay goes on (`LivingMap.told_site`): a belief that age alone has lowered is no change, and
-    what came to be known without its place having been seen empty is no arrival.
+    A clique stands where its stay goes on (`LivingMap.told_site`): a belief that age alone has lowered is no change,
+    and what came to be known without its place having been seen empty is no arrival.
 
     Probabilities are of both beliefs together: that it stood there in `a`, and that it does not, or stands elsewhere,
     in `b`. Hits are detections at the new place, misses expected ones at the old place, both since `a`. The interval is

@@ -23,7 +23,6 @@ from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
 
-
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.maps.diff import edits
-from evermap.maps.living import Evidence, LivingMap, Stays
+from evermap.maps.living import EXISTS, Evidence, LivingMap, Stays
 from evermap.maps.stamps import stamp_text
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
 from evermap.survival.durations import duration_text
