@@ -276,7 +276,8 @@ def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int) -> IntA
     """
     side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (SIDES / (2.0 * np.pi))).astype(np.int64)
     count = np.bincount(rows.clique[missed] * SIDES + side[missed] % SIDES, minlength=n * SIDES).reshape(n, SIDES)
-    return np.clip(np.sum(count >= WITNESSES, axis=1), 1, MOST_SIDES)
+    sides: IntArray = np.sum(count >= WITNESSES, axis=1)
+    return np.asarray(np.clip(sides, 1, MOST_SIDES))
 
 
 def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
