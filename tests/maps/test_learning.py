@@ -174,3 +174,47 @@ def test_learning_does_not_depend_on_how_long_ago_a_class_was_first_seen() -> No
     assert lower < np.exp(-1.0) < upper
     assert upper - lower < 0.15
     assert np.exp(lives.of(0, np.zeros(2)).stay.log_survival(2.0 * DAY_S)) == pytest.approx(mean[0], rel=1e-2)
+
+
+def with_doubts(stays: Stays, kind: int, n: int, p_gone: float) -> Stays:
+    """Some stays of a class that go on are said to have ended a look later, with this probability."""
+    rows = np.flatnonzero((stays.class_id == kind) & np.isinf(stays.gone_s))[:n]
+    assert len(rows) == n
+    gone_s, doubt, last_s = stays.gone_s.copy(), stays.p_gone.copy(), stays.last_s.copy()
+    last_s[rows], gone_s[rows], doubt[rows] = LOOKS_S[-2], LOOKS_S[-1], p_gone
+    return replace(stays, last_s=last_s, gone_s=gone_s, p_gone=doubt)
+
+
+def survival(stays: Stays, kind: int) -> np.ndarray:
+    """Of a class, after a day, a week and a month."""
+    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    return np.exp(lives.of(kind, np.array([500.0, 500.0])).stay.log_survival(np.array([1.0, 7.0, 28.0]) * DAY_S))
+
+
+@pytest.mark.parametrize("kind", [0, 1, 2])
+def test_an_end_that_is_not_believed_is_none(kind: int) -> None:
+    """The same as a stay that goes on, but was not seen any more."""
+    stays = seen_in_four_weeks(1)
+    doubted = with_doubts(stays, kind, 3, 0.0)
+    going_on = replace(doubted, gone_s=np.where(doubted.p_gone == stays.p_gone, doubted.gone_s, np.inf))
+    going_on = replace(going_on, gone_s=np.where(np.isinf(stays.gone_s), np.inf, doubted.gone_s))
+    np.testing.assert_allclose(survival(doubted, kind), survival(going_on, kind), rtol=1e-6)
+
+
+def test_a_handful_of_doubtful_ends_does_not_move_lifetimes() -> None:
+    """Of what never leaves: five false alarms that hardly anybody believes in, against five that are certain."""
+    stays = seen_in_four_weeks(0)
+    before, doubtful, certain = (
+        survival(one, 0) for one in (stays, with_doubts(stays, 0, 5, 0.03), with_doubts(stays, 0, 5, 1.0))
+    )
+    assert (before - doubtful <= 0.02).all()
+    assert (before - doubtful < 0.2 * (before - certain)).all()
+    assert certain[-1] < before[-1] - 0.05
+
+
+@pytest.mark.parametrize(("kind", "age"), [(0, 1), (0, 2), (1, 0)])
+def test_lifetimes_are_the_shorter_the_more_ends_are_believed(kind: int, age: int) -> None:
+    """At ages at which the class has not nearly all left, nor all stayed."""
+    stays = seen_in_four_weeks(3)
+    found = [survival(with_doubts(stays, kind, 4, p), kind)[age] for p in (0.0, 0.2, 0.5, 0.8, 1.0)]
+    assert (np.diff(found) < 0.0).all()

@@ -294,6 +294,75 @@ def test_what_an_older_evermap_did_not_write_has_its_default() -> None:
     assert_same(read, living)
 
 
+def to_format_1(manifest: dict[str, Any]) -> None:
+    """As format 1 would have had the map: lines of sight between cells of the floor, and nothing that came later."""
+    columns, values = manifest["columns"], manifest["values"]
+    manifest["format"] = 1
+    for name in [*columns]:
+        if name.startswith(("sightlines.", "views.")) or name in ("sites.p_kept", "stays.p_gone"):
+            del columns[name]
+    for name in [*values]:
+        if name.startswith(("sightlines.", "views.")) or name in ("log_size_information", "session_start_s"):
+            del values[name]
+    columns |= {"sightlines.key": columns["stays.clique_id"], "sightlines.hits": columns["stays.first_s"]}
+    columns |= {"sightlines.looks": columns["stays.first_s"]}
+    values["sightlines.cell_m"] = 1.0
+
+
+@pytest.mark.parametrize(("variance", "information"), [(0.0, np.inf), (0.25, 4.0)])
+def test_format_1_is_read_with_lines_of_sight_to_be_learned_again(variance: float, information: float) -> None:
+    living = replace(random_map(4), log_size_variance=variance, log_size_information=7.0)
+    read = rewritten(living, to_format_1)
+    wanted = replace(random_map(4, format_1=True), log_size_variance=variance, log_size_information=information)
+    assert_same(read, wanted)
+    assert len(read.sightlines) == len(read.views) == 0
+    np.testing.assert_array_equal(read.sites.p_kept, read.sites.p_here)
+    np.testing.assert_array_equal(read.stays.p_gone, np.isfinite(read.stays.gone_s))
+    # and is written as format 2 from then on
+    assert_same(rewritten(read, lambda manifest: None), read)
+
+
+def test_lines_of_sight_and_views_read_back() -> None:
+    living = replace(random_map(5), log_size_variance=0.01, log_size_information=250.0)
+    assert len(living.sightlines) > 10
+    assert len(living.views) == 30
+    assert living.sightlines.hidden.min() > 0.0
+    seen = []
+    assert_same(rewritten(living, lambda manifest: seen.append(manifest["format"])), living)
+    assert seen == [2]
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "line"),
+    [
+        ("sites", {"p_kept": 1.5}, "'sites.p_kept' is not a probability"),
+        ("stays", {"p_gone": -0.1}, "'stays.p_gone' is not a probability"),
+        ("stays", {"p_gone": np.nan}, "'stays.p_gone' is not a probability"),
+        ("sightlines", {"hits": -1.0}, "a negative count"),
+        ("sightlines", {"shown": np.inf}, "'sightlines.shown' is not finite"),
+        ("views", {"frames": -3.0}, "a negative count"),
+        ("views", {"stamp_s": np.nan}, "'views.stamp_s' is not finite"),
+        ("views", {"cell_m": 0.0}, "a cell without size"),
+    ],
+)
+def test_what_format_2_brought_is_checked(part: str, change: dict[str, float], line: str) -> None:
+    living = random_map(6)
+    table = getattr(living, part)
+    ((name, value),) = change.items()
+    wrong = value if isinstance(getattr(table, name), float) else np.append(getattr(table, name)[:-1], value)
+    assert content.flaw(living) == ""
+    assert line in content.flaw(replace(living, **{part: replace(table, **{name: wrong})}))
+
+
+@pytest.mark.parametrize("column", ["sightlines.cell", "views.heading", "stays.p_gone", "sightlines.hidden"])
+def test_columns_of_other_lengths_are_a_flaw(column: str) -> None:
+    living = random_map(6)
+    part, name = column.split(".")
+    table = getattr(living, part)
+    short = replace(table, **{name: getattr(table, name)[:-1]})
+    assert "length" in content.flaw(replace(living, **{part: short}))
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
