@@ -13,6 +13,7 @@ from scipy.stats import betabinom
 from evermap import se2
 from evermap.errors import InputError
 from evermap.sensing.sightlines import (
+    BLOCKED,
     HEADINGS,
     HIDDEN_LOOKS,
     MOST_LOOKS,
@@ -178,7 +179,7 @@ def test_lines_are_what_the_beta_binomial_says(seed: int, n: int, nominal: float
     table = SightLines.empty().learned(ONE, np.zeros(n, np.int64), cell, hit, np.ones(n))
     asked = rng.integers(3, 9, (5, 2))
     lines, p_clear, seen = table.lines(ONE, np.zeros(5, np.int64), cells_of((asked + 0.5) * 0.5), np.full(5, nominal))
-    rate, blocked, share = table._kinds(nominal)
+    rate, share = table._kinds(nominal)
     for k, at in enumerate(asked):
         gap = np.abs(square - at).max(axis=1) if n else np.zeros(0)
         worth = np.where(gap == 0, 1.0, np.where(gap == 1, NEIGHBOUR, 0.0))
@@ -186,7 +187,7 @@ def test_lines_are_what_the_beta_binomial_says(seed: int, n: int, nominal: float
         free = rate[round(float(np.hypot(*(at + 0.5))))]
         # beta functions for numbers of looks that are no integers; compared with scipy's law where they are
         posterior = share * _beta_binomial(hits, misses, free)
-        posterior /= posterior + (1.0 - share) * _beta_binomial(hits, misses, blocked)
+        posterior /= posterior + (1.0 - share) * _beta_binomial(hits, misses, BLOCKED)
         assert p_clear[k] == pytest.approx(posterior, rel=1e-9, abs=1e-12)
         assert seen[k] == (hits > 0.0)
         assert lines.hits[k] == pytest.approx(hits + STRENGTH * free)
@@ -204,10 +205,10 @@ def _beta_binomial(hits: float, misses: float, rate: float) -> float:
 @pytest.mark.parametrize(("hits", "looks"), [(0, 0), (1, 1), (0, 3), (2, 5), (30, 40)])
 def test_a_single_line_is_as_scipy_has_it(hits: int, looks: int) -> None:
     table = looked_along(SightLines.empty(), hits, looks)
-    rate, blocked, share = table._kinds(0.8)
+    rate, share = table._kinds(0.8)
     cell = cells_of(np.array([(3.2, 0.2)]))
     length = round(float(np.hypot(6.5, 0.5)))
-    of_kind = [betabinom.pmf(hits, looks, STRENGTH * r, STRENGTH * (1.0 - r)) for r in (rate[length], blocked)]
+    of_kind = [betabinom.pmf(hits, looks, STRENGTH * r, STRENGTH * (1.0 - r)) for r in (rate[length], BLOCKED)]
     _, p_clear, _ = table.lines(ONE, np.zeros(1, np.int64), cell, np.array([0.8]))
     assert p_clear[0] == pytest.approx(share * of_kind[0] / (share * of_kind[0] + (1.0 - share) * of_kind[1]), rel=1e-9)
 
@@ -245,16 +246,15 @@ def test_both_kinds_are_found() -> None:
     rate = np.where(
         free,
         rng.beta(STRENGTH * 0.7, STRENGTH * 0.3, n),
-        rng.beta(STRENGTH * 0.05, STRENGTH * 0.95, n),
+        rng.beta(STRENGTH * BLOCKED, STRENGTH * (1.0 - BLOCKED), n),
     )
     hit = rng.random((per_line, n)) < rate
     table = SightLines.empty().learned(
         places, np.tile(np.arange(n), per_line), np.tile(cell, per_line), hit.ravel(), np.ones(n * per_line)
     )
-    clear, blocked, share = table._kinds(0.9)
+    clear, share = table._kinds(0.9)
     assert share == pytest.approx(0.3, abs=0.04)
     assert clear[6] == pytest.approx(0.7, abs=0.04)  # cells (5, 0): between middles 5.5 and a half
-    assert blocked == pytest.approx(0.05, abs=0.02)
     # and a line of the same length to a new place is clear as often, and then shows as much
     lines, p_clear, _ = table.lines(ONE, ONE[0], cells_of(np.array([[0.2, 2.7]])), np.array([0.9]))
     assert p_clear[0] == pytest.approx(0.3, abs=0.04)
@@ -368,8 +368,7 @@ def test_sessions_to_come_are_predicted_better_than_by_the_field_of_view() -> No
         places = np.arange(len(names)), np.array(names)
         cell = table.cells(sensor, place_m)
         lines, p_clear, seen = table.lines(places, place, cell, nominal)
-        blocked = table._kinds(float(nominal.max()))[1]
-        p = p_clear * lines.p_detect + (1.0 - p_clear) * blocked
+        p = p_clear * lines.p_detect + (1.0 - p_clear) * BLOCKED
         log_score = [np.where(hit, np.log(q), np.log1p(-q)).mean() for q in (nominal, np.full(len(hit), hit.mean()), p)]
         score.append((log_score[0], log_score[1], log_score[2]))
         if session >= 2:
