@@ -1,0 +1,172 @@
+"""Sessions that arrive late: the map is the one that the right order gives."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import evermap as em
+from evermap.config import Config, parse_config, to_toml
+from evermap.errors import DataError, InputError
+from evermap.maps.living import LivingMap
+from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.store.recorded import pack_recording, unpack_recording
+from evermap.sessions import at_time
+from evermap.sim import BuildingConfig, simulate_building
+from evermap.types import Recording
+
+SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
+
+
+def fed(store: MapStore, recording: Recording) -> em.Entered:
+    entered = em.enter_session(store, recording)
+    stamps = recording.frames.stamp_s
+    provenance = Provenance(
+        recording=recording.name,
+        config=to_toml(Config()),
+        stamp_from_s=float(stamps[0]),
+        stamp_to_s=float(stamps[-1]),
+    )
+    store.commit(
+        entered.living,
+        provenance,
+        entered.changes,
+        entered.session.evidence,
+        parent=entered.parent,
+        attachments=entered.attachments,
+    )
+    return entered
+
+
+def edited(store: MapStore, landmark: int) -> None:
+    living = store.load().edited(landmark, pinned=True)
+    store.commit(living, Provenance(kind=RevisionKind.EDIT), parent=store.head())
+
+
+def built(path: Path, order: Sequence[int], recordings: Sequence[Recording] = SESSIONS) -> LivingMap:
+    with open_store(path, create=True) as store:
+        for k in order:
+            fed(store, recordings[k])
+        return store.load()
+
+
+def assert_same(a: LivingMap, b: LivingMap) -> None:
+    """But for the numbers of cliques and sites, which count up."""
+    one, other = a.landmarks(), b.landmarks()
+    np.testing.assert_array_equal(one.landmark_id, other.landmark_id)
+    for name in ("position_m", "covariance_m2", "p_exists", "n_hits", "n_misses", "last_seen_s"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0.0, atol=1e-12, err_msg=name)
+    assert len(a.stays) == len(b.stays)
+    for name in ("elsewhere_s", "first_s", "last_s", "gone_s", "p_gone"):
+        np.testing.assert_allclose(np.sort(getattr(a.stays, name)), np.sort(getattr(b.stays, name)), err_msg=name)
+    assert a.stamp_s == b.stamp_s
+
+
+@pytest.fixture(scope="module")
+def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
+    return built(tmp_path_factory.mktemp("order") / "site.evermap", range(4))
+
+
+@pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2)])
+def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
+    assert_same(built(tmp_path / "site.evermap", order), in_order)
+
+
+def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        for k in (0, 1, 3):
+            fed(store, SESSIONS[k])
+        entered = fed(store, SESSIONS[2])
+        assert entered.replayed == (SESSIONS[3].name,)
+        assert store.head() == 4
+        told = [(change.kind, change.landmark_ids) for change in store.changes(4)]
+        assert told == [(change.kind, change.landmark_ids) for change in entered.changes]
+
+
+def test_an_operators_word_is_kept(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        for k in (0, 1):
+            fed(store, SESSIONS[k])
+        landmark = int(store.load().members.landmark_id[2])
+        edited(store, landmark)
+        fed(store, SESSIONS[3])
+        fed(store, SESSIONS[2])
+        members = store.load().members
+        assert members.landmark_id[members.pinned].tolist() == [landmark]
+
+
+def test_a_session_is_evidence_once(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        for k in (0, 1):
+            fed(store, SESSIONS[k])
+        with pytest.raises(InputError, match="is in the map already, as revision 1"):
+            em.enter_session(store, SESSIONS[0])
+        assert store.head() == 2
+
+
+def test_two_robots_at_once(tmp_path: Path) -> None:
+    """The second begins while the first is at work; both are entered, whichever ends first."""
+    first = SESSIONS[0]
+    late_s = float(first.frames.stamp_s[0] + 10.0 - SESSIONS[1].frames.stamp_s[0])
+    second = SESSIONS[1]
+    second = replace(
+        second,
+        name="second robot",
+        odometry=replace(second.odometry, stamp_s=second.odometry.stamp_s + late_s),
+        frames=replace(second.frames, stamp_s=second.frames.stamp_s + late_s),
+    )
+    both = (first, second, SESSIONS[2])
+    assert first.frames.stamp_s[0] < second.frames.stamp_s[0] < first.frames.stamp_s[-1]
+    assert_same(built(tmp_path / "a.evermap", (0, 1, 2), both), built(tmp_path / "b.evermap", (1, 0, 2), both))
+
+
+def test_without_history_a_late_session_is_refused() -> None:
+    living = em.run_session(SESSIONS[1]).living
+    with pytest.raises(DataError, match="before the newest session of the map"):
+        em.run_session(SESSIONS[0], living)
+
+
+def test_a_revision_without_its_recording_is_named(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        living = em.run_session(SESSIONS[1]).living
+        store.commit(living, Provenance(stamp_from_s=float(SESSIONS[1].frames.stamp_s[0])), parent=0)
+        with pytest.raises(InputError, match="revision 1 keeps no recording"):
+            em.enter_session(store, SESSIONS[0])
+
+
+def test_the_map_as_it_was(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        for k in (0, 1, 2):
+            fed(store, SESSIONS[k])
+        for k in (0, 1, 2):
+            assert at_time(store, float(SESSIONS[k].frames.stamp_s[-1])).stamp_s == store.load(k + 1).stamp_s
+        assert at_time(store, 0.0).stamp_s == store.load(1).stamp_s
+
+
+def test_a_recording_survives_being_kept() -> None:
+    recording = SESSIONS[0]
+    data = pack_recording(recording)
+    assert data == pack_recording(recording)
+    found = unpack_recording(data)
+    for table in ("odometry", "frames", "detections"):
+        for name in getattr(recording, table).__slots__:
+            np.testing.assert_array_equal(
+                getattr(getattr(found, table), name), getattr(getattr(recording, table), name)
+            )
+    assert (found.sensor, found.name, found.class_names, found.clock) == (
+        recording.sensor,
+        recording.name,
+        recording.class_names,
+        recording.clock,
+    )
+    assert found.truth is None
+
+
+def test_a_configuration_is_read_back_from_a_revision() -> None:
+    config = Config.model_validate({"living": {"returns": False}, "slam": {"seed": 7}})
+    assert parse_config(to_toml(config)) == config
+    assert parse_config("") == Config()
