@@ -84,7 +84,10 @@ def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, Living
     detections = rows_of(recording.detections, kept)
     detections = replace(detections, class_id=number[detections.class_id])
     return replace(recording, detections=detections, class_names=names), replace(
-        living, class_names=names, clock=recording.clock
+        living,
+        class_names=names,
+        landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
+        clock=recording.clock,
     )
 
 
@@ -267,6 +270,7 @@ def decided(
     """
     arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
     after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s)
+    changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)
     if config.cliques and config.existence and config.misses:

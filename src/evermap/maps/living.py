@@ -21,7 +21,7 @@ import numpy as np
 from evermap import se2
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of
 
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
@@ -203,6 +203,7 @@ class LivingMap:
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
         class_names: names of the classes.
+        landmark_texts: texts that landmarks were called by, for those that have no number (`types.landmark_id_of`).
         clock: of all stamps.
         n_cliques_ever, n_sites_ever: next free ids.
     """
@@ -220,9 +221,15 @@ class LivingMap:
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)
     class_names: tuple[str, ...] = ()
+    landmark_texts: tuple[str, ...] = ()
     clock: Clock = Clock.RECORDING
     n_cliques_ever: int = 0
     n_sites_ever: int = 0
+
+    @property
+    def landmark_names(self) -> dict[int, str]:
+        """Texts of landmarks by their ids."""
+        return {landmark_id_of(text): text for text in self.landmark_texts}
 
     def p_exists(self) -> FloatArray:
         """(L,) probability that each landmark stands at one of its known places."""
@@ -294,6 +301,7 @@ class LivingMap:
             class_names=self.class_names,
             frame="prior_map",
             clock=self.clock,
+            names=self.landmark_names,
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
@@ -327,6 +335,7 @@ class LivingMap:
             class_names=self.class_names,
             frame="prior_map",
             clock=self.clock,
+            names=self.landmark_names,
         )
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from evermap.maps.store.content import DamagedError
-from evermap.types import Clock, Detections, Frames, Odometry, Recording, Sensor
+from evermap.types import Clock, Detections, Frames, Odometry, Recording, Sensor, landmark_id_of
 
 RECORDING = "recording"
 """Name of the attachment."""
@@ -26,6 +26,7 @@ def pack_recording(recording: Recording) -> bytes:
     """The bytes of a recording; equal recordings have equal bytes."""
     arrays: dict[str, Any] = {"objects": recording.objects}
     values: dict[str, Any] = {name: getattr(recording, name) for name in _PLAIN}
+    values["landmark_texts"] = sorted(recording.landmark_names.values())
     for table in _TABLES:
         part = getattr(recording, table)
         for item in fields(part):
@@ -59,6 +60,7 @@ def unpack_recording(data: bytes) -> Recording:
             objects=arrays["objects"],
             class_names=tuple(values["class_names"]),
             clock=Clock(values["clock"]),
+            landmark_names={landmark_id_of(text): text for text in values["landmark_texts"]},
             **tables,
         )
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
