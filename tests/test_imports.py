@@ -27,7 +27,7 @@ RULES = {
     "persistence": "errors types se2 compiled survival sensing",
     "recurrence": "errors types compiled survival persistence io",
     "tracking": "errors types se2 compiled config survival sensing persistence recurrence",
-    "slam": "errors interrupts types se2 compiled config survival sensing persistence recurrence",
+    "slam": "errors interrupts types valid se2 compiled config survival sensing persistence recurrence",
     "maps": "errors types se2 config survival sensing persistence recurrence",
     "io": "errors interrupts types valid se2",
     "sim": "errors types se2 survival sensing",

@@ -67,7 +67,9 @@ class Quantity:
         return f"{value:g} is outside [{self.low:g}, {self.high:g}]"
 
 
-STAMP_S = Quantity("stamp_s", -1e11, 1e11, hint="stamps in seconds, not in milli- or nanoseconds", dates=True)
+LATEST_S = 9.2e9
+"""Stamps beyond this, the year 2261, do not fit into 64 bits of nanoseconds; they are milliseconds or garbage."""
+STAMP_S = Quantity("stamp_s", -LATEST_S, LATEST_S, hint="stamps in seconds, not in milli- or nanoseconds", dates=True)
 FORWARD_MPS = Quantity("forward_mps", -1e3, 1e3, hint="metres per second")
 LATERAL_MPS = Quantity("lateral_mps", -1e3, 1e3, hint="metres per second")
 ANGULAR_RADPS = Quantity("angular_radps", -1e3, 1e3, hint="radians per second")

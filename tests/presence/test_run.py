@@ -319,3 +319,12 @@ def test_a_table_made_in_python_is_held_to_the_same(tmp_path: Path, change: dict
     path.write_text("stamp_s,feature_id,detected\n0,a,1\n5,a,1\n")
     with pytest.raises(InputError, match=message):
         replace(read_looks(path), **change)
+
+
+@pytest.mark.parametrize("kind", ["two-state", "phase-type", "run-length", "run-length-rhythm", "auto"])
+def test_a_stray_stamp_is_refused_before_it_costs_gigabytes(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "looks.csv"
+    rows = "".join(f"{stamp},{name},{stamp % 3 % 2}\n" for name in "ab" for stamp in [*range(600), 9_000_000_000])
+    path.write_text(f"stamp_s,feature_id,detected\n{rows}")
+    with pytest.raises(DataError, match=r"steps of .* lie between the looks, the longest pause is 9e"):
+        run_persist(read_looks(path), PersistConfig(recurrent=kind))

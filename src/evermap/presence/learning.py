@@ -13,6 +13,7 @@ from evermap.presence.models import ModelOfEach, looks_at, some_looks
 from evermap.presence.table import LookTable
 from evermap.recurrence.choose import KINDS, Choice, choose
 from evermap.recurrence.protocol import Looks
+from evermap.recurrence.rhythm import BIN_S
 from evermap.types import UNKNOWN, IntArray
 
 AUTO = "auto"
@@ -21,6 +22,11 @@ MOST_FEATURES_ALONE = 32
 FEWEST_LOOKS_ALONE = 200
 MOST_LOOKS = 100_000
 """Looks that are learned from: more make learning slow and the model hardly better."""
+
+MOST_STEPS = 20_000_000
+"""Steps of time that learning of run lengths goes through, hundreds of times: more would need gigabytes and days."""
+MOST_BINS = 2_000_000
+"""Ten minutes each, of one feature, that learning of phases goes through: 38 years."""
 
 Progress = Callable[[float], None]
 
@@ -62,7 +68,8 @@ def learn_models(
 
     Raises:
         ConfigError: an unknown kind or grouping, or classes where the table has none.
-        DataError: a group with too few looks to learn from.
+        DataError: a group with too few looks to learn from, or with looks over so long a time, in steps of their
+            usual gap, that no memory holds it.
     """
     if kind != AUTO and kind not in KINDS:
         raise ConfigError(f"'{kind}' is no kind of model", field="--recurrent", hint=", ".join((AUTO, *KINDS)))
@@ -79,6 +86,7 @@ def learn_models(
         def within(done: float, number: int = number) -> None:
             tell((number + done) / len(groups))
 
+        _check_span(part, kind)
         try:
             choices.append(choose(part, None if kind == AUTO else [kind], progress=within))
         except DataError as error:
@@ -88,6 +96,22 @@ def learn_models(
     names = tuple(name for name, _ in groups)
     models = ModelOfEach(tuple(choice.model for choice in choices), names, of_feature)
     return LearnedModels(models, grouping, tuple(choices))
+
+
+def _check_span(looks: Looks, kind: str) -> None:
+    """Raise DataError for stamps between which there are more steps than can be gone through."""
+    of_look = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    pause_s = np.diff(looks.stamp_s)[np.diff(of_look) == 0]
+    if not np.any(pause_s > 0.0):
+        return
+    # phases go from ten minutes to ten minutes, run lengths from look to look
+    phases = "phase" in kind or kind == "two-state"
+    step_s = BIN_S if phases else float(np.median(pause_s[pause_s > 0.0]))
+    steps = float(pause_s.sum()) / step_s
+    if steps > (MOST_BINS * looks.n_features if phases else MOST_STEPS):
+        problem = f"{steps:.2g} steps of {step_s:g} s lie between the looks, the longest pause is {pause_s.max():g} s"
+        hint = "is a stamp astray? else fewer looks (--learn-from), or --recurrent two-state"
+        raise DataError(problem, field="stamp_s", hint=hint)
 
 
 def _grouping(table: LookTable, looks: Looks) -> str:

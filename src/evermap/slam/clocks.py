@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.types import FloatArray
+from evermap.valid import LATEST_S
 
 STRAY_S = 10.0
 """A stamp farther than this from those that arrive around it is none."""
@@ -17,8 +18,6 @@ STEP_S = 1.0
 """Smallest step of a clock that is noticed; less is taken for messages that come late."""
 AROUND = 9
 """Messages that a stamp is compared with: fewer than half of them may be late or wrong."""
-STAMP_MOST_S = 1e11
-"""Stamps beyond this are milliseconds or garbage, as for the readers of files."""
 
 
 def restored(stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -31,7 +30,7 @@ def restored(stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         (N,) stamps, nan where one is none; late ones still stand where they arrived. And (K,) by how much the clock was
         set back, each time.
     """
-    stamps = np.where(np.abs(stamp_s) <= STAMP_MOST_S, stamp_s, np.nan)  # nan fails the comparison
+    stamps = np.where(np.abs(stamp_s) <= LATEST_S, stamp_s, np.nan)  # nan fails the comparison
     if np.all(np.diff(stamps) > 0.0):
         return stamps, np.zeros(0)
     found = np.flatnonzero(np.isfinite(stamps))
