@@ -188,9 +188,6 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
             return _lost(visit, slam, alone.prior, alone.step_s, living, interrupted=alone.interrupted)
         if where is not None:
             living, visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
-            living = lifelong.informed(living, where, visit, config.living)
-            aged = believe.aged(living, config.living, visit.start_s)
-            expected = aged.p_here
         living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
         # what was found goes into the map, then hits and misses into beliefs, and those into decisions
         entry = lifelong.entered(living, expected, where, visit, config.living)

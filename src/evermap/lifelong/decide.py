@@ -139,7 +139,7 @@ def decided(
         if newest >= 0:
             # where it was last it was found missing; elsewhere it may have come when it left
             elsewhere_s = float(gone[newest] if same else last[newest])
-            p_gone[newest] = probability if same else max(p_gone[newest], probability)
+            p_gone[newest] = max(p_gone[newest], probability)
         elif site in arrival:
             k = arrival[site]
             kind, elsewhere_s, probability = ChangeKind.APPEARED, arrivals.looked_s[k], arrivals.p_appeared[k]

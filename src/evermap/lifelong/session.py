@@ -155,30 +155,6 @@ def refit(
     return living, replace(alone, outcome=outcome)
 
 
-def informed(living: LivingMap, where: Laid, visit: Visit, config: LivingConfig) -> LivingMap:
-    """The map with lifetimes that know already what the session found where it stood, and what elsewhere.
-
-    So the first doubtful miss is not judged by lifetimes that have never been learned, in a session that has just seen
-    that most things stay.
-    """
-    if not config.learn_lifetimes:
-        return living
-    members, stays = living.members, living.stays
-    row = np.searchsorted(members.landmark_id, where.landmark_id)
-    known = row < len(members)
-    known[known] = members.landmark_id[row[known]] == where.landmark_id[known]
-    clique, place = members.clique_id[row[known]], where.place[known]
-    site = np.append(living.places.site_id, UNKNOWN)[place]
-    goes_on = stays.gone_s == np.inf
-    stood = goes_on & np.isin(stays.site_id, site[place >= 0])
-    moved = goes_on & ~stood & np.isin(stays.clique_id, clique)
-    last = np.where(stood, np.maximum(stays.last_s, visit.start_s), stays.last_s)
-    gone = np.where(moved, np.maximum(visit.start_s, np.nextafter(last, np.inf)), stays.gone_s)
-    seen = replace(stays, last_s=last, gone_s=gone, p_gone=np.where(moved, 1.0, stays.p_gone))
-    lives = learned_lives(seen, living.lives, visit.start_s)
-    return replace(living, lives=replace(lives, looks_s=living.lives.looks_s))
-
-
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
     """The map with the places and sites that the session found."""
     in_place = None
