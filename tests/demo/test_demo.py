@@ -308,7 +308,7 @@ def test_four_weeks_show_what_they_were_built_to_show(tmp_path: Path, seed: int)
     numbers = run_demo(tmp_path / "out", seed=seed, processes=2)["demo"]
     whole = {name: method["whole"] for name, method in numbers["methods"].items()}
     assert len(numbers["methods"]["static"]["weeks"]) == 4
-    # who never doubts is wrong about what has gone; who is told the truth is not
+    # a map without existence estimates is wrong about what has gone; the oracle is not
     assert whole["static"]["precision"] < 0.6 < 0.98 < whole["oracle"]["precision"]
     assert whole["static"]["pose_rmse_m"] > 1.5 * whole["oracle"]["pose_rmse_m"]
     others = [name for name in whole if name not in ("evermap", "oracle")]

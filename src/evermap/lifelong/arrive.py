@@ -22,7 +22,7 @@ from evermap.sensing.visibility import detection_probability
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 NEAR_M = 0.6
-"""Who stands this close to where a place is seen from sees it, too."""
+"""Positions this close to one from which a place was seen have a clear line to it, too [m]."""
 LEAST_EXPECTED = 2.0
 """Detections that earlier looks must have been expected to give to count as looks."""
 STICKY = 2.0

@@ -108,7 +108,8 @@ def decided(
                 left_s = last[stay] = max(last[stay], left_s)
                 gone[stay], p_gone[stay] = _first_miss(looks, old, left_s, start_s), 1.0
             if looked_away:
-                p_gone[stay if stay >= 0 else slice(0, 0)] = p_away
+                if stay >= 0:
+                    p_gone[stay] = p_away
                 to_s = _first_miss(looks, old, left_s, start_s)
                 found.append(_change(after, ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(misses[old])))
                 continue

@@ -14,10 +14,10 @@ from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 SMALLEST_P = 1e-6
-BENT_M = 0.15
-BENT_CLIQUES = 3
+BENT_M, BENT_CLIQUES = 0.15, 3
+"""A session is bent where this many bodies seem to have moved by one rigid motion, to within this distance [m]."""
 BENT_ROUNDS = 5
-"""So many bodies that moved by one rigid motion, to this distance, have not moved: the session is bent."""
+"""Refits of that motion to the bodies that agree with it."""
 
 
 @dataclass(frozen=True, slots=True)

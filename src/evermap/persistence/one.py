@@ -24,7 +24,7 @@ class PersistenceFilter:
         prior: how long such features stay; a text such as `exponential:half-life=30d` is read as one.
 
     Raises:
-        ConfigError, InputError: `prior` is no lifetime prior.
+        ConfigError, InputError: `prior` is not a lifetime prior.
     """
 
     __slots__ = ("_death_odds", "_evidence", "_inverse_odds", "_stamp")
