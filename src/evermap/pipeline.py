@@ -74,6 +74,10 @@ def run_slam(
         return _conclude(recording, prepared, slam, prior, step_s, interrupted=interrupted)
 
 
+ROUNDS = 2
+"""Times that a session is judged: the second time by lifetimes that have learned from the first."""
+
+
 @dataclass(frozen=True, slots=True)
 class Session:
     """What a session made of a map.
@@ -185,16 +189,25 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
         expected = aged.p_here
         where = lifelong.laid(living, expected, visit, config.living)
         if where is None and len(living.places):
-            return _lost(visit, slam, alone.prior, alone.step_s, living, interrupted=alone.interrupted)
+            return _lost(alone, living, "too few of its landmarks were seen standing to each other as it says")
         if where is not None:
-            living, visit = lifelong.refit(living, where, visit, alone.prior, robust=config.slam.robust)
-        living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
-        # what was found goes into the map, then hits and misses into beliefs, and those into decisions
-        entry = lifelong.entered(living, expected, where, visit, config.living)
-        looks, eye = lifelong.looks(entry, visit, config.living)
-        now = lifelong.believed(entry, looks, visit, config.living)
-        after, changes = lifelong.decided(entry.before, now, looks, visit, config.living)
-        after = lifelong.learned(after, looks, replace(entry, living=now.living), eye, config.living)
+            before = living
+            living, where, visit = lifelong.refit(
+                living, expected, where, visit, alone.prior, robust=config.slam.robust
+            )
+            if not lifelong.fits(visit, alone.visit):
+                return _lost(alone, before, "most sightings contradict it; the session is bent, or of another place")
+        known: LivingMap | None = None
+        for _ in range(ROUNDS):
+            entering = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
+            # what was found goes into the map, then hits and misses into beliefs, and those into decisions
+            entry = lifelong.entered(entering, aged.p_here, where, visit, config.living)
+            looks, eye = lifelong.looks(entry, visit, config.living)
+            now = lifelong.believed(entry, looks, visit, config.living)
+            after, changes = lifelong.decided(entry.before, now, looks, visit, config.living, known)
+            after = lifelong.learned(after, looks, replace(entry, living=now.living), eye, config.living)
+            living = replace(living, lives=replace(after.lives, looks_s=living.lives.looks_s))
+            aged, known = believe.aged(living, config.living, visit.start_s), after
         frame = "first_pose" if where is None else "prior_map"
         names = visit.recording.landmark_names
         landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)
@@ -459,21 +472,15 @@ def _alone(config: Config) -> SlamConfig:
     return config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
 
 
-def _lost(
-    visit: Visit,
-    slam: StreamingSlam,
-    prior: CalibrationPrior,
-    step_s: FloatArray,
-    living: LivingMap,
-    *,
-    interrupted: bool,
-) -> Session:
+def _lost(alone: Alone, living: LivingMap, reason: str) -> Session:
     """The session cannot be found in the map: it stands by itself, and the map as it was."""
     from evermap.maps.living import Evidence
     from evermap.slam import session
 
+    visit = alone.visit
     landmarks = session.landmarks(visit.prepared, visit.outcome, visit.recording, "first_pose")
-    result = _result(visit, slam, prior, step_s, "first_pose", landmarks=landmarks, interrupted=interrupted)
-    warning = "cannot localise in the map: too few of its landmarks were seen standing to each other as it says"
-    result = replace(result, warnings=(*result.warnings, warning))
+    result = _result(
+        visit, alone.slam, alone.prior, alone.step_s, "first_pose", landmarks=landmarks, interrupted=alone.interrupted
+    )
+    result = replace(result, warnings=(*result.warnings, f"cannot localise in the map: {reason}"))
     return Session(living, False, visit.recording, result, (), Evidence.empty())

@@ -9,6 +9,7 @@ import numpy as np
 from evermap.lifelong.arrive import Arrivals
 from evermap.lifelong.believe import Looks, class_of, clique_rows, site_middles
 from evermap.lifelong.geometry import of_places
+from evermap.maps.learning import LongestLives
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.slam.align import rigid
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
@@ -50,7 +51,13 @@ def standing(living: LivingMap) -> Standing:
 
 
 def decided(
-    before: LivingMap, after: LivingMap, looks: Looks, log_evidence: FloatArray, arrivals: Arrivals, start_s: float
+    before: LivingMap,
+    after: LivingMap,
+    looks: Looks,
+    log_evidence: FloatArray,
+    arrivals: Arrivals,
+    start_s: float,
+    longest: LongestLives | None = None,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date, and what changed since it was told last, by clique.
 
@@ -64,6 +71,8 @@ def decided(
         log_evidence: (C,) what they say for 'it stands somewhere' against 'it is away', by clique.
         arrivals: what earlier looks said of the places of new sites.
         start_s: beginning of the session.
+        longest: lifetimes that are credible: a clique is told to have vanished where the looks outweigh even these.
+            None where nothing is known of lifetimes.
     """
     hits, misses = _counted(looks, len(after.sites))
     middle, sites = site_middles(after), after.sites
@@ -71,6 +80,12 @@ def decided(
     told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
     last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
     p_kept, hidden, shown = sites.p_kept.copy(), np.zeros(3), np.zeros(3)
+    least = np.full(len(cliques), LEAST_EVIDENCE)
+    if longest is not None:
+        newest_s = np.full(len(cliques), -np.inf)
+        np.maximum.at(newest_s, row_of, sites.seen_s)
+        p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
+        least = np.maximum(least, np.log(p_stays / np.maximum(1.0 - p_stays, 1e-300)))
     begun: list[tuple[int, int, float, float, float]] = []
     found: list[MapChange] = []
     for c, clique in enumerate(cliques.tolist()):
@@ -98,7 +113,7 @@ def decided(
                 if here:
                     p_kept[site] = sites.p_here[site]
                 continue
-            looked_away = not stands and misses[old] > 0 and log_evidence[c] <= -LEAST_EVIDENCE and p_away >= EXISTS
+            looked_away = not stands and misses[old] > 0 and log_evidence[c] <= -least[c] and p_away >= EXISTS
             if not (stands and here) and not looked_away:
                 if stay >= 0 and log_evidence[c] <= -LEAST_EVIDENCE:
                     p_gone[stay] = p_away

@@ -109,12 +109,9 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
         where: as most landmarks have it.
         position_m: (K, 2) landmarks of `where` in the session's frame.
     """
-    members, places = living.members, living.places
-    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
-    at = np.minimum(np.searchsorted(members.landmark_id, where.landmark_id), max(len(members) - 1, 0))
-    known = members.landmark_id[at] == where.landmark_id
-    home = np.where(known, living.place_row(where.landmark_id, site[at]), -1)
+    home = _homes(living, p_site, where)
     moved = np.flatnonzero((where.place < 0) & (home >= 0))
+    places, body = living.places, living.members.clique_id[_members(living, where)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
         motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
@@ -128,11 +125,31 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
             agree = gap < max(BENT_M, float(np.median(gap[agree])))
         agree &= gap < BENT_M
         fits = moved[agree]
-        if len(np.unique(members.clique_id[at[fits]])) < BENT_CLIQUES:
+        if len(np.unique(body[fits])) < BENT_CLIQUES:
             break
         place[fits], probability[fits] = home[fits], 1.0
         moved = moved[~agree]
     return replace(where, place=place, probability=probability)
+
+
+def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
+    """Where a session lies if nothing has moved: every landmark of the map at its most probable place."""
+    home = _homes(living, p_site, where)
+    return replace(where, place=np.where(where.place >= 0, where.place, home))
+
+
+def _members(living: LivingMap, where: Laid) -> IntArray:
+    """(K,) rows of the map's members, any for landmarks that are none."""
+    rows = np.searchsorted(living.members.landmark_id, where.landmark_id)
+    return np.minimum(rows, max(len(living.members) - 1, 0))
+
+
+def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
+    """(K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
+    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
+    at = _members(living, where)
+    known = living.members.landmark_id[at] == where.landmark_id
+    return np.where(known, living.place_row(where.landmark_id, site[at]), -1)
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:

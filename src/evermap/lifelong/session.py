@@ -12,8 +12,8 @@ from evermap.lifelong import arrive, believe, decide
 from evermap.lifelong.believe import Looks, Sighting
 from evermap.lifelong.extend import Extended, Found, extended
 from evermap.lifelong.geometry import anchored, drifted, of_places, resized
-from evermap.lifelong.overlaying import Laid, laid_over, unbent, with_glimpsed
-from evermap.maps.learning import learned_lives
+from evermap.lifelong.overlaying import Laid, all_at_home, laid_over, unbent, with_glimpsed
+from evermap.maps.learning import LongestLives, learned_lives
 from evermap.maps.living import EXISTS, Evidence, LivingMap
 from evermap.maps.missed import without_missed
 from evermap.slam import session as of_slam
@@ -27,6 +27,10 @@ from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
 
 INLIER = 0.5
+LEAST_FIT = 0.75
+"""Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
+CREDIBLE = 0.6
+"""Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
 GLIMPSE_M = 0.4
 """A landmark that was seen once, this close to its place, was seen there."""
 
@@ -118,41 +122,56 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
 
 
 def refit(
-    living: LivingMap, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool
-) -> tuple[LivingMap, Visit]:
-    """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized."""
-    outcome = alone.outcome
-    stand = np.flatnonzero(where.place >= 0)
-    places = where.place[stand]
-    row = np.searchsorted(alone.prepared.landmark_id, where.landmark_id[stand])
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool
+) -> tuple[LivingMap, Laid, Visit]:
+    """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized.
+
+    A session that had to be straightened for that is asked again what stands where it stood.
+    """
+    outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
         own = own_landmarks(outcome)
-        _, mine, theirs = np.intersect1d(own.row, row, return_indices=True)
-        covariance = drifted(of_places(living.covariance_m2, places[theirs]), where.drift_m)
+        _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
+        places = where.place[where.place >= 0][theirs]
         shown = log_ratio(
             own.position_m[mine],
             of_places(own.covariance_m2, mine),
-            living.places.position_m[places[theirs]],
-            covariance,
+            living.places.position_m[places],
+            drifted(of_places(living.covariance_m2, places), where.drift_m),
         )
         known = living.log_size_variance, living.log_size_information
         found = settled(*shown, (0.0, outcome.log_scale_sigma), *known)
         living = resized(living, found.map_factor, found.variance, found.information)
         size *= found.session_factor
-    position = living.places.position_m[places]
-    motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
-    outcome = refitted(
-        outcome,
-        prior,
-        motion,
-        size,
-        row,
-        position,
-        drifted(of_places(living.covariance_m2, places), where.drift_m),
-        robust=robust,
-    )
-    return living, replace(alone, outcome=outcome)
+
+    def in_map(where: Laid) -> tuple[Outcome, bool]:
+        stand = np.flatnonzero(where.place >= 0)
+        row = np.searchsorted(names, where.landmark_id[stand])
+        position = living.places.position_m[where.place[stand]]
+        motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
+        covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+        return refitted(outcome, prior, motion, size, row, position, covariance, robust=robust)
+
+    solved, straightened = in_map(where)
+    if straightened:
+        at_home = all_at_home(living, p_site, where)
+        solved, _ = in_map(at_home)
+        landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
+        n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
+        stays = (2.0 * n_fit > count)[np.searchsorted(names, where.landmark_id)]
+        where = replace(
+            where,
+            place=np.where(stays, at_home.place, where.place),
+            probability=np.where(stays, 1.0, where.probability),
+        )
+        solved, _ = in_map(where)
+    return living, where, replace(alone, outcome=solved)
+
+
+def fits(visit: Visit, alone: Visit) -> bool:
+    """False for a session that the map contradicts: what fits together by itself does not fit once it is held there."""
+    return bool(visit.outcome.inlier.mean() >= LEAST_FIT * alone.outcome.inlier.mean())
 
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
@@ -257,7 +276,7 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig
+    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig, known: LivingMap | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date and without what is forgotten, and what changed since the session before.
 
@@ -267,9 +286,13 @@ def decided(
         seen: looks of the session.
         visit: the session.
         config: which parts of the engine are on.
+        known: a map that knows how long things stay, with what the session found; None for nothing.
     """
+    longest = None
+    if known is not None and config.learn_lifetimes:
+        longest = LongestLives.of(known.stays, known.lives.looks_s, CREDIBLE)
     arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
-    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s)
+    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s, longest)
     changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)

@@ -7,6 +7,7 @@ looks only the outcome is known; `history` says what could have been.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,6 +80,29 @@ def class_survival(
     history = History.of(stays, lives.looks_s)
     found = np.flatnonzero(history.class_ids == class_id)
     return _learned(history).stay.band(int(found[0]) if len(found) else -1, ages_s, confidence)
+
+
+@dataclass(frozen=True, slots=True)
+class LongestLives:
+    """The longest lifetimes that are credible: upper bounds of the survival functions of classes."""
+
+    class_ids: IntArray
+    stay: ClassPosterior
+    confidence: float
+
+    @classmethod
+    def of(cls, stays: Stays, looks_s: FloatArray, confidence: float) -> Self:
+        """From all stays of a map, with the ends (M,) of its sessions."""
+        history = History.of(stays, looks_s)
+        return cls(history.class_ids, _learned(history).stay, confidence)
+
+    def survival(self, class_id: IntArray, age_s: FloatArray) -> FloatArray:
+        """(N,) upper bounds of `P(stay > age)`, of classes (N,) at ages (N,)."""
+        upper = np.empty(len(class_id))
+        for kind in np.unique(class_id):
+            mine, row = class_id == kind, np.flatnonzero(self.class_ids == kind)
+            upper[mine] = self.stay.band(int(row[0]) if len(row) else -1, age_s[mine], self.confidence)[2]
+        return upper
 
 
 @dataclass(frozen=True, slots=True)

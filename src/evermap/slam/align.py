@@ -56,12 +56,16 @@ def consensus(
     return rigid(source[near], target[near]), agree
 
 
-def rigid(source: FloatArray, target: FloatArray) -> FloatArray:
-    """(3,) rotation and translation that brings points (k, 2) onto others, least squares."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    theta = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
-    shift = target.mean(axis=0) - se2.rotation(theta) @ source.mean(axis=0)
-    return np.array([shift[0], shift[1], theta])
+def rigid(source: FloatArray, target: FloatArray, weight: FloatArray | None = None) -> FloatArray:
+    """(..., 3) rotation and translation that brings points (..., k, 2) onto others, least squares; weights (..., k)."""
+    share = np.ones(source.shape[:-1]) if weight is None else weight
+    share = (share / share.sum(axis=-1, keepdims=True))[..., None]
+    middle, to = (share * source).sum(axis=-2), (share * target).sum(axis=-2)
+    a, b = source - middle[..., None, :], target - to[..., None, :]
+    across = (share[..., 0] * (a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])).sum(axis=-1)
+    theta = np.arctan2(across, (share * a * b).sum(axis=(-2, -1)))
+    turned = np.stack([np.zeros_like(theta), np.zeros_like(theta), theta], axis=-1)
+    return np.concatenate([to - se2.transform(turned, middle), theta[..., None]], axis=-1)
 
 
 def _pairs_of_one_length(source: FloatArray, target: FloatArray, name: IntArray) -> tuple[IntArray, IntArray]:

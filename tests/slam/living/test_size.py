@@ -53,12 +53,15 @@ def test_the_metre_of_a_map_is_the_weighted_mean_of_those_of_its_sessions(
     for k in range(1, len(sessions)):
         # the session says by its priors that its metre is `own` short of the true one
         found = settled(metre - true[k], shown[k] ** 2, (own[k], sigma[k]), variance, information)
+        innovation = metre - true[k] - own[k]
+        total = sigma[k] ** 2 + shown[k] ** 2 + 1.0 / information + WALK**2
         weight = _by_all_sessions(true[: k + 1], shown[: k + 1], sigma[: k + 1])
         metre += np.log(found.map_factor)
         ours = np.array([true[0], *(true[j] + own[j] for j in range(1, k + 1))])
         assert metre == pytest.approx(float(weight @ ours), abs=1e-12)
-        # both agree on the metre then: the session's factor leads to the map's new one
-        assert np.log(found.session_factor) == pytest.approx(metre - true[k], abs=1e-12)
+        # the session's factor leads to the map's new metre, up to its share of what the comparison got wrong
+        misread = innovation * shown[k] ** 2 / total
+        assert np.log(found.session_factor) == pytest.approx(metre - true[k] - misread, abs=1e-12)
         noise = noise * (1.0 - weight[k]) ** 2 + weight[k] ** 2 * shown[k] ** 2
         common = float(weight @ np.array(sigma[: k + 1])) ** 2
         assert common - 1e-15 <= found.variance <= (np.sqrt(common) + np.sqrt(noise)) ** 2 + 1e-15
@@ -105,7 +108,7 @@ def test_a_session_that_shows_no_size_changes_nothing() -> None:
     assert (ratio, variance) == (0.0, np.inf)
     found = settled(ratio, variance, (0.02, 0.01), 0.02**2, 1.0 / 0.02**2)
     assert found.map_factor == 1.0
-    assert found.session_factor == pytest.approx(np.exp(0.0))
+    assert found.session_factor == pytest.approx(np.exp(0.02))  # its own priors
     assert found.variance == pytest.approx(0.02**2)
 
 
@@ -144,3 +147,22 @@ def test_the_similarity_is_that_of_least_squares(seed: int) -> None:
         ]
     )  # fmt: skip
     assert variance == pytest.approx(np.linalg.inv(0.5 * hessian)[3, 3], rel=0.05)
+
+
+def test_a_comparison_that_shows_nothing_leaves_a_session_its_own_size() -> None:
+    for shown_variance, factor in ((1e-12, np.exp(2.0)), (1e12, 1.0)):
+        found = settled(2.0, shown_variance, (0.0, 0.1), 1e-12, 1e12)
+        assert found.session_factor == pytest.approx(factor, rel=1e-3)
+
+
+def test_a_bent_session_says_little_of_its_size() -> None:
+    """Half of the landmarks stand elsewhere than the rest has them: the residuals tell that, the covariances do not."""
+    rng = np.random.default_rng(0)
+    session_m = rng.uniform(0.0, 20.0, (20, 2))
+    map_m = session_m.copy()
+    covariance = 1e-4 * np.eye(40)
+    _, variance = log_ratio(session_m, covariance, map_m, covariance)
+    map_m[10:] += [6.0, -8.0]
+    size, bent_variance = log_ratio(session_m, covariance, map_m, covariance)
+    assert np.sqrt(variance) < 1e-3
+    assert abs(size) < 3.0 * np.sqrt(bent_variance)

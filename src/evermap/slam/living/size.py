@@ -59,7 +59,7 @@ def settled(
     innovation = log_ratio - own
     return Size(
         map_factor=float(np.exp(-gain * innovation)),
-        session_factor=float(np.exp(own + (1.0 - gain) * innovation)),
+        session_factor=float(np.exp(own + innovation * sigma**2 / (1.0 / before + sigma**2 + ratio_variance))),
         variance=((1.0 - gain) * np.sqrt(map_variance) + gain * sigma) ** 2 + gain**2 * min(ratio_variance, 1.0),
         information=before + after,
     )
@@ -69,6 +69,8 @@ def log_ratio(
     session_m: FloatArray, session_m2: FloatArray, map_m: FloatArray, map_m2: FloatArray
 ) -> tuple[float, float]:
     """Log of the map's size over the session's, and its variance: a similarity by generalised least squares.
+
+    Where residuals are larger than the covariances allow, as in a session that is bent, the variance grows with them.
 
     Args:
         session_m: (K, 2) landmarks in the session's frame and metres.
@@ -88,11 +90,13 @@ def log_ratio(
         turned = se2.transform(np.array([0.0, 0.0, motion[2]]), session_m) * factor
         turn = factor * np.kron(np.eye(len(session_m)), se2.rotation(motion[2]))
         columns = np.column_stack([se2.rigid_directions(turned), turned.ravel()])
-        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, columns)
-        information = columns.T @ weighed
-        step = np.linalg.solve(information, weighed.T @ (map_m - turned - motion[:2]).ravel())
+        rest = (map_m - turned - motion[:2]).ravel()
+        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, np.column_stack([columns, rest]))
+        information = columns.T @ weighed[:, :4]
+        step = np.linalg.solve(information, columns.T @ weighed[:, 4])
         motion, log_size = motion + step[:3], log_size + step[3]
-        variance = float(np.linalg.inv(information)[3, 3])
+        squared = float(rest @ weighed[:, 4] - step @ information @ step)
+        variance = float(np.linalg.inv(information)[3, 3]) * max(1.0, squared / max(len(rest) - 4, 1))
         if np.abs(step).max() < 1e-9:
             break
     return float(log_size), variance
