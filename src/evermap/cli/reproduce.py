@@ -63,7 +63,7 @@ def reproduce(
         list[str] | None,
         typer.Option(
             help="Only this part, repeatable; nielsen2024: simulation, recordings, during, search; lifelong: five, "
-            "fifty, ablation-recorded, ablation-simulated. Rows of an older run of other parts in --out stay.",
+            "fifty, ablation-recorded, ablation-simulated; partial-views: changing, still. Rows of an older run of other parts in --out stay.",
             show_default=False,
         ),
     ] = None,
@@ -207,7 +207,7 @@ def reproduce(
             from evermap.experiments import partial_views
 
             first = partial_views.QUICK if quick else partial_views.Settings()
-            views: dict[str, Any] = {"seed": seed, "buildings": runs, "processes": jobs}
+            views: dict[str, Any] = {"seed": seed, "buildings": runs, "processes": jobs, "parts": part and tuple(part)}
             seen = replace(first, **{name: value for name, value in views.items() if value is not None})
             table = partial_views.reproduce(target, seen, progress=progress, force=force)
             as_text = partial_views.as_markdown
@@ -241,7 +241,7 @@ def _refuse_options(experiment: Experiment, given: dict[str, bool]) -> None:
         Experiment.BATEMAN2020: {"--seed", "--runs", "--world", "--filters"},
         Experiment.LIFETIMES: {"--data", "--seed", "--runs"},
         Experiment.LIFELONG: {"--data", "--seed", "--part", "--quick", "--runs"},
-        Experiment.PARTIAL_VIEWS: {"--seed", "--quick", "--jobs", "--runs"},
+        Experiment.PARTIAL_VIEWS: {"--seed", "--part", "--quick", "--jobs", "--runs"},
     }[experiment]
     for name in (name for name, is_given in given.items() if is_given and name not in known):
         raise ConfigError(f"{experiment.value} has no such option", field=name, hint=", ".join(sorted(known)))

@@ -44,6 +44,7 @@ Row = dict[str, Any]
 
 SCHEMA_VERSION = "1"
 EXPERIMENT = "partial-views"
+PARTS = ("changing", "still")
 HARD = 0
 """Stands for the length of patrols in a harder world."""
 HARD_LENGTHS_S = (20.0, 40.0, 60.0, 90.0, 165.0)
@@ -71,6 +72,7 @@ class Settings:
         change_rate: factor on how often things move; 0 is a world in which nothing ever changes.
         seed: of the first building.
         processes: worlds at a time.
+        parts: 'changing' worlds, and 'still' ones, the same in which nothing ever changes.
     """
 
     buildings: int = 20
@@ -79,8 +81,12 @@ class Settings:
     change_rate: float = 1.0
     seed: int = 1000
     processes: int = 1
+    parts: tuple[str, ...] = PARTS
 
     def __post_init__(self) -> None:
+        for part in self.parts:
+            if part not in PARTS:
+                raise ConfigError(f"no such part: {part!r}", field="--part", hint=", ".join(PARTS))
         for name, least in (("buildings", 1), ("sessions", 2), ("seed", 0), ("processes", 1)):
             if getattr(self, name) < least:
                 raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
@@ -102,7 +108,8 @@ def reproduce(
         force: write into a folder that holds other files, too; they stay.
 
     Returns:
-        `worlds` (a dictionary a world), `settings`, `machine`; plain JSON values.
+        `worlds` (a dictionary a world), `still` (the same of worlds in which nothing changes), `settings`, `machine`;
+        plain JSON values.
 
     Raises:
         ConfigError: `out` must not be replaced.
@@ -113,14 +120,16 @@ def reproduce(
 
     settings = settings or Settings()
     worlds = [(settings.seed + k, patrol) for patrol in settings.patrols_s for k in range(settings.buildings)]
-    total = float(len(worlds) * settings.sessions)
+    total = float(len(worlds) * settings.sessions * len(settings.parts))
     with RunFolder(out, force=force) as folder:
         wall, cpu = time.perf_counter(), time.process_time()
-        rows: list[Row] = []
-        for found in _each_world(settings, worlds):
-            rows.append(found)
-            if progress is not None:
-                progress(float(len(rows) * settings.sessions), total)
+        found: dict[str, list[Row]] = {part: [] for part in PARTS}
+        for part in settings.parts:
+            of_part = settings if part == "changing" else replace(settings, change_rate=0.0)
+            for row in _each_world(of_part, worlds):
+                found[part].append(row)
+                if progress is not None:
+                    progress(float(sum(map(len, found.values())) * settings.sessions), total)
         wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         content: dict[str, Any] = {
             "schema_version": SCHEMA_VERSION,
@@ -130,9 +139,12 @@ def reproduce(
             "settings": json.loads(json.dumps(asdict(settings))),
             "machine": machine(cpu / wall),
             "processing_s": wall,
-            "worlds": rows,
+            "worlds": found["changing"],
+            "still": found["still"],
         }
-        save_all({"reliability": draw_reliability(content), "false-changes": draw_false_changes(content)}, folder.path)
+        if found["changing"]:
+            figures = {"reliability": draw_reliability(content), "false-changes": draw_false_changes(content)}
+            save_all(figures, folder.path)
         folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
         content["outputs"] = sorted([*folder.files(), "summary.json"])
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

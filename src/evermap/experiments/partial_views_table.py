@@ -19,12 +19,12 @@ def patrol_name(patrol_s: int) -> str:
     return f"{patrol_s} s" if patrol_s else "hard"
 
 
-def by_patrol(content: Mapping[str, Any]) -> dict[str, list[Row]]:
+def by_patrol(content: Mapping[str, Any], part: str = "worlds") -> dict[str, list[Row]]:
     """Worlds by the length of their patrols, and all of them together."""
     groups: dict[str, list[Row]] = {}
-    for world in content["worlds"]:
+    for world in content[part]:
         groups.setdefault(patrol_name(world["patrol_s"]), []).append(world)
-    plain = [world for world in content["worlds"] if world["patrol_s"]]
+    plain = [world for world in content[part] if world["patrol_s"]]
     return groups | ({PLAIN: plain} if len(plain) > 0 else {})
 
 
@@ -94,11 +94,19 @@ def as_markdown(table: Mapping[str, Any]) -> str:
         if name in (patrol_name(0), PLAIN):
             for p, share_true, count in reliability(row for world in worlds for row in world["told"]):
                 bins.append([name, f"{p:.3f}", f"{share_true:.3f}", f"{count}"])
-    return (
-        markdown_table(header, lines)
-        + "\n\n"
-        + markdown_table(("patrols", "mean p told", "share true", "changes"), bins)
+    still = [_still_line(name, summary(worlds), worlds) for name, worlds in by_patrol(table, "still").items()]
+    parts = (
+        (header, lines),
+        (("patrols", "mean p told", "share true", "changes"), bins),
+        (("nothing changes; patrols", "sessions", "not found", "told", "highest p", "precision, p >= .9"), still),
     )
+    return "\n\n".join(markdown_table(head, rows) for head, rows in parts if rows)
+
+
+def _still_line(name: str, s: Mapping[str, Any], worlds: Sequence[Row]) -> list[str]:
+    p = [row["p"] for world in worlds for row in world["told"]]
+    highest = f"{max(p):.2f}" if p else "–"
+    return [name, f"{s['sessions']}", f"{s['lost']}", f"{s['told']}", highest, number("{:.3f}", s["precision"])]
 
 
 def _mean(values: Any) -> float | None:
