@@ -15,8 +15,10 @@ def still(request: pytest.FixtureRequest) -> Row:
     return live(Settings(sessions=6, change_rate=0.0), *request.param)
 
 
-@pytest.mark.xfail(reason="in the first two sessions, before lifetimes are learned, changes of p up to .83 are told")
-def test_where_nothing_changes_no_change_is_told(still: Row) -> None:
+def test_where_nothing_changes_no_change_is_told(still: Row, request: pytest.FixtureRequest) -> None:
+    if still["seed"] == 501:
+        why = "a shelf in a room whose door was shut has appeared, p .73: docs/results.md counts how often that happens"
+        request.applymarker(pytest.mark.xfail(reason=why))
     assert len(still["after"]) == 6
     assert all(session["found"] for session in still["after"])
     assert still["after"][-1]["n_sure"] > 20

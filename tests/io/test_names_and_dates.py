@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from evermap import read_looks, read_recording, run_session, run_slam, write_native
+from evermap.cli.main import app
 from evermap.errors import InputError
 from evermap.io import read_landmarks, write_map_geojson, write_map_parquet, write_template
 from evermap.runsummary import change_dict
@@ -76,6 +78,29 @@ def test_texts_go_through_a_run_into_every_output(tmp_path: Path) -> None:
     features = json.loads((tmp_path / "map.geojson").read_text())["features"]
     names = {each["properties"].get("name") for each in features if each["geometry"]["type"] == "Point"}
     assert names == {"door-3", "tag:17", ""}
+
+
+def test_a_map_tells_and_takes_texts(tmp_path: Path) -> None:
+    runner, file = CliRunner(), str(tmp_path / "site.evermap")
+    recording = str(named_template(tmp_path / "named"))
+
+    def told(*words: str) -> str:
+        result = runner.invoke(app, [*words])
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    told("slam", recording, "--map", file, "--out", str(tmp_path / "run"))
+    assert "door-3" in told("map", "show", file)
+    assert "landmark door-3 " in told("map", "why", file, "door-3")
+    assert "pinned landmark tag:17" in told("map", "pin", file, "tag:17")
+    assert "landmark tag:17 pinned" in told("map", "diff", file, "1", "2")
+    assert [
+        item["label"] for item in json.loads(told("map", "show", file, "--json"))["landmarks"] if item["pinned"]
+    ] == ["tag:17"]
+    for name in ("door-4", "tag:99"):
+        result = runner.invoke(app, ["map", "why", file, name])
+        assert result.exit_code == 2
+        assert re.search(f"no landmark '{name}'; there is .*door-3", result.output)
 
 
 def test_texts_are_written_as_texts_and_read_back(tmp_path: Path) -> None:

@@ -131,7 +131,7 @@ def diff(
     with open_store(file) as store:
         later = store.head() if b is None else b
         old, new = store.load(a), store.load(later)
-    changes, edited = between(old, new), edits(old, new)
+    changes, edited = [change.named(new.landmark_names) for change in between(old, new)], edits(old, new)
     if as_json:
         listed = [{"landmark": name, "what": word} for name, word in edited]
         print_json({"map": file, "a": a, "b": later, "changes": [*map(change_content, changes)], "edits": listed})
@@ -139,7 +139,7 @@ def diff(
     for change in changes:
         echo(change_line(change, new.clock))
     for name, word in edited:
-        echo(f"landmark {name} {word} by an operator")
+        echo(f"landmark {new.label(name)} {word} by an operator")
     if not changes and not edited:
         say(f"no difference between revisions {a} and {later}")
 
@@ -180,7 +180,7 @@ def export(
 @app.command("why")
 def why(
     file: _File,
-    landmark: Annotated[int, typer.Argument(metavar="LANDMARK", help="Its id.")],
+    landmark: Annotated[str, typer.Argument(metavar="LANDMARK", help="Its id, or its name.")],
     revision: _AtRevision = None,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw its belief over time.", show_default="none")

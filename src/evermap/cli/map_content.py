@@ -103,6 +103,7 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
         content.append(
             {
                 "landmark": int(members.landmark_id[row]),
+                "label": living.label(int(members.landmark_id[row])),
                 "class": class_name(living, int(members.class_id[row])),
                 "clique": int(members.clique_id[row]),
                 "p_exists": float(p_exists[row]),
@@ -130,7 +131,7 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
     flags = " ".join(word for word in ("pinned", "deleted") if content[word])
     ahead = content["p_ahead"]
     return [
-        str(content["landmark"]),
+        content["label"],
         content["class"] or "-",
         probability_text(content["p_exists"]),
         "-" if ahead is None else probability_text(ahead),
@@ -148,6 +149,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
     seen, stays = answer.evidence, answer.stays
     return {
         "landmark": answer.landmark_id,
+        "label": answer.label,
         "class": answer.class_name,
         "clique": answer.clique_id,
         "companions": list(answer.companions),

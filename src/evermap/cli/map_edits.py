@@ -11,7 +11,7 @@ from evermap.errors import InputError
 
 _File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 _AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
-_Ids = Annotated[list[int], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks.")]
+_Ids = Annotated[list[str], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks, or their names.")]
 _Note = Annotated[str, typer.Option(help="A word for the log.")]
 
 
@@ -123,7 +123,7 @@ def undelete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = 
 
 def _edit(
     file: str,
-    landmarks: list[int],
+    landmarks: list[str],
     word: str,
     note: str,
     as_json: bool,
@@ -140,14 +140,14 @@ def _edit(
         before = after = store.load(parent)
         for name in landmarks:
             try:
-                after = after.edited(name, pinned=pinned, deleted=deleted)
+                after = after.edited(after.landmark_called(name), pinned=pinned, deleted=deleted)
             except KeyError:
                 problem = f"no landmark {name} in revision {parent}"
                 raise InputError(problem, path=file, hint=f"evermap map show {file} --all") from None
         changed = [name for name, _ in edits(before, after)]
         number = parent
         if changed:
-            listed = ", ".join(map(str, changed))
+            listed = ", ".join(map(after.label, changed))
             said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
             number = store.commit(
                 after, Provenance(kind=RevisionKind.EDIT, command=command_line(), note=said), parent=parent

@@ -63,7 +63,8 @@ def reproduce(
         list[str] | None,
         typer.Option(
             help="Only this part, repeatable; nielsen2024: simulation, recordings, during, search; lifelong: five, "
-            "fifty, ablation-recorded, ablation-simulated; partial-views: changing, still. Rows of an older run of other parts in --out stay.",
+            "fifty, ablation-recorded, ablation-simulated (rows of an older run of other parts in --out stay); "
+            "partial-views: changing, still.",
             show_default=False,
         ),
     ] = None,

@@ -26,6 +26,9 @@ from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landm
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
 
+MOST_DIGITS = 18
+"""Of ids of landmarks, which are 64 bits wide."""
+
 
 class _Rows:
     """Columns of equal length that are taken and joined together."""
@@ -230,6 +233,16 @@ class LivingMap:
     def landmark_names(self) -> dict[int, str]:
         """Texts of landmarks by their ids."""
         return {landmark_id_of(text): text for text in self.landmark_texts}
+
+    def label(self, landmark_id: int) -> str:
+        """What a landmark is called: its text, or its id."""
+        return self.landmark_names.get(landmark_id, str(landmark_id))
+
+    def landmark_called(self, name: str) -> int:
+        """The id of a landmark by its text, or by its id in digits; -1 where that is neither."""
+        if name in self.landmark_texts:
+            return landmark_id_of(name)
+        return int(name) if name.isdecimal() and len(name) <= MOST_DIGITS else -1
 
     def p_exists(self) -> FloatArray:
         """(L,) probability that each landmark stands at one of its known places."""

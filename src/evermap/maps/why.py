@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,7 +46,7 @@ class Answer:
     """All that a map knows of why it believes what it believes of one landmark.
 
     Attributes:
-        landmark_id, class_name: which; '' where the class is not known.
+        landmark_id, label, class_name: which, and what it is called; '' where the class is not known.
         clique_id, companions: the body it belongs to, and the other landmarks on that.
         clock, stamp_s: of all stamps, and until when the map has seen anything.
         p_exists: now.
@@ -60,6 +61,7 @@ class Answer:
     """
 
     landmark_id: int
+    label: str
     class_name: str
     clique_id: int
     companions: tuple[int, ...]
@@ -77,16 +79,22 @@ class Answer:
     reasons: tuple[str, ...]
 
 
-def why(store: MapStore, landmark_id: int, revision: int | None = None) -> Answer:
+def why(store: MapStore, landmark: int | str, revision: int | None = None) -> Answer:
     """The answer for a landmark, in the newest revision or in another.
+
+    Args:
+        store: the map.
+        landmark: its id, or what it is called.
+        revision: None for the newest.
 
     Raises:
         InputError: the map does not know the landmark, or there is no such revision.
     """
     living = store.load(revision)
+    landmark_id = living.landmark_called(str(landmark))
     found = np.flatnonzero(living.members.landmark_id == landmark_id)
     if not len(found):
-        raise InputError(_unknown(living, landmark_id), path=store.where, hint=f"evermap map show {store.where}")
+        raise InputError(_unknown(living, str(landmark)), path=store.where, hint=f"evermap map show {store.where}")
     row = int(found[0])
     clique = int(living.members.clique_id[row])
     on_it = living.members.landmark_id[living.members.clique_id == clique]
@@ -97,10 +105,15 @@ def why(store: MapStore, landmark_id: int, revision: int | None = None) -> Answe
     for _, part in parts:
         evidence = evidence.joined(part)
     visits = tuple(_visit(log[number], part) for number, part in parts if len(part))
-    changes = tuple((number, change) for number, change in store.changes_of(landmark_id) if number in line)
+    changes = tuple(
+        (number, change.named(living.landmark_names))
+        for number, change in store.changes_of(landmark_id)
+        if number in line
+    )
     class_id = int(living.members.class_id[row])
     answer = Answer(
         landmark_id=landmark_id,
+        label=living.label(landmark_id),
         class_name=living.class_names[class_id] if 0 <= class_id < len(living.class_names) else "",
         clique_id=clique,
         companions=tuple(int(name) for name in on_it if name != landmark_id),
@@ -149,7 +162,7 @@ def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tup
 def _with_words(answer: Answer, living: LivingMap) -> Answer:
     """The same with its headline and reasons."""
     kind = f" ({answer.class_name})" if answer.class_name else ""
-    what = f"landmark {answer.landmark_id}{kind}"
+    what = f"landmark {answer.label}{kind}"
     belief = f"P(exists) {_belief(answer.p_exists)}"
     if answer.deleted:
         headline = f"{what} is not used: an operator deleted it; by what was seen, {belief}"
@@ -239,9 +252,13 @@ def probability_text(p: float) -> str:
     return ("< 0.0001" if p < 0.5 else "> 0.9999") if low < 5e-5 else f"{p:.4f}"
 
 
-def _unknown(living: LivingMap, landmark_id: int) -> str:
+def _unknown(living: LivingMap, name: str) -> str:
     names = living.members.landmark_id
     if not len(names):
-        return f"no landmark {landmark_id}: the map is empty"
-    near = sorted(names[np.argsort(np.abs(names - landmark_id), kind="stable")[:3]].tolist())
-    return f"no landmark {landmark_id}; the nearest ids are {', '.join(map(str, near))}"
+        return f"no landmark {name}: the map is empty"
+    number = living.landmark_called(name)
+    if number >= 0:
+        near = sorted(names[np.argsort(np.abs(names - number), kind="stable")[:3]].tolist())
+        return f"no landmark {name}; the nearest ids are {', '.join(map(living.label, near))}"
+    like = difflib.get_close_matches(name, living.landmark_texts, n=3, cutoff=0.0)
+    return f"no landmark {name!r}" + (f"; there is {', '.join(like)}" if like else "; all have numbers")
