@@ -75,7 +75,7 @@ def run_slam(
 
 
 ROUNDS = 2
-"""Times that a session is judged: the second time by lifetimes that have learned from the first."""
+"""Times that a session is judged, the second time by the lifetimes that the first has learned."""
 
 
 @dataclass(frozen=True, slots=True)
