@@ -103,3 +103,13 @@ def test_what_is_surely_there_outweighs_many_that_are_hardly_believed():
     assert agree.sum() >= 8
     _, agree = consensus(source, target, weight=np.zeros(20))
     assert not agree.any()
+
+
+def test_weighted_fits_are_those_of_repeated_points_and_many_go_at_once() -> None:
+    rng = np.random.default_rng(0)
+    source, target = rng.normal(size=(2, 5, 6, 2))
+    times = rng.integers(1, 4, size=(5, 6))
+    found = rigid(source, target, times.astype(float))
+    for k in range(5):
+        alone = rigid(np.repeat(source[k], times[k], axis=0), np.repeat(target[k], times[k], axis=0))
+        np.testing.assert_allclose(found[k], alone, atol=1e-12)
