@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -74,121 +75,274 @@ def decided(
         longest: lifetimes that are credible: a clique is told to have vanished where the looks outweigh even these.
             None where nothing is known of lifetimes.
     """
-    hits, misses = _counted(looks, len(after.sites))
-    middle, sites = site_middles(after), after.sites
-    cliques, row_of = clique_rows(sites)
-    told, arrival = _told(before, after), {int(site): k for k, site in enumerate(arrivals.site)}
-    last, gone, p_gone = after.stays.last_s.copy(), after.stays.gone_s.copy(), after.stays.p_gone.copy()
-    p_kept, hidden, shown = sites.p_kept.copy(), np.zeros(3), np.zeros(3)
-    least = np.full(len(cliques), LEAST_EVIDENCE)
-    if longest is not None:
-        newest_s = np.full(len(cliques), -np.inf)
-        np.maximum.at(newest_s, row_of, sites.seen_s)
-        p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
-        least = np.maximum(least, np.log(p_stays / np.maximum(1.0 - p_stays, 1e-300)))
-    begun: list[tuple[int, int, float, float, float]] = []
-    found: list[MapChange] = []
-    for c, clique in enumerate(cliques.tolist()):
-        mine = np.flatnonzero(row_of == c)
-        site = int(mine[np.argmax(sites.p_here[mine])])
-        stands, here = sites.p_here[site] >= EXISTS, int(hits[site]) > 0
-        p_away = min(max(1.0 - float(sites.p_here[mine].sum()), 0.0), 1.0)
-        sight = int(looks.sight[c])
-        old, stay = told.get(clique, (-1, -1))
-        if log_evidence[c] <= -LEAST_EVIDENCE and not hits[mine].any():
-            hidden[sight % 2] += 1.0 - p_away
-        newest = stay if stay >= 0 else _newest_stay(after, clique)
-        if old >= 0:
-            if stands and site == old:
-                if stay >= 0:
-                    last[stay] = max(last[stay], sites.seen_s[site])
-                    if here:  # if it was missed before, it was hidden then
-                        hidden[sight % 2] += min(p_kept[site] / sites.p_here[site], 1.0) * p_gone[stay]
-                        p_gone[stay] = 0.0
-                        shown[sight % 2] += 1.0
-                    elif log_evidence[c] <= -LEAST_EVIDENCE:
-                        p_gone[stay] = p_away
-                else:  # a body that was taken apart: its part goes on
-                    begun.append((clique, site, -np.inf, float(sites.since_s[site]), float(sites.seen_s[site])))
-                if here:
-                    p_kept[site] = sites.p_here[site]
-                continue
-            looked_away = not stands and misses[old] > 0 and log_evidence[c] <= -least[c] and p_away >= EXISTS
-            if not (stands and here) and not looked_away:
-                if stay >= 0 and log_evidence[c] <= -LEAST_EVIDENCE:
-                    p_gone[stay] = p_away
-                continue
-            left_s = float(sites.seen_s[old])
-            if stay >= 0:
-                left_s = last[stay] = max(last[stay], left_s)
-                gone[stay], p_gone[stay] = _first_miss(looks, old, left_s, start_s), 1.0
-            if looked_away:
-                if stay >= 0:
-                    p_gone[stay] = p_away
-                to_s = _first_miss(looks, old, left_s, start_s)
-                found.append(_change(after, ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(misses[old])))
-                continue
-            since = max(float(sites.since_s[site]), np.nextafter(left_s, np.inf))
-            begun.append((clique, site, left_s, since, max(float(sites.seen_s[site]), since)))
-            p_kept[site] = sites.p_here[site]
-            if np.hypot(*_motion(after, old, site)[0]) < SAME_SPOT_M:
-                continue
-            p_moved = float(sites.p_here[site])
-            n_hits, n_misses = int(hits[site]), int(misses[old])
-            found.append(_change(after, ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses))
-            continue
-        if not (stands and here):
-            if newest >= 0 and np.isfinite(gone[newest]):
-                at = _row(after, int(after.stays.site_id[newest]))
-                p_gone[newest] = min(max(1.0 - p_kept[at], 0.0), 1.0) if at >= 0 else p_gone[newest]
-            continue
-        seen_s = float(sites.seen_s[site])
-        share = min(p_kept[site] / sites.p_here[site], 1.0)
-        p_kept[site] = sites.p_here[site]
-        same = newest >= 0 and after.stays.site_id[newest] == sites.site_id[site]
-        hidden[sight % 2] += share * p_gone[newest] if same else 0.0
-        if same and share >= 1.0 - EXISTS:  # it had never left
-            last[newest], gone[newest], p_gone[newest] = seen_s, np.inf, 0.0
-            continue
-        elsewhere_s, probability = -np.inf, 1.0 - share if same else 1.0
-        kind, left = ChangeKind.RETURNED, _last_site(before, after, clique)
-        if newest >= 0:
-            # where it was last it was found missing; elsewhere it may have come when it left
-            elsewhere_s = float(gone[newest] if same else last[newest])
-            p_gone[newest] = max(p_gone[newest], probability)
-        elif site in arrival:
-            k = arrival[site]
-            kind, elsewhere_s, probability = ChangeKind.APPEARED, arrivals.looked_s[k], arrivals.p_appeared[k]
-            if probability < EXISTS:
-                elsewhere_s = -np.inf
+    session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest)
+    told = _told(before, after)
+    for row, clique in enumerate(session.cliques.tolist()):
+        session.weigh(row)
+        if clique in told:
+            session.told_before(row, *told[clique])
         else:
-            probability = 0.0
-        since = max(float(sites.since_s[site]), np.nextafter(elsewhere_s, np.inf))
-        begun.append((clique, site, elsewhere_s, since, max(seen_s, since)))
-        if probability >= EXISTS and len(before.places):
-            p = probability * float(sites.p_here[site])
-            n_misses = int(misses[left]) if left >= 0 else 0
-            found.append(_change(after, kind, left, site, elsewhere_s, since, p, int(hits[site]), n_misses))
-    stays = replace(after.stays, last_s=last, gone_s=gone, p_gone=p_gone)
-    if begun:
-        clique_id, rows, elsewhere, first, until = (np.array(column) for column in zip(*begun, strict=True))
+            session.was_away(row)
+    hidden, shown = session.hidden, session.shown
+    hidden[2], shown[2] = looks.unwitnessed
+    after = replace(
+        after,
+        stays=session.stays(),
+        sites=replace(after.sites, p_kept=session.p_kept),
+        sightlines=after.sightlines.after_session(hidden, shown),
+    )
+    return after, _swaps(session.found, before, after)
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """What is decided of cliques one after the other; columns of stays, sites and sight are written to as it goes.
+
+    Attributes:
+        cliques: (C,) ids; site: (C,) row of the most probable site of each.
+        p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
+        least: (C,) evidence against it that it takes to tell that it vanished.
+        hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
+        newest: row of the last stay by clique.
+        last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
+        hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `Looks.sight`.
+        begun: clique, site, not there before, first and last sighting of new stays.
+        found: changes.
+    """
+
+    before: LivingMap
+    after: LivingMap
+    looks: Looks
+    arrivals: Arrivals
+    start_s: float
+    cliques: IntArray
+    site: IntArray
+    p_away: FloatArray
+    log_evidence: FloatArray
+    least: FloatArray
+    hits: IntArray
+    misses: IntArray
+    was_hit: BoolArray
+    newest: dict[int, int]
+    last_s: FloatArray
+    gone_s: FloatArray
+    p_gone: FloatArray
+    p_kept: FloatArray
+    hidden: FloatArray
+    shown: FloatArray
+    begun: list[tuple[int, int, float, float, float]]
+    found: list[MapChange]
+
+    @classmethod
+    def of(
+        cls,
+        before: LivingMap,
+        after: LivingMap,
+        looks: Looks,
+        log_evidence: FloatArray,
+        arrivals: Arrivals,
+        start_s: float,
+        longest: LongestLives | None,
+    ) -> Self:
+        """Before anything is decided."""
+        sites, stays = after.sites, after.stays
+        cliques, row = clique_rows(sites)
+        count = len(cliques)
+        hits, misses = _counted(looks, len(sites))
+        site, newest_s = np.zeros(count, dtype=np.int64), np.full(count, -np.inf)
+        order = np.argsort(-sites.p_here, kind="stable")[::-1]
+        site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
+        np.maximum.at(newest_s, row, sites.seen_s)
+        least = np.full(count, LEAST_EVIDENCE)
+        if longest is not None:
+            p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
+            least = np.maximum(least, np.log(p_stays / np.maximum(1.0 - p_stays, 1e-300)))
+        return cls(
+            before=before,
+            after=after,
+            looks=looks,
+            arrivals=arrivals,
+            start_s=start_s,
+            cliques=cliques,
+            site=site,
+            p_away=np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0),
+            log_evidence=log_evidence,
+            least=least,
+            hits=hits,
+            misses=misses,
+            was_hit=np.bincount(row, hits, minlength=count) > 0,
+            newest={clique: k for k, clique in enumerate(stays.clique_id.tolist())},
+            last_s=stays.last_s.copy(),
+            gone_s=stays.gone_s.copy(),
+            p_gone=stays.p_gone.copy(),
+            p_kept=sites.p_kept.copy(),
+            hidden=np.zeros(3),
+            shown=np.zeros(3),
+            begun=[],
+            found=[],
+        )
+
+    def weigh(self, row: int) -> None:
+        """A clique that was missed and stands was hidden: so much is learned of how often that happens."""
+        if self._missed(row) and not self.was_hit[row]:
+            self.hidden[self._sight(row)] += 1.0 - self.p_away[row]
+
+    def told_before(self, row: int, old: int, stay: int) -> None:
+        """A clique that is said to stand at the site `old`, by the stay `stay` (-1 for none)."""
+        site = int(self.site[row])
+        if self._stands(row) and site == old:
+            self._goes_on(row, stay)
+        elif self._stands(row) and self.hits[site]:
+            self._moved(row, old, stay)
+        elif (
+            not self._stands(row)
+            and self.misses[old]
+            and self.log_evidence[row] <= -self.least[row]
+            and self.p_away[row] >= EXISTS
+        ):
+            self._vanished(row, old, stay)
+        elif stay >= 0 and self._missed(row):
+            self.p_gone[stay] = self.p_away[row]
+
+    def was_away(self, row: int) -> None:
+        """A clique that is said to stand nowhere, or is new."""
+        clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
+        newest = self.newest.get(clique, -1)
+        if not (self._stands(row) and self.hits[site]):
+            if newest >= 0 and np.isfinite(self.gone_s[newest]):
+                at = _row(self.after, int(self.after.stays.site_id[newest]))
+                self.p_gone[newest] = np.clip(1.0 - self.p_kept[at], 0.0, 1.0) if at >= 0 else self.p_gone[newest]
+            return
+        seen_s = float(sites.seen_s[site])
+        share = min(self.p_kept[site] / sites.p_here[site], 1.0)
+        self.p_kept[site] = sites.p_here[site]
+        same = newest >= 0 and self.after.stays.site_id[newest] == sites.site_id[site]
+        self.hidden[self._sight(row)] += share * self.p_gone[newest] if same else 0.0
+        if same and share >= 1.0 - EXISTS:  # it had never left
+            self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
+            return
+        kind, elsewhere_s, probability = self._since_when(site, newest, same, share)
+        if newest >= 0:
+            self.p_gone[newest] = max(self.p_gone[newest], probability)
+        since = self._begins(clique, site, elsewhere_s)
+        if probability >= EXISTS and len(self.before.places):
+            p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.after, clique)
+            n_misses = int(self.misses[left]) if left >= 0 else 0
+            self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
+
+    def stays(self) -> Stays:
+        """Old and new ones, in the order of their beginning."""
+        stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
+        if not self.begun:
+            return stays
+        clique_id, site, elsewhere_s, first_s, last_s = (np.array(part) for part in zip(*self.begun, strict=True))
         fresh = Stays(
             clique_id,
-            sites.site_id[rows],
-            class_of(after, clique_id),
-            middle[rows],
-            elsewhere,
-            first,
-            until,
-            np.full(len(rows), np.inf),
-            np.zeros(len(rows)),
+            self.after.sites.site_id[site],
+            class_of(self.after, clique_id),
+            site_middles(self.after)[site],
+            elsewhere_s,
+            first_s,
+            last_s,
+            np.full(len(site), np.inf),
+            np.zeros(len(site)),
         )
         stays = stays.joined(fresh)
-        stays = stays[np.argsort(stays.first_s, kind="stable")]
-    hidden[2], shown[2] = looks.unwitnessed
-    sightlines = after.sightlines.after_session(hidden, shown)
-    after = replace(after, stays=stays, sites=replace(sites, p_kept=p_kept), sightlines=sightlines)
-    return after, _swaps(found, before, after)
+        return stays[np.argsort(stays.first_s, kind="stable")]
+
+    def _stands(self, row: int) -> bool:
+        return bool(self.after.sites.p_here[self.site[row]] >= EXISTS)
+
+    def _missed(self, row: int) -> bool:
+        return bool(self.log_evidence[row] <= -LEAST_EVIDENCE)
+
+    def _sight(self, row: int) -> int:
+        return int(self.looks.sight[row]) % 2
+
+    def _goes_on(self, row: int, stay: int) -> None:
+        site, sites = int(self.site[row]), self.after.sites
+        if stay < 0:  # a body that was taken apart: its part goes on
+            first_s, last_s = float(sites.since_s[site]), float(sites.seen_s[site])
+            self.begun.append((int(self.cliques[row]), site, -np.inf, first_s, last_s))
+        else:
+            self.last_s[stay] = max(self.last_s[stay], sites.seen_s[site])
+            if self.hits[site]:  # if it was missed before, it was hidden then
+                share = min(self.p_kept[site] / sites.p_here[site], 1.0)
+                self.hidden[self._sight(row)] += share * self.p_gone[stay]
+                self.shown[self._sight(row)] += 1.0
+                self.p_gone[stay] = 0.0
+            elif self._missed(row):
+                self.p_gone[stay] = self.p_away[row]
+        if self.hits[site]:
+            self.p_kept[site] = sites.p_here[site]
+
+    def _moved(self, row: int, old: int, stay: int) -> None:
+        site = int(self.site[row])
+        left_s = self._ends(old, stay, 1.0)
+        since = self._begins(int(self.cliques[row]), site, left_s)
+        self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
+        if np.hypot(*_motion(self.after, old, site)[0]) >= SAME_SPOT_M:
+            n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
+            self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
+
+    def _vanished(self, row: int, old: int, stay: int) -> None:
+        p_away = float(self.p_away[row])
+        left_s = self._ends(old, stay, p_away)
+        to_s = _first_miss(self.looks, old, left_s, self.start_s)
+        self._tell(ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(self.misses[old]))
+
+    def _since_when(self, site: int, newest: int, same: bool, share: float) -> tuple[ChangeKind, float, float]:
+        """Whether a clique that is there now returned or appeared, until when it was not there, and how probably."""
+        if newest >= 0:  # where it was last it was found missing; elsewhere it may have come when it left
+            elsewhere_s = float(self.gone_s[newest] if same else self.last_s[newest])
+            return ChangeKind.RETURNED, elsewhere_s, 1.0 - share if same else 1.0
+        at = np.flatnonzero(self.arrivals.site == site)
+        if not len(at) or self.arrivals.p_appeared[at[0]] < EXISTS:
+            return ChangeKind.APPEARED, -np.inf, 0.0
+        return ChangeKind.APPEARED, float(self.arrivals.looked_s[at[0]]), float(self.arrivals.p_appeared[at[0]])
+
+    def _ends(self, old: int, stay: int, probability: float) -> float:
+        """The stay at a site ends; returns when the clique was seen there last."""
+        left_s = float(self.after.sites.seen_s[old])
+        if stay >= 0:
+            left_s = max(float(self.last_s[stay]), left_s)
+            self.last_s[stay] = left_s
+            self.gone_s[stay] = _first_miss(self.looks, old, left_s, self.start_s)
+            self.p_gone[stay] = probability
+        return left_s
+
+    def _begins(self, clique: int, site: int, elsewhere_s: float) -> float:
+        """A stay begins; returns when it was seen first."""
+        sites = self.after.sites
+        since = max(float(sites.since_s[site]), float(np.nextafter(elsewhere_s, np.inf)))
+        self.begun.append((clique, site, elsewhere_s, since, max(float(sites.seen_s[site]), since)))
+        return since
+
+    def _tell(
+        self,
+        kind: ChangeKind,
+        left: int,
+        site: int,
+        from_s: float,
+        to_s: float,
+        probability: float,
+        n_hits: int,
+        n_misses: int,
+    ) -> None:
+        """A change of the clique that left one site (row, -1 for none), and stands at another."""
+        step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
+        change = MapChange(
+            landmark_ids=_members_at(self.after, site if site >= 0 else left),
+            kind=kind,
+            stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
+            stamp_to_s=to_s,
+            displacement_m=(float(step[0]), float(step[1])),
+            rotation_rad=turn,
+            probability=float(min(max(probability, 0.0), 1.0)),
+            n_hits=n_hits,
+            n_misses=n_misses,
+        )
+        self.found.append(change)
 
 
 def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
@@ -207,38 +361,6 @@ def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
             if site >= 0:
                 told[clique] = (site, -1)
     return told
-
-
-def _newest_stay(living: LivingMap, clique: int) -> int:
-    """Row of the last stay of a clique, -1 for none."""
-    mine = np.flatnonzero(living.stays.clique_id == clique)
-    return int(mine[-1]) if len(mine) else -1
-
-
-def _change(
-    living: LivingMap,
-    kind: ChangeKind,
-    left: int,
-    site: int,
-    from_s: float,
-    to_s: float,
-    probability: float,
-    n_hits: int,
-    n_misses: int,
-) -> MapChange:
-    """A change of the clique that left one site (row, -1 for none), and stands at another."""
-    step, turn = _motion(living, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
-    return MapChange(
-        landmark_ids=_members_at(living, site if site >= 0 else left),
-        kind=kind,
-        stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
-        stamp_to_s=to_s,
-        displacement_m=(float(step[0]), float(step[1])),
-        rotation_rad=turn,
-        probability=float(min(max(probability, 0.0), 1.0)),
-        n_hits=n_hits,
-        n_misses=n_misses,
-    )
 
 
 def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
