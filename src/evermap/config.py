@@ -10,7 +10,6 @@ This module needs pydantic and is therefore imported only by what really runs, n
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
 from collections.abc import Iterable, Mapping
@@ -20,7 +19,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, similar
 from evermap.types import Sensor
 
 Positive = Annotated[float, Field(gt=0)]
@@ -284,11 +283,10 @@ def _validate(values: Mapping[str, Any], path: Path | None) -> Config:
 def _nearest_key(names: list[str]) -> str:
     """The known key that resembles an unknown one most, or the keys of its section."""
     known = list(_known_keys(Config, ()))
-    close = difflib.get_close_matches(".".join(names), known, n=1, cutoff=0.6)
-    if not close:  # the right name in the wrong section
-        close = [key for key in known if key.rsplit(".", maxsplit=1)[-1] == names[-1]]
-    if close:
-        return close[0]
+    meant = similar(".".join(names), known, cutoff=0.6)
+    in_other_section = [key for key in known if key.rsplit(".", maxsplit=1)[-1] == names[-1]]
+    if meant or in_other_section:
+        return meant or in_other_section[0]
     section = max(
         (key.rpartition(".")[0] for key in known if ".".join(names).startswith(key.rpartition(".")[0])), key=len
     )

@@ -7,6 +7,7 @@ exits with 2; anything that is not an `EvermapError` is a defect of ours and exi
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 _UNSHOWN = re.compile("[\x00-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -28,6 +29,20 @@ def printable(text: str, most: int | None = None) -> str:
     if most is not None and len(text) > most:
         text = f"{text[: most * 2 // 3]} ... {text[len(text) - most // 4 :]}"
     return _UNSHOWN.sub(lambda found: found.group().encode("unicode_escape", "surrogatepass").decode(), text)
+
+
+def similar(name: str, known: Iterable[str], *, cutoff: float = 0.5) -> str | None:
+    """The known name that resembles another most, None where none does by the share `cutoff` of difflib."""
+    import difflib
+
+    close = difflib.get_close_matches(name.strip(), list(known), n=1, cutoff=cutoff)
+    return close[0] if close else None
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """A hint where a name is not known: the one that was probably meant, or all of them."""
+    names = list(known)
+    return similar(name, names) or ("one of " if len(names) > 1 else "") + ", ".join(names)
 
 
 class EvermapError(Exception):

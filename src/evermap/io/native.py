@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 
 from evermap import se2
 from evermap import valid as q
-from evermap.errors import DataError, InputError
+from evermap.errors import DataError, InputError, similar
 from evermap.io.assemble import finish_recording, forward_stamps, last_of_equal, wrap_far
 from evermap.io.files import FileSet, find_file_set
 from evermap.io.landmarks import distinct_labels, landmarks_from_table
@@ -245,6 +244,6 @@ def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:
     """A misspelt optional file would be missed in silence."""
     known = [f"{name}{ending}" for name in TABLES for ending in ENDINGS] + [SENSOR_FILE]
     for name in files.members:
-        close = difflib.get_close_matches(name, known, n=1, cutoff=0.85)
-        if name not in known and close:
-            warnings.append(f"file {name} is not read; did you mean {close[0]}?")
+        meant = similar(name, known, cutoff=0.85)
+        if name not in known and meant:
+            warnings.append(f"file {name} is not read; did you mean {meant}?")

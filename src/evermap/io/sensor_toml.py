@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
 from dataclasses import dataclass, field
@@ -10,7 +9,7 @@ from math import inf, pi
 from pathlib import Path
 from typing import Any
 
-from evermap.errors import InputError
+from evermap.errors import InputError, suggestion
 from evermap.io.text import decode_text, reason
 from evermap.types import Clock, Sensor
 
@@ -130,9 +129,8 @@ class _Reader:
     def expect(self, known: tuple[str, ...], content: dict[str, Any], section: str | None) -> None:
         for key in content:
             if key not in known:
-                close = difflib.get_close_matches(key, known, n=1, cutoff=0.4)
-                hint = close[0] if close else "one of " + ", ".join(known)
-                raise self.error(section, key, "unknown key" if section else "unknown section or key", hint)
+                problem = "unknown key" if section else "unknown section or key"
+                raise self.error(section, key, problem, suggestion(key, known))
 
     def section(self, name: str, known: tuple[str, ...]) -> dict[str, Any]:
         content = self.document.get(name, {})

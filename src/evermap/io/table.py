@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isnan
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, similar, suggestion
 from evermap.io.text import clock_of_date, date_s, decode_text, parse_float, quote, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, landmark_id_of
 from evermap.valid import STAMP_S, Quantity
@@ -53,7 +52,8 @@ class Table:
         known = [*required, *optional]
         for name in self.columns:
             if name not in known:
-                hint = _nearest(name, [other for other in known if other not in self.columns], known)
+                unused = [other for other in known if other not in self.columns]
+                hint = similar(name, unused) or suggestion(name, known)
                 raise self.error("unknown column", row=None, field=name[:40], hint=hint)
         for name in required:
             if name not in self.columns:
@@ -333,8 +333,3 @@ def dates_as_text(column: Any) -> list[str]:
 
     dates = column.cast(pa.timestamp("us", tz=column.type.tz), safe=False).to_pylist()
     return ["" if date is None else date.isoformat() for date in dates]
-
-
-def _nearest(name: str, unused: list[str], known: list[str]) -> str:
-    close = difflib.get_close_matches(name, unused, n=1, cutoff=0.4) or difflib.get_close_matches(name, known, n=1)
-    return f"{close[0]}" if close else f"one of {', '.join(known)}"

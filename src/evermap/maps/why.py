@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.errors import InputError
+from evermap.errors import InputError, similar
 from evermap.maps.diff import edits
 from evermap.maps.living import EXISTS, Evidence, LivingMap, Stays
 from evermap.maps.stamps import stamp_text
@@ -260,5 +259,5 @@ def _unknown(living: LivingMap, name: str) -> str:
     if number >= 0:
         near = sorted(names[np.argsort(np.abs(names - number), kind="stable")[:3]].tolist())
         return f"no landmark {name}; the nearest ids are {', '.join(map(living.label, near))}"
-    like = difflib.get_close_matches(name, living.landmark_texts, n=3, cutoff=0.0)
-    return f"no landmark {name!r}" + (f"; there is {', '.join(like)}" if like else "; all have numbers")
+    meant = similar(name, living.landmark_texts, cutoff=0.0)
+    return f"no landmark {name!r}" + (f"; there is {meant}" if meant else "; all have numbers")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, suggestion
 from evermap.io.text import quote
 from evermap.survival.protocol import LifetimePrior
 from evermap.survival.text import parse_prior
@@ -91,7 +91,7 @@ def parse_settings(texts: Sequence[str]) -> TrackerSettings:
         if not equals:
             raise ConfigError(f"{quote(text)} is no NAME=VALUE", field="--set", hint="max_missed=20")
         if name not in known:
-            raise ConfigError(f"no setting is called {quote(name)}", field="--set", hint=_nearest(name, list(known)))
+            raise ConfigError(f"no setting is called {quote(name)}", field="--set", hint=suggestion(name, known))
         kind = type(known[name])
         try:
             values[name] = kind(value)
@@ -127,10 +127,3 @@ def _known(by_class: Mapping[str, object], class_names: Sequence[str], option: s
         if name not in class_names:
             hint = f"one of {', '.join(class_names)}" if any(class_names) else "a column class_id in the table"
             raise ConfigError(f"no detection is of class {quote(name)}", field=option, hint=hint)
-
-
-def _nearest(word: str, known: list[str]) -> str:
-    import difflib
-
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
-    return close[0] if close else ", ".join(known)

@@ -6,14 +6,13 @@ A form is a name and, after a colon, values: `name:key=value,key=value`. Weighte
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from evermap.errors import ConfigError
+from evermap.errors import ConfigError, suggestion
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
@@ -100,7 +99,7 @@ def _parse_form(text: str) -> LifetimePrior:
     name, _, body = text.partition(":")
     form = FORMS.get(name.strip())
     if form is None:
-        raise ConfigError(f"no lifetime is called '{name}'", hint=_nearest(name, FORMS))
+        raise ConfigError(f"no lifetime is called '{name}'", hint=suggestion(name.lower(), FORMS))
     values: dict[str, Any] = {}
     steps: list[tuple[float, float]] = []
     spans: list[tuple[float, float, float]] = []
@@ -119,7 +118,9 @@ def _parse_form(text: str) -> LifetimePrior:
         elif form.spans and (key[:1].isdigit() or key == "never"):
             spans.append((*_span_s(key), _read(parse_number, key, value)))
         else:
-            raise ConfigError(f"{name} has no '{key}'", hint=_nearest(key, form.keys) if form.keys else form.example)
+            raise ConfigError(
+                f"{name} has no '{key}'", hint=suggestion(key.lower(), form.keys) if form.keys else form.example
+            )
     missing = [key for key in form.needed if key not in values]
     if missing or (form.steps and not steps) or (form.spans and not spans):
         raise ConfigError(f"needs {missing[0] if missing else 'rates' if form.steps else 'shares'}", hint=form.example)
@@ -150,13 +151,6 @@ def _read(reader: Reader, key: str, value: str) -> Any:
         return reader(value)
     except ConfigError as error:
         raise ConfigError(error.problem, field=error.field or key, hint=error.hint) from None
-
-
-def _nearest(word: str, known: Iterable[str]) -> str:
-    """The closest known word, or all of them."""
-    words = list(known)
-    close = difflib.get_close_matches(word.strip().lower(), words, n=1, cutoff=0.5)
-    return close[0] if close else ("one of " if len(words) > 1 else "") + ", ".join(words)
 
 
 def _between(reader: Reader) -> Reader:
