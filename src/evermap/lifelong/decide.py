@@ -156,7 +156,8 @@ class _Session:
         least = np.full(count, LEAST_EVIDENCE)
         if longest is not None:
             p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
-            least = np.maximum(least, np.log(p_stays / np.maximum(1.0 - p_stays, 1e-300)))
+            p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
+            least = np.maximum(least, np.log(p_stays / (1.0 - p_stays)))
         return cls(
             before=before,
             after=after,

@@ -27,7 +27,7 @@ from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
 
 INLIER = 0.5
-LEAST_FIT = 0.75
+LEAST_FIT = 0.9
 """Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
 CREDIBLE = 0.6
 """Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""

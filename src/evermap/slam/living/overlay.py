@@ -124,7 +124,9 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
         chosen = options.gated(options.agreeing())
     else:
         chosen = _joint(options)
-    if options.n_standing(chosen) < 2 or (search == "joint" and not options.is_this_place(chosen)):
+    if options.n_standing(chosen) < 2:
+        return None
+    if search == "joint" and not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
         return None
     return options.concluded(chosen, split=search == "joint")
 
@@ -134,7 +136,12 @@ def _joint(options: _Options) -> IntArray:
     best, highest, drift_m = options.agreeing(), -math.inf, DRIFTS_M[0]
     for k, options.drift_m in enumerate(DRIFTS_M):
         chosen = options.climb(best)
-        score = options.log_probability(chosen) + k * LOG_P_COARSER
+        score = options.log_probability(chosen)
+        # bodies that moved together agree, too, on a motion of their own: what stands may be the rest
+        rest = options.climb(options.rest_of(chosen))
+        if np.sum(rest != ELSEWHERE) >= 2 and (at := options.log_probability(rest)) > score:  # two tell the motion
+            chosen, score = rest, at
+        score += k * LOG_P_COARSER
         if score > highest:  # the next may still be better: with more drift other bodies stay
             best, highest, drift_m = chosen, score, options.drift_m
     options.drift_m = drift_m
@@ -185,6 +192,11 @@ class _Options:
                 chosen[clique] = min(near)[1]
         return chosen
 
+    def rest_of(self, chosen: IntArray) -> IntArray:
+        """(C,) those that are elsewhere at their most probable sites, and those that stand elsewhere."""
+        likely = self.likeliest_sites()
+        return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
+
     def climb(self, chosen: IntArray) -> IntArray:
         """From an assignment to one that no change of a single clique makes more probable."""
         chosen = chosen.copy()
@@ -224,6 +236,20 @@ class _Options:
         """
         here, count = self._log_standing(chosen)
         return here > LOG_P_ANOTHER_PLACE + count * self._log_room
+
+    def outweighs_the_rest(self, chosen: IntArray) -> bool:
+        """False where a single body says where the session is, and is less likely to have stayed than what it denies.
+
+        Two that stand to each other as in the map have hardly both moved. One fits itself wherever it is.
+        """
+        log_odds = {
+            c: max(float(self.known.log_p_site[site]) for site in sites) - float(self.known.log_p_elsewhere[c])
+            for c, sites in enumerate(self.sites)
+            if sites
+        }
+        stand = [c for c in log_odds if chosen[c] != ELSEWHERE]
+        denied = [odds for c, odds in log_odds.items() if chosen[c] == ELSEWHERE]
+        return len(stand) != 1 or not denied or log_odds[stand[0]] > sum(denied)
 
     def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
         """Log probability of the options, with the density of all that stands at its site; and how many places do."""
