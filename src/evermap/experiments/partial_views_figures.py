@@ -27,7 +27,7 @@ def draw_reliability(content: Mapping[str, Any]) -> Figure:
             axes.plot([0.5, 1.0], [0.5, 1.0], color=MUTED, lw=0.9, ls="--", label="calibrated")
             bins = BEFORE["reliability"].get(name)
             if bins:
-                _curve(axes, bins, ALERT, "first edition, 60 s")
+                _curve(axes, bins, ALERT, "first edition")
             if name in groups:
                 told = [row for world in groups[name] for row in world["told"]]
                 _curve(axes, reliability(told), ESTIMATE, "evermap")
@@ -57,7 +57,7 @@ def draw_false_changes(content: Mapping[str, Any]) -> Figure:
             before = [100.0 * BEFORE["by_patrol"].get(name, {}).get(key, np.nan) for name in groups]
             numbers = [summary(worlds) for worlds in groups.values()]
             now = [100.0 * s[key] / max(s["told"], 1) for s in numbers]
-            axes.bar(at - 0.2, before, 0.38, color=ALERT, label="first edition, 60 s")
+            axes.bar(at - 0.2, before, 0.38, color=ALERT, label="first edition")
             bars = axes.bar(at + 0.2, now, 0.38, color=ESTIMATE, label="evermap")
             axes.bar_label(bars, [f"{value:.1f}" for value in now], size=7, padding=1)
             axes.set(title=title, xticks=at, xticklabels=list(groups), xlabel="patrols")

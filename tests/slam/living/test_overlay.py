@@ -190,3 +190,23 @@ def test_a_place_in_which_two_agree_by_chance_is_not_taken_for_this_one() -> Non
     most = world(np.random.default_rng(1), [1] * 12, [1] * 12, [0] * 5 + [ELSEWHERE] * 7, p_site=[0.6] * 12)
     found = laid(most)
     assert np.flatnonzero(found.place >= 0).tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(("p_body", "p_single", "is_found"), [(0.65, 0.98, False), (0.98, 0.65, True)])
+def test_a_single_body_must_be_likelier_to_have_stayed_than_what_it_denies(
+    p_body: float, p_single: float, is_found: bool
+) -> None:
+    """A body of three fits itself wherever it is, one landmark beside it tells no heading."""
+    one = world(np.random.default_rng(5), [3, 1], [1, 1], [0, ELSEWHERE], sigma_m=0.01, p_site=[p_body, p_single])
+    found = lay_over(one.sighted, one.known)
+    assert (found is not None) == is_found
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_bodies_that_moved_together_by_less_than_agreement_do_not_bend_what_stands(seed: int) -> None:
+    """The motion that most are near lies between both; either reading is found from there, the likelier one is taken."""
+    site = [0] * 5 + [ELSEWHERE] * 2
+    shift = np.array([0.0, -0.78])
+    one = world(np.random.default_rng(seed), [1, 1, 1, 2, 2, 2, 2], [1] * 7, site, sigma_m=0.01, shift_m=shift)
+    found = laid(one)
+    np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), one.site)
