@@ -204,7 +204,7 @@ def test_a_single_body_must_be_likelier_to_have_stayed_than_what_it_denies(
 
 @pytest.mark.parametrize("seed", range(8))
 def test_bodies_that_moved_together_by_less_than_agreement_do_not_bend_what_stands(seed: int) -> None:
-    """The motion that most are near lies between both; either reading is found from there, the likelier one is taken."""
+    """The motion that most are near lies between both; either reading is found from there, the likelier is taken."""
     site = [0] * 5 + [ELSEWHERE] * 2
     shift = np.array([0.0, -0.78])
     one = world(np.random.default_rng(seed), [1, 1, 1, 2, 2, 2, 2], [1] * 7, site, sigma_m=0.01, shift_m=shift)
