@@ -37,7 +37,7 @@ def at_home(living: LivingMap) -> tuple[IntArray, FloatArray]:
 def laid(living: LivingMap, moved: IntArray) -> Laid:
     place = at_home(living)[0].copy()
     place[moved] = ELSEWHERE
-    return Laid(NAMES, np.zeros(3), place, np.full(len(NAMES), 0.9), 0.01)
+    return Laid(NAMES, np.zeros(3), place, np.full(len(NAMES), 0.9), 0.01, np.zeros(len(NAMES), bool))
 
 
 @settings(max_examples=60, deadline=None)
@@ -53,6 +53,7 @@ def test_a_part_that_is_turned_as_a_whole_is_laid_on_its_places(seed: int, n: in
     where = unbent(living, living.sites.p_here, laid(living, turned), at)
     np.testing.assert_array_equal(where.place, row)
     np.testing.assert_array_equal(where.probability[turned], 1.0)
+    np.testing.assert_array_equal(where.as_seen().place, laid(living, turned).place)
 
 
 @settings(max_examples=60, deadline=None)
@@ -104,14 +105,14 @@ def test_landmarks_of_one_body_are_one_witness() -> None:
     place = np.where(np.arange(6) < 4, ELSEWHERE, row)
     session = np.array(at, dtype=np.float64)
     session[:4] = se2.transform(np.array([3.0, 3.0, 1.0]), session[:4])
-    where = Laid(np.array(names), np.zeros(3), place, np.ones(6), 0.01)
+    where = Laid(np.array(names), np.zeros(3), place, np.ones(6), 0.01, np.zeros(6, bool))
     np.testing.assert_array_equal(unbent(living, living.sites.p_here, where, session).place, place)
 
 
 def test_new_landmarks_are_nowhere() -> None:
     living = a_map(np.random.default_rng(0))
     names = np.array([1, 4, 7])
-    where = Laid(names, np.zeros(3), np.full(3, ELSEWHERE), np.ones(3), 0.01)
+    where = Laid(names, np.zeros(3), np.full(3, ELSEWHERE), np.ones(3), 0.01, np.zeros(3, bool))
     np.testing.assert_array_equal(unbent(living, living.sites.p_here, where, np.eye(3, 2)).place, np.full(3, ELSEWHERE))
 
 
@@ -120,7 +121,9 @@ def test_what_was_glimpsed_is_laid_where_the_rest_of_its_body_stands_and_nowhere
     living = begun(found(names, at)).living
     row = dict(zip(names, living.place_row(np.array(names), living.site_of()).tolist(), strict=True))
     # 1 stands, 8 moved, nobody saw the third body well; 50 is new
-    where = Laid(np.array([1, 8]), np.zeros(3), np.array([row[1], ELSEWHERE]), np.array([0.9, 0.8]), 0.01)
+    where = Laid(
+        np.array([1, 8]), np.zeros(3), np.array([row[1], ELSEWHERE]), np.array([0.9, 0.8]), 0.01, np.zeros(2, bool)
+    )
     after = with_glimpsed(living, where, np.array([50, 13, 9, 2]))
     assert after.landmark_id.tolist() == [1, 2, 8]
     assert after.place.tolist() == [row[1], row[2], ELSEWHERE]

@@ -11,7 +11,7 @@ from evermap.lifelong.geometry import of_places
 from evermap.maps.living import LivingMap
 from evermap.slam.align import consensus, rigid
 from evermap.slam.living.overlay import ELSEWHERE, Known, Sighted, lay_over
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 SMALLEST_P = 1e-6
 BENT_M, BENT_CLIQUES = 0.15, 3
@@ -30,6 +30,7 @@ class Laid:
         place: (K,) row of the map's places, `ELSEWHERE` where a landmark stands at none of its own, or is new.
         probability: (K,) of that.
         drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
+        assumed: (K,) those that seem to have moved and are taken to stand, since the session seems bent; see `unbent`.
     """
 
     landmark_id: IntArray
@@ -37,6 +38,12 @@ class Laid:
     place: IntArray
     probability: FloatArray
     drift_m: float
+    assumed: BoolArray
+
+    def as_seen(self) -> Laid:
+        """The same without what is assumed."""
+        place = np.where(self.assumed, ELSEWHERE, self.place)
+        return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
 
 def laid_over(
@@ -93,7 +100,8 @@ def laid_over(
     place[seen] = np.where(found.place >= 0, used[found.place], ELSEWHERE)
     probability = np.ones(len(landmark_id))
     probability[seen] = found.probability
-    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m)
+    assumed = np.zeros(len(place), dtype=np.bool_)
+    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m, assumed)
 
 
 def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray) -> Laid:
@@ -129,7 +137,7 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
             break
         place[fits], probability[fits] = home[fits], 1.0
         moved = moved[~agree]
-    return replace(where, place=place, probability=probability)
+    return replace(where, place=place, probability=probability, assumed=(where.place < 0) & (place >= 0))
 
 
 def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
@@ -176,4 +184,5 @@ def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid
         landmark_id=np.concatenate([where.landmark_id, names])[order],
         place=np.concatenate([where.place, place])[order],
         probability=np.concatenate([where.probability, np.ones(len(names))])[order],
+        assumed=np.concatenate([where.assumed, np.zeros(len(names), dtype=np.bool_)])[order],
     )

@@ -20,14 +20,14 @@ from evermap.slam import session as of_slam
 from evermap.slam.align import rigid
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.living.own import of_unknown_size, own_landmarks
-from evermap.slam.living.refit import refitted
+from evermap.slam.living.refit import MOST_LOST, refitted
 from evermap.slam.living.size import log_ratio, settled
 from evermap.slam.session import Prepared
 from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
 
 INLIER = 0.5
-LEAST_FIT = 0.9
+LEAST_FIT = 0.75
 """Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
 CREDIBLE = 0.6
 """Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
@@ -154,6 +154,10 @@ def refit(
         return refitted(outcome, prior, motion, size, row, position, covariance, robust=robust)
 
     solved, straightened = in_map(where)
+    if where.assumed.any() and solved.inlier.mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
+        as_seen, straightened_too = in_map(where.as_seen())
+        if as_seen.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
+            where, solved, straightened = where.as_seen(), as_seen, straightened_too
     if straightened:
         at_home = all_at_home(living, p_site, where)
         solved, _ = in_map(at_home)
