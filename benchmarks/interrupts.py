@@ -16,6 +16,7 @@ import hashlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -144,7 +145,7 @@ def _interrupted(folder: Path, verb: str, after_s: float) -> Ending | None:
     code, stderr = ended
     wrong = ""
     lines = stderr.splitlines()
-    if code != 130 and after_s < PYTHON_STARTS_S and "evermap" not in stderr:
+    if code != 130 and after_s < PYTHON_STARTS_S and not re.search(r"evermap/\w+\.py", stderr):
         wrong = BEFORE_OURS
     elif code != 130:
         wrong = "another exit code"

@@ -195,7 +195,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
             living, where, visit = lifelong.refit(
                 living, expected, where, visit, alone.prior, robust=config.slam.robust
             )
-            if not lifelong.fits(visit, alone.visit):
+            if config.living.search == "joint" and not lifelong.fits(visit, alone.visit):
                 return _lost(alone, before, "most sightings contradict it; the session is bent, or of another place")
         known: LivingMap | None = None
         for _ in range(ROUNDS):
