@@ -145,7 +145,7 @@ def _interrupted(folder: Path, verb: str, after_s: float) -> Ending | None:
     wrong = ""
     lines = stderr.splitlines()
     # Python's own death by the signal: none of our handlers was there yet, they all end with 130
-    if code == -signal.SIGINT and after_s < PYTHON_STARTS_S:
+    if code != 130 and after_s < PYTHON_STARTS_S and (code == -signal.SIGINT or "evermap" not in stderr):
         wrong = BEFORE_OURS
     elif code != 130:
         wrong = "another exit code"
