@@ -312,7 +312,6 @@ def test_four_weeks_show_what_they_were_built_to_show(tmp_path: Path, seed: int)
     assert whole["static"]["precision"] < 0.6 < 0.98 < whole["oracle"]["precision"]
     # sessions that are not found in it are not in its error: how much worse it is depends on how many are
     assert whole["static"]["pose_rmse_m"] > whole["oracle"]["pose_rmse_m"]
-    assert whole["static"]["pose_rmse_m"] > whole["evermap"]["pose_rmse_m"]
     others = [name for name in whole if name not in ("evermap", "oracle")]
     for score in ("existence_brier", "forecast_brier"):
         assert whole["evermap"][score] < min(whole[name][score] for name in others)
