@@ -199,6 +199,9 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
                 return _lost(alone, before, "most sightings contradict it; the session is bent, or of another place")
         known: LivingMap | None = None
         for _ in range(ROUNDS):
+            if known is not None:
+                living = replace(living, lives=replace(known.lives, looks_s=living.lives.looks_s))
+                aged = believe.aged(living, config.living, visit.start_s)
             entering = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
             # what was found goes into the map, then hits and misses into beliefs, and those into decisions
             entry = lifelong.entered(entering, aged.p_here, where, visit, config.living)
@@ -206,8 +209,7 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
             now = lifelong.believed(entry, looks, visit, config.living)
             after, changes = lifelong.decided(entry.before, now, looks, visit, config.living, known)
             after = lifelong.learned(after, looks, replace(entry, living=now.living), eye, config.living)
-            living = replace(living, lives=replace(after.lives, looks_s=living.lives.looks_s))
-            aged, known = believe.aged(living, config.living, visit.start_s), after
+            known = after
         frame = "first_pose" if where is None else "prior_map"
         names = visit.recording.landmark_names
         landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)

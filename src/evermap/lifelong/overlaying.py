@@ -147,7 +147,7 @@ def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
 
 
 def _members(living: LivingMap, where: Laid) -> IntArray:
-    """(K,) rows of the map's members, any for landmarks that are none."""
+    """(K,) rows of the map's members; arbitrary rows for landmarks that the map does not know."""
     rows = np.searchsorted(living.members.landmark_id, where.landmark_id)
     return np.minimum(rows, max(len(living.members) - 1, 0))
 

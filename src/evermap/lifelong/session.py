@@ -155,9 +155,10 @@ def refit(
 
     solved, straightened = in_map(where)
     if where.assumed.any() and solved.inlier.mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
-        as_seen, straightened_too = in_map(where.as_seen())
-        if as_seen.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
-            where, solved, straightened = where.as_seen(), as_seen, straightened_too
+        as_seen = where.as_seen()
+        other, straightened_too = in_map(as_seen)
+        if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
+            where, solved, straightened = as_seen, other, straightened_too
     if straightened:
         at_home = all_at_home(living, p_site, where)
         solved, _ = in_map(at_home)
