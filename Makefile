@@ -68,14 +68,14 @@ $(VENV)/bin/python:
 	  || { rm -rf $(VENV); echo "evermap needs Python's venv module; on Debian: sudo apt-get install python3-venv" >&2; exit 1; }
 
 # The lock files pin every version; the project itself is installed in place, without resolving anything.
-$(RUNTIME): requirements.lock pyproject.toml | $(VENV)/bin/python
+$(RUNTIME): requirements.lock pyproject.toml studies/pyproject.toml | $(VENV)/bin/python
 	$(PIP_INSTALL) --requirement requirements.lock
-	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable . --editable ./studies
 	@touch $@
 
-$(DEVELOPMENT): requirements-dev.lock pyproject.toml | $(VENV)/bin/python
+$(DEVELOPMENT): requirements-dev.lock pyproject.toml studies/pyproject.toml | $(VENV)/bin/python
 	$(PIP_INSTALL) --requirement requirements-dev.lock
-	$(PIP_INSTALL) --no-deps --no-build-isolation --editable .
+	$(PIP_INSTALL) --no-deps --no-build-isolation --editable . --editable ./studies
 	@touch $(RUNTIME) $@
 
 # For maintainers: renew the pins. Index addresses are kept out of the files: they are the machine's business.
@@ -83,9 +83,9 @@ COMPILE = $(VENV)/bin/pip-compile --quiet --upgrade --strip-extras --no-header -
           --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
 lock: $(DEVELOPMENT)
 	$(PIP_INSTALL) pip-tools
-	$(COMPILE) --extra rerun --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml
-	$(COMPILE) --extra rerun --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml
+	$(COMPILE) --extra rerun --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml studies/pyproject.toml
+	$(COMPILE) --extra rerun --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml studies/pyproject.toml
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find src studies tests -name __pycache__ -type d -prune -exec rm -rf {} +

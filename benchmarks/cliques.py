@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks import persistence, rosen
-from evermap.persistence import joint, single
-from evermap.persistence.state import Belief
+from evermap.existence import joint, single
+from evermap.existence.state import Belief
 from evermap.sensing import learned
 from evermap.sensing.field import LIDAR
 from evermap.sensing.learned import CliqueLook, Learned

@@ -11,12 +11,12 @@ import gtsam
 import numpy as np
 
 from benchmarks.world import World
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
-from evermap.slam.isam import RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD, IncrementalSmoother
 from evermap.slam.problem import Estimate
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray
+from evermap_studies.peers.isam import RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD, IncrementalSmoother
 
 CAUCHY_SCALE = 3.0
 """Of evermap's heavy-tailed kernel; gtsam's Cauchy loss with it weighs a detection alike."""

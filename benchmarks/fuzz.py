@@ -573,10 +573,10 @@ def _recording(folder: Path) -> bytes:
 
 
 def _models(folder: Path) -> tuple[bytes, ...]:
-    from evermap.presence.table import read_looks
-    from evermap.recurrence.one_stay import OneStay
-    from evermap.recurrence.phase_type import PhaseType
-    from evermap.recurrence.run_length import RunLength
+    from evermap.existence.one_stay import OneStay
+    from evermap.existence.phase_type import PhaseType
+    from evermap.existence.run_length import RunLength
+    from evermap.runs.persist.table import read_looks
     from evermap.survival import Exponential, Mixture, Weibull
 
     models = [
@@ -594,9 +594,9 @@ def _models(folder: Path) -> tuple[bytes, ...]:
 
 
 def _read_model(folder: Path) -> Callable[[Path], Any]:
-    from evermap.presence.modelfile import load_models
-    from evermap.presence.table import read_looks
-    from evermap.recurrence.protocol import Instants
+    from evermap.existence.protocol import Instants
+    from evermap.runs.persist.modelfile import load_models
+    from evermap.runs.persist.table import read_looks
 
     table = folder / "looks-for-models.csv"
     table.write_bytes(_looks(folder))
@@ -632,19 +632,19 @@ def _read_config(path: Path) -> Any:
 
 
 def _read_looks(path: Path) -> Any:
-    from evermap.presence.table import read_looks
+    from evermap.runs.persist.table import read_looks
 
     return plain(read_looks(path))
 
 
 def _read_detections(path: Path) -> Any:
-    from evermap.objects.detections import read_detections
+    from evermap.runs.track.detections import read_detections
 
     return plain(read_detections(path))
 
 
 def _read_lifetimes(path: Path) -> Any:
-    from evermap.objects.lifetimes import groups_of, read_lifetimes
+    from evermap.runs.track.lifetimes import groups_of, read_lifetimes
 
     table = read_lifetimes(path)
     return plain(table), len(groups_of(table, ("class",), 10.0))

@@ -15,7 +15,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Localizer, Sightings

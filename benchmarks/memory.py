@@ -18,7 +18,9 @@ _WARM_UP_POSES = 50
 
 def measure(race: str, contender: str, n_poses: int) -> dict[str, float]:
     """Peak resident memory [MB] of a fresh process that runs one contender once, and what it had before the run."""
-    path = os.pathsep.join(filter(None, [str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]))
+    path = os.pathsep.join(
+        filter(None, [str(ROOT), str(ROOT / "src"), str(ROOT / "studies" / "src"), os.environ.get("PYTHONPATH", "")])
+    )
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.memory", race, contender, str(n_poses)],
         capture_output=True,

@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks import rosen
-from evermap.persistence import single
-from evermap.persistence.batch import Look, look_exponential, look_general_purpose, look_two_state
-from evermap.persistence.one import PersistenceFilter
-from evermap.recurrence import run_length as run_length_filter
+from evermap.existence import run_length as run_length_filter
+from evermap.existence import single
+from evermap.existence.batch import Look, look_exponential, look_general_purpose, look_two_state
+from evermap.existence.one import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LogNormal
 from evermap.types import FloatArray
 

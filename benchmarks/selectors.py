@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.selectors.chain import ModeChain, ModeLooks
-from evermap.slam.selectors.protocol import Selector, selector_by_name
-from evermap.slam.selectors.tree_search import TreeSearch
+from evermap_studies.nielsen2024.selectors.chain import ModeChain, ModeLooks
+from evermap_studies.nielsen2024.selectors.protocol import Selector, selector_by_name
+from evermap_studies.nielsen2024.selectors.tree_search import TreeSearch
 
 N_LANDMARKS, N_LOOKS, N_MODES = 15, 200, 3
 TURNS = 5

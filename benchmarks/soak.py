@@ -1,7 +1,8 @@
 """A day of driving with everything going wrong: does one map live through it?
 
 A robot patrols a changing building for `hours` of driving, session after session into one living map, twice: with all
-faults of `evermap.sim.faults`, and with none. After every session all arrays of map and result are looked through, and
+faults of `evermap_studies.worlds.faults`, and with none. After every session all arrays of map and result are looked
+through, and
 the memory of the process is read.
 
     python -m benchmarks.soak              # 24 h, as in docs/results.md
@@ -20,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError, EvermapError, NumericalError
+from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.metrics.alignment import align_points, interpolate
 from evermap.metrics.trajectory import scored_stamps
 from evermap.pipeline import Session, run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
-from evermap.sim.faults import FAULTLESS, FaultConfig, with_faults
 from evermap.types import FloatArray, Landmarks, Recording
+from evermap_studies.worlds.faults import FAULTLESS, FaultConfig, with_faults
 
 SESSION_S = 180.0
 SESSIONS_A_DAY = 48

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import integrate_odometry
 from evermap.slam.noise import START

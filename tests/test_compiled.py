@@ -133,12 +133,12 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
     code = """
 import sys
 sys.argv = ["evermap", "survival", "fit", "nothing.csv"]
-import evermap.objects.lifetimes
+import evermap.runs.track.lifetimes
 def read(*_):
     from module import twice
     twice(2)
     raise evermap.errors.InputError("no such file", path="nothing.csv")
-evermap.objects.lifetimes.read_lifetimes = read
+evermap.runs.track.lifetimes.read_lifetimes = read
 from evermap.__main__ import run
 run()
 """

@@ -18,35 +18,24 @@ RULES = {
     "errors": "",
     "interrupts": "",
     "compiled": "errors interrupts",
+    "plugins": "errors",
     "types": "errors",
-    "valid": "errors types",
-    "se2": "types",
     "config": "errors types",
-    "survival": "errors types se2 compiled",
-    "sensing": "errors types se2 compiled",
-    "persistence": "errors types se2 compiled survival sensing",
-    "recurrence": "errors types compiled survival persistence io",
-    "tracking": "errors types se2 compiled config survival sensing persistence recurrence",
-    "slam": "errors interrupts types valid se2 compiled config survival sensing persistence recurrence",
-    "maps": "errors types se2 config survival sensing persistence recurrence",
-    "io": "errors interrupts types valid se2",
-    "sim": "errors types se2 survival sensing",
-    "metrics": "errors types se2 survival",
-    "viz": "errors types se2 survival recurrence metrics",
-    "lifelong": "errors types se2 config survival sensing persistence slam maps",
-    "pipeline": "errors interrupts types valid se2 config survival sensing persistence recurrence tracking slam maps "
-    "lifelong",
-    "sessions": "errors types valid config maps pipeline",
-    "runsummary": "errors types",
-    "runfolder": "errors interrupts types se2 config io metrics viz runsummary",
-    "server": "errors types se2 config survival sensing persistence recurrence maps pipeline",
-    "experiments": "errors interrupts types valid se2 compiled config survival sensing persistence recurrence tracking "
-    "slam maps lifelong sim io metrics viz pipeline runsummary runfolder demo",
-    "demo": "errors interrupts types se2 compiled config survival maps lifelong sim io metrics viz pipeline runfolder",
-    "presence": "errors types valid survival persistence recurrence io metrics viz runsummary runfolder",
-    "objects": "errors types valid survival tracking io viz runsummary runfolder",
-    "cli": "errors interrupts types config survival recurrence io sim metrics viz maps lifelong pipeline sessions "
-    "runfolder presence objects server experiments demo",
+    "geometry": "types",
+    "survival": "errors compiled types",
+    "valid": "errors types",
+    "io": "errors interrupts types geometry valid",
+    "metrics": "errors types geometry",
+    "sensing": "errors compiled types geometry",
+    "sim": "errors types geometry",
+    "existence": "errors compiled types survival io sensing",
+    "slam": "errors interrupts compiled plugins types geometry valid sensing",
+    "maps": "errors types config geometry survival sensing existence slam",
+    "tracking": "errors compiled types survival existence",
+    "viz": "errors types geometry survival metrics existence",
+    "pipeline": "errors interrupts plugins types config valid sensing slam maps",
+    "runs": "errors interrupts types config survival valid io metrics existence maps tracking viz pipeline",
+    "cli": "errors interrupts plugins types config survival io sim existence maps viz pipeline runs",
 }
 
 # loaded by the functions that need them, never by starting up
@@ -93,12 +82,22 @@ def test_rules_have_no_cycle() -> None:
         left = {part: needs for part, needs in left.items() if part not in free}
 
 
-def test_meeting_rules_of_the_core() -> None:
-    for part in ("tracking", "slam", "maps"):
-        assert not set(RULES[part].split()) & {"tracking", "slam", "maps"}, "they meet in pipeline"
-    outside = {"viz", "cli", "server", "runsummary", "runfolder", "experiments", "demo"}
-    for part in ("survival", "sensing", "persistence", "tracking", "slam", "maps", "pipeline"):
-        assert not set(RULES[part].split()) & outside, f"the core ({part}) knows nothing of its users"
+def test_every_permission_is_used() -> None:
+    used: dict[str, set[str]] = {}
+    for path in MODULES:
+        used.setdefault(part_of(path), set()).update(imported_parts(path) - {part_of(path)})
+    assert used == {part: set(allowed.split()) for part, allowed in RULES.items()}
+
+
+def test_the_library_knows_no_study() -> None:
+    for path in MODULES:
+        assert "evermap_studies" not in path.read_text(encoding="utf-8"), path
+
+
+def test_the_core_knows_nothing_of_its_users() -> None:
+    outside = {"viz", "cli", "runs", "sim", "metrics"}
+    for part in ("survival", "sensing", "existence", "tracking", "slam", "maps", "pipeline"):
+        assert not set(RULES[part].split()) & outside, part
 
 
 def test_architecture_page_shows_the_same_table() -> None:

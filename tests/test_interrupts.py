@@ -196,7 +196,7 @@ def test_a_command_ends_with_130_and_what_was_kept(tmp_path: Path) -> None:
 
 def test_a_command_removes_what_is_half_written(tmp_path: Path) -> None:
     write = """
-from evermap.runfolder import RunFolder
+from evermap.runs.folder import RunFolder
 from evermap.io.atomic import staged_folder
 with RunFolder("out") as folder, staged_folder("template") as staging:
     folder.path("figures/map.png").write_text("half")
@@ -208,7 +208,7 @@ with RunFolder("out") as folder, staged_folder("template") as staging:
 
 def test_a_command_finishes_what_it_puts_in_place(tmp_path: Path) -> None:
     swap = f"""
-import evermap.runfolder as runfolder
+import evermap.runs.folder as runfolder
 take = runfolder.RunFolder._swap
 def interrupted(self, ours):
     {INTERRUPT}

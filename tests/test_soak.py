@@ -17,8 +17,8 @@ from evermap.errors import DataError
 from evermap.maps.living import LivingMap
 from evermap.pipeline import Session, run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
-from evermap.sim.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 from evermap.types import Recording
+from evermap_studies.worlds.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 
 LARGEST_FACTOR = 1.5
 """Median pose error with a bad day's faults, over that without any."""

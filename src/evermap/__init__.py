@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.store import open_store
     from evermap.pipeline import Session, check_recording, run_localization, run_session, run_slam
-    from evermap.presence.config import PersistConfig
-    from evermap.presence.run import run_persist
-    from evermap.presence.table import read_looks
-    from evermap.runfolder import write_run
-    from evermap.sessions import Entered, enter_session
+    from evermap.runs.folder import write_run
+    from evermap.runs.persist.config import PersistConfig
+    from evermap.runs.persist.run import run_persist
+    from evermap.runs.persist.table import read_looks
+    from evermap.runs.sessions import Entered, enter_session
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
 _HOME = {
@@ -39,11 +39,11 @@ _HOME = {
     "evermap.maps.living": ("LivingMap",),
     "evermap.maps.store": ("open_store",),
     "evermap.pipeline": ("Session", "check_recording", "run_localization", "run_session", "run_slam"),
-    "evermap.presence.config": ("PersistConfig",),
-    "evermap.presence.run": ("run_persist",),
-    "evermap.presence.table": ("read_looks",),
-    "evermap.runfolder": ("write_run",),
-    "evermap.sessions": ("Entered", "enter_session"),
+    "evermap.runs.persist.config": ("PersistConfig",),
+    "evermap.runs.persist.run": ("run_persist",),
+    "evermap.runs.persist.table": ("read_looks",),
+    "evermap.runs.folder": ("write_run",),
+    "evermap.runs.sessions": ("Entered", "enter_session"),
     "evermap.types": (
         "Detections",
         "Frames",

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evermap import plugins
 from evermap.interrupts import watched
 from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult
 
 if TYPE_CHECKING:
     from evermap.config import Config, SlamConfig
-    from evermap.lifelong.session import Visit
     from evermap.maps.living import Evidence, LivingMap
+    from evermap.maps.sessions.session import Visit
     from evermap.slam.calibration import CalibrationPrior
     from evermap.slam.check import Check
     from evermap.slam.method import Method
@@ -121,8 +122,8 @@ def run_session(
         DataError: nothing can be estimated, or the session is earlier than the map.
         NumericalError: no finite optimum.
     """
-    from evermap.lifelong.session import check_in_order
     from evermap.maps.living import LivingMap
+    from evermap.maps.sessions.session import check_in_order
     from evermap.valid import check_type
 
     config = _or_default(config)
@@ -158,7 +159,7 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     """
     from threadpoolctl import threadpool_limits
 
-    from evermap.lifelong.session import Visit, admitted
+    from evermap.maps.sessions.session import Visit, admitted
     from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
     from evermap.slam.session import prepare
@@ -178,8 +179,8 @@ def bring_in(alone: Alone, living: LivingMap, config: Config) -> Session:
     """The second half of `run_session`: what a session that was solved alone makes of a map."""
     from threadpoolctl import threadpool_limits
 
-    from evermap.lifelong import believe
-    from evermap.lifelong import session as lifelong
+    from evermap.maps.sessions import believe
+    from evermap.maps.sessions import session as lifelong
 
     visit, slam = alone.visit, alone.slam
     _, living = lifelong.admitted(visit.recording, living)
@@ -247,8 +248,8 @@ def run_localization(
         DataError: the map is empty, or the robot's place in it could not be found.
     """
     from evermap.errors import DataError
-    from evermap.lifelong.believe import predicted
-    from evermap.lifelong.session import admitted
+    from evermap.maps.sessions.believe import predicted
+    from evermap.maps.sessions.session import admitted
     from evermap.slam.check import odd
     from evermap.slam.localize_recording import localize
 
@@ -347,11 +348,8 @@ def _method(prepared: Prepared, prior: CalibrationPrior, recording: Recording, c
             p_rotated=settings.changes.p_rotated,
         )
         return Joint(n_landmarks, prior, prepared.given_map(), changes, robust=settings.robust)
-    from evermap.slam.modes.alternation import ModeModel
-    from evermap.slam.modes.multi_hypothesis import MultiHypothesis
-
-    model = ModeModel.from_settings(settings.method, settings.modes, recording.sensor, robust=settings.robust)
-    return MultiHypothesis(n_landmarks, model, seed=settings.seed)
+    method: Method = plugins.load("evermap.methods", settings.method)(n_landmarks, settings, recording.sensor)
+    return method
 
 
 def _estimator(
@@ -408,7 +406,7 @@ def _conclude(
     interrupted: bool,
 ) -> SlamResult:
     """Smooth, and say what moved and what may have moved instead."""
-    from evermap.lifelong.session import Visit
+    from evermap.maps.sessions.session import Visit
     from evermap.slam import session
 
     outcome = slam.finish()

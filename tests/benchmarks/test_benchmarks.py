@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from evermap import se2
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import InputError
-from evermap.metrics.tracking import score_tracks
-from evermap.persistence import single
+from evermap.existence import single
+from evermap.geometry import se2
 from evermap.survival import Exponential
 from evermap.survival.censored import CensoredLifetimes
 from evermap.tracking import kalman
+from evermap_studies.lifetimes.tracking_scores import score_tracks
 
 SMALL = 150
 

@@ -10,8 +10,8 @@ from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
 from evermap.io import read_recording, write_template
-from evermap.presence.example import write_example
-from evermap.runfolder import MANIFEST
+from evermap.runs.folder import MANIFEST
+from evermap.runs.persist.example import write_example
 
 
 def run(*arguments: object) -> Result:

@@ -14,8 +14,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.presence.table import read_looks
-from evermap.runfolder import MANIFEST
+from evermap.runs.folder import MANIFEST
+from evermap.runs.persist.table import read_looks
 
 PNG = b"\x89PNG"
 

@@ -12,8 +12,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.objects import example
-from evermap.objects.lifetimes import read_lifetimes
+from evermap.runs.track import example
+from evermap.runs.track.lifetimes import read_lifetimes
 
 HOUR_S = 3600.0
 

@@ -68,7 +68,9 @@ def blocks(page: Path) -> Iterator[Block]:
 def environment() -> dict[str, str]:
     """As after activating the environment that runs the tests: `evermap` and `python` are those of this checkout."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    source = os.pathsep.join(filter(None, [str(REPOSITORY / "src"), os.environ.get("PYTHONPATH", "")]))
+    source = os.pathsep.join(
+        filter(None, [str(REPOSITORY / "src"), str(REPOSITORY / "studies" / "src"), os.environ.get("PYTHONPATH", "")])
+    )
     return {**os.environ, "PATH": path, "PYTHONPATH": source, "MPLBACKEND": "agg", "NO_COLOR": "1"}
 
 

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from evermap.io import read_recording, write_map_parquet
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
-from evermap.runsummary import RunInfo, change_dict, summary_dict
+from evermap.runs.summary import RunInfo, change_dict, summary_dict
 from evermap.types import (
     ChangeKind,
     Detections,

@@ -15,7 +15,7 @@ from evermap import read_looks, read_recording, run_session, run_slam, write_nat
 from evermap.cli.main import app
 from evermap.errors import InputError
 from evermap.io import read_landmarks, write_map_geojson, write_map_parquet, write_template
-from evermap.runsummary import change_dict
+from evermap.runs.summary import change_dict
 from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
 
 FIVE = "2026-03-01T12:00:05Z"

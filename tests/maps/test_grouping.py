@@ -8,7 +8,7 @@ from scipy.integrate import quad
 from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.maps.grouping import MOVE_SIGMA_M, Fate, group, log_evidence_of_motion, regrouped
 from evermap.sim import BuildingConfig, simulate_building
 from evermap.types import FloatArray, IntArray

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.belief import belief_scores
 from evermap.metrics.existence import Existence, existence_score, p_near, stands_at, statement_score
 from evermap.types import Landmarks

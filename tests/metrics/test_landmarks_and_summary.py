@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import compare_with_truth, evaluate, in_view, metrics_dict
 from evermap.types import Innovations, Landmarks

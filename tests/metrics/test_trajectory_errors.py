@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from synthetic_run import figure_eight, trajectory
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.metrics.alignment import align_points, interpolate
 from evermap.metrics.trajectory import drift_per_metre, evaluate_trajectory, scored_stamps
 

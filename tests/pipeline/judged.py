@@ -11,8 +11,8 @@ import numpy as np
 from recordings import building
 from scipy import stats
 
-from evermap import se2
 from evermap.config import Config, load_config
+from evermap.geometry import se2
 from evermap.pipeline import run_slam
 from evermap.types import FloatArray, Landmarks, ParameterEstimate, Recording, SlamResult
 

@@ -7,7 +7,7 @@ import pytest
 from judged import SEEDS, consistent, judged, true_pose_at
 from scipy import stats
 
-from evermap import se2
+from evermap.geometry import se2
 
 
 def test_trajectory_and_map_are_as_good_as_they_say():

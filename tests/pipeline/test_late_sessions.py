@@ -15,7 +15,7 @@ from evermap.errors import DataError, InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
 from evermap.maps.store.recorded import pack_recording, unpack_recording
-from evermap.sessions import at_time
+from evermap.runs.sessions import at_time
 from evermap.sim import BuildingConfig, simulate_building
 from evermap.types import Recording
 

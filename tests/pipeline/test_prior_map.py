@@ -9,7 +9,7 @@ import pytest
 from judged import assert_same, judge, judged, recording_of, surveyed
 from recordings import some_rows
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.pipeline import run_slam
 from evermap.types import FloatArray, Landmarks
 

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import log_softmax
 
 from evermap.errors import DataError, InputError
-from evermap.persistence import joint, single
+from evermap.existence import joint, single
 from evermap.sensing import learned
 from evermap.sensing.field import CAMERA, LIDAR, Field, Projection
 from evermap.sensing.learned import Learned

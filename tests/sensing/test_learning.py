@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from evermap.persistence import single
+from evermap.existence import single
 from evermap.sensing import learned
 from evermap.sensing.field import LIDAR
 from evermap.sensing.learned import Learned

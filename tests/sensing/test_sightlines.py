@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import betabinom
 
-from evermap import se2
 from evermap.errors import InputError
+from evermap.geometry import se2
 from evermap.sensing.sightlines import (
     BLOCKED,
     HEADINGS,

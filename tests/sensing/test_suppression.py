@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, InputError
-from evermap.sensing.clique_range import nearest_per_clique, range_degraded_miss
-from evermap.sensing.suppression import suppressed
+from evermap_studies.bateman2020.clique_range import nearest_per_clique, range_degraded_miss
+from evermap_studies.bateman2020.suppression import suppressed
 
 LIMITS = {"observed_m": 6.0, "range_max_m": 16.0, "share": 0.25}
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import scipy.optimize
 from problems import closed_increment, integrated, slow_detection
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.problem import Estimate, Noise, Problem
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import FLOOR_FORWARD_M, FLOOR_TURN_RAD
 from evermap.slam.known_places import KnownPlaces

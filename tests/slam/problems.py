@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.calibration import N_STATES, CalibrationPrior
 from evermap.slam.kernels import integrate_odometry
 from evermap.slam.problem import Drive, Estimate, Noise, Problem, independent

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from problems import QUIET, World, default_prior, integrated, make_world, slow_increment
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.problem import Estimate

@@ -17,9 +17,9 @@ from evermap.errors import DataError
 from evermap.io import read_recording, write_template
 from evermap.pipeline import run_slam
 from evermap.sim import BuildingConfig, SensorConfig, simulate_building
-from evermap.sim.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
 from evermap.slam.cleaning import clean
 from evermap.types import Recording
+from evermap_studies.worlds.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
 
 RATE_HZ = 5.0
 

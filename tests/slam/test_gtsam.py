@@ -12,16 +12,16 @@ import pytest
 from problems import default_prior, slow_detection
 from recordings import building, first_seconds
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
-from evermap.slam.isam import STATES_KEY, IncrementalSmoother, frame_factor
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.session import prepare
 from evermap.slam.solver import Motion, compare
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import Recording
+from evermap_studies.peers.isam import STATES_KEY, IncrementalSmoother, frame_factor
 
 NOISE = replace(START, detection=np.array([0.03, 0.01]), odometry=np.array([0.02, 0.02, 0.01, 0.015, 0.02]))
 

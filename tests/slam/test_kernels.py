@@ -18,7 +18,7 @@ from problems import (
     wandering_drive,
 )
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.kernels import (
     FLOOR_FORWARD_M,
     FLOOR_TURN_RAD,

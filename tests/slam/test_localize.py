@@ -20,7 +20,7 @@ from drives import (
     surveyed,
 )
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.sensing.visibility import detection_probability
 from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from recordings import building, first_seconds, some_rows, with_ids, with_odometry
 
-from evermap import se2
 from evermap.config import Config
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.io.mrclam import read_mrclam
 from evermap.pipeline import run_slam
 from evermap.sim import BuildingConfig, simulate_building

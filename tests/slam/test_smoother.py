@@ -10,8 +10,8 @@ import pytest
 from dense import DensePosterior
 from problems import QUIET, World, default_prior, make_world
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.problem import Estimate
 

@@ -11,13 +11,13 @@ import pytest
 from problems import QUIET, World, make_world
 from test_smoother import elsewhere, tied
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
-from evermap.slam.isam import IncrementalSmoother
 from evermap.slam.problem import Estimate
 from evermap.slam.solver import IncrementalSolver, Motion
 from evermap.slam.triangulate import sighted_at
+from evermap_studies.peers.isam import IncrementalSmoother
 
 SOLVERS: dict[str, Callable[..., IncrementalSolver]] = {"arrow": BorderFilter, "gtsam": IncrementalSmoother}
 

@@ -12,7 +12,7 @@ import scipy.optimize
 import scipy.stats
 
 from evermap.errors import ConfigError, DataError
-from evermap.persistence import single
+from evermap.existence import single
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import DAY_S, Covariates, gp_fit

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.persistence import single
+from evermap.existence import single
 from evermap.survival import Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.locality import ChunkIndex, chunks_of, ring_query

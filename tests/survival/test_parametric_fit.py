@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.persistence import single
+from evermap.existence import single
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull, never_leaves
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import KINDS, Kind, fit, fit_best, log_likelihood

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.patches import FancyArrowPatch
 from synthetic_run import with_changes
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import Alternative, ChangeKind, MapChange
 from evermap.viz.change_layer import GROUP_COLOURS, moves

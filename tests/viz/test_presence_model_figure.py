@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.recurrence.phase_type import PhaseType
-from evermap.recurrence.rhythm import BINS, Rhythm
-from evermap.recurrence.run_length import RunLength
+from evermap.existence.phase_type import PhaseType
+from evermap.existence.rhythm import BINS, Rhythm
+from evermap.existence.run_length import RunLength
 from evermap.survival import Exponential
 from evermap.viz.presence_model_figure import has_rhythm, plot_presence_models, week_of_presence
 

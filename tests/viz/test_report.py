@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap.metrics.summary import compare_with_truth, metrics_dict
-from evermap.runsummary import RunInfo, summary_dict, timing_dict
+from evermap.runs.summary import RunInfo, summary_dict, timing_dict
 from evermap.viz.report import ReportSection, render_report
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}

@@ -6,8 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from evermap import se2
 from evermap.errors import MissingExtraError
+from evermap.geometry import se2
 from evermap.types import Landmarks, Trajectory
 from evermap.viz.rerun_scene import write_scene
 

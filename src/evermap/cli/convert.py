@@ -38,7 +38,7 @@ def convert(
       evermap convert MRCLAM_Dataset6.zip robot1 --robot 1
     """
     from evermap.io import read_recording, write_native
-    from evermap.runfolder import RunFolder
+    from evermap.runs.folder import RunFolder
 
     folder = RunFolder(out, force=force, inputs=[recording_path], renew=False)
     recording = read_recording(recording_path, robot=robot)

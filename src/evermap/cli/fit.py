@@ -14,8 +14,8 @@ from evermap.cli.terminal import print_json, print_table, progress_bar, say, war
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
-    from evermap.objects.estimate import Estimate
-    from evermap.objects.lifetimes import Group, LifetimeTable
+    from evermap.runs.track.estimate import Estimate
+    from evermap.runs.track.lifetimes import Group, LifetimeTable
 
 
 def fit(
@@ -63,9 +63,9 @@ def fit(
       evermap survival fit lifetimes.csv --by class,chunk --estimator best --json
       evermap persist looks.csv --model priors.json
     """
-    from evermap.objects.estimate import check_estimator, estimates
-    from evermap.objects.lifetimes import BY_CHUNK, groups_of, parse_by, read_lifetimes
-    from evermap.runfolder import check_output_file
+    from evermap.runs.folder import check_output_file
+    from evermap.runs.track.estimate import check_estimator, estimates
+    from evermap.runs.track.lifetimes import BY_CHUNK, groups_of, parse_by, read_lifetimes
 
     check_estimator(estimator)
     words = parse_by(by)
@@ -106,9 +106,9 @@ def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> 
     """The priors as models of one stay."""
     import numpy as np
 
-    from evermap.presence.modelfile import save_models
-    from evermap.presence.models import ModelOfEach
-    from evermap.recurrence.one_stay import OneStay
+    from evermap.existence.one_stay import OneStay
+    from evermap.runs.persist.modelfile import save_models
+    from evermap.runs.persist.models import ModelOfEach
 
     models = tuple(OneStay(found.prior, found.text) for found in estimates)
     names = tuple(group.class_id or "" for group in groups)

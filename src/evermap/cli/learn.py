@@ -11,8 +11,8 @@ from evermap.cli.picture import check_picture, write_picture
 from evermap.cli.terminal import print_json, print_table, progress_bar, say
 
 if TYPE_CHECKING:
-    from evermap.presence.learning import LearnedModels
-    from evermap.recurrence.choose import Choice
+    from evermap.existence.choose import Choice
+    from evermap.runs.persist.learning import LearnedModels
 
 
 def learn(
@@ -43,10 +43,10 @@ def learn(
     """
     if figure is not None:
         check_picture(figure, "--figure", inputs=[table_path])
-    from evermap.presence.learning import learn_models
-    from evermap.presence.modelfile import save_models
-    from evermap.presence.table import read_looks
-    from evermap.runfolder import check_output_file
+    from evermap.runs.folder import check_output_file
+    from evermap.runs.persist.learning import learn_models
+    from evermap.runs.persist.modelfile import save_models
+    from evermap.runs.persist.table import read_looks
 
     check_output_file(out, inputs=[table_path], ending=".json")
     table = read_looks(table_path, p_miss=p_miss, p_false=p_false)

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from evermap import __version__, interrupts
-from evermap.cli import bench, check, convert, demo, persist, reproduce, simulate, slam, survival, track
+from evermap import __version__, interrupts, plugins
+from evermap.cli import bench, check, convert, persist, reproduce, simulate, slam, survival, track
 from evermap.cli import map as living_map
 from evermap.cli.terminal import fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
@@ -31,7 +31,15 @@ _ClickException: Any = typer.BadParameter.__mro__[2]
 
 
 class Verbs(TyperGroup):
-    """The group of verbs; the one place where exceptions end."""
+    """The group of verbs, ours and those of other packages; the one place where exceptions end."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of all verbs, those of other packages first."""
+        return [*plugins.found("evermap.verbs"), *super().list_commands(ctx)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of a verb; None where there is none of this name."""
+        return super().get_command(ctx, cmd_name) or reproduce.command("evermap.verbs", cmd_name)
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
         """Parse and run; a wrong command line is one line as any other mistake, not a paragraph."""
@@ -82,7 +90,6 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-app.command("demo")(demo.demo)
 app.command("check")(check.check)
 app.command("slam")(slam.slam)
 app.command("persist")(persist.persist)
@@ -91,7 +98,7 @@ app.command("convert")(convert.convert)
 app.add_typer(living_map.app)
 app.add_typer(survival.app)
 app.command("simulate")(simulate.simulate)
-app.command("reproduce")(reproduce.reproduce)
+app.add_typer(reproduce.app)
 app.command("bench")(bench.bench)
 
 

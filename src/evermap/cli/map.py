@@ -163,7 +163,7 @@ def export(
       evermap map export site.evermap --out map.geojson
     """
     from evermap.maps.store import open_store
-    from evermap.runfolder import check_output_file
+    from evermap.runs.folder import check_output_file
 
     write = _writer(out)
     check_output_file(out, inputs=[file])
@@ -217,7 +217,7 @@ def _p_ahead(living: LivingMap, ahead_s: float) -> FloatArray:
     import numpy as np
 
     from evermap.config import LivingConfig
-    from evermap.lifelong.believe import predicted
+    from evermap.maps.sessions.believe import predicted
 
     if not (np.isfinite(living.stamp_s) and len(living.sites)):
         return np.full(len(living.members), np.nan)

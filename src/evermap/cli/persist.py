@@ -104,19 +104,19 @@ def persist(
       evermap persist looks.csv --recurrent auto
     """
     if init is not None:
-        from evermap.presence.example import write_example
+        from evermap.runs.persist.example import write_example
 
         write_example(init)
         say(f"wrote an example to {init}; try: evermap persist {init}")
         return
     if table_path is None:
         raise ConfigError("a table is needed", field="INPUT", hint="--init looks.csv writes an example")
-    from evermap.presence.config import DEFAULT_PRIOR, PersistConfig, split_priors
-    from evermap.presence.run import run_persist
-    from evermap.presence.run import warm_up as compile_kernels
-    from evermap.presence.table import read_looks, read_truth
-    from evermap.presence.write import write_persist
-    from evermap.runfolder import check_replaceable
+    from evermap.runs.folder import check_replaceable
+    from evermap.runs.persist.config import DEFAULT_PRIOR, PersistConfig, split_priors
+    from evermap.runs.persist.run import run_persist
+    from evermap.runs.persist.run import warm_up as compile_kernels
+    from evermap.runs.persist.table import read_looks, read_truth
+    from evermap.runs.persist.write import write_persist
     from evermap.types import Clock
 
     out = out or default_out(table_path)

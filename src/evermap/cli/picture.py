@@ -26,7 +26,7 @@ def check_picture(path: Path, field: str, *, inputs: Sequence[str | Path] = ()) 
     Raises:
         ConfigError: a suffix that is neither .png nor .svg, or the file is an input.
     """
-    from evermap.runfolder import check_output_file
+    from evermap.runs.folder import check_output_file
 
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"cannot draw a '{path.suffix}' file", path=path, field=field, hint="a name ending in .png")

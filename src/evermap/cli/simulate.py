@@ -59,7 +59,7 @@ def simulate(
       evermap simulate hard --patrol-s 20 --patrol-s 60 --patrol-s 165 --doors --wing-opens-day 3 --clutter
     """
     from evermap.io import write_native
-    from evermap.runfolder import RunFolder
+    from evermap.runs.folder import RunFolder
     from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
 
     folder = RunFolder(out, force=force, renew=False)

@@ -140,7 +140,7 @@ def slam(
             "a recording is needed", field="INPUT", hint="a folder or zip; --init DIR shows what to put in"
         )
     from evermap.io import parse_shift, read_recording, shifted
-    from evermap.runfolder import check_replaceable
+    from evermap.runs.folder import check_replaceable
 
     shifts = [parse_shift(text) for text in shift or []]
     if shifts and prior_map is None:
@@ -185,7 +185,7 @@ def run_and_write(
 ) -> None:
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
-    from evermap.runfolder import RunInfo, write_run
+    from evermap.runs.folder import RunInfo, write_run
     from evermap.viz.change_words import explanations
 
     warm_up()

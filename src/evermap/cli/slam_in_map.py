@@ -34,7 +34,7 @@ def run_in_map(
     from evermap.config import to_toml
     from evermap.maps.store import Provenance, RevisionKind, open_store
     from evermap.pipeline import run_localization
-    from evermap.sessions import at_time, enter_session
+    from evermap.runs.sessions import at_time, enter_session
 
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
@@ -104,7 +104,7 @@ def _write(
     force: bool,
     inputs: Sequence[str | Path | None],
 ) -> None:
-    from evermap.runfolder import RunInfo, write_run
+    from evermap.runs.folder import RunInfo, write_run
     from evermap.viz.change_words import explanations
 
     info = RunInfo(

@@ -102,21 +102,21 @@ def track(
       evermap survival fit out/yard/lifetimes.csv --by class --estimator best
     """
     if init is not None:
-        from evermap.objects.example import RANGE_M, write_example
+        from evermap.runs.track.example import RANGE_M, write_example
 
         write_example(init)
         say(f"wrote an example to {init}; try: evermap track {init} --range-m {RANGE_M:g}")
         return
     if table_path is None:
         raise ConfigError("a table is needed", field="INPUT", hint="--init detections.csv writes an example")
-    from evermap.objects.config import DEFAULT_PRIOR, TrackConfig, parse_settings, parse_speeds
-    from evermap.objects.confusion import read_confusion
-    from evermap.objects.detections import read_detections
-    from evermap.objects.run import run_track
-    from evermap.objects.run import warm_up as compile_kernels
-    from evermap.objects.write import write_track
-    from evermap.presence.config import split_priors
-    from evermap.runfolder import check_replaceable
+    from evermap.runs.folder import check_replaceable
+    from evermap.runs.persist.config import split_priors
+    from evermap.runs.track.config import DEFAULT_PRIOR, TrackConfig, parse_settings, parse_speeds
+    from evermap.runs.track.confusion import read_confusion
+    from evermap.runs.track.detections import read_detections
+    from evermap.runs.track.run import run_track
+    from evermap.runs.track.run import warm_up as compile_kernels
+    from evermap.runs.track.write import write_track
 
     out = out or default_out(table_path)
     inputs = [table_path, confusion_path]

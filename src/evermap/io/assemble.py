@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError, InputError
+from evermap.geometry import se2
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording

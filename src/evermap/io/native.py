@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from evermap import se2
 from evermap import valid as q
 from evermap.errors import DataError, InputError, similar
+from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, last_of_equal, wrap_far
 from evermap.io.files import FileSet, find_file_set
 from evermap.io.landmarks import distinct_labels, landmarks_from_table

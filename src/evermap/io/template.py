@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.io.atomic import staged_folder
 from evermap.io.table import csv_text
 from evermap.types import FloatArray

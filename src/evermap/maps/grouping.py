@@ -17,7 +17,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.types import FloatArray, IntArray
 
 P_ONE_BODY = 0.9

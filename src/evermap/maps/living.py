@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 

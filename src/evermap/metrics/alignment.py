@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.types import FloatArray, Trajectory
 
 

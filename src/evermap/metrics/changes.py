@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.se2 import wrap
+from evermap.geometry.se2 import wrap
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange, SlamResult
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
 NEAR_M = 0.25

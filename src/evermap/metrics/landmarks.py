@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.metrics.alignment import align_points, rotate_covariance
 from evermap.metrics.consistency import nees
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.alignment import align_poses, interpolate
 from evermap.metrics.consistency import nees
 from evermap.types import BoolArray, FloatArray, IntArray, Trajectory

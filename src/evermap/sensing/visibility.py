@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.special import log_ndtr
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.types import Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
 
 RANGE_MARGIN_M = 0.2

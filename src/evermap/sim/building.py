@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import ConfigError
+from evermap.geometry import se2
 from evermap.sim.classes import ObjectClass
 from evermap.sim.floorplan import FloorPlan, Room
 from evermap.types import BoolArray, FloatArray

@@ -14,7 +14,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.sim.building import Circles, Placer, SceneObject, attach_landmarks
 from evermap.sim.classes import DAY_S
 from evermap.sim.config import BuildingConfig

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.sim.config import SensorConfig
 from evermap.sim.floorplan import FloorPlan
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray

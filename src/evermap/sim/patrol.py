@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.sim.config import DriveConfig, OdometryConfig
 from evermap.sim.floorplan import ROOM_INSET_M, FloorPlan
 from evermap.types import Clock, FloatArray, Odometry

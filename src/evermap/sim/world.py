@@ -12,8 +12,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import ConfigError
+from evermap.geometry import se2
 from evermap.sim.building import Placer, SceneObject, furnish
 from evermap.sim.changes import ChangeEvent, Stay, Timeline, events_of, live
 from evermap.sim.classes import DAY_S

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.types import UNKNOWN, FloatArray, IntArray, Odometry, ParameterEstimate, Recording
 
 LAGS_S = (1.0, 4.0)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.types import FloatArray, IntArray, Landmarks
 
 LEAST_VARIANCE = 1e-6

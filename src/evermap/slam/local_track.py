@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap import se2
-from evermap.slam.align import AGREE_M, consensus
+from evermap.geometry import se2
+from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.triangulate import sighted_at
 from evermap.types import FloatArray, IntArray

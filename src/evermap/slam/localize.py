@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.sensing.visibility import (
     RANGE_MARGIN_M,
     WORTH_A_MISS,

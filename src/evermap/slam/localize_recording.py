@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.interrupts import watched
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior

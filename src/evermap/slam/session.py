@@ -7,8 +7,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from evermap import se2
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
 from evermap.slam.changes.explain import GivenMap

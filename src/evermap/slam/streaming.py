@@ -13,8 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from evermap import se2
-from evermap.slam.align import consensus
+from evermap import plugins
+from evermap.geometry import se2
+from evermap.geometry.rigid import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
 from evermap.slam.calibration import CalibrationPrior
@@ -383,9 +384,8 @@ class StreamingSlam:
 def _solver(name: Literal["arrow", "gtsam"], problem: Problem, noise: Noise, *, robust: bool) -> IncrementalSolver:
     if name == "arrow":
         return BorderFilter(problem, noise, robust=robust)
-    from evermap.slam.isam import IncrementalSmoother  # loads gtsam
-
-    return IncrementalSmoother(problem, noise, robust=robust)
+    solver: IncrementalSolver = plugins.load("evermap.solvers", name)(problem, noise, robust=robust)
+    return solver
 
 
 def _settled(before: Noise, after: Noise) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.problem import Estimate, Problem
 from evermap.types import FloatArray, IntArray
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.types import ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
 from evermap.viz.style import ALERT, GROUP, MUTED, ONLINE, PAPER

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.alignment import rotate_covariance
 from evermap.metrics.summary import Evaluation
 from evermap.types import FloatArray, Recording, SlamResult

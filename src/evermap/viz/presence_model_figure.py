@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import printable
-from evermap.recurrence.protocol import Instants, Looks, PresenceModel
-from evermap.recurrence.rhythm import MONDAY_S
+from evermap.existence.protocol import Instants, Looks, PresenceModel
+from evermap.existence.rhythm import MONDAY_S
 from evermap.types import FloatArray
 from evermap.viz.style import ALERT, ESTIMATE, MUTED, SHADE, house_style, new_figure, settle
 from evermap.viz.time_axis import DURATIONS

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.metrics.consistency import chi2_interval
 from evermap.metrics.summary import Evaluation, compare_with_truth
 from evermap.types import FloatArray, IntArray, Recording, SlamResult, Trajectory

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.association.constellation import LocalMap, agreed_pairs, overlays
 
 MOTION = np.array([4.0, -7.0, 2.2])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems import make_world
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.changes.explain import SLACK_M, GivenMap, Group, explained
 from evermap.slam.problem import Estimate
 

@@ -17,7 +17,7 @@ from references import (
 )
 from scipy.integrate import quad
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, Evidence, compare
 from evermap.slam.changes.explain import GivenMap, Group, explained
 from evermap.slam.changes.gain import hypothesis_gain

@@ -9,7 +9,7 @@ import pytest
 from problems import QUIET, World, make_world, slow_detection
 from scipy.stats import binom
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.changes.timing import parting_time
 from evermap.slam.problem import Problem
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from problems import World, default_prior, make_world, slow_detection
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.joint import Joint

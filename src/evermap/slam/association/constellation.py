@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap import se2
-from evermap.slam.align import rigid
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
 from evermap.slam.association.jcbb import Pairings, most_pairings
 from evermap.types import BoolArray, FloatArray
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.association.jcbb import Pairings, gates, kernel
 from evermap.slam.border import drive_on
 from evermap.slam.kernels import AT_PLACES, detection_residual

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.problem import Estimate, Problem, independent
 from evermap.types import BoolArray, FloatArray, IntArray
 

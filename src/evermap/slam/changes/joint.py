@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap import se2
-from evermap.slam.align import consensus
+from evermap.geometry import se2
+from evermap.geometry.rigid import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap import se2
+from evermap.geometry import se2
 from evermap.slam.changes.climb import Tables, Weighed, climb_from_many_starts, weigh_neighbours
 from evermap.slam.changes.evidence import Comparison, Evidence
 from evermap.slam.changes.gain import hypothesis_gain

@@ -1,0 +1,319 @@
+"""The filter of a Markov chain of phases, compiled.
+
+A belief is a row of phase probabilities. Over a gap it is multiplied by `exp(Q gap)`, computed by uniformisation: with
+`q` the fastest exit, `exp(Q t) = sum_k Poisson(k; q t) U^k`, `U = I + Q / q` (Jensen 1953). Every term is positive, so
+nothing cancels and small probabilities keep their digits. Rates may differ from each ten minutes of the week to the
+next; whole tens of minutes and whole weeks are multiplied with matrices made beforehand.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import prange
+
+from evermap.existence.compiled import inlined, kernel, parallel_kernel
+from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
+from evermap.types import FloatArray, IntArray
+
+LONG = 16.0
+"""Jumps in a gap above which squaring a matrix is cheaper than a row times its powers."""
+NEGLIGIBLE = 1e-17
+
+
+class Chain(NamedTuple):
+    """All that the kernels know of a model; B is 1, or 1008 where there is a rhythm.
+
+    Attributes:
+        rates_hz: (B, n, n) rate of each change of phase, the diagonal zero.
+        exit_hz: (B, n) sums of its rows.
+        whole: (B, n, n) transition over ten whole minutes.
+        week: (n, n) transition over a week from Monday 00:00.
+        present: (n,) 1.0 where a feature in this phase is there, else 0.0.
+    """
+
+    rates_hz: FloatArray
+    exit_hz: FloatArray
+    whole: FloatArray
+    week: FloatArray
+    present: FloatArray
+
+
+@inlined
+def _two_states(leave: Any, comes: Any, span: Any) -> Any:
+    """Probability of a change from 0 to 1, and from 1 to 0, in a chain of two phases; `1 -` each is safe to take."""
+    total = leave + comes
+    changed = -np.expm1(-total * span) / total if total > 0.0 else 0.0
+    return leave * changed, comes * changed
+
+
+@kernel
+def multiply(belief: FloatArray, matrix: FloatArray, spare: FloatArray) -> None:
+    """`belief @ matrix`, in place."""
+    n = belief.size
+    for j in range(n):
+        total = 0.0
+        for i in range(n):
+            total += belief[i] * matrix[i, j]
+        spare[j] = total
+    for j in range(n):
+        belief[j] = spare[j]
+
+
+@kernel
+def advance(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float, spare: FloatArray) -> None:
+    """`belief @ exp(Q span)`, in place, for constant rates and few jumps; `spare` is (3, n)."""
+    n = belief.size
+    if n == 2:
+        a, b = _two_states(rates[0, 1], rates[1, 0], span_s)
+        decay = np.exp(-(exits[0] + exits[1]) * span_s)
+        first, second = belief[0], belief[1]
+        belief[0] = first * (b + decay) + second * b
+        belief[1] = first * a + second * (a + decay)
+        return
+    fastest = exits.max()
+    mean = fastest * span_s
+    if mean <= 0.0:
+        return
+    term, following = spare[0], spare[1]
+    weight = np.exp(-mean)
+    reference = weight
+    per_fastest = 1.0 / fastest
+    for j in range(n):
+        term[j] = belief[j]
+        belief[j] *= weight
+    k = 0
+    while True:
+        k += 1
+        weight *= mean / k
+        for j in range(n):
+            total = 0.0
+            for i in range(n):
+                total += term[i] * rates[i, j]
+            following[j] = (total + term[j] * (fastest - exits[j])) * per_fastest
+        for j in range(n):
+            term[j] = following[j]
+            belief[j] += weight * following[j]
+        if k < n:
+            reference = weight
+        elif weight <= NEGLIGIBLE * reference:
+            return
+
+
+@kernel
+def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """`a @ b` of small matrices."""
+    n = len(a)
+    for i in range(n):
+        for j in range(n):
+            total = 0.0
+            for k in range(n):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+@kernel
+def transition(rates: FloatArray, exits: FloatArray, span_s: float, out: FloatArray) -> None:
+    """`exp(Q span)`: a short piece row by row, then squared; rows keep their sum of 1."""
+    n = exits.size
+    fastest = exits.max()
+    squarings = 0
+    if n > 2:
+        while fastest * span_s > 1.0:
+            span_s *= 0.5
+            squarings += 1
+    spare = np.empty((3, n))
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 1.0 if i == j else 0.0
+        advance(out[i], rates, exits, span_s, spare)
+    square = np.empty((n, n))
+    for _ in range(squarings):
+        _product(out, out, square)
+        for i in range(n):
+            total = 0.0
+            for j in range(n):
+                total += square[i, j]
+            for j in range(n):
+                out[i, j] = square[i, j] / total
+
+
+@kernel
+def transitions(rates: FloatArray, exits: FloatArray, span_s: float) -> FloatArray:
+    """`transition` of (B, n, n) rates."""
+    out = np.empty_like(rates)
+    for b in range(len(rates)):
+        transition(rates[b], exits[b], span_s, out[b])
+    return out
+
+
+@kernel
+def leap(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float, spare: FloatArray) -> None:
+    """`belief @ exp(Q span)`, in place, for constant rates and any gap."""
+    if exits.size > 2 and exits.max() * span_s > LONG:
+        matrix = np.empty_like(rates)
+        transition(rates, exits, span_s, matrix)
+        multiply(belief, matrix, spare[0])
+    else:
+        advance(belief, rates, exits, span_s, spare)
+
+
+@kernel
+def travel(belief: FloatArray, chain: Any, from_s: float, to_s: float, spare: FloatArray) -> None:
+    """The belief at `to_s`, in place, through as many tens of minutes of the week as lie between."""
+    left = to_s - from_s
+    if left <= 0.0:
+        return
+    if len(chain.rates_hz) == 1:
+        leap(belief, chain.rates_hz[0], chain.exit_hz[0], left, spare)
+        return
+    phase = (from_s - MONDAY_S) % WEEK_S
+    b = min(int(phase / BIN_S), BINS - 1)
+    part = (b + 1) * BIN_S - phase
+    while left > 0.0:
+        if b == 0 and part == BIN_S and left >= WEEK_S:
+            multiply(belief, chain.week, spare[0])
+            left -= WEEK_S
+            continue
+        if left >= part and part == BIN_S:
+            multiply(belief, chain.whole[b], spare[0])
+        else:
+            leap(belief, chain.rates_hz[b], chain.exit_hz[b], min(left, part), spare)
+        left -= part
+        b = b + 1 if b + 1 < BINS else 0
+        part = BIN_S
+
+
+@kernel
+def observe(belief: FloatArray, present: FloatArray, there: float, gone: float) -> float:
+    """Weigh the phases by an observation, in place; its likelihood, 0 where it is impossible."""
+    likelihood = 0.0
+    for j in range(belief.size):
+        belief[j] *= there if present[j] == 1.0 else gone
+        likelihood += belief[j]
+    if likelihood > 0.0:
+        for j in range(belief.size):
+            belief[j] /= likelihood
+    return likelihood
+
+
+@kernel
+def first_belief(start: FloatArray, chain: Any, at_s: float, belief: FloatArray, spare: FloatArray) -> None:
+    """Fill in the belief before anything was seen: one row of `start`, or one of 1008 at their ten minutes' begin."""
+    if len(start) == 1:
+        belief[:] = start[0]
+        return
+    phase = (at_s - MONDAY_S) % WEEK_S
+    b = min(int(phase / BIN_S), BINS - 1)
+    belief[:] = start[b]
+    leap(belief, chain.rates_hz[b], chain.exit_hz[b], phase - b * BIN_S, spare)
+
+
+@kernel
+def track_feature(
+    chain: Any,
+    start: FloatArray,
+    fixed: bool,
+    look_s: FloatArray,
+    there: FloatArray,
+    gone: FloatArray,
+    asked_s: FloatArray,
+    p_present: FloatArray,
+    belief: FloatArray,
+) -> tuple[float, int]:
+    """One feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
+
+    `belief`, (n,), is filled in with what is believed at the last of them all.
+    """
+    looks, asks = look_s.size, asked_s.size
+    if looks + asks == 0:
+        return 0.0, -1
+    n = chain.present.size
+    spare = np.empty((3, n))
+    begin = look_s[0] if looks else asked_s[0]
+    if asks and not fixed:
+        begin = min(begin, asked_s[0])
+    first_belief(start, chain, begin, belief, spare)
+    now, evidence, k = begin, 0.0, 0
+    for i in range(asks + 1):
+        until = asked_s[i] if i < asks else np.inf
+        while k < looks and look_s[k] <= until:
+            travel(belief, chain, now, look_s[k], spare)
+            now = look_s[k]
+            likelihood = observe(belief, chain.present, there[k], gone[k])
+            if not likelihood > 0.0:
+                return evidence, k
+            evidence += np.log(likelihood)
+            k += 1
+        if i < asks:
+            travel(belief, chain, now, until, spare)
+            now = max(now, until)
+            total = 0.0
+            for j in range(n):
+                total += belief[j] * chain.present[j]
+            p_present[i] = min(total, 1.0)
+    return evidence, -1
+
+
+@kernel
+def track_all(
+    chain: Any,
+    start: FloatArray,
+    fixed: bool,
+    first_look: IntArray,
+    look_s: FloatArray,
+    there: FloatArray,
+    gone: FloatArray,
+    first_asked: IntArray,
+    asked_s: FloatArray,
+    p_present: FloatArray,
+    evidence: FloatArray,
+    beliefs: FloatArray,
+) -> int:
+    """Every feature in turn; the first look that is impossible, or -1."""
+    for f in range(evidence.size):
+        a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
+        evidence[f], bad = track_feature(
+            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
+        )
+        if bad >= 0:
+            return int(a + bad)
+    return -1
+
+
+@parallel_kernel
+def track_all_parallel(
+    chain: Any,
+    start: FloatArray,
+    fixed: bool,
+    first_look: IntArray,
+    look_s: FloatArray,
+    there: FloatArray,
+    gone: FloatArray,
+    first_asked: IntArray,
+    asked_s: FloatArray,
+    p_present: FloatArray,
+    evidence: FloatArray,
+    beliefs: FloatArray,
+) -> int:
+    """`track_all`, the features spread over all threads."""
+    bads = np.full(evidence.size, -1)
+    for f in prange(evidence.size):
+        a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
+        evidence[f], bad = track_feature(
+            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
+        )
+        bads[f] = a + bad if bad >= 0 else -1
+    for f in range(evidence.size):
+        if bads[f] >= 0:
+            return int(bads[f])
+    return -1
+
+
+@kernel
+def travel_rows(beliefs: FloatArray, chain: Any, from_s: FloatArray, to_s: FloatArray) -> None:
+    """`travel` of (N, n) beliefs, each between its own instants, in place."""
+    spare = np.empty((3, beliefs.shape[1]))
+    for row in range(len(beliefs)):
+        travel(beliefs[row], chain, from_s[row], to_s[row], spare)

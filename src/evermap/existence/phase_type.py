@@ -1,0 +1,239 @@
+"""Stays and absences of phase type: presence as a Markov chain in continuous time (MATH.md section 4).
+
+Some phases are 'there', the others 'not there'; a feature changes from phase to phase at constant rates, or at rates
+that follow the hours of the week. Two phases are exponential stays and absences; more make mixtures (a door that is
+closed briefly or for the night). The filter is exact, and its cost does not grow with the past.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from evermap.errors import ConfigError
+from evermap.existence.exponentials import exponential_mixture_of
+from evermap.existence.protocol import Instants, Looks, Track
+from evermap.existence.rhythm import BIN_S, BINS, Rhythm
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.existence.phase_kernels import Chain
+
+_ENDLESS = 100
+"""Doublings of a time after which nothing of its beginning is left: 2^100 ten-minute steps."""
+_UNIQUE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PhaseType:
+    """Presence as a Markov chain of `n` phases.
+
+    Attributes:
+        present: (n,) bool, whether a feature in this phase is there.
+        rates_hz: (n, n) rate of the change from phase `i` to phase `j` in 1/s; the diagonal is zero.
+        start: (n,) probability of each phase at a feature's first look (at its first instant, if it has no look);
+            None: as it is in the long run at that time of the week.
+        rhythms: factors on rates over the week.
+        rhythm_of: (n, n) which of `rhythms` multiplies each rate, -1 for none; None: none anywhere.
+
+    Raises:
+        ConfigError: shapes or numbers that cannot be.
+    """
+
+    present: BoolArray
+    rates_hz: FloatArray
+    start: FloatArray | None = None
+    rhythms: tuple[Rhythm, ...] = ()
+    rhythm_of: IntArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.present)
+        object.__setattr__(self, "present", np.array(self.present, dtype=np.bool_))
+        object.__setattr__(self, "rates_hz", np.array(self.rates_hz, dtype=np.float64))
+        which = np.full((n, n), -1) if self.rhythm_of is None else np.array(self.rhythm_of, dtype=np.int64)
+        object.__setattr__(self, "rhythm_of", which)
+        if not (self.present.any() and not self.present.all()):
+            raise ConfigError("some phases must be there and some not", field="present")
+        if self.rates_hz.shape != (n, n) or which.shape != (n, n):
+            raise ConfigError(f"{n} phases need ({n}, {n}) rates", field="rates_hz")
+        if not (np.isfinite(self.rates_hz).all() and (self.rates_hz >= 0.0).all()) or np.diag(self.rates_hz).any():
+            raise ConfigError("rates are finite, not negative, and zero on the diagonal", field="rates_hz")
+        if not ((which >= -1) & (which < len(self.rhythms))).all():
+            raise ConfigError(f"{len(self.rhythms)} rhythms, and an index of another", field="rhythm_of")
+        if self.start is not None:
+            start = np.array(self.start, dtype=np.float64)
+            if start.shape != (n,) or not (start >= 0.0).all() or abs(start.sum() - 1.0) > 1e-9:
+                raise ConfigError(f"{n} probabilities of sum 1 are needed", field="start")
+            object.__setattr__(self, "start", start / start.sum())
+
+    @classmethod
+    def two_state(cls, leave_hz: float, return_hz: float, *, p_present: float | None = None) -> Self:
+        """Exponential stays and absences.
+
+        Args:
+            leave_hz: rate at which what is there leaves, in 1/s.
+            return_hz: rate at which what is away returns; 0 for never.
+            p_present: probability of presence at the first look; None: as in the long run, half where nothing changes.
+
+        Raises:
+            ConfigError: a rate or a probability that cannot be, or a feature that never returns without `p_present`.
+        """
+        if p_present is None and leave_hz > 0.0 and return_hz == 0.0:
+            raise ConfigError(
+                "a feature that never returns is long gone", field="p_present", hint="its probability at the first look"
+            )
+        if p_present is None and leave_hz == return_hz == 0.0:
+            p_present = 0.5
+        start = None if p_present is None else np.array([1.0 - p_present, p_present])
+        return cls(np.array([False, True]), np.array([[0.0, return_hz], [leave_hz, 0.0]]), start)
+
+    @classmethod
+    def from_mixtures(cls, stay: LifetimePrior, absence: LifetimePrior) -> Self:
+        """Stays and absences that are mixtures of exponentials, each independent of those before.
+
+        Args:
+            stay: exponential, general purpose (unknown rate), or a mixture of such.
+            absence: likewise.
+
+        Raises:
+            ConfigError: a prior that is no mixture of exponentials.
+        """
+        away, there = exponential_mixture_of(absence), exponential_mixture_of(stay)
+        k, m = len(away.weights), len(there.weights)
+        rates = np.zeros((k + m, k + m))
+        rates[:k, k:] = np.outer([c.rate for c in away.components], there.weights)
+        rates[k:, :k] = np.outer([c.rate for c in there.components], away.weights)
+        return cls(np.arange(k + m) >= k, rates)
+
+    @property
+    def n_phases(self) -> int:
+        """Number of phases."""
+        return len(self.present)
+
+    def track(self, looks: Looks, instants: Instants | None = None, *, threads: bool = False) -> Track:
+        """Filter every feature's looks in one compiled pass; see `PresenceModel.track`.
+
+        Args:
+            looks: what was seen and missed.
+            instants: when presence is asked for; at the looks where None.
+            threads: spread the features over all threads.
+
+        Raises:
+            NumericalError: a look that is impossible, whether the feature is there or not.
+        """
+        asked = Instants.of_looks(looks) if instants is None else instants
+        p_present, evidence, _ = self.filtered(looks, asked, threads=threads)
+        return Track(p_present, evidence, np.zeros(looks.n_features))
+
+    def filtered(
+        self, looks: Looks, asked: Instants, *, threads: bool = False
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each feature."""
+        from evermap.existence import phase_kernels
+
+        there, gone = looks.likelihoods()
+        p_present, evidence = np.empty(len(asked.stamp_s)), np.zeros(looks.n_features)
+        last = np.empty((looks.n_features, self.n_phases))
+        run = phase_kernels.track_all_parallel if threads else phase_kernels.track_all
+        start, fixed = self._starts, self.start is not None
+        bad = run(
+            self.chain, start, fixed, looks.first, looks.stamp_s, there, gone, asked.first, asked.stamp_s,
+            p_present, evidence, last,
+        )  # fmt: skip
+        if bad >= 0:
+            raise looks.impossible(bad)
+        return p_present, evidence, last
+
+    def stationary(self, stamp_s: float | None = None) -> FloatArray:
+        """(n,) probability of each phase in the long run; at this local time of the week where there is a rhythm.
+
+        Raises:
+            ConfigError: what lasts depends on the beginning, or a rhythm without a time.
+        """
+        from evermap.existence.phase_kernels import first_belief
+
+        rows = self._long_run
+        if len(rows) > 1 and stamp_s is None:
+            raise ConfigError("with a rhythm the long run depends on the time of the week", field="stamp_s")
+        belief = np.empty(self.n_phases)
+        first_belief(rows, self.chain, 0.0 if stamp_s is None else stamp_s, belief, np.empty((3, self.n_phases)))
+        return belief
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for JSON."""
+        assert self.rhythm_of is not None  # filled in above
+        return {
+            "kind": "phase-type",
+            "present": self.present.tolist(),
+            "rates_hz": self.rates_hz.tolist(),
+            "start": None if self.start is None else self.start.tolist(),
+            "rhythms": [rhythm.to_dict() for rhythm in self.rhythms],
+            "rhythm_of": self.rhythm_of.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """What `to_dict` wrote."""
+        return cls(
+            np.array(data["present"], dtype=np.bool_),
+            np.array(data["rates_hz"], dtype=np.float64),
+            None if data["start"] is None else np.array(data["start"]),
+            tuple(Rhythm.from_dict(rhythm) for rhythm in data["rhythms"]),
+            np.array(data["rhythm_of"], dtype=np.int64),
+        )
+
+    @cached_property
+    def chain(self) -> Chain:
+        """Rates and transitions for the kernels, made once."""
+        from evermap.existence.phase_kernels import Chain, transitions
+
+        rates = self.rates_by_bin
+        exits = rates.sum(2)
+        if len(rates) == 1:
+            nothing = np.zeros((1, self.n_phases, self.n_phases))
+            return Chain(rates, exits, nothing, nothing[0], self.present.astype(np.float64))
+        whole = transitions(rates, exits, BIN_S)
+        week = np.eye(self.n_phases)
+        for matrix in whole:
+            week = week @ matrix
+        return Chain(rates, exits, whole, week, self.present.astype(np.float64))
+
+    @property
+    def rates_by_bin(self) -> FloatArray:
+        """(1008, n, n) rates at each ten minutes of the week; (1, n, n) where there is no rhythm."""
+        if not self.rhythms:
+            return self.rates_hz[None].copy()
+        factors = np.vstack([*(rhythm.factor for rhythm in self.rhythms), np.ones(BINS)])
+        return np.ascontiguousarray(np.moveaxis(self.rates_hz[..., None] * factors[self.rhythm_of], 2, 0))
+
+    @cached_property
+    def _starts(self) -> FloatArray:
+        """(1, n) the belief at the first look, or (1008, n) at the begin of each ten minutes."""
+        return self._long_run if self.start is None else self.start[None]
+
+    @cached_property
+    def _long_run(self) -> FloatArray:
+        """(1, n), or (1008, n) at the begin of each ten minutes: what is left of any beginning."""
+        from evermap.existence.phase_kernels import transitions
+
+        chain = self.chain
+        if len(chain.rates_hz) == 1:
+            fastest = chain.exit_hz.max()
+            power = transitions(chain.rates_hz, chain.exit_hz, 1.0 / fastest)[0] if fastest > 0.0 else np.eye(2)
+        else:
+            power = chain.week
+        for _ in range(_ENDLESS):
+            power = power @ power
+            power /= power.sum(1, keepdims=True)
+        if np.ptp(power, axis=0).max() > _UNIQUE:
+            raise ConfigError(
+                "how it is in the long run depends on the beginning", field="start", hint="probabilities to start with"
+            )
+        rows = [power.mean(0)]
+        for matrix in chain.whole[:-1]:
+            rows.append(rows[-1] @ matrix)
+        return np.array(rows)

@@ -1,0 +1,300 @@
+"""The run-length filter: presence as stays and absences of any lifetime, each with or without a rhythm of the week.
+
+The belief about a feature is a list of hypotheses: in this state, since this instant, with this probability. For
+lifetimes that forget their age use `PhaseType`, which needs no list.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import ConfigError, NumericalError
+from evermap.existence import checks
+from evermap.existence.checks import impossible
+from evermap.existence.hazard_table import HazardTable, tabulate
+from evermap.existence.protocol import Instants, Looks, Track
+from evermap.existence.rhythm import BIN_S, BINS, Rhythm
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.existence.run_length_kernels import First, Law
+
+ABSENT, PRESENT = 0, 1
+_MOST_HYPOTHESES = 10_000
+
+
+@dataclass(frozen=True)
+class RunLength:
+    """How features come and go: an alternating renewal process (MATH.md section 4).
+
+    A hazard at local time `t` of a stay of age `a` is that of its lifetime at `a` times its rhythm at `t`. Within one
+    step of time a feature changes at most once, in the middle of it.
+
+    Attributes:
+        stay: lifetime of presences.
+        absence: lifetime of absences.
+        step_s: longest step of time; a small part of a typical stay or absence.
+        stay_rhythm: factor on the hazard of leaving, over the local week.
+        absence_rhythm: factor on the hazard of returning.
+        newborn: features are there, and new, when they are first heard of; otherwise they have come and gone for ever.
+        hypotheses: how many are kept of each feature.
+
+    Raises:
+        ConfigError: a step that is not positive, or fewer than 8 hypotheses or more than 10,000.
+    """
+
+    stay: LifetimePrior
+    absence: LifetimePrior
+    step_s: float
+    stay_rhythm: Rhythm | None = None
+    absence_rhythm: Rhythm | None = None
+    newborn: bool = False
+    hypotheses: int = 64
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step_s < np.inf:
+            raise ConfigError(f"{self.step_s} s is no step of time", field="step_s", hint="a positive number")
+        if self.hypotheses < 8:
+            raise ConfigError(f"{self.hypotheses} hypotheses are too few", field="hypotheses", hint="8 or more")
+        if self.hypotheses > _MOST_HYPOTHESES:
+            problem = f"{self.hypotheses} hypotheses are too many"
+            raise ConfigError(problem, field="hypotheses", hint=f"at most {_MOST_HYPOTHESES}")
+
+    def track(self, looks: Looks, instants: Instants | None = None) -> Track:
+        """Filter every feature's looks; asked at the looks themselves where `instants` is None.
+
+        Raises:
+            NumericalError: a look that is impossible, whether the feature is there or not.
+        """
+        from evermap.existence import run_length_kernels as kernels
+
+        asked = instants or Instants.of_looks(looks)
+        n = looks.n_features
+        answer, evidence, moved = np.empty(len(asked.stamp_s)), np.empty(n), np.empty(n)
+        bad = np.empty(n, dtype=np.int64)
+        there, gone = looks.likelihoods()
+        kernels.track(
+            looks.first, looks.stamp_s, gone, there, asked.first, asked.stamp_s, self.slots, self.law,
+            self.first, answer, evidence, moved, bad,
+        )  # fmt: skip
+        for feature in np.flatnonzero(bad >= 0)[:1]:
+            raise looks.impossible(int(looks.first[feature] + bad[feature]))
+        return Track(answer, evidence, moved)
+
+    @property
+    def slots(self) -> int:
+        """Places of a list: those of one state, and one for the newcomer."""
+        return self.hypotheses // 2 + 1
+
+    @cached_property
+    def law(self) -> Law:
+        """The model as the kernels want it."""
+        from evermap.existence.run_length_kernels import Law
+
+        absence, stay = self.tables
+        none = np.ones((2, 1))
+        if self.stay_rhythm or self.absence_rhythm:
+            rhythms = (self.absence_rhythm, self.stay_rhythm)
+            factor = np.stack([rhythm.factor if rhythm else np.ones(BINS) for rhythm in rhythms])
+        else:
+            factor = none
+        hazard = np.stack([absence.hazard_hz, stay.hazard_hz])
+        intercept = np.stack([table.cumulative - table.hazard_hz * table.edge_s for table in self.tables])
+        # a step is never longer than the rhythm is constant
+        step_s = min(self.step_s, BIN_S) if factor is not none else self.step_s
+        return Law(float(step_s), factor, absence.offset, hazard, intercept)
+
+    @cached_property
+    def tables(self) -> tuple[HazardTable, HazardTable]:
+        """The lifetimes of absences and of stays as tables."""
+        return tabulate(self.absence, self.step_s), tabulate(self.stay, self.step_s)
+
+    @cached_property
+    def first(self) -> First:
+        """What is believed before the first look."""
+        from evermap.existence.run_length_kernels import First, week_of_beliefs
+
+        age, weight = np.zeros((1, 2, self.slots)), np.zeros((1, 2, self.slots))
+        if self.newborn:
+            weight[0, PRESENT, 0] = 1.0
+            return First(age, weight, np.array([[0, 1]]))
+        for state, table in enumerate(self.tables):
+            age[0, state, :-1], weight[0, state, :-1] = _equilibrium(table, self.slots - 1)
+        weight /= weight.sum()
+        count = np.full((1, 2), self.slots - 1)
+        if self.law.factor.shape[1] == 1:
+            return First(age, weight, count)
+        from evermap.existence.rhythm import MONDAY_S
+
+        ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, 2, self.slots))
+        counts = np.zeros((BINS, 2), dtype=np.int64)
+        week_of_beliefs(MONDAY_S - age[0], weight[0], count[0], self.law, ages, weights, counts)
+        return First(ages, weights, counts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The model as plain numbers and words, for JSON."""
+        from evermap.survival.plain import prior_to_dict
+
+        return {
+            "kind": "run-length",
+            "stay": prior_to_dict(self.stay),
+            "absence": prior_to_dict(self.absence),
+            "step_s": self.step_s,
+            "stay_rhythm": self.stay_rhythm.to_dict() if self.stay_rhythm else None,
+            "absence_rhythm": self.absence_rhythm.to_dict() if self.absence_rhythm else None,
+            "newborn": self.newborn,
+            "hypotheses": self.hypotheses,
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> RunLength:
+        """What `to_dict` wrote."""
+        from evermap.survival.plain import prior_from_dict
+
+        rhythms = (data["stay_rhythm"], data["absence_rhythm"])
+        stay_rhythm, absence_rhythm = (Rhythm.from_dict(rhythm) if rhythm else None for rhythm in rhythms)
+        return cls(
+            prior_from_dict(data["stay"]),
+            prior_from_dict(data["absence"]),
+            float(data["step_s"]),
+            stay_rhythm,
+            absence_rhythm,
+            bool(data["newborn"]),
+            int(data["hypotheses"]),
+        )
+
+
+def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
+    """Ages that a state has been found in after a long time, as `n` points of equal weight, times the mean lifetime.
+
+    The age of what is met at random has density `S(age)`, of integral `E[T]`; ages beyond the table count as its end.
+    """
+    survival, width = table.survival(), table.width_s
+    drop = np.append(np.diff(table.cumulative), 0.0)
+    mass = survival * width * np.where(drop > 1e-9, -np.expm1(-drop) / np.maximum(drop, 1e-300), 1.0)
+    middle = table.edge_s + 0.5 * width
+    total = mass.sum()
+    group = np.minimum((np.cumsum(mass) / total * n).astype(np.int64), n - 1)
+    weight = np.bincount(group, mass, n)
+    age = np.bincount(group, mass * middle, n) / np.where(weight > 0.0, weight, 1.0)
+    # older hypotheses first, as everywhere
+    return np.maximum.accumulate(age)[::-1].copy(), np.array(weight[::-1], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class RunLengthBelief:
+    """Beliefs about N features, one row each; state `s` is 0 absent, 1 present.
+
+    Attributes:
+        model: how they come and go.
+        start_s: (N, 2, S) since when.
+        weight: (N, 2, S) with which probability.
+        count: (N, 2) number of hypotheses; places beyond it hold anything.
+        stamp_s: (N,) when these held.
+        log_evidence: (N,) `log p(looks)`.
+        merged_mass: (N,) probability moved between hypotheses so far.
+    """
+
+    model: RunLength
+    start_s: FloatArray
+    weight: FloatArray
+    count: IntArray
+    stamp_s: FloatArray
+    log_evidence: FloatArray
+    merged_mass: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+    @property
+    def probability(self) -> FloatArray:
+        """(N,) probability of presence at `stamp_s`."""
+        held = np.arange(self.weight.shape[2]) < self.count[:, PRESENT, None]
+        return np.asarray(self.weight[:, PRESENT].sum(axis=1, where=held).clip(0.0, 1.0), dtype=np.float64)
+
+
+def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
+    """Beliefs about features that are heard of for the first time.
+
+    Args:
+        model: how they come and go.
+        stamp_s: (N,) when, on one clock.
+
+    Raises:
+        InputError: an instant that is not finite.
+    """
+    from evermap.existence.run_length_kernels import begin_rows
+
+    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
+    n = len(time)
+    checks.check_times(time, np.full(n, -np.inf))
+    start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, 2, model.slots))
+    count = np.zeros((n, 2), dtype=np.int64)
+    begin_rows(start, weight, count, time, model.first)
+    return RunLengthBelief(model, start, weight, count, time, np.zeros(n), np.zeros(n))
+
+
+def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
+    """Probability that each feature is present at `stamp_s`; the state stays as it is.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: scalar, (N,) or (len(rows),) instants, none before the row's last.
+        rows: row numbers asked about; all where None.
+
+    Raises:
+        InputError: an instant that is not finite or lies before the last look.
+    """
+    from evermap.existence.run_length_kernels import predict_rows
+
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
+    time = checks.as_rows(stamp_s, len(index), "stamp_s")
+    checks.check_times(time, state.stamp_s[index], index)
+    belief = np.empty(len(index))
+    predict_rows(index, state.start_s, state.weight, state.count, state.stamp_s, time, state.model.law, belief)
+    return belief
+
+
+def update(
+    state: RunLengthBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
+) -> RunLengthBelief:
+    """Beliefs after one look at each feature.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: scalar, (N,) or (len(rows),) instants of the looks.
+        detected: 1 or 0, of the same shape.
+        p_miss: `P(no detection | there)`, of the same shape.
+        p_false: `P(detection | not there)`, of the same shape.
+        rows: the rows looked at, each once; all where None.
+
+    Raises:
+        InputError: a probability outside [0, 1], time running back, or a row that does not exist.
+        DataError: a row twice.
+        NumericalError: a look that is impossible under both states.
+    """
+    from evermap.existence.run_length_kernels import look_rows
+
+    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
+    time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[index], index)
+    after = replace(
+        state,
+        start_s=state.start_s.copy(),
+        weight=state.weight.copy(),
+        count=state.count.copy(),
+        stamp_s=state.stamp_s.copy(),
+        log_evidence=state.log_evidence.copy(),
+        merged_mass=state.merged_mass.copy(),
+    )
+    bad = look_rows(
+        index, after.start_s, after.weight, after.count, after.stamp_s, time, gone, there, state.model.law,
+        after.log_evidence, after.merged_mass, np.empty(len(index)),
+    )  # fmt: skip
+    if bad >= 0:
+        raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
+    return after

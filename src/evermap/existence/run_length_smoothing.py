@@ -1,0 +1,196 @@
+"""Forward and backward through the run-length filter's hypotheses, compiled: what happened, given all looks.
+
+The backward pass runs through the lattice of hypotheses that the forward pass kept. To store all of it would take a
+megabyte for every thousand steps, so the forward pass keeps a checkpoint every few thousand steps, and each stretch is
+run again when the backward pass arrives there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.existence.compiled import exp, expm1, kernel
+from evermap.existence.run_length_kernels import (
+    MOST,
+    NO_MERGE,
+    First,
+    Law,
+    _hazards,
+    _look,
+    _step,
+    _week_bin,
+    age_bin,
+    begin,
+)
+from evermap.types import FloatArray, IntArray
+
+STRETCH = 4096
+"""Steps between two checkpoints."""
+
+
+class Counts(NamedTuple):
+    """Expected events and exposure of absences (0) and stays (1), by age and time of the week.
+
+    Attributes:
+        events: (2, A, W) how many ended.
+        exposure_s: (2, A, W) time spent, times the period's level.
+        open_ended: (2, A) how many were going on at the end of the looks.
+        of_period: (2, P) how many ended in each period of the calendar.
+        expected_of_period: (2, P) how many would have by the hazards of the model alone, without the period's level.
+    """
+
+    events: FloatArray
+    exposure_s: FloatArray
+    open_ended: FloatArray
+    of_period: FloatArray
+    expected_of_period: FloatArray
+
+
+@kernel
+def _forward(
+    a: int,
+    b: int,
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    law: Law,
+    period: IntArray,
+    level: FloatArray,
+    start: FloatArray,
+    weight: FloatArray,
+    count: IntArray,
+    scratch: FloatArray,
+    starts: FloatArray,
+    weights: FloatArray,
+    counts: IntArray,
+    merges: IntArray,
+    scales: FloatArray,
+) -> None:
+    """Steps `a` to `b`, keeping the belief before each, where it merged, and the probability of its look."""
+    merged = np.zeros(2, dtype=np.int64)
+    for k in range(a, b):
+        i = k - a
+        starts[i], weights[i], counts[i] = start, weight, count
+        scale = (level[0, period[k]], level[1, period[k]])
+        _step(start, weight, count, stamp_s[k], stamp_s[k + 1], law, scale, scratch, merged)
+        merges[i] = merged
+        scales[i] = _look(weight, count, absent[k + 1], present[k + 1])
+
+
+@kernel
+def expectations(
+    stamp_s: FloatArray,
+    absent: FloatArray,
+    present: FloatArray,
+    importance: FloatArray,
+    period: IntArray,
+    level: FloatArray,
+    slots: int,
+    law: Law,
+    prior: First,
+    counts_out: Counts,
+    smoothed: FloatArray,
+) -> tuple[float, float]:
+    """Add one feature's expected counts, and fill in its presence given all looks.
+
+    Args:
+        stamp_s: (T + 1,) instants of the lattice, at most a step apart, in order and different.
+        absent: (T + 1,) likelihoods of the looks there if the feature is absent, 1 where there was none.
+        present: (T + 1,) the same if it is present.
+        importance: (T,) weight of what happens in each step.
+        period: (T,) period of the calendar of each step.
+        level: (2, P) by what hazards are multiplied in each.
+        slots: places of a list of hypotheses.
+        law: the model.
+        prior: its belief before the first look.
+        counts_out: filled up.
+        smoothed: (T + 1,) filled in.
+
+    Returns:
+        Log evidence of the looks (-inf if they are impossible), and the presence at the first instant, given all.
+    """
+    steps = stamp_s.size - 1
+    stretches = (steps + STRETCH - 1) // STRETCH
+    start, weight, count = np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64)
+    scratch = np.zeros((2, slots))
+    starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 2, slots))
+    counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
+    scales = np.zeros(STRETCH)
+    kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 2, slots))
+    kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
+
+    begin(start, weight, count, stamp_s[0], prior)
+    evidence = np.log(_look(weight, count, absent[0], present[0]))
+    for c in range(stretches):
+        kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
+        a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
+        _forward(
+            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
+            starts, weights, counts, merges, scales,
+        )  # fmt: skip
+        for i in range(b - a):
+            evidence += np.log(scales[i])
+    if not np.isfinite(evidence):
+        return -np.inf, 0.0
+
+    n_bins, n_groups = law.hazard_hz.shape[1], counts_out.events.shape[1]
+    group = np.arange(n_bins) // ((n_bins + n_groups - 1) // n_groups)
+    weeks = counts_out.events.shape[2]
+    for s in range(2):
+        for j in range(count[s]):
+            oldest = age_bin(stamp_s[steps] - start[s, j], law)
+            counts_out.open_ended[s, group[oldest]] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
+    smoothed[steps] = weight[1, : count[1]].sum()
+
+    # what the looks to come say for each hypothesis, after this step and before it
+    later, sooner = np.ones((2, slots)), np.ones((2, slots))
+    usual, lived, died, part = (np.empty((2, slots)), np.empty(slots), np.empty(slots), np.empty(slots))
+    for c in range(stretches - 1, -1, -1):
+        a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
+        start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
+        _forward(
+            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
+            starts, weights, counts, merges, scales,
+        )  # fmt: skip
+        for k in range(b - 1, a - 1, -1):
+            i = k - a
+            now, then = stamp_s[k], stamp_s[k + 1]
+            gap, middle = then - now, 0.5 * (now + then)
+            week = _week_bin(middle, law.factor.shape[1])
+            column = week if weeks > 1 else 0
+            there, when = 0.0, period[k]
+            for s in range(2):
+                same = (present[k + 1] if s == 1 else absent[k + 1]) / scales[i]
+                other = (absent[k + 1] if s == 1 else present[k + 1]) / scales[i]
+                newcomer = counts[i, 1 - s]
+                if merges[i, 1 - s] != NO_MERGE and newcomer > merges[i, 1 - s]:
+                    newcomer -= 1
+                other *= later[1 - s, newcomer]
+                n, drift = counts[i, s], level[s, when]
+                _hazards(starts[i], n, s, now, then, law.factor[s, week], law, usual)
+                for j in range(n):
+                    x = min(drift * usual[s, j], MOST)
+                    p_end, p_live = -expm1(-x), exp(-x)
+                    died[j], lived[j] = p_end * other, p_live * same
+                    # a stay that ends in this step lasted on the mean for this part of it
+                    part[j] = 0.5 - x / 12.0 if x < 1e-2 else 1.0 / x - p_live / p_end
+                ended = expected = 0.0
+                for j in range(n):
+                    to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
+                    mass, lives, ends = weights[i, s, j], lived[j] * later[s, to], died[j]
+                    sooner[s, j] = lives + ends
+                    if s == 1:
+                        there += mass * (lives + ends)
+                    spent = mass * (lives + part[j] * ends)
+                    ended += mass * ends
+                    expected += usual[s, j] * spent
+                    row = group[age_bin(middle - starts[i, s, j], law)]
+                    counts_out.events[s, row, column] += importance[k] * mass * ends
+                    counts_out.exposure_s[s, row, column] += importance[k] * drift * gap * spent
+                counts_out.of_period[s, when] += ended
+                counts_out.expected_of_period[s, when] += expected
+            smoothed[k] = there
+            later, sooner = sooner, later
+    return evidence, smoothed[0]

@@ -1,0 +1,291 @@
+"""Lifetimes of stays and absences from expected counts: the maximisation step of learning, one family a function.
+
+What is given is a table of events and exposure by age (and time of the week), with fractional counts, as the
+expectation step of EM leaves them. What is found is a lifetime, and a rhythm where one is wanted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from math import exp
+
+import numpy as np
+
+from evermap.existence.hazard_table import CERTAIN
+from evermap.existence.rhythm import Rhythm
+from evermap.existence.smooth_rates import HALF_AN_EVENT, SmoothRates, age_basis, constant, fit, week_basis
+from evermap.survival import Exponential, Gamma, LogNormal, Mixture, PiecewiseConstantHazard, Weibull
+from evermap.survival.protocol import LifetimePrior
+from evermap.types import FloatArray
+
+KNOTS_PER_DOUBLING = 2
+MOST_KNOTS = 40
+MOST_PEAKS = 5
+PEAK_SPREAD = 0.05
+"""Spread of a peak to begin with. Then each peak's spread is its own and, as one more event, that of all peaks
+together: a peak of one event would have none else."""
+BACKGROUND_SPREAD = 1.0
+"""Spread of the wide component that takes what is no peak, as one event."""
+SHARE_STRENGTH = 0.5
+"""Events added to each component, so that none dies out."""
+_MOST_LOG_SHAPE = 6.0
+_ROUNDS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Sojourns:
+    """Counts of one state.
+
+    Attributes:
+        age_s: (A,) middle of each bin of age; its edges lie between.
+        edge_s: (A + 1,) edges of the bins.
+        events: (A, W) how many ended.
+        exposure_s: (A, W) time spent.
+        open_ended: (A,) how many went on.
+    """
+
+    edge_s: FloatArray
+    events: FloatArray
+    exposure_s: FloatArray
+    open_ended: FloatArray
+
+    @property
+    def age_s(self) -> FloatArray:
+        """(A,) middle of each bin of age."""
+        return np.asarray(0.5 * (self.edge_s[:-1] + self.edge_s[1:]), dtype=np.float64)
+
+    @property
+    def n_events(self) -> float:
+        """How many ended."""
+        return float(self.events.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """A lifetime that was fitted.
+
+    Attributes:
+        family: its kind.
+        prior: the lifetime.
+        rhythm: factor on its hazard, or None.
+        freedom: how many parameters it took.
+        rates: the smooth rates behind it, for the next fit to begin with.
+    """
+
+    family: str
+    prior: LifetimePrior
+    rhythm: Rhythm | None
+    freedom: float
+    rates: SmoothRates | None = None
+
+    def log_likelihood(self, counts: Sojourns) -> float:
+        """`sum events log h - exposure h`, of the table of counts."""
+        hazard = hazards(self.prior, counts.edge_s)[:, None]
+        if self.rhythm is not None:
+            hazard = hazard * self.rhythm.factor[None, :]
+        else:
+            counts = Sojourns(
+                counts.edge_s, counts.events.sum(1)[:, None], counts.exposure_s.sum(1)[:, None], counts.open_ended
+            )
+        happened = counts.events > 0.0
+        log_hazard = np.log(np.where(happened, np.maximum(hazard, 1e-300), 1.0))
+        return float((counts.events * log_hazard).sum() - (counts.exposure_s * hazard).sum())
+
+    def score(self, counts: Sojourns) -> float:
+        """Log likelihood less the price of the parameters (Schwarz 1978)."""
+        return self.log_likelihood(counts) - 0.5 * self.freedom * float(np.log(max(counts.n_events, 2.0)))
+
+
+def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
+    """(A,) mean hazard of a lifetime in each bin of age."""
+    return _mean_hazards(prior.cumulative_hazard(edge_s), edge_s)
+
+
+def _mean_hazards(cumulative: FloatArray, edge_s: FloatArray) -> FloatArray:
+    """(A,) mean hazard in each bin, of the cumulative hazard at the edges."""
+    with np.errstate(invalid="ignore"):
+        within = np.where(np.isfinite(cumulative[1:]), np.minimum(np.diff(cumulative), CERTAIN), CERTAIN)
+    return np.asarray(within / np.diff(edge_s), dtype=np.float64)
+
+
+def exponential(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
+    """A hazard that does not depend on age."""
+    total = counts.exposure_s.sum()
+    if rhythm:
+        events, exposure = counts.events.sum(0)[None, :], counts.exposure_s.sum(0)[None, :]
+        rates = fit(events, exposure, constant(1), week_basis(), start.rates if start else None)
+        return Fitted(
+            "exponential", Exponential(float(np.exp(rates.log_age[0]))), Rhythm(rates.log_week), rates.freedom
+        )
+    rate = (counts.n_events + HALF_AN_EVENT) / total if total > 0.0 else 0.0
+    return Fitted("exponential", Exponential(float(rate)), None, 1.0)
+
+
+def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
+    """Any smooth function of log age as log hazard, constant beyond the ages that were seen."""
+    seen = np.flatnonzero(counts.exposure_s.sum(1) > 0.0)
+    if not seen.size:
+        return exponential(counts, rhythm=rhythm)
+    earlier = start.rates if start else None
+    rows = slice(int(seen[0]), int(seen[-1]) + 1)
+    log_age = np.log(counts.age_s[rows])
+    knots = int(np.clip(KNOTS_PER_DOUBLING * (log_age[-1] - log_age[0]) / np.log(2.0), 4, MOST_KNOTS))
+    basis = age_basis(log_age, knots)
+    if rhythm:
+        rates = fit(counts.events[rows], counts.exposure_s[rows], basis, week_basis(), earlier)
+    else:
+        rates = fit(counts.events[rows].sum(1)[:, None], counts.exposure_s[rows].sum(1)[:, None], basis, None, earlier)
+    edge = counts.edge_s[:-1][rows].copy()
+    edge[0] = 0.0
+    prior = PiecewiseConstantHazard(tuple(edge), tuple(np.exp(rates.log_age)))
+    return Fitted("smooth", prior, Rhythm(rates.log_week) if rhythm else None, rates.freedom, rates)
+
+
+def weibull(counts: Sojourns, _: Fitted | None = None) -> Fitted:
+    """A hazard that is a power of age."""
+    return _two_parameters("weibull", counts, lambda a, b: Weibull(exp(a), exp(b)))
+
+
+def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
+    """A sum of exponential phases."""
+    from scipy.special import gammaincc
+
+    def cumulative(a: float, b: float, edge_s: FloatArray) -> FloatArray:
+        """As `Gamma` has it, but for its far tails, at a fortieth of the time."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(-np.log(gammaincc(exp(b), edge_s / exp(a - b))), dtype=np.float64)
+
+    return _two_parameters("gamma", counts, lambda a, b: Gamma(exp(a - b), exp(b)), cumulative)
+
+
+def lognormal(counts: Sojourns, _: Fitted | None = None) -> Fitted:
+    """One typical duration and its spread."""
+    return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, exp(b)))
+
+
+def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
+    """Some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
+    best = _mixture(counts, 0)
+    for n in range(1, MOST_PEAKS + 1):
+        fitted = _mixture(counts, n)
+        if fitted.score(counts) > best.score(counts):
+            best = fitted
+    return best
+
+
+Family = Callable[[Sojourns, Fitted | None], Fitted]
+"""Counts, and an earlier fit to begin with, to a lifetime."""
+FAMILIES: dict[str, Family] = {
+    "exponential": exponential,
+    "weibull": weibull,
+    "gamma": gamma,
+    "lognormal": lognormal,
+    "peaks": peaks,
+    "smooth": smooth,
+}
+"""Families without a rhythm, by name."""
+WITH_RHYTHM: dict[str, Family] = {
+    "exponential": partial(exponential, rhythm=True),
+    "smooth": partial(smooth, rhythm=True),
+}
+"""Families with a rhythm of the week."""
+
+
+def _two_parameters(
+    family: str,
+    counts: Sojourns,
+    build: Callable[[float, float], LifetimePrior],
+    cumulative: Callable[[float, float, FloatArray], FloatArray] | None = None,
+) -> Fitted:
+    """Best lifetime of a family with a logarithm of typical duration, and a logarithm of shape.
+
+    Args:
+        family: its name.
+        counts: what it is fitted to.
+        build: makes the lifetime of the two.
+        cumulative: makes its cumulative hazard at some ages, if there is a quicker way than the lifetime's own.
+    """
+    from scipy.optimize import minimize
+
+    events, exposure = counts.events.sum(1), counts.exposure_s.sum(1)
+    used = np.flatnonzero(exposure > 0.0)
+    if counts.n_events < 2.0 or not used.size:
+        return exponential(counts)
+    edge = counts.edge_s[: used[-1] + 2]
+    events, exposure = events[: used[-1] + 1], exposure[: used[-1] + 1]
+
+    def bounded(parameters: FloatArray) -> tuple[float, float]:
+        return float(parameters[0]), float(np.clip(parameters[1], -_MOST_LOG_SHAPE, _MOST_LOG_SHAPE))
+
+    def loss(parameters: FloatArray) -> float:
+        a, b = bounded(parameters)
+        at_edges = cumulative(a, b, edge) if cumulative else build(a, b).cumulative_hazard(edge)
+        hazard = np.maximum(_mean_hazards(at_edges, edge), 1e-300)
+        likelihood = (events * np.log(hazard)).sum() - (exposure * hazard).sum()
+        return float(0.01 * parameters[1] ** 2 - likelihood)  # a weak pull to shape 1
+
+    log_mean = float(np.log(exposure.sum() / counts.n_events))
+    # from a triangle of some size: scipy's own, a hair's breadth around shape 1, is taken for an optimum
+    triangle = np.array([[log_mean, 0.0], [log_mean + 0.5, 0.0], [log_mean, 0.5]])
+    found = minimize(
+        loss, triangle[0], method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3, "initial_simplex": triangle}
+    )
+    return Fitted(family, build(*bounded(found.x)), None, 2.0)
+
+
+def _mixture(counts: Sojourns, n: int) -> Fitted:
+    """A wide log-normal and `n` narrow ones, by EM on binned durations, those that went on counted by survival."""
+    from scipy.special import ndtr
+
+    events = counts.events.sum(1)
+    used = np.flatnonzero((events > 1e-6) | (counts.open_ended > 1e-6))
+    if counts.n_events < 2.0:
+        return exponential(counts)
+    x = np.log(counts.age_s[used])
+    width = np.log(np.diff(counts.edge_s)[used] / counts.age_s[used] + 1.0)
+    ended, going = events[used], counts.open_ended[used]
+    mean, typical = np.empty(n + 1), np.full(n + 1, PEAK_SPREAD**2)
+    typical[0] = BACKGROUND_SPREAD**2
+    centre = float((ended * x).sum() / ended.sum())
+    mean[0], mean[1:] = centre, _highest(x, ended, n)
+    spread, share = np.sqrt(typical), np.full(n + 1, 1.0 / (n + 1))
+    for _ in range(_ROUNDS):
+        z = (x[:, None] - mean) / spread
+        density = share * np.exp(-0.5 * z * z) / spread
+        beyond = share * ndtr(-z)
+        mine = ended[:, None] * density / np.maximum(density.sum(1, keepdims=True), 1e-300)
+        open_mine = going[:, None] * beyond / np.maximum(beyond.sum(1, keepdims=True), 1e-300)
+        # moments of a normal variable known to lie beyond x
+        ratio = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi) / np.maximum(ndtr(-z), 1e-300)
+        expected = mean + spread * ratio
+        second = spread**2 * (1.0 + z * ratio) - (spread * ratio) ** 2
+        weight = mine.sum(0) + open_mine.sum(0)
+        total = np.maximum(weight, 1e-9)
+        new_mean = (mine.T @ x + (open_mine * expected).sum(0)) / total
+        new_mean = np.where(weight > 1e-6, new_mean, mean)
+        squares = (mine * (x[:, None] - new_mean) ** 2).sum(0)
+        squares += (mine * width[:, None] ** 2 / 12.0).sum(0)
+        squares += (open_mine * (np.maximum(second, 0.0) + (expected - new_mean) ** 2)).sum(0)
+        if n:
+            typical[1:] = squares[1:].sum() / max(weight[1:].sum(), 1e-9)
+        new_spread = np.sqrt((squares + typical) / (weight + 1.0))
+        new_share = (weight + SHARE_STRENGTH) / (weight + SHARE_STRENGTH).sum()
+        change = float(np.abs(new_mean - mean).max() + np.abs(new_share - share).max())
+        mean, spread, share = new_mean, new_spread, new_share
+        if change < 1e-6:
+            break
+    parts = [LogNormal(float(m), float(s)) for m, s in zip(mean, spread, strict=True)]
+    prior = Mixture.of(parts, [float(s) for s in share]) if n else parts[0]
+    return Fitted("peaks", prior, None, 3.0 * n + 2.0)
+
+
+def _highest(x: FloatArray, ended: FloatArray, n: int) -> FloatArray:
+    """Where the most events are, one peak after another, each taking away what it explains."""
+    left, found = ended.copy(), np.empty(n)
+    for i in range(n):
+        near = np.exp(-0.5 * ((x[:, None] - x[None, :]) / (2.0 * PEAK_SPREAD)) ** 2)
+        found[i] = x[int(np.argmax(near @ left))]
+        left = left * (1.0 - np.exp(-0.5 * ((x - found[i]) / (3.0 * PEAK_SPREAD)) ** 2))
+    return found

@@ -1,1 +1,0 @@
-"""The tables of the documents, each by one command."""

@@ -1,0 +1,1 @@
+"""Planar motions and rigid alignment."""

@@ -1,0 +1,513 @@
+"""What changed in a session: stays that ended or began, and the changes that are told of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from evermap.geometry.rigid import rigid
+from evermap.maps.learning import LongestLives
+from evermap.maps.living import EXISTS, LivingMap, Stays
+from evermap.maps.sessions.arrive import Arrivals
+from evermap.maps.sessions.believe import Looks, class_of, clique_rows, site_middles
+from evermap.maps.sessions.geometry import of_places
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
+
+SAME_PLACE_M = 0.3
+"""Cliques that stand this close to where another stood have taken its place."""
+SAME_SPOT_M = 0.1
+"""Cliques that stand this close to where they stood have not moved."""
+LEAST_EVIDENCE = 1.5
+"""What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
+SURELY_AWAY = 0.02
+FORGOTTEN_P = 0.05
+"""Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
+MOST_AWAY = 20
+"""Cliques that are away are remembered up to this number, and as many again as stand somewhere."""
+MOST_STAYS = 5000
+"""Newest stays that lifetimes are learned from: a year of a large building."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """Where cliques stand: their ids, and the row of the site of each, -1 where it is away."""
+
+    clique_id: IntArray
+    site: IntArray
+
+    def of(self, clique_id: int) -> int:
+        """The row of a clique's site; -1 where it is away or unknown."""
+        return int(np.append(self.site, -1)[_found(self.clique_id, clique_id)])
+
+
+def standing(living: LivingMap) -> Standing:
+    """The site of every clique that is more probable than all else."""
+    cliques, row = clique_rows(living.sites)
+    site = np.full(len(cliques), -1, dtype=np.int64)
+    likely = np.flatnonzero(living.sites.p_here >= EXISTS)
+    site[row[likely]] = likely
+    return Standing(cliques, site)
+
+
+def decided(
+    before: LivingMap,
+    after: LivingMap,
+    looks: Looks,
+    log_evidence: FloatArray,
+    arrivals: Arrivals,
+    start_s: float,
+    longest: LongestLives | None = None,
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """The map with its stays up to date, and what changed since it was told last, by clique.
+
+    A stay goes on until looks end it: age alone lowers a belief, and is never told as a change. A clique that was away
+    and is seen again has returned only if it had really left.
+
+    Args:
+        before: the map as the session found it.
+        after: with the session's beliefs, and sites with their sightings.
+        looks: of the session, at places of `after`.
+        log_evidence: (C,) what they say for 'it stands somewhere' against 'it is away', by clique.
+        arrivals: what earlier looks said of the places of new sites.
+        start_s: beginning of the session.
+        longest: lifetimes that are credible: a clique is told to have vanished where the looks outweigh even these.
+            None where nothing is known of lifetimes.
+    """
+    session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest)
+    told = _told(before, after)
+    for row, clique in enumerate(session.cliques.tolist()):
+        session.weigh(row)
+        if clique in told:
+            session.told_before(row, *told[clique])
+        else:
+            session.was_away(row)
+    hidden, shown = session.hidden, session.shown
+    hidden[2], shown[2] = looks.unwitnessed
+    after = replace(
+        after,
+        stays=session.stays(),
+        sites=replace(after.sites, p_kept=session.p_kept),
+        sightlines=after.sightlines.after_session(hidden, shown),
+    )
+    return after, _swaps(session.found, before, after)
+
+
+@dataclass(frozen=True, slots=True)
+class _Session:
+    """What is decided of cliques one after the other; columns of stays, sites and sight are written to as it goes.
+
+    Attributes:
+        cliques: (C,) ids; site: (C,) row of the most probable site of each.
+        p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
+        least: (C,) evidence against it that it takes to tell that it vanished.
+        hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
+        newest: row of the last stay by clique.
+        last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
+        hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `Looks.sight`.
+        begun: clique, site, not there before, first and last sighting of new stays.
+        found: changes.
+    """
+
+    before: LivingMap
+    after: LivingMap
+    looks: Looks
+    arrivals: Arrivals
+    start_s: float
+    cliques: IntArray
+    site: IntArray
+    p_away: FloatArray
+    log_evidence: FloatArray
+    least: FloatArray
+    hits: IntArray
+    misses: IntArray
+    was_hit: BoolArray
+    newest: dict[int, int]
+    last_s: FloatArray
+    gone_s: FloatArray
+    p_gone: FloatArray
+    p_kept: FloatArray
+    hidden: FloatArray
+    shown: FloatArray
+    begun: list[tuple[int, int, float, float, float]]
+    found: list[MapChange]
+
+    @classmethod
+    def of(
+        cls,
+        before: LivingMap,
+        after: LivingMap,
+        looks: Looks,
+        log_evidence: FloatArray,
+        arrivals: Arrivals,
+        start_s: float,
+        longest: LongestLives | None,
+    ) -> Self:
+        """Before anything is decided."""
+        sites, stays = after.sites, after.stays
+        cliques, row = clique_rows(sites)
+        count = len(cliques)
+        hits, misses = _counted(looks, len(sites))
+        site, newest_s = np.zeros(count, dtype=np.int64), np.full(count, -np.inf)
+        order = np.argsort(-sites.p_here, kind="stable")[::-1]
+        site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
+        np.maximum.at(newest_s, row, sites.seen_s)
+        least = np.full(count, LEAST_EVIDENCE)
+        if longest is not None:
+            p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
+            p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
+            least = np.maximum(least, np.log(p_stays / (1.0 - p_stays)))
+        return cls(
+            before=before,
+            after=after,
+            looks=looks,
+            arrivals=arrivals,
+            start_s=start_s,
+            cliques=cliques,
+            site=site,
+            p_away=np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0),
+            log_evidence=log_evidence,
+            least=least,
+            hits=hits,
+            misses=misses,
+            was_hit=np.bincount(row, hits, minlength=count) > 0,
+            newest={clique: k for k, clique in enumerate(stays.clique_id.tolist())},
+            last_s=stays.last_s.copy(),
+            gone_s=stays.gone_s.copy(),
+            p_gone=stays.p_gone.copy(),
+            p_kept=sites.p_kept.copy(),
+            hidden=np.zeros(3),
+            shown=np.zeros(3),
+            begun=[],
+            found=[],
+        )
+
+    def weigh(self, row: int) -> None:
+        """A clique that was missed and stands was hidden: so much is learned of how often that happens."""
+        if self._missed(row) and not self.was_hit[row]:
+            self.hidden[self._sight(row)] += 1.0 - self.p_away[row]
+
+    def told_before(self, row: int, old: int, stay: int) -> None:
+        """A clique that is said to stand at the site `old`, by the stay `stay` (-1 for none)."""
+        site = int(self.site[row])
+        if self._stands(row) and site == old:
+            self._goes_on(row, stay)
+        elif self._stands(row) and self.hits[site]:
+            self._moved(row, old, stay)
+        elif (
+            not self._stands(row)
+            and self.misses[old]
+            and self.log_evidence[row] <= -self.least[row]
+            and self.p_away[row] >= EXISTS
+        ):
+            self._vanished(row, old, stay)
+        elif stay >= 0 and self._missed(row):
+            self.p_gone[stay] = self.p_away[row]
+
+    def was_away(self, row: int) -> None:
+        """A clique that is said to stand nowhere, or is new."""
+        clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
+        newest = self.newest.get(clique, -1)
+        if not (self._stands(row) and self.hits[site]):
+            if newest >= 0 and np.isfinite(self.gone_s[newest]):
+                at = _row(self.after, int(self.after.stays.site_id[newest]))
+                self.p_gone[newest] = np.clip(1.0 - self.p_kept[at], 0.0, 1.0) if at >= 0 else self.p_gone[newest]
+            return
+        seen_s = float(sites.seen_s[site])
+        share = min(self.p_kept[site] / sites.p_here[site], 1.0)
+        self.p_kept[site] = sites.p_here[site]
+        same = newest >= 0 and self.after.stays.site_id[newest] == sites.site_id[site]
+        self.hidden[self._sight(row)] += share * self.p_gone[newest] if same else 0.0
+        if same and share >= 1.0 - EXISTS:  # it had never left
+            self.last_s[newest], self.gone_s[newest], self.p_gone[newest] = seen_s, np.inf, 0.0
+            return
+        kind, elsewhere_s, probability = self._since_when(site, newest, same, share)
+        if newest >= 0:
+            self.p_gone[newest] = max(self.p_gone[newest], probability)
+        since = self._begins(clique, site, elsewhere_s)
+        if probability >= EXISTS and len(self.before.places):
+            p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.after, clique)
+            n_misses = int(self.misses[left]) if left >= 0 else 0
+            self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
+
+    def stays(self) -> Stays:
+        """Old and new ones, in the order of their beginning."""
+        stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
+        if not self.begun:
+            return stays
+        clique_id, site, elsewhere_s, first_s, last_s = (np.array(part) for part in zip(*self.begun, strict=True))
+        fresh = Stays(
+            clique_id,
+            self.after.sites.site_id[site],
+            class_of(self.after, clique_id),
+            site_middles(self.after)[site],
+            elsewhere_s,
+            first_s,
+            last_s,
+            np.full(len(site), np.inf),
+            np.zeros(len(site)),
+        )
+        stays = stays.joined(fresh)
+        return stays[np.argsort(stays.first_s, kind="stable")]
+
+    def _stands(self, row: int) -> bool:
+        return bool(self.after.sites.p_here[self.site[row]] >= EXISTS)
+
+    def _missed(self, row: int) -> bool:
+        return bool(self.log_evidence[row] <= -LEAST_EVIDENCE)
+
+    def _sight(self, row: int) -> int:
+        return int(self.looks.sight[row]) % 2
+
+    def _goes_on(self, row: int, stay: int) -> None:
+        site, sites = int(self.site[row]), self.after.sites
+        if stay < 0:  # a body that was taken apart: its part goes on
+            first_s, last_s = float(sites.since_s[site]), float(sites.seen_s[site])
+            self.begun.append((int(self.cliques[row]), site, -np.inf, first_s, last_s))
+        else:
+            self.last_s[stay] = max(self.last_s[stay], sites.seen_s[site])
+            if self.hits[site]:  # if it was missed before, it was hidden then
+                share = min(self.p_kept[site] / sites.p_here[site], 1.0)
+                self.hidden[self._sight(row)] += share * self.p_gone[stay]
+                self.shown[self._sight(row)] += 1.0
+                self.p_gone[stay] = 0.0
+            elif self._missed(row):
+                self.p_gone[stay] = self.p_away[row]
+        if self.hits[site]:
+            self.p_kept[site] = sites.p_here[site]
+
+    def _moved(self, row: int, old: int, stay: int) -> None:
+        site = int(self.site[row])
+        left_s = self._ends(old, stay, 1.0)
+        since = self._begins(int(self.cliques[row]), site, left_s)
+        self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
+        if np.hypot(*_motion(self.after, old, site)[0]) >= SAME_SPOT_M:
+            n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
+            self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
+
+    def _vanished(self, row: int, old: int, stay: int) -> None:
+        p_away = float(self.p_away[row])
+        left_s = self._ends(old, stay, p_away)
+        to_s = _first_miss(self.looks, old, left_s, self.start_s)
+        self._tell(ChangeKind.VANISHED, old, -1, left_s, to_s, p_away, 0, int(self.misses[old]))
+
+    def _since_when(self, site: int, newest: int, same: bool, share: float) -> tuple[ChangeKind, float, float]:
+        """Whether a clique that is there now returned or appeared, until when it was not there, and how probably."""
+        if newest >= 0:  # where it was last it was found missing; elsewhere it may have come when it left
+            elsewhere_s = float(self.gone_s[newest] if same else self.last_s[newest])
+            return ChangeKind.RETURNED, elsewhere_s, 1.0 - share if same else 1.0
+        at = np.flatnonzero(self.arrivals.site == site)
+        if not len(at) or self.arrivals.p_appeared[at[0]] < EXISTS:
+            return ChangeKind.APPEARED, -np.inf, 0.0
+        return ChangeKind.APPEARED, float(self.arrivals.looked_s[at[0]]), float(self.arrivals.p_appeared[at[0]])
+
+    def _ends(self, old: int, stay: int, probability: float) -> float:
+        """The stay at a site ends; returns when the clique was seen there last."""
+        left_s = float(self.after.sites.seen_s[old])
+        if stay >= 0:
+            left_s = max(float(self.last_s[stay]), left_s)
+            self.last_s[stay] = left_s
+            self.gone_s[stay] = _first_miss(self.looks, old, left_s, self.start_s)
+            self.p_gone[stay] = probability
+        return left_s
+
+    def _begins(self, clique: int, site: int, elsewhere_s: float) -> float:
+        """A stay begins; returns when it was seen first."""
+        sites = self.after.sites
+        since = max(float(sites.since_s[site]), float(np.nextafter(elsewhere_s, np.inf)))
+        self.begun.append((clique, site, elsewhere_s, since, max(float(sites.seen_s[site]), since)))
+        return since
+
+    def _tell(
+        self,
+        kind: ChangeKind,
+        left: int,
+        site: int,
+        from_s: float,
+        to_s: float,
+        probability: float,
+        n_hits: int,
+        n_misses: int,
+    ) -> None:
+        """A change of the clique that left one site (row, -1 for none), and stands at another."""
+        step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
+        change = MapChange(
+            landmark_ids=_members_at(self.after, site if site >= 0 else left),
+            kind=kind,
+            stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
+            stamp_to_s=to_s,
+            displacement_m=(float(step[0]), float(step[1])),
+            rotation_rad=turn,
+            probability=float(min(max(probability, 0.0), 1.0)),
+            n_hits=n_hits,
+            n_misses=n_misses,
+        )
+        self.found.append(change)
+
+
+def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
+    """For every clique that is said to stand somewhere the row of its site, and of its stay (-1 for none)."""
+    told: dict[int, tuple[int, int]] = {}
+    stays = after.stays
+    for row in np.flatnonzero(stays.gone_s == np.inf).tolist():
+        site = _row(after, int(stays.site_id[row]))
+        if site >= 0:
+            told[int(stays.clique_id[row])] = (site, row)
+    known = set(stays.clique_id.tolist())
+    then = standing(before)
+    for clique, at in zip(then.clique_id.tolist(), then.site.tolist(), strict=True):
+        if clique not in known and at >= 0:  # part of a body that stood there
+            site = _row(after, int(before.sites.site_id[at]))
+            if site >= 0:
+                told[clique] = (site, -1)
+    return told
+
+
+def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
+    """The map without what it need not remember: its cost is that of what stands there, whatever its age.
+
+    Left out are the least probable sites of cliques that have more than `most_sites`, and cliques that are away for
+    good: those that return with little probability, or, where too many are away, that went first. Their stays are kept
+    to learn from.
+    """
+    sites, members = living.sites, living.members
+    order = np.lexsort((-sites.seen_s, -sites.p_here, sites.clique_id))
+    rank = np.arange(len(order)) - np.searchsorted(sites.clique_id[order], sites.clique_id[order])
+    kept = np.zeros(len(sites), dtype=np.bool_)
+    kept[order[rank < most_sites]] = True
+    gone = _gone_for_good(living)
+    kept &= ~np.isin(sites.clique_id, gone)
+    stays = living.stays
+    if len(stays) > MOST_STAYS:
+        stays = stays[np.sort(np.argsort(stays.last_s, kind="stable")[-MOST_STAYS:])]
+    if kept.all():
+        return replace(living, stays=stays)
+    rows = np.flatnonzero(np.isin(living.places.site_id, sites.site_id[kept]))
+    return replace(
+        living,
+        members=members[~np.isin(members.clique_id, gone)],
+        sites=sites[kept],
+        places=living.places[rows],
+        covariance_m2=of_places(living.covariance_m2, rows),
+        stays=stays,
+    )
+
+
+def _gone_for_good(living: LivingMap) -> IntArray:
+    """Ids of cliques that are away and need not be remembered."""
+    sites = living.sites
+    cliques, row = clique_rows(sites)
+    p_here, seen = np.zeros(len(cliques)), np.full(len(cliques), -np.inf)
+    np.add.at(p_here, row, sites.p_here)
+    np.maximum.at(seen, row, sites.seen_s)
+    operated = living.members.pinned | living.members.deleted
+    away = np.flatnonzero((p_here < SURELY_AWAY) & ~np.isin(cliques, living.members.clique_id[operated]))
+    kinds, middle = class_of(living, cliques[away]), site_middles(living)
+    newest = {int(row[s]): s for s in np.argsort(sites.seen_s, kind="stable")}
+    p_return = np.zeros(len(away))
+    for k, clique in enumerate(away):
+        absence = living.lives.of(int(kinds[k]), middle[newest[int(clique)]]).absence
+        still_away = float(np.exp(absence.log_survival(max(living.stamp_s - seen[clique], 0.0))))
+        p_return[k] = 1.0 - absence.p_never_leaves / still_away if still_away > 0.0 else 0.0
+    hopeless = away[p_return < FORGOTTEN_P]
+    waiting = away[p_return >= FORGOTTEN_P]
+    most = MOST_AWAY + len(cliques) - len(away)
+    too_many = waiting[np.argsort(seen[waiting], kind="stable")][: max(len(waiting) - most, 0)]
+    return np.asarray(cliques[np.concatenate([hopeless, too_many])])
+
+
+def _swaps(found: list[MapChange], before: LivingMap, after: LivingMap) -> tuple[MapChange, ...]:
+    """Two that moved to each other's place have been exchanged, or carry each other's identity."""
+    then, now = before.landmarks(), after.landmarks()
+
+    def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
+        rows = np.isin(records.landmark_id, names)
+        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(2, np.nan)
+
+    moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
+    was = {k: at(then, found[k].landmark_ids) for k in moved}
+    is_at = {k: at(now, found[k].landmark_ids) for k in moved}
+    swapped: dict[int, int] = {}
+    for a in moved:
+        for b in moved:
+            if a < b and a not in swapped and b not in swapped:
+                across = max(np.linalg.norm(is_at[a] - was[b]), np.linalg.norm(is_at[b] - was[a]))
+                if across < SAME_PLACE_M:
+                    swapped[a] = b
+    partners = set(swapped.values())
+    told = []
+    for k, change in enumerate(found):
+        if k in partners:
+            continue
+        if k in swapped:
+            told.append(_exchanged(change, found[swapped[k]]))
+        else:
+            told.append(change)
+    return tuple(told)
+
+
+def _exchanged(change: MapChange, other: MapChange) -> MapChange:
+    """Two moves told as one exchange; the displacement is that of the first."""
+    return replace(
+        change,
+        kind=ChangeKind.SWAPPED,
+        landmark_ids=tuple(sorted((*change.landmark_ids, *other.landmark_ids))),
+        probability=min(change.probability, other.probability),
+        n_hits=change.n_hits + other.n_hits,
+        n_misses=change.n_misses + other.n_misses,
+    )
+
+
+def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
+    """Shift and rotation of a body from one site to another, by the landmarks that have places at both.
+
+    Of none the shift is that of the middles; the rotation of fewer than two is 0.
+    """
+    a = np.flatnonzero(living.places.site_id == living.sites.site_id[old])
+    b = np.flatnonzero(living.places.site_id == living.sites.site_id[new])
+    _, i, j = np.intersect1d(living.places.landmark_id[a], living.places.landmark_id[b], return_indices=True)
+    if len(i):
+        a, b = a[i], b[j]
+    was, now = living.places.position_m[a], living.places.position_m[b]
+    shift = now.mean(axis=0) - was.mean(axis=0)
+    if len(i) < 2:
+        return shift, 0.0
+    return shift, float(rigid(was, now)[2])
+
+
+def _first_miss(looks: Looks, site: int, last_s: float, start_s: float) -> float:
+    """The first look of a session at which a clique was missed at its site after its last sighting there."""
+    rows = (looks.rows.site == site) & ~looks.rows.hit & looks.counts & (looks.rows.stamp_s > last_s)
+    return float(looks.rows.stamp_s[rows].min()) if rows.any() else max(start_s, float(np.nextafter(last_s, np.inf)))
+
+
+def _counted(looks: Looks, count: int) -> tuple[IntArray, IntArray]:
+    hit: BoolArray = looks.rows.hit
+    hits = np.bincount(looks.rows.site[hit], minlength=count)
+    return hits, np.bincount(looks.rows.site[~hit & looks.counts], minlength=count)
+
+
+def _row(living: LivingMap, site_id: int) -> int:
+    return _found(living.sites.site_id, site_id)
+
+
+def _found(ids: IntArray, wanted: int) -> int:
+    """The row of an id among sorted ones, -1 where it is none of them."""
+    at = int(np.searchsorted(ids, wanted))
+    return at if at < len(ids) and ids[at] == wanted else -1
+
+
+def _last_site(before: LivingMap, after: LivingMap, clique: int) -> int:
+    """Where a clique that is away was seen last, in rows of the new map."""
+    mine = np.flatnonzero(before.sites.clique_id == clique)
+    if not len(mine):
+        return -1
+    return _row(after, int(before.sites.site_id[mine[np.argmax(before.sites.seen_s[mine])]]))
+
+
+def _members_at(living: LivingMap, site: int) -> tuple[int, ...]:
+    if site < 0:
+        return ()
+    rows = living.places.site_id == living.sites.site_id[site]
+    return tuple(int(name) for name in np.sort(living.places.landmark_id[rows]))

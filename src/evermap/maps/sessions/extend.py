@@ -1,0 +1,273 @@
+"""The map with what a session found: new cliques, new sites of old ones, new places, all with one joint covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.config import LivingConfig
+from evermap.maps.grouping import Fate, group, regrouped
+from evermap.maps.living import LivingMap, Members, Places, Sites
+from evermap.maps.relabel import relabelled
+from evermap.maps.sessions.geometry import blocks, of_places, with_session
+from evermap.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Landmarks of a session, in the map's frame, in the order of their ids.
+
+    Attributes:
+        landmark_id, class_id: (K,).
+        place: (K,) row of the old map's places, -1 where it stands at none of its own.
+        probability: (K,) of that.
+        position_m: (K, 2) posterior.
+        covariance_m2: (2 K, 2 K) joint covariance of it.
+        object_id: (K,) object that it is on, as an object detector says; -1 for none.
+        first_s: (K,) first sighting.
+        last_s: (K,) last sighting.
+    """
+
+    landmark_id: IntArray
+    class_id: IntArray
+    place: IntArray
+    probability: FloatArray
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    object_id: IntArray
+    first_s: FloatArray
+    last_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Extended:
+    """The map, before its beliefs are updated.
+
+    Attributes:
+        before: the map as it was, but for bodies that this session took apart or put together.
+        living: with the session's places and sites.
+        landmark_id: (K,) landmarks of the session.
+        place: (K,) row of the map's places at which each of them stands.
+        p_start: (S,) beliefs in its sites at the beginning of the session.
+        is_new: (S,) sites that the session found.
+    """
+
+    before: LivingMap
+    living: LivingMap
+    landmark_id: IntArray
+    place: IntArray
+    p_start: FloatArray
+    is_new: BoolArray
+
+
+NEW_CLIQUE_P = 0.9
+"""Belief in a body that nobody knew, before its sightings are counted."""
+
+
+def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
+    """Enter what a session found.
+
+    Args:
+        living: the map as it was.
+        p_site: (S,) belief in its sites, at the beginning of the session.
+        found: the session's landmarks.
+        config: how far landmarks of one body may be apart.
+        drift_m: by which places may have been off when the session was solved.
+    """
+    expected = replace(living, sites=replace(living.sites, p_here=p_site))
+    clique_id = _bodies(expected, found, config, drift_m)
+    if not np.array_equal(clique_id, living.members.clique_id):
+        before, (living, moved_to) = relabelled(living, clique_id)[0], relabelled(expected, clique_id)
+        if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
+            before = living
+        p_site = living.sites.p_here
+        found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
+    else:
+        before = living
+    members, cliques_ever = _with_members(living, found, config)
+    clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
+    site_of = _standing_at(living, found, clique)
+
+    new = np.flatnonzero(found.place < 0)
+    fresh = np.unique(clique[new][[int(c) not in site_of for c in clique[new]]])  # cliques that get a new site
+    new_ids = living.n_sites_ever + np.arange(len(fresh))
+    site_of |= {int(c): int(s) for c, s in zip(fresh, new_ids, strict=True)}
+    site = np.array([site_of[int(c)] for c in clique[new]], dtype=np.int64)
+
+    order = np.concatenate([np.flatnonzero(found.place >= 0), new])
+    seen = found.place[found.place >= 0]
+    position, covariance = with_session(
+        living.places.position_m,
+        living.covariance_m2,
+        seen,
+        found.position_m[order],
+        of_places(found.covariance_m2, order),
+        drift_m,
+    )
+    nothing = np.zeros(len(new), dtype=np.int64)
+    places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
+    places = replace(places, position_m=position)
+    sites, p_start, is_new = _with_sites(living, p_site, found, clique, fresh, new_ids)
+    sorted_rows = np.lexsort((places.landmark_id, places.site_id))
+    rank = np.empty(len(sorted_rows), dtype=np.int64)
+    rank[sorted_rows] = np.arange(len(sorted_rows))
+    place = found.place.copy()
+    place[new] = len(living.places) + np.arange(len(new))
+    return Extended(
+        before,
+        replace(
+            living,
+            members=members,
+            sites=sites,
+            places=places[sorted_rows],
+            covariance_m2=of_places(covariance, sorted_rows),
+            n_cliques_ever=cliques_ever,
+            n_sites_ever=living.n_sites_ever + len(fresh),
+        ),
+        found.landmark_id,
+        rank[place],
+        p_start,
+        is_new,
+    )
+
+
+def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tuple[Members, int]:
+    """The map's landmarks and the new ones, these with cliques of their own or in those they stand among."""
+    members = living.members
+    is_new = ~np.isin(found.landmark_id, members.landmark_id)
+    new = np.flatnonzero(is_new)
+    if not len(new):
+        return members, living.n_cliques_ever
+    if config.cliques:
+        clique = living.n_cliques_ever + _numbered(found.object_id[new], found, new, config.clique_reach_m)
+        _join_known(clique, new, members, found, config.clique_reach_m)
+    else:
+        clique = living.n_cliques_ever + np.arange(len(new))
+    off = np.zeros(len(new), dtype=np.bool_)
+    both = members.joined(Members(found.landmark_id[new], found.class_id[new], clique, off, off))
+    return both[np.argsort(both.landmark_id, kind="stable")], int(clique.max(initial=living.n_cliques_ever - 1)) + 1
+
+
+def _numbered(object_id: IntArray, found: Found, new: IntArray, reach_m: float) -> IntArray:
+    """Bodies of new landmarks, from 0: by the detector of objects where it says something, else by proximity."""
+    number = np.zeros(len(new), dtype=np.int64)
+    told = object_id >= 0
+    number[told] = np.unique(object_id[told], return_inverse=True)[1].ravel()
+    first = len(np.unique(object_id[told]))
+    rest = new[~told]
+    if len(rest):
+        number[~told] = first + group(found.position_m[rest], found.class_id[rest], reach_m=reach_m)
+    return number
+
+
+def _join_known(clique: IntArray, new: IntArray, members: Members, found: Found, reach_m: float) -> None:
+    """A body of which another landmark was missed at first: the same object, or within reach of all of its class."""
+    old = np.flatnonzero(np.isin(found.landmark_id, members.landmark_id))
+    old_clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id[old])]
+    for name in np.unique(clique):
+        mine = np.flatnonzero(clique == name)
+        body, kind = found.object_id[new[mine[0]]], found.class_id[new[mine[0]]]
+        if body >= 0:
+            same = old_clique[found.object_id[old] == body]
+            clique[mine] = same[0] if len(same) else name
+            continue
+        near = {}
+        for other in np.unique(old_clique[(found.class_id[old] == kind) & (kind >= 0)]):
+            theirs = old[old_clique == other]
+            gap = np.linalg.norm(found.position_m[new[mine]][:, None] - found.position_m[theirs][None], axis=2).max()
+            if gap <= reach_m:
+                near[float(gap)] = int(other)
+        if near:
+            clique[mine] = near[min(near)]
+
+
+def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: float) -> IntArray:
+    """(L,) cliques of the map's landmarks: taken apart whose members went apart, and put together that moved as one."""
+    if not config.cliques or not len(living.members):
+        return living.members.clique_id
+    members, places = living.members, living.places
+    stood = living.place_row(members.landmark_id, living.site_of())
+    _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
+    known = stood[member] >= 0
+    member, row = member[known], row[known]
+    fate = np.full(len(members), Fate.UNSEEN, dtype=np.int64)
+    fate[member] = np.where(found.place[row] == stood[member], Fate.STAYED, Fate.MOVED)
+    if not (fate == Fate.MOVED).any():
+        return _torn(living, members.clique_id, found, config.clique_reach_m)
+    before = places.position_m[np.maximum(stood, 0)]
+    after, spread = before.copy(), np.zeros((len(members), 2, 2))
+    after[member] = found.position_m[row]
+    spread[member] = blocks(found.covariance_m2)[row] + blocks(living.covariance_m2)[stood[member]]
+    spread += drift_m**2 * np.eye(2)
+    clique_id = regrouped(
+        members.clique_id,
+        members.class_id,
+        fate,
+        before,
+        after,
+        spread,
+        reach_m=config.clique_reach_m,
+        next_id=living.n_cliques_ever,
+    )
+    return _torn(living, clique_id, found, config.clique_reach_m)
+
+
+def _torn(living: LivingMap, clique_id: IntArray, found: Found, reach_m: float) -> IntArray:
+    """Cliques without members that cannot be where the others are: a clique stands at one site.
+
+    Those who stand at another known site, or at a new place though they have one at the site of the others, or out of
+    reach of these, are cliques of their own. Those at the site that was believed in most keep the clique.
+    """
+    members, places, sites = living.members, living.places, living.sites
+    label = clique_id.copy()
+    next_id = max(living.n_cliques_ever, int(label.max(initial=-1)) + 1)
+    _, member, row = np.intersect1d(members.landmark_id, found.landmark_id, return_indices=True)
+    at = np.where(found.place[row] >= 0, np.append(places.site_id, -1)[found.place[row]], -1)
+    for name in np.unique(label[member]):
+        mine = np.flatnonzero(label[member] == name)
+        known = mine[at[mine] >= 0]
+        if len(mine) < 2 or not len(known):
+            continue
+        believed = sites.p_here[np.searchsorted(sites.site_id, at[known])]
+        main = at[known[np.argmax(believed)]]
+        there = mine[at[mine] == main]
+        has_one = living.place_row(members.landmark_id[member[mine]], np.full(len(mine), main)) >= 0
+        gap = np.linalg.norm(found.position_m[row[mine]][:, None] - found.position_m[row[there]][None], axis=2)
+        apart = mine[(at[mine] != main) & ((at[mine] >= 0) | has_one | (gap.max(axis=1) > reach_m))]
+        nowhere = row[apart[at[apart] < 0]]
+        bodies = [apart[at[apart] == site] for site in np.unique(at[apart]) if site >= 0]
+        if len(nowhere):
+            number = group(found.position_m[nowhere], found.class_id[nowhere], reach_m=reach_m)
+            bodies += [apart[at[apart] < 0][number == k] for k in np.unique(number)]
+        for body in bodies:
+            label[member[body]] = next_id
+            next_id += 1
+    return label
+
+
+def _standing_at(living: LivingMap, found: Found, clique: IntArray) -> dict[int, int]:
+    """For every clique that stands at a known site which one."""
+    rows = np.flatnonzero(found.place >= 0)
+    return {int(clique[k]): int(living.places.site_id[found.place[k]]) for k in rows}
+
+
+def _with_sites(
+    living: LivingMap,
+    p_site: FloatArray,
+    found: Found,
+    clique: IntArray,
+    fresh: IntArray,
+    new_ids: IntArray,
+) -> tuple[Sites, FloatArray, BoolArray]:
+    """The map's sites and the new ones, with beliefs before the session's looks are counted."""
+    p_start = p_site.copy()
+    p_new, first, last = np.zeros(len(fresh)), np.zeros(len(fresh)), np.zeros(len(fresh))
+    for k, name in enumerate(fresh):
+        mine = np.flatnonzero((clique == name) & (found.place < 0))
+        first[k], last[k] = found.first_s[mine].min(), found.last_s[mine].max()
+        old = np.flatnonzero(living.sites.clique_id == name)
+        p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else NEW_CLIQUE_P
+        p_start[old] *= 1.0 - p_new[k]
+    sites = living.sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))
+    return sites, np.append(p_start, p_new), np.arange(len(sites)) >= len(living.sites)

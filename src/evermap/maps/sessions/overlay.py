@@ -1,0 +1,415 @@
+"""Which cliques stand where the map has them: the joint search over changes, for bodies that are known (MATH.md 5).
+
+A session that was solved alone is a joint Gaussian over its landmarks, in a frame of its own, with trajectory and
+calibration marginalised. Laid over the map by an unknown rigid motion, the landmarks that stand at places of the map
+differ from these by `e ~ N(0, Sigma + P)`, the motion's freedom included. A body that is not at any of its sites says
+nothing about that motion; where it is now has the density of a move. So an assignment of a site, or none, to every
+clique has a likelihood in closed form, and given all other cliques the options of one are a conditional Gaussian each:
+exact coordinate ascent, one change at a time, from what most landmarks agree on.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from evermap.geometry import se2
+from evermap.geometry.rigid import AGREE_M, consensus, rigid
+from evermap.types import FloatArray, IntArray
+
+ELSEWHERE = -1
+"""Option of a clique that stands at no known site."""
+FREE_MOTION = (20.0, 20.0, 3.0)
+"""Standard deviations (m, m, rad) of the motion between session and map, around the one that was agreed on."""
+NUDGE_M = 0.7
+SHARE_NUDGED = 0.5
+"""Moves: this share are shifts of this standard deviation an axis, the others lead anywhere."""
+TURN_M = 0.35
+"""Standard deviation of how members of a body move against each other when it is moved: it may be turned."""
+LOG_P_SPLIT = math.log(1e-3)
+"""Log probability that landmarks which were taken for one body are not."""
+SMALLEST_ROOM_M2 = 50.0
+DRIFTS_M = (0.01, 0.02, 0.04, 0.08)
+"""Standard deviations by which landmarks may not quite be where they were, though nobody moved them: another robot with
+errors of its own, warmth, a sensor that sees another corner. Each is half as probable as the one before, a session."""
+FAR_M = 2.0
+HOPELESS = -200.0
+"""Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
+LOG_P_COARSER = math.log(0.5)
+LOG_P_ANOTHER_PLACE = math.log(1e-3)
+"""Log probability that a session is of another place, where the map's identities stand anywhere."""
+MOST_FLIPS = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Sighted:
+    """Landmarks of a session that was solved alone.
+
+    Attributes:
+        position_m: (L, 2) in the session's frame.
+        covariance_m2: (2 L, 2 L).
+        clique: (L,) row of the clique of each.
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    clique: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Places of these landmarks in the map.
+
+    Attributes:
+        position_m, covariance_m2: (P, 2), (2 P, 2 P), in the map's frame.
+        landmark: (P,) row of the session's landmark.
+        site: (P,) row of its site.
+        log_p_site: (S,) log probability that the clique of each site stands there, before this session.
+        log_p_elsewhere: (C,) log probability that a clique stands at none of its sites.
+    """
+
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    landmark: IntArray
+    site: IntArray
+    log_p_site: FloatArray
+    log_p_elsewhere: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """How a session lies over the map.
+
+    Attributes:
+        pose_map_session: (3,) the rigid motion.
+        place: (L,) row of the place at which each landmark stands, `ELSEWHERE` where it stands at none.
+        probability: (L,) of that, given what is decided of the others.
+        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
+    """
+
+    pose_map_session: FloatArray
+    place: IntArray
+    probability: FloatArray
+    drift_m: float
+
+
+def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay | None:
+    """The most probable assignment of sites to cliques, and the motion that goes with it.
+
+    Args:
+        sighted: the session's landmarks.
+        known: their places in the map.
+        search: 'joint' weighs every clique with the motion, and all it depends on, marginalised; 'gate' decides each by
+            itself, at the motion that most landmarks agree on; 'none' leaves each at its most probable site.
+
+    Returns:
+        None where no two landmarks stand to each other as in the map, or where another place explains all better.
+    """
+    if len(known.landmark) < 2:
+        return None
+    weight = np.exp(known.log_p_site[known.site])
+    motion, _ = consensus(
+        sighted.position_m[known.landmark], known.position_m, landmark=known.landmark, weight=np.maximum(weight, 1e-3)
+    )
+    gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
+    if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
+        return None
+    options = _Options(sighted, known, motion)
+    if search == "none":
+        chosen = options.likeliest_sites()
+    elif search == "gate":
+        chosen = options.gated(options.agreeing())
+    else:
+        chosen = _joint(options)
+    if options.n_standing(chosen) < 2:
+        return None
+    if search == "joint" and not (options.is_this_place(chosen) and options.outweighs_the_rest(chosen)):
+        return None
+    return options.concluded(chosen, split=search == "joint")
+
+
+def _joint(options: _Options) -> IntArray:
+    """The most probable assignment, and with it how well sessions agree at all."""
+    best, highest, drift_m = options.agreeing(), -math.inf, DRIFTS_M[0]
+    for k, options.drift_m in enumerate(DRIFTS_M):
+        chosen = options.climb(best)
+        score = options.log_probability(chosen)
+        # bodies that moved together agree, too, on a motion of their own: what stands may be the rest
+        rest = options.climb(options.rest_of(chosen))
+        if np.sum(rest != ELSEWHERE) >= 2 and (at := options.log_probability(rest)) > score:  # two tell the motion
+            chosen, score = rest, at
+        score += k * LOG_P_COARSER
+        if score > highest:  # the next may still be better: with more drift other bodies stay
+            best, highest, drift_m = chosen, score, options.drift_m
+    options.drift_m = drift_m
+    return best
+
+
+class _Options:
+    """Cliques with their options, linearised at one motion."""
+
+    def __init__(self, sighted: Sighted, known: Known, motion: FloatArray) -> None:
+        self.sighted, self.known, self.motion = sighted, known, motion
+        self.landmark_m = se2.transform(motion, sighted.position_m)
+        turn = np.kron(np.eye(len(self.landmark_m)), se2.rotation(motion[2]))
+        # the session turned with the map, and the motion's own freedom
+        middle = self.landmark_m - self.landmark_m.mean(axis=0)
+        freedom = se2.rigid_directions(middle) * FREE_MOTION
+        self._session = turn @ sighted.covariance_m2 @ turn.T
+        self._freedom = freedom @ freedom.T
+        self.drift_m = DRIFTS_M[0]
+        spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
+        self._log_room = -math.log(max(float(np.prod(spread)), SMALLEST_ROOM_M2))
+        self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
+        order = np.argsort(known.site, kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(known.site[order])) + 1)
+        self._rows = {int(known.site[part[0]]): part for part in parts if len(part)}
+        gap = np.linalg.norm(self.landmark_m[known.landmark] - known.position_m, axis=1)
+        self._gap_m = {site: float(gap[rows].max()) for site, rows in self._rows.items()}
+        self._hopeless: dict[int, float] = {}
+        for site, rows in self._rows.items():
+            self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
+
+    def likeliest_sites(self) -> IntArray:
+        """(C,) for every clique its most probable site; `ELSEWHERE` where it is more probably away."""
+        chosen = np.full(len(self.sites), ELSEWHERE, dtype=np.int64)
+        for clique, sites in enumerate(self.sites):
+            if sites:
+                best = max(sites, key=lambda site: float(self.known.log_p_site[site]))
+                if self.known.log_p_site[best] > self.known.log_p_elsewhere[clique]:
+                    chosen[clique] = best
+        return chosen
+
+    def agreeing(self) -> IntArray:
+        """(C,) for every clique the site that it lies nearest to, if that is near."""
+        chosen = np.full(len(self.sites), ELSEWHERE, dtype=np.int64)
+        for clique, sites in enumerate(self.sites):
+            near = [(self._gap_m[site], site) for site in sites]
+            if near and min(near)[0] < AGREE_M:
+                chosen[clique] = min(near)[1]
+        return chosen
+
+    def rest_of(self, chosen: IntArray) -> IntArray:
+        """(C,) those that are elsewhere at their most probable sites, and those that stand elsewhere."""
+        likely = self.likeliest_sites()
+        return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
+
+    def climb(self, chosen: IntArray) -> IntArray:
+        """From an assignment to one that no change of a single clique makes more probable."""
+        chosen = chosen.copy()
+        seen = {chosen.tobytes()}
+        for _ in range(MOST_FLIPS):
+            table = self._scores(chosen)
+            gain, clique, option = 0.0, -1, ELSEWHERE
+            for c, scores in enumerate(table):
+                for site, score in scores.items():
+                    if score - scores[int(chosen[c])] > gain + 1e-9:
+                        gain, clique, option = score - scores[int(chosen[c])], c, site
+            if clique < 0:
+                break
+            chosen[clique] = option
+            if chosen.tobytes() in seen:  # two that hold each other: the rest of the way leads back
+                break
+            seen.add(chosen.tobytes())
+        return chosen
+
+    def gated(self, chosen: IntArray) -> IntArray:
+        """(C,) every clique by itself, at the motion that was agreed on."""
+        table = self._scores(chosen)
+        return np.array([max(scores, key=lambda o: scores[o]) for scores in table], dtype=np.int64)
+
+    def log_probability(self, chosen: IntArray) -> float:
+        """Of an assignment with all that was seen, up to a constant that all assignments share."""
+        total, _ = self._log_standing(chosen)
+        for clique, sites in enumerate(self.sites):
+            if sites and chosen[clique] == ELSEWHERE:
+                total += max(self._log_elsewhere(self._rows[other]) for other in sites)
+        return total
+
+    def is_this_place(self, chosen: IntArray) -> bool:
+        """Whether what stands where it stood outweighs the surprise that all else was moved.
+
+        In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
+        """
+        here, count = self._log_standing(chosen)
+        return here > LOG_P_ANOTHER_PLACE + count * self._log_room
+
+    def outweighs_the_rest(self, chosen: IntArray) -> bool:
+        """False where a single body says where the session is, and is less likely to have stayed than what it denies.
+
+        Two that stand to each other as in the map have hardly both moved. One fits itself wherever it is.
+        """
+        log_odds = {
+            c: max(float(self.known.log_p_site[site]) for site in sites) - float(self.known.log_p_elsewhere[c])
+            for c, sites in enumerate(self.sites)
+            if sites
+        }
+        stand = [c for c in log_odds if chosen[c] != ELSEWHERE]
+        denied = [odds for c, odds in log_odds.items() if chosen[c] == ELSEWHERE]
+        return len(stand) != 1 or not denied or log_odds[stand[0]] > sum(denied)
+
+    def _log_standing(self, chosen: IntArray) -> tuple[float, int]:
+        """Log probability of the options, with the density of all that stands at its site; and how many places do."""
+        error, inverse, rows = self._field(chosen)
+        log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
+        total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - len(rows) * math.log(2.0 * math.pi)
+        for clique, sites in enumerate(self.sites):
+            if sites:
+                site = int(chosen[clique])
+                total += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self.known.log_p_site[site])
+        return total, len(rows)
+
+    def n_standing(self, chosen: IntArray) -> int:
+        """Landmarks that stand where the map has them."""
+        return len(np.unique(self.known.landmark[self._chosen_rows(chosen)]))
+
+    def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
+        """The assignment, landmark by landmark, with bodies taken apart whose members disagree."""
+        table = self._scores(chosen)
+        place = np.full(len(self.landmark_m), ELSEWHERE, dtype=np.int64)
+        probability = np.zeros(len(place))
+        for clique, scores in enumerate(table):
+            values = np.array(list(scores.values()))
+            share = np.exp(values - values.max())
+            share /= share.sum()
+            best = int(chosen[clique])
+            mine = np.flatnonzero(self.sighted.clique == clique)
+            probability[mine] = share[list(scores).index(best)]
+            if best != ELSEWHERE:
+                rows = self._rows[best]
+                place[self.known.landmark[rows]] = rows
+            elif split and len(mine) > 1:
+                self._split(clique, chosen, scores[ELSEWHERE], place)
+        rows = self._chosen_rows(chosen)
+        matched = self.known.landmark[rows]
+        motion = self.motion
+        if len(rows) >= 2:
+            motion = rigid(self.sighted.position_m[matched], self.known.position_m[rows])
+        return Overlay(motion, place, probability, self.drift_m)
+
+    def _split(self, clique: int, chosen: IntArray, together: float, place: IntArray) -> None:
+        """Members that stand where they stood, while the body as a whole does not."""
+        error, inverse, rows = self._field(chosen)
+        for site in self.sites[clique]:
+            stay = []
+            total = LOG_P_SPLIT + float(self.known.log_p_elsewhere[clique])
+            for row in self._rows[site]:
+                one = np.array([row])
+                at_place = self._log_at(one, rows, error, inverse)
+                moved = self._log_elsewhere(one)
+                stay.append(at_place > moved)
+                total += max(at_place, moved)
+            if any(stay) and total > together:
+                kept = self._rows[site][np.array(stay)]
+                place[self.known.landmark[kept]] = kept
+                return
+
+    def _chosen_rows(self, chosen: IntArray) -> IntArray:
+        parts = [self._rows[int(site)] for site in chosen if site != ELSEWHERE]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
+
+    def _scores(self, chosen: IntArray) -> list[dict[int, float]]:
+        """For every clique the log probability of its options, given what is chosen for the others."""
+        error, inverse, rows = self._field(chosen)
+        start = {}
+        at = 0
+        for site in chosen:
+            if site != ELSEWHERE:
+                start[int(site)] = at
+                at += len(self._rows[int(site)])
+        pull = inverse @ error
+        table: list[dict[int, float]] = []
+        for clique, sites in enumerate(self.sites):
+            scores = {ELSEWHERE: float(self.known.log_p_elsewhere[clique])}
+            if not sites:
+                table.append(scores)
+                continue
+            mine = int(chosen[clique])
+            others: tuple[IntArray, FloatArray, FloatArray] | None = None
+            for site in sites:
+                prior = float(self.known.log_p_site[site])
+                if site == mine:  # leave-one-out by the inverse alone
+                    block = slice(2 * start[site], 2 * (start[site] + len(self._rows[site])))
+                    precision = inverse[block, block]
+                    squared = float(pull[block] @ np.linalg.solve(precision, pull[block]))
+                    scores[site] = prior + 0.5 * float(np.linalg.slogdet(precision)[1]) - 0.5 * squared
+                    scores[site] -= 0.5 * len(precision) * math.log(2.0 * math.pi)
+                    continue
+                if site in self._hopeless:
+                    scores[site] = self._hopeless[site]
+                    continue
+                if others is None:
+                    others = self._without(mine, rows, error, inverse, start)
+                scores[site] = prior + self._log_at(self._rows[site], *others)
+                if self._gap_m[site] > FAR_M and scores[site] < HOPELESS:
+                    self._hopeless[site] = scores[site]
+            best = max(sites, key=lambda site: scores[site])
+            scores[ELSEWHERE] += self._log_elsewhere(self._rows[best])
+            table.append(scores)
+        return table
+
+    def _without(
+        self,
+        site: int,
+        rows: IntArray,
+        error: FloatArray,
+        inverse: FloatArray,
+        start: dict[int, int],
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Rows, errors and inverse covariance of all that is chosen, but one site."""
+        if site == ELSEWHERE:
+            return rows, error, inverse
+        kept = np.ones(len(rows), dtype=np.bool_)
+        kept[start[site] : start[site] + len(self._rows[site])] = False
+        both = np.repeat(kept, 2)
+        ties = inverse[np.ix_(both, ~both)]
+        rest = inverse[np.ix_(both, both)] - ties @ np.linalg.solve(inverse[np.ix_(~both, ~both)], ties.T)
+        return rows[kept], error[both], rest
+
+    def _log_at(self, of: IntArray, rows: IntArray, error: FloatArray, inverse: FloatArray) -> float:
+        """Log density of places `of`, being where their landmarks are, given those of `rows`."""
+        mine = (self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]).ravel()
+        across = self._covariance(of, rows)
+        gain = across @ inverse
+        off = mine - gain @ error
+        spread = self._covariance(of, of) - gain @ across.T
+        sign, log_volume = np.linalg.slogdet(spread)
+        if sign <= 0:
+            return -math.inf
+        squared = float(off @ np.linalg.solve(spread, off))
+        return -0.5 * (squared + float(log_volume) + len(off) * math.log(2.0 * math.pi))
+
+    def _log_elsewhere(self, of: IntArray) -> float:
+        """Log density of the landmarks of places `of`, if their body was moved."""
+        step = self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]
+        middle = step.mean(axis=0)
+        near = math.log(SHARE_NUDGED) - math.log(2.0 * math.pi * NUDGE_M**2) - 0.5 * float(middle @ middle) / NUDGE_M**2
+        log_density = float(np.logaddexp(near, math.log(1.0 - SHARE_NUDGED) + self._log_room))
+        rest = step - middle
+        count = 2 * (len(of) - 1)
+        return log_density - 0.5 * float((rest**2).sum()) / TURN_M**2 - 0.5 * count * math.log(2 * math.pi * TURN_M**2)
+
+    def _field(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Differences, inverse of their covariance, and rows of all places that are chosen."""
+        rows = self._chosen_rows(chosen)
+        return (*self._whitened(rows), rows)
+
+    def _whitened(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        error = (self.landmark_m[self.known.landmark[rows]] - self.known.position_m[rows]).ravel()
+        if not len(rows):
+            return error, np.zeros((0, 0))
+        factor = cho_factor(self._covariance(rows, rows), lower=True)
+        return error, np.asarray(cho_solve(factor, np.eye(len(error))))
+
+    def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Between the differences of two sets of places."""
+        la, lb = se2.xy_rows(self.known.landmark[a]), se2.xy_rows(self.known.landmark[b])
+        pa, pb = se2.xy_rows(a), se2.xy_rows(b)
+        both: FloatArray = (
+            self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)] + self._freedom[np.ix_(la, lb)]
+        )
+        both[pa[:, None] == pb[None, :]] += self.drift_m**2
+        return both

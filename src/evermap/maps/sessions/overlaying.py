@@ -1,0 +1,188 @@
+"""A session laid over the map: which of the map's places its landmarks stand at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.geometry import se2
+from evermap.geometry.rigid import consensus, rigid
+from evermap.maps.living import LivingMap
+from evermap.maps.sessions.geometry import of_places
+from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+SMALLEST_P = 1e-6
+BENT_M, BENT_CLIQUES = 0.15, 3
+"""A session is bent where this many bodies seem to have moved by one rigid motion, to within this distance [m]."""
+BENT_ROUNDS = 5
+"""Refits of that motion to the bodies that agree with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """Where the landmarks of a session stand in the map.
+
+    Attributes:
+        landmark_id: (K,) landmarks of the session, sorted.
+        pose_map_session: (3,) motion from the session's frame to the map's.
+        place: (K,) row of the map's places, `ELSEWHERE` where a landmark stands at none of its own, or is new.
+        probability: (K,) of that.
+        drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
+        assumed: (K,) those that seem to have moved and are taken to stand, since the session seems bent; see `unbent`.
+    """
+
+    landmark_id: IntArray
+    pose_map_session: FloatArray
+    place: IntArray
+    probability: FloatArray
+    drift_m: float
+    assumed: BoolArray
+
+    def as_seen(self) -> Laid:
+        """The same without what is assumed."""
+        place = np.where(self.assumed, ELSEWHERE, self.place)
+        return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
+
+
+def laid_over(
+    living: LivingMap,
+    p_site: FloatArray,
+    landmark_id: IntArray,
+    position_m: FloatArray,
+    covariance_m2: FloatArray,
+    search: str,
+) -> Laid | None:
+    """Find a session in the map.
+
+    Args:
+        living: the map.
+        p_site: (S,) probability of its sites, at the beginning of the session.
+        landmark_id: (K,) landmarks of the session.
+        position_m: (K, 2) in its own frame.
+        covariance_m2: (2 K, 2 K).
+        search: see `overlay.lay_over`.
+
+    Returns:
+        None where the session shows nothing that stands as in the map.
+    """
+    members, places, sites = living.members, living.places, living.sites
+    at = np.minimum(np.searchsorted(members.landmark_id, landmark_id), max(len(members) - 1, 0))
+    known = members.landmark_id[at] == landmark_id if len(members) else np.zeros(len(landmark_id), np.bool_)
+    seen = np.flatnonzero(known)
+    row_of = {int(landmark_id[k]): n for n, k in enumerate(seen)}
+    landmark = np.array([row_of.get(int(name), -1) for name in places.landmark_id], dtype=np.int64)
+    used = np.flatnonzero(landmark >= 0)
+    if len(used) < 2:
+        return None
+    clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
+    used_sites, site = np.unique(places.site_id[used], return_inverse=True)
+    site_rows = np.searchsorted(sites.site_id, used_sites)
+    total = np.zeros(len(clique_ids))
+    of_known = np.isin(sites.clique_id, clique_ids)
+    np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
+    found = lay_over(
+        Sighted(position_m[seen], of_places(covariance_m2, seen), clique.ravel().astype(np.int64)),
+        Known(
+            position_m=places.position_m[used],
+            covariance_m2=of_places(living.covariance_m2, used),
+            landmark=landmark[used],
+            site=site.ravel().astype(np.int64),
+            log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
+            log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
+        ),
+        search,
+    )
+    if found is None:
+        return None
+    place = np.full(len(landmark_id), ELSEWHERE, dtype=np.int64)
+    place[seen] = np.where(found.place >= 0, used[found.place], ELSEWHERE)
+    probability = np.ones(len(landmark_id))
+    probability[seen] = found.probability
+    assumed = np.zeros(len(place), dtype=np.bool_)
+    return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m, assumed)
+
+
+def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray) -> Laid:
+    """Where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid motion.
+
+    One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
+    by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
+    the session is straightened when it is solved with the map.
+
+    Args:
+        living: the map.
+        p_site: (S,) belief in its sites.
+        where: as most landmarks have it.
+        position_m: (K, 2) landmarks of `where` in the session's frame.
+    """
+    home = _homes(living, p_site, where)
+    moved = np.flatnonzero((where.place < 0) & (home >= 0))
+    places, body = living.places, living.members.clique_id[_members(living, where)]
+    place, probability = where.place.copy(), where.probability.copy()
+    while len(moved):
+        motion, agree = consensus(position_m[moved], places.position_m[home[moved]])
+        gap = np.full(len(moved), np.inf)
+        for _ in range(BENT_ROUNDS):
+            if np.count_nonzero(agree) < 2:
+                break
+            motion = rigid(position_m[moved[agree]], places.position_m[home[moved[agree]]])
+            rest = places.position_m[home[moved]] - se2.transform(motion, position_m[moved])
+            gap = np.hypot(*rest.T)
+            agree = gap < max(BENT_M, float(np.median(gap[agree])))
+        agree &= gap < BENT_M
+        fits = moved[agree]
+        if len(np.unique(body[fits])) < BENT_CLIQUES:
+            break
+        place[fits], probability[fits] = home[fits], 1.0
+        moved = moved[~agree]
+    return replace(where, place=place, probability=probability, assumed=(where.place < 0) & (place >= 0))
+
+
+def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
+    """Where a session lies if nothing has moved: every landmark of the map at its most probable place."""
+    home = _homes(living, p_site, where)
+    return replace(where, place=np.where(where.place >= 0, where.place, home))
+
+
+def _members(living: LivingMap, where: Laid) -> IntArray:
+    """(K,) rows of the map's members; arbitrary rows for landmarks that the map does not know."""
+    rows = np.searchsorted(living.members.landmark_id, where.landmark_id)
+    return np.minimum(rows, max(len(living.members) - 1, 0))
+
+
+def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
+    """(K,) rows of the map's places at which landmarks are most probably expected; -1 for none."""
+    site = replace(living, sites=replace(living.sites, p_here=p_site)).site_of()
+    at = _members(living, where)
+    known = living.members.landmark_id[at] == where.landmark_id
+    return np.where(known, living.place_row(where.landmark_id, site[at]), -1)
+
+
+def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
+    """Landmarks that were seen too rarely to say where they are, laid at the sites at which others of their body stand.
+
+    Whether their sightings fit there is seen when the session is solved with the map.
+
+    Args:
+        living: the map.
+        where: where all others lie.
+        landmark_id: (K,) those.
+    """
+    members, places = living.members, living.places
+    names = np.intersect1d(landmark_id, members.landmark_id)
+    laid = where.place >= 0
+    body = members.clique_id[np.searchsorted(members.landmark_id, where.landmark_id[laid])]
+    stands = dict(zip(body.tolist(), places.site_id[where.place[laid]].tolist(), strict=True))
+    clique = members.clique_id[np.searchsorted(members.landmark_id, names)]
+    place = living.place_row(names, np.array([stands.get(c, UNKNOWN) for c in clique.tolist()], dtype=np.int64))
+    names, place = names[place >= 0], place[place >= 0]
+    order = np.argsort(np.concatenate([where.landmark_id, names]), kind="stable")
+    return replace(
+        where,
+        landmark_id=np.concatenate([where.landmark_id, names])[order],
+        place=np.concatenate([where.place, place])[order],
+        probability=np.concatenate([where.probability, np.ones(len(names))])[order],
+        assumed=np.concatenate([where.assumed, np.zeros(len(names), dtype=np.bool_)])[order],
+    )

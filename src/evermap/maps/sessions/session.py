@@ -1,0 +1,337 @@
+"""The steps of a session in a living map, in the order in which `pipeline.run_session` takes them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.config import LivingConfig
+from evermap.errors import DataError
+from evermap.geometry.rigid import rigid
+from evermap.maps.learning import LongestLives, learned_lives
+from evermap.maps.living import EXISTS, Evidence, LivingMap
+from evermap.maps.missed import without_missed
+from evermap.maps.sessions import arrive, believe, decide
+from evermap.maps.sessions.believe import Looks, Sighting
+from evermap.maps.sessions.extend import Extended, Found, extended
+from evermap.maps.sessions.geometry import anchored, drifted, of_places, resized
+from evermap.maps.sessions.overlaying import Laid, all_at_home, laid_over, unbent, with_glimpsed
+from evermap.maps.sessions.own import of_unknown_size, own_landmarks
+from evermap.maps.sessions.refit import MOST_LOST, refitted
+from evermap.maps.sessions.size import log_ratio, settled
+from evermap.slam import session as of_slam
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.session import Prepared
+from evermap.slam.streaming import Outcome
+from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
+
+INLIER = 0.5
+LEAST_FIT = 0.75
+"""Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
+CREDIBLE = 0.6
+"""Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
+GLIMPSE_M = 0.4
+"""A landmark that was seen once, this close to its place, was seen there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Visit:
+    """A session as it was recorded, as the estimator wants it, and what the estimator made of it."""
+
+    recording: Recording
+    prepared: Prepared
+    outcome: Outcome
+
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first frame that has a pose."""
+        return float(self.recording.frames.stamp_s[self.prepared.pose_frame[0]])
+
+    @property
+    def end_s(self) -> float:
+        """Stamp of the last frame that was processed."""
+        return self.prepared.start_s + float(self.outcome.problem.stamp_s[-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Believed:
+    """The map with the session's beliefs.
+
+    Attributes:
+        living: all but stays and what is learned.
+        log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
+            log likelihood ratio, by clique, in the order of `believe.clique_rows`.
+        evidence: of every clique and frame.
+    """
+
+    living: LivingMap
+    log_evidence: FloatArray
+    evidence: Evidence
+
+
+def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, LivingMap]:
+    """The recording without landmarks that an operator deleted, and with the map's class numbers.
+
+    Raises:
+        DataError: another clock than the map's.
+    """
+    if len(living.places) and recording.clock != living.clock:
+        raise DataError(
+            f"{recording.name}: its stamps count '{recording.clock}', the map's '{living.clock}'",
+            field="stamp_s",
+            hint="sessions of one map need one clock, best seconds since 1970",
+        )
+    names = living.class_names + tuple(name for name in recording.class_names if name not in living.class_names)
+    number = np.array([names.index(name) for name in recording.class_names] + [UNKNOWN], dtype=np.int64)
+    kept = ~np.isin(recording.detections.landmark_id, living.members.landmark_id[living.members.deleted])
+    detections = rows_of(recording.detections, kept)
+    detections = replace(detections, class_id=number[detections.class_id])
+    return replace(recording, detections=detections, class_names=names), replace(
+        living,
+        class_names=names,
+        landmark_texts=tuple(sorted({*living.landmark_texts, *recording.landmark_names.values()})),
+        clock=recording.clock,
+    )
+
+
+def check_in_order(recording: Recording, living: LivingMap) -> None:
+    """Raise `DataError` for a session that begins before the newest one of the map."""
+    stamps = recording.frames.stamp_s
+    if len(stamps) and stamps[0] < living.session_start_s:
+        raise DataError(
+            f"{recording.name}: begins at {stamps[0]:.1f} s, before the newest session of the map, "
+            f"{living.session_start_s:.1f} s",
+            field="stamp_s",
+            hint="evermap.enter_session(store, recording), or evermap slam --map FILE, enter it where it belongs",
+        )
+
+
+def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConfig) -> Laid | None:
+    """Where the session lies in the map; None where it shows nothing that stands as in the map."""
+    own = own_landmarks(alone.outcome)
+    names = alone.prepared.landmark_id[own.row]
+    log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
+    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config.search)
+    if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
+        return None
+    if config.search == "joint":
+        where = unbent(living, p_site, where, own.position_m)
+    glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
+    return with_glimpsed(living, where, glimpsed)
+
+
+def refit(
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool
+) -> tuple[LivingMap, Laid, Visit]:
+    """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized.
+
+    A session that had to be straightened for that is asked again what stands where it stood.
+    """
+    outcome, names = alone.outcome, alone.prepared.landmark_id
+    size = outcome.scale
+    if outcome.log_scale_sigma > 0.0:
+        own = own_landmarks(outcome)
+        _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
+        places = where.place[where.place >= 0][theirs]
+        shown = log_ratio(
+            own.position_m[mine],
+            of_places(own.covariance_m2, mine),
+            living.places.position_m[places],
+            drifted(of_places(living.covariance_m2, places), where.drift_m),
+        )
+        known = living.log_size_variance, living.log_size_information
+        found = settled(*shown, (0.0, outcome.log_scale_sigma), *known)
+        living = resized(living, found.map_factor, found.variance, found.information)
+        size *= found.session_factor
+
+    def in_map(where: Laid) -> tuple[Outcome, bool]:
+        stand = np.flatnonzero(where.place >= 0)
+        row = np.searchsorted(names, where.landmark_id[stand])
+        position = living.places.position_m[where.place[stand]]
+        motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
+        covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
+        return refitted(outcome, prior, motion, size, row, position, covariance, robust=robust)
+
+    solved, straightened = in_map(where)
+    if where.assumed.any() and solved.inlier.mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
+        as_seen = where.as_seen()
+        other, straightened_too = in_map(as_seen)
+        if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
+            where, solved, straightened = as_seen, other, straightened_too
+    if straightened:
+        at_home = all_at_home(living, p_site, where)
+        solved, _ = in_map(at_home)
+        landmark = alone.prepared.problem.landmark_row[: len(solved.inlier)]
+        n_fit, count = (np.bincount(landmark, w, minlength=len(names)) for w in (solved.inlier, np.ones(len(landmark))))
+        stays = (2.0 * n_fit > count)[np.searchsorted(names, where.landmark_id)]
+        where = replace(
+            where,
+            place=np.where(stays, at_home.place, where.place),
+            probability=np.where(stays, 1.0, where.probability),
+        )
+        solved, _ = in_map(where)
+    return living, where, replace(alone, outcome=solved)
+
+
+def fits(visit: Visit, alone: Visit) -> bool:
+    """False for a session that the map contradicts: what fits together by itself does not fit once it is held there."""
+    return bool(visit.outcome.inlier.mean() >= LEAST_FIT * alone.outcome.inlier.mean())
+
+
+def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
+    """The map with the places and sites that the session found."""
+    in_place = None
+    if where is None:
+        variance = visit.outcome.log_scale_sigma**2
+        information = 1.0 / variance if variance > 0.0 else np.inf
+        living = replace(living, log_size_variance=variance, log_size_information=information)
+    else:
+        in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
+    own = own_landmarks(visit.outcome, in_place)
+    detection, landmark = _inliers(visit)
+    stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
+    count = len(visit.prepared.landmark_id)
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, landmark, stamps)
+    np.maximum.at(last, landmark, stamps)
+    kind = np.full(count, UNKNOWN, dtype=np.int64)
+    kind[landmark] = visit.recording.detections.class_id[detection]
+    seen = np.flatnonzero(np.isfinite(last[own.row]))
+    row = own.row[seen]
+    names = visit.prepared.landmark_id[row]
+    place, probability = np.full(len(names), -1, dtype=np.int64), np.ones(len(names))
+    if where is not None:
+        _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
+        place[here], probability[here] = where.place[there], where.probability[there]
+    covariance = of_places(own.covariance_m2, seen)
+    if where is None:
+        covariance = anchored(own.position_m[seen], covariance)
+    body = np.full(len(names), UNKNOWN, dtype=np.int64)
+    _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
+    body[here] = visit.recording.objects[there, 1]
+    found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row])
+    return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
+
+
+def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, FloatArray]:
+    """Which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor poses."""
+    recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
+    trajectory = of_slam.trajectory(prepared, outcome, recording, "")
+    stamps = recording.frames.stamp_s
+    frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
+    pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
+    detection, landmark = _inliers(visit)
+    place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
+    _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
+    place_of[rows] = entry.place[found]
+    _place_glimpsed(place_of, entry, visit)
+    hit = place_of[landmark]
+    frame = np.searchsorted(frames, recording.detections.frame[detection])
+    sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
+    seen = believe.looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
+    return seen, believe.sensor_poses(sighting, recording.sensor)
+
+
+def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Visit) -> None:
+    """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
+    living, estimate = entry.living, visit.outcome.estimate
+    names = visit.prepared.landmark_id
+    row = np.flatnonzero((place_of < 0) & estimate.known & np.isin(names, living.members.landmark_id))
+    member = np.searchsorted(living.members.landmark_id, names[row])
+    place = living.place_row(names[row], living.site_of()[member])
+    row, place = row[place >= 0], place[place >= 0]
+    near = np.hypot(*(estimate.landmark[row] - living.places.position_m[place]).T) < GLIMPSE_M
+    place_of[row[near]] = place[near]
+
+
+def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -> Believed:
+    """The map with the beliefs and the counts of the session."""
+    living, rows = entry.living, seen.rows
+    hit, missed = rows.hit, seen.counts & ~rows.hit
+    places = replace(
+        living.places,
+        n_hits=living.places.n_hits + np.bincount(seen.place[hit], minlength=len(living.places)),
+        n_misses=living.places.n_misses + np.bincount(seen.place[missed], minlength=len(living.places)),
+    )
+    count = len(living.sites)
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, rows.site[hit], rows.stamp_s[hit])
+    np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
+    sites = living.sites
+    if config.existence:
+        beliefs = believe.believed(
+            living, entry.p_start, seen, visit.recording.sensor, config, visit.start_s, visit.end_s
+        )
+        sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), believe.said(living, beliefs)
+        evidence = believe.evidence(living, beliefs)
+    else:
+        sites = replace(sites, p_here=_as_seen(living, rows.site[hit], last))
+        log_evidence, evidence = np.zeros(len(np.unique(sites.clique_id))), Evidence.empty()
+    stood = (entry.p_start >= EXISTS) & ~entry.is_new
+    arrived = np.isfinite(first) & ~stood & (sites.p_here >= EXISTS)
+    sites = replace(
+        sites,
+        since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
+        seen_s=np.maximum(living.sites.seen_s, last),
+    )
+    until_s = max(visit.end_s, living.stamp_s)
+    living = replace(living, stamp_s=until_s, session_start_s=visit.start_s, places=places, sites=sites)
+    return Believed(living, log_evidence, evidence)
+
+
+def decided(
+    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig, known: LivingMap | None = None
+) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """The map with its stays up to date and without what is forgotten, and what changed since the session before.
+
+    Args:
+        before: the map as the session found it.
+        now: with the session's beliefs.
+        seen: looks of the session.
+        visit: the session.
+        config: which parts of the engine are on.
+        known: a map that knows how long things stay, with what the session found; None for nothing.
+    """
+    longest = None
+    if known is not None and config.learn_lifetimes:
+        longest = LongestLives.of(known.stays, known.lives.looks_s, CREDIBLE)
+    arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
+    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s, longest)
+    changes = tuple(change.named(after.landmark_names) for change in changes)
+    if not config.learn_sight:
+        after = replace(after, sightlines=before.sightlines)
+    if config.cliques and config.existence and config.misses:
+        after = without_missed(before, after)
+    return decide.without_forgotten(after, config.most_sites), changes
+
+
+def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, config: LivingConfig) -> LivingMap:
+    """The map with what the session taught of lifetimes, and of from where places are seen."""
+    if config.learn_sight and config.existence:
+        names = entry.living.places.site_id, entry.living.places.landmark_id
+        p_there = entry.living.sites.p_here[seen.rows.site]
+        weight = np.where(seen.settled, 1.0, p_there)
+        lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight)
+        after = replace(after, sightlines=lines, views=after.views.seen_from(eye, after.stamp_s))
+    if config.learn_lifetimes:
+        after = replace(after, lives=learned_lives(after.stays, after.lives, after.stamp_s))
+    return after
+
+
+def _inliers(visit: Visit) -> tuple[IntArray, IntArray]:
+    """Rows of the detections that fit, and of their landmarks."""
+    good = np.flatnonzero(visit.outcome.inlier >= INLIER)
+    return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]
+
+
+def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
+    """Beliefs of a map that never doubts: a clique stands where it was seen last."""
+    p_here = living.sites.p_here.copy()
+    _, clique = believe.clique_rows(living.sites)
+    seen = np.unique(hit_site)
+    for row in np.unique(clique[seen]):
+        mine = np.flatnonzero(clique == row)
+        p_here[mine] = 0.0
+        p_here[mine[np.argmax(last_s[mine])]] = 1.0
+    return p_here

@@ -1,0 +1,1 @@
+"""Runs of the verbs: read, run, write."""

@@ -1,0 +1,135 @@
+"""When features vanished and returned: decisions of which one could be sure, and when the change can have happened.
+
+A change is decided at the first look after which the belief in the other state reaches a confidence. When it happened
+is another question, and the looks answer it: between two decisions there was one change, and its place has a
+posterior distribution over the gaps between the looks (uniform over time before, weighed by the looks' likelihoods).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.existence.protocol import Looks
+from evermap.types import BoolArray, FloatArray, IntArray
+
+TAIL = 0.025
+"""Posterior probability that a change lies before the interval given for it, and as much after it."""
+_SHORTEST_GAP_S = 1e-9
+"""Looks at one time are no time apart, but a change between them can be all that is left."""
+_CERTAIN = 700.0
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """C changes in the order in which they were decided.
+
+    Attributes:
+        feature: (C,) index of the feature.
+        returned: (C,) True where it came, False where it went.
+        stamp_s: (C,) when: median of the posterior.
+        earliest_s, latest_s: (C,) the looks between which it happened, with 95 % probability.
+        decided_s: (C,) the look at which it became clear.
+        confidence: (C,) belief in the new state then.
+    """
+
+    feature: IntArray
+    returned: BoolArray
+    stamp_s: FloatArray
+    earliest_s: FloatArray
+    latest_s: FloatArray
+    decided_s: FloatArray
+    confidence: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.feature)
+
+    def per_feature(self, n_features: int) -> IntArray:
+        """(F,) number of changes of each feature."""
+        return np.bincount(self.feature, minlength=n_features)
+
+
+def find_changes(looks: Looks, p_present: FloatArray, confidence: float) -> Changes:
+    """Changes of all features.
+
+    Args:
+        looks: by feature and time.
+        p_present: (M,) belief right after each look, nan where there is none.
+        confidence: belief in a state from which on it is taken to be so, above 0.5.
+    """
+    feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    state = np.where(p_present >= confidence, 1, np.where(p_present <= 1.0 - confidence, -1, 0))
+    sure = np.flatnonzero(state)
+    same = feature[sure[1:]] == feature[sure[:-1]]
+    flip = np.flatnonzero(same & (state[sure[1:]] != state[sure[:-1]])) + 1
+    decided = sure[flip]
+    entered = _since(sure, feature, flip)
+    returned = state[decided] == 1
+    stamp_s, before, after = _when(looks, entered, decided, returned)
+    belief = p_present[decided]
+    found = Changes(
+        feature=feature[decided],
+        returned=returned,
+        stamp_s=stamp_s,
+        earliest_s=looks.stamp_s[before],
+        latest_s=looks.stamp_s[after],
+        decided_s=looks.stamp_s[decided],
+        confidence=np.where(returned, belief, 1.0 - belief),
+    )
+    order = np.lexsort((found.feature, found.stamp_s, found.decided_s))
+    return Changes(*(getattr(found, name)[order] for name in Changes.__slots__))
+
+
+def _since(sure: IntArray, feature: IntArray, flip: IntArray) -> IntArray:
+    """The look at which the state that ends at each flip began to be sure: the flip before, or the first sure look."""
+    begins = np.ones(len(sure), dtype=np.bool_)
+    begins[1:] = feature[sure[1:]] != feature[sure[:-1]]
+    begins[flip] = True
+    latest = np.maximum.accumulate(np.where(begins, np.arange(len(sure)), 0))
+    return sure[latest[flip - 1]]
+
+
+def _when(
+    looks: Looks, entered: IntArray, decided: IntArray, returned: BoolArray
+) -> tuple[FloatArray, IntArray, IntArray]:
+    """Posterior of one change within each window of looks `entered` to `decided`: median, and the looks around 95 %.
+
+    If the change lies in the gap after look `k`, the looks up to `k` speak about the old state and later ones about
+    the new. All windows are laid one behind the other, so that no loop over them is needed.
+    """
+    if len(decided) == 0:
+        return np.zeros(0), decided, decided
+    length = decided - entered
+    begin = np.concatenate([[0], np.cumsum(length)])[:-1]
+    window = np.repeat(np.arange(len(length)), length)
+    gap = np.arange(length.sum()) - begin[window] + entered[window]  # the gap after this look
+
+    evidence = np.where(returned[window], -1.0, 1.0) * _log_ratio(looks)[gap]  # for the old state
+    evidence[begin] = 0.0  # the window opens after this look
+    running = np.cumsum(evidence)
+    duration_s = np.maximum(looks.stamp_s[gap + 1] - looks.stamp_s[gap], _SHORTEST_GAP_S)
+    log_weight = running + np.log(duration_s)
+    weight = np.exp(log_weight - np.maximum.reduceat(log_weight, begin)[window])
+    weight /= np.add.reduceat(weight, begin)[window]
+    total = np.cumsum(weight)  # grows by one from window to window
+
+    def entry(share: float) -> IntArray:
+        found = np.searchsorted(total, np.arange(len(length)) + share)
+        return np.clip(found, begin, begin + length - 1)
+
+    middle = entry(0.5)
+    left = total[middle] - np.arange(len(length)) - weight[middle]
+    inside = np.clip((0.5 - left) / weight[middle], 0.0, 1.0)
+    start_s, stop_s = looks.stamp_s[gap[middle]], looks.stamp_s[gap[middle] + 1]
+    return start_s + inside * (stop_s - start_s), gap[entry(TAIL)], gap[entry(1.0 - TAIL)] + 1
+
+
+def _log_ratio(looks: Looks) -> FloatArray:
+    """(M,) log likelihood of each look if there, minus that if not; certainties are cut to 700 nats."""
+    hit = looks.detected == 1.0
+    there = np.where(hit, 1.0 - looks.p_miss, looks.p_miss)
+    gone = np.where(hit, looks.p_false, 1.0 - looks.p_false)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.log(there) - np.log(gone)
+    return np.where(np.isnan(ratio), 0.0, np.clip(ratio, -_CERTAIN, _CERTAIN))

@@ -1,0 +1,216 @@
+"""The folder of a run: beliefs, changes, forecasts, summary, figures and report, whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap import __version__
+from evermap.io.columns import csv_bytes, named
+from evermap.runs.folder import SUMMARY, RunFolder, summary_text
+from evermap.runs.persist.draw import draw_run
+from evermap.runs.persist.report import render_report
+from evermap.runs.persist.run import PersistResult
+from evermap.runs.summary import peak_memory_mb, versions
+from evermap.types import Clock
+from evermap.viz.style import NamedFigure, save_png
+
+SCHEMA_VERSION = "1"
+FIGURES = 12
+
+
+def write_persist(
+    out: str | Path,
+    result: PersistResult,
+    *,
+    figures: int = FIGURES,
+    clock: Clock | None = None,
+    command: str = "",
+    read_s: float | None = None,
+    force: bool = False,
+    inputs: Iterable[str | Path | None] = (),
+    progress: Callable[[float, float], None] | None = None,
+) -> dict[str, Any]:
+    """Writes the folder of a run. Returns the content of `summary.json`.
+
+    Args:
+        out: the folder; an older run there is replaced at the end.
+        result: of `run_persist`.
+        figures: how many features get a figure of their own.
+        clock: of the stamps, for the figures; None guesses.
+        command: the command line, '' if there was none.
+        read_s: wall time of reading the table.
+        force: write into a folder that holds other files, too; they stay.
+        inputs: files that were read, beside the table.
+        progress: told after each figure.
+
+    Raises:
+        ConfigError: `out` must not or cannot be written.
+    """
+    with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
+        start = _now()
+        folder.path("beliefs.csv").write_bytes(_beliefs(result))
+        folder.path("forecasts.csv").write_bytes(_forecasts(result))
+        folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
+        if result.learned is not None:
+            from evermap.runs.persist.modelfile import save_models
+
+            save_models(result.models, result.learned.per, folder.path("model.json"))
+        written = _now()
+        drawn: list[NamedFigure] = []
+        total = min(figures, result.table.n_features) + 1 + (result.scores is not None)
+        for figure in draw_run(result, figures=figures, clock=clock):
+            save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
+            drawn.append(figure)
+            if progress:
+                progress(len(drawn), total)
+        timing = {
+            **({} if read_s is None else {"read_s": read_s}),
+            **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
+            "write_s": written - start,
+            "draw_s": _now() - written,
+        }
+        summary = persist_summary(result, command=command, timing=timing)
+        summary["outputs"] = sorted([*folder.files(), SUMMARY, "report.html"])
+        pages = [folder.path(f"figures/{figure.name}.png").read_bytes() for figure in drawn]
+        folder.path("report.html").write_text(render_report(result, summary, drawn, pages), encoding="utf-8")
+        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+    return summary
+
+
+def persist_summary(result: PersistResult, *, command: str, timing: dict[str, float]) -> dict[str, Any]:
+    """The content of `summary.json`; outside of `timing` and `versions` a function of the input and the choices."""
+    table, changes = result.table, result.changes
+    looked = table.looked
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "evermap": __version__,
+        "versions": versions(),
+        "command": command,
+        "source": table.source,
+        "config": result.config.to_dict(),
+        "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
+        "learning": _learning(result),
+        "counts": {
+            "rows": len(table),
+            "looks": int(looked.sum()),
+            "detections": int((table.detected == 1.0).sum()),
+            "features": table.n_features,
+            "features_detected": len(np.unique(table.feature[table.detected == 1.0])),
+            "classes": len(table.class_names),
+            "beliefs": int((~np.isnan(result.beliefs.p_exists)).sum()),
+            "vanished": int((~changes.returned).sum()),
+            "returned": int(changes.returned.sum()),
+            "duration_s": float(table.stamp_s.max() - table.stamp_s.min()),
+        },
+        "detector": {
+            name: {"least": float(values[looked].min()), "most": float(values[looked].max())}
+            for name, values in (("p_miss", table.p_miss), ("p_false", table.p_false))
+        },
+        "never_leave_share": _never_leave(result),
+        "expected_present_now": _number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
+        "merged_mass": _number(result.merged_mass),
+        "metrics": None if result.scores is None else {k: _number(v) for k, v in asdict(result.scores).items()},
+        "reliability": None if result.reliability is None else _reliability(result),
+        "timing": {
+            **timing,
+            "total_s": sum(timing.values()),
+            "peak_memory_mb": _number(peak_memory_mb()),
+            "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        },
+        "warnings": list(result.warnings),
+    }
+
+
+def _beliefs(result: PersistResult) -> bytes:
+    beliefs = result.beliefs
+    return csv_bytes(
+        {
+            "stamp_s": beliefs.stamp_s,
+            "feature_id": named(result.table.names, beliefs.feature),
+            "p_exists": beliefs.p_exists,
+        }
+    )
+
+
+def _forecasts(result: PersistResult) -> bytes:
+    """By feature and time; what is expected from now on stands where the forecast begins."""
+    stamp_s, p_exists = result.forecasts.stamp_s, result.forecasts.p_exists
+    features, steps = p_exists.shape
+    columns = {
+        "stamp_s": np.tile(stamp_s, features),
+        "feature_id": named(result.table.names, np.repeat(np.arange(features), steps)),
+        "p_exists": p_exists.ravel(),
+    }
+    for name in ("median_stay_s", "mean_stay_s", "mean_absence_s"):
+        column = np.full((features, steps), np.nan)
+        column[:, 0] = getattr(result.forecasts, name)
+        columns[name] = column.ravel()
+    return csv_bytes(columns)
+
+
+def _changes(result: PersistResult) -> str:
+    """One JSON object a line; ids that are numbers in the table are numbers here."""
+    names: tuple[Any, ...] = result.table.names
+    if all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names):
+        names = tuple(int(name) for name in names)
+    return "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in _rows(result, names))
+
+
+def _rows(result: PersistResult, names: tuple[Any, ...]) -> Iterator[dict[str, Any]]:
+    changes = result.changes
+    columns = ("stamp_s", "earliest_s", "latest_s", "decided_s", "confidence")
+    values = zip(*(getattr(changes, name).tolist() for name in columns), strict=True)
+    for feature, returned, row in zip(changes.feature.tolist(), changes.returned.tolist(), values, strict=True):
+        what = {"feature_id": names[feature], "change": "returned" if returned else "vanished"}
+        yield what | dict(zip(columns, row, strict=True))
+
+
+def _learning(result: PersistResult) -> dict[str, Any] | None:
+    """Whose looks were put together, and why each model is of its kind: evidence for looks that were held out."""
+    learned = result.learned
+    if learned is None:
+        return None
+    models = {
+        name or "all": {
+            "kind": choice.kind,
+            "held_out_s": choice.held_out_s,
+            "scores": {kind: _number(score) for kind, score in choice.scores.items()},
+        }
+        for name, choice in zip(result.models.names, learned.choices, strict=True)
+    }
+    return {"per": learned.per, "models": models}
+
+
+def _never_leave(result: PersistResult) -> dict[str, float]:
+    """Share of the features that never leave, by class, where the lifetime says so."""
+    models = zip(result.models.names, result.models.models, strict=True)
+    return {name or "all": float(getattr(getattr(m, "prior", None), "p_never_leaves", 0.0)) for name, m in models}
+
+
+def _reliability(result: PersistResult) -> dict[str, list[Any]]:
+    bins = result.reliability
+    assert bins is not None
+    return {
+        "edge": bins.edge.tolist(),
+        "count": bins.count.tolist(),
+        "belief": [_number(value) for value in bins.belief.tolist()],
+        "present": [_number(value) for value in bins.present.tolist()],
+    }
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
+
+
+def _now() -> float:
+    from time import perf_counter
+
+    return perf_counter()

@@ -1,0 +1,232 @@
+"""A run of `evermap track`: frames through the tracker, then tracks, static spells and lifetimes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from evermap.errors import ConfigError, DataError
+from evermap.io.text import counted
+from evermap.runs.track.config import TrackConfig
+from evermap.runs.track.detections import DetectionTable, said_of
+from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.sightings import lifetimes_of_sightings
+from evermap.tracking.record import Recorder, Tracks
+from evermap.tracking.spells import StaticSpells
+from evermap.tracking.tracker import Tracker
+from evermap.tracking.tracklets import Event
+from evermap.tracking.views import View
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+_GAP_STEPS = 10.0
+"""A time between frames that is so many times as long as usual is one at which nobody looked."""
+_SLOW_STEP_S = 2.0
+"""Frames that are farther apart than this say little about motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackResult:
+    """What came out of a run.
+
+    Attributes:
+        table: what was tracked.
+        config: the choices.
+        tracks: of objects that were confirmed, one row an object and frame.
+        track_of_detection: (M,) the object that each detection is of, `UNKNOWN` for one never confirmed.
+        events: all that happened, in order.
+        spells: times at which objects were seen to rest for at least `rest_for_s`.
+        lifetimes: samples of how long things stay, several rows a spell (see `survival.sightings`); None where the
+            beginning of no spell is bounded.
+        spell_of_lifetime: (N,) the spell that each row of `lifetimes` belongs to.
+        n_gaps: times at which nobody looked, between two frames.
+        seconds: wall time of the tracker.
+        warnings: remarks.
+    """
+
+    table: DetectionTable
+    config: TrackConfig
+    tracks: Tracks
+    track_of_detection: IntArray
+    events: tuple[Event, ...]
+    spells: StaticSpells
+    lifetimes: CensoredLifetimes | None
+    spell_of_lifetime: IntArray
+    n_gaps: int
+    seconds: float
+    warnings: tuple[str, ...]
+
+    def first_rows(self) -> IntArray:
+        """(T,) row of `tracks` at which each object begins."""
+        return np.unique(self.tracks.track_id, return_index=True)[1]
+
+    def class_of_track(self) -> IntArray:
+        """(T,) most probable class of each object in the end, in the order of their ids."""
+        ends = np.append(self.first_rows()[1:], len(self.tracks)) - 1
+        return np.asarray(self.tracks.class_p[ends].argmax(axis=1), dtype=np.int64)
+
+
+def run_track(
+    table: DetectionTable,
+    config: TrackConfig | None = None,
+    *,
+    confusion: FloatArray | None = None,
+    progress: Callable[[float, float], None] | None = None,
+) -> TrackResult:
+    """Track all frames of a table.
+
+    Args:
+        table: of `read_detections`.
+        config: the choices.
+        confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
+        progress: told after every hundredth frame what is done, and how many there are.
+
+    Raises:
+        ConfigError: choices that do not fit the table.
+        DataError: nothing was seen often enough to be an object.
+    """
+    config = config or TrackConfig()
+    if config.range_m is not None and table.sensor_m is None:
+        hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
+        raise ConfigError("nobody knows where the sensor was", field="--range-m", hint=hint)
+    names = table.class_names
+    tracker = Tracker(
+        replace(config.settings, class_speed_mps=config.speeds(names)),
+        n_classes=len(names),
+        confusion=confusion,
+        n_appearance=0 if table.appearance is None else table.appearance.shape[1],
+        priors=config.priors(names),
+    )
+    start = perf_counter()
+    recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
+    tracks = recorder.tracks()
+    if len(tracks) == 0:
+        hint = f"fewer detections to be believed: --set warm_up={max(1, config.settings.warm_up - 1)}"
+        if _usual_step_s(table) > _SLOW_STEP_S:
+            hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
+        raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
+    spells = _long_enough(tracker.static_spells(), config.settings.rest_for_s)
+    lifetimes, spell_of_lifetime = _lifetimes(spells, config.settings.rest_for_s)
+    confirmed = np.isin(track_of_detection, tracks.track_id)
+    return TrackResult(
+        table=table,
+        config=config,
+        tracks=tracks,
+        track_of_detection=np.where(confirmed, track_of_detection, UNKNOWN),
+        events=tuple(recorder.events),
+        spells=spells,
+        lifetimes=lifetimes,
+        spell_of_lifetime=spell_of_lifetime,
+        n_gaps=n_gaps,
+        seconds=perf_counter() - start,
+        warnings=tuple(_remarks(table, config, spells)),
+    )
+
+
+def _follow(
+    tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
+) -> tuple[Recorder, IntArray, int]:
+    """Frame after frame; between them, where nobody looked for long, blind ones."""
+    noise = _noise(table, config.settings.sigma_position_m)
+    step_s = _usual_step_s(table)
+    gap_s = config.gap_s or _GAP_STEPS * step_s
+    recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
+    for k, stamp_s in enumerate(table.stamp_s.tolist()):
+        rows = slice(int(table.first[k]), int(table.first[k + 1]))
+        found[rows], events = tracker.step(
+            stamp_s,
+            table.position_m[rows],
+            table.class_id[rows],
+            covariance_m2=None if noise is None else noise[rows],
+            appearance=None if table.appearance is None else table.appearance[rows],
+            view=_view(table, config, k),
+        )
+        recorder.add(tracker, events)
+        if k + 1 < table.n_frames and table.stamp_s[k + 1] - stamp_s > gap_s:
+            n_gaps += 1
+            centre_m = np.zeros(3) if table.sensor_m is None else table.sensor_m[k]
+            until_s = float(table.stamp_s[k + 1])
+            recorder.events.extend(_close_eyes(tracker, centre_m, stamp_s, until_s, min(step_s, gap_s)))
+        if progress and k % 100 == 99:
+            progress(k + 1, table.n_frames)
+    return recorder, found, n_gaps
+
+
+def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
+    """What could be seen in frame `k`, if that is known: a ball around the sensor."""
+    if config.range_m is None or table.sensor_m is None:
+        return None
+    return View.ball(table.sensor_m[k], config.range_m, config.settings.p_detect)
+
+
+def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
+    """Frames in which nothing can be seen, until what rests is kept and what moves is given up.
+
+    A filter's prediction over hours says nothing, and the first frame after would take every object for another.
+    """
+    nowhere = View.ball(centre_m, 0.0, 0.0)
+    n = tracker.settings.max_missed + 1
+    step_s = min(step_s, 0.5 * (until_s - stamp_s) / n)
+    events: list[Event] = []
+    for k in range(1, n + 1):
+        events.extend(tracker.step(stamp_s + k * step_s, np.empty((0, 3)), view=nowhere)[1])
+    return events
+
+
+def _noise(table: DetectionTable, sigma_m: float) -> FloatArray | None:
+    """(M, 3, 3), the settings' noise where a detection brings none."""
+    if table.covariance_m2 is None:
+        return None
+    return np.where(np.isnan(table.covariance_m2), sigma_m**2 * np.eye(3), table.covariance_m2)
+
+
+def _long_enough(spells: StaticSpells, rest_for_s: float) -> StaticSpells:
+    """Those seen to last: a slow object is where it was for a moment again and again, and does not rest."""
+    return spells[spells.last_s - spells.first_s >= rest_for_s]
+
+
+def _lifetimes(spells: StaticSpells, rest_for_s: float) -> tuple[CensoredLifetimes | None, IntArray]:
+    if not _bounded(spells).any():
+        return None, np.zeros(0, dtype=np.int64)
+    return lifetimes_of_sightings(
+        spells.elsewhere_s, spells.first_s, spells.last_s, spells.gone_s, least_stay_s=rest_for_s
+    )
+
+
+def _bounded(spells: StaticSpells) -> BoolArray:
+    """(K,) whether it is known when they can have begun."""
+    return np.asarray(np.isfinite(spells.elsewhere_s))
+
+
+def _usual_step_s(table: DetectionTable) -> float:
+    """Median time from frame to frame; any for a single frame."""
+    return float(np.median(np.diff(table.stamp_s))) if table.n_frames > 1 else 1.0
+
+
+def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -> list[str]:
+    remarks = said_of(table)
+    step_s = _usual_step_s(table)
+    if step_s > _SLOW_STEP_S:
+        remarks.append(f"frames are {step_s:.3g} s apart: what moves is hardly followed at that pace")
+    if config.range_m is None and table.sensor_m is not None:
+        remarks.append("without --range-m, what should be seen and is not counts for nothing")
+    unknown = int((~_bounded(spells)).sum())
+    if unknown:
+        what = f"{counted(unknown, 'spell')} with a beginning that nobody can bound"
+        remarks.append(f"{what}, as the place had not been looked at before: in spells.csv, not in lifetimes.csv")
+    return remarks
+
+
+def warm_up() -> None:
+    """Compile the kernels, or load them: a few frames with one object that comes, stays, goes, and comes back."""
+    tracker = Tracker()
+    here, nothing = np.zeros((1, 3)), np.empty((0, 3))
+    seen = View.ball(np.zeros(3), 1.0, 0.9)
+    for k in range(60):
+        tracker.step(0.1 * k, here if k < 30 else nothing)
+    tracker.step(7.0, here, view=seen)
+    _close_eyes(tracker, np.zeros(3), 7.0, 9.0, 0.1)
+    for k in range(20):
+        tracker.step(10.0 + 2.0 * k, nothing, view=seen)

@@ -1,0 +1,1 @@
+"""Sessions of recorded robots entered into one map while landmarks move, leave and come back."""

@@ -1,0 +1,1 @@
+"""Lifetimes learned from tracks, patrols and looks at rooms, against the truth."""

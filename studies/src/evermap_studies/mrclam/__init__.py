@@ -1,0 +1,1 @@
+"""All robots of the UTIAS recordings against the truth."""

@@ -1,0 +1,1 @@
+"""Landmarks with several discrete positions (Nielsen 2024): selectors, simulation and recordings."""

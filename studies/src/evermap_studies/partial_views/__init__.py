@@ -1,0 +1,1 @@
+"""What is told as changed where patrols see only part of a building."""

@@ -1,0 +1,1 @@
+"""Libraries of other people behind our protocols."""

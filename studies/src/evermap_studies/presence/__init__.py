@@ -1,0 +1,1 @@
+"""Models of features that come and go, in a room and at a door."""

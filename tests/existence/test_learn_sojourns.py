@@ -1,0 +1,246 @@
+"""Stays and absences learned from uncertain looks, against the lifetimes that the looks were simulated with."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evermap.errors import ConfigError, DataError
+from evermap.existence.learn_sojourns import Learned, learn
+from evermap.existence.protocol import Looks
+from evermap.existence.run_length import RunLength
+from evermap.existence.sojourn_em import Data, with_lifetimes
+from evermap.existence.sojourns import FAMILIES
+from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
+from evermap.types import BoolArray, FloatArray
+
+STEP_S, SPAN_S, ERROR = 2.0, 6000.0, 0.1
+
+
+def truth(stay: LifetimePrior, absence: LifetimePrior, seed: int, features: int = 6) -> tuple[FloatArray, BoolArray]:
+    """Instants (T,) and presence (features, T), each feature in the middle of its life."""
+    rng = np.random.default_rng(seed)
+    cycle = stay.mean() + absence.mean()
+    time = np.arange(0.0, SPAN_S, STEP_S)
+    there = np.empty((features, len(time)), dtype=np.bool_)
+    for row in there:
+        n = int(4.0 * (SPAN_S / cycle + 20.0)) + 20
+        changes = np.cumsum(np.column_stack([stay.sample(rng, n), absence.sample(rng, n)]).ravel())
+        row[:] = np.searchsorted(changes, time + 20.0 * cycle * rng.uniform(0.5, 1.0), side="right") % 2 == 0
+    return time, there
+
+
+def looks_at(time: FloatArray, there: BoolArray, error: float = ERROR, seed: int = 0) -> Looks:
+    """One look at every instant, wrong as often as said."""
+    wrong = np.random.default_rng(1000 + seed).random(there.shape) < error
+    feature = np.repeat(np.arange(len(there)), len(time))
+    return Looks.from_rows(feature, 1e6 + np.tile(time, len(there)), (there ^ wrong).ravel(), error, error)
+
+
+def standard_errors(
+    learned: Learned, prior: LifetimePrior, expected: LifetimePrior, name: str, which: int
+) -> FloatArray:
+    """By how many standard errors of fully observed durations the parameters are off."""
+    n = learned.expected.counts[which].n_events
+    if name == "exponential":
+        assert isinstance(prior, Exponential)
+        assert isinstance(expected, Exponential)
+        return np.array([np.log(prior.rate / expected.rate) * np.sqrt(n)])
+    if name == "lognormal":
+        assert isinstance(prior, LogNormal)
+        assert isinstance(expected, LogNormal)
+        return np.array(
+            [
+                (prior.mu - expected.mu) / expected.sigma * np.sqrt(n),
+                np.log(prior.sigma / expected.sigma) * np.sqrt(2.0 * n),
+            ]
+        )
+    if name == "weibull":
+        assert isinstance(prior, Weibull)
+        assert isinstance(expected, Weibull)
+        # Fisher information of log scale and log shape: 1.053 / shape and 0.780 a root n
+        return np.array(
+            [
+                np.log(prior.scale_s / expected.scale_s) * expected.shape / 1.053 * np.sqrt(n),
+                np.log(prior.shape / expected.shape) / 0.780 * np.sqrt(n),
+            ]
+        )
+    mean = np.log(prior.mean() / expected.mean()) * np.sqrt(n * expected.shape)  # type: ignore[attr-defined]
+    from scipy.special import polygamma
+
+    shape = float(expected.shape)  # type: ignore[attr-defined]
+    information = shape * (shape * float(polygamma(1, shape)) - 1.0)  # of log shape, mean unknown
+    return np.array([mean, np.log(prior.shape / shape) * np.sqrt(n * information)])  # type: ignore[attr-defined]
+
+
+PAIRS: dict[str, tuple[LifetimePrior, LifetimePrior]] = {
+    "exponential": (Exponential(1.0 / 60.0), Exponential(1.0 / 90.0)),
+    "lognormal": (LogNormal(np.log(60.0), 0.5), LogNormal(np.log(90.0), 0.3)),
+    "weibull": (Weibull(60.0, 3.0), Weibull(90.0, 2.0)),
+    "gamma": (Gamma(10.0, 6.0), Gamma(30.0, 3.0)),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_family_that_is_known_is_learned_from_noisy_looks(name: str) -> None:
+    """4.5 standard errors of durations seen exactly leave some room for what noise hides."""
+    stay, absence = PAIRS[name]
+    looks = looks_at(*truth(stay, absence, 0))
+    learned = learn(looks, families=[name])
+    off = [
+        *standard_errors(learned, learned.model.stay, stay, name, 1),
+        *standard_errors(learned, learned.model.absence, absence, name, 0),
+    ]
+    assert (np.abs(off) < 4.5).all()
+    # what was learned explains the looks better than the truth, as the maximum does
+    best = RunLength(stay, absence, learned.model.step_s).track(looks).log_evidence.sum()
+    assert learned.log_evidence > best - 0.5
+    # twice the gain of a maximum is chi-squared of as many degrees of freedom as parameters
+    assert learned.log_evidence < best + 12.0
+
+
+def test_two_peaks_are_learned_from_noisy_looks() -> None:
+    stay = Mixture.of([LogNormal(np.log(30.0), 0.08), LogNormal(np.log(120.0), 0.08)], [0.5, 0.5])
+    looks = looks_at(*truth(stay, Exponential(1.0 / 60.0), 3))
+    learned = learn(looks, families=("exponential", "peaks"))
+    assert learned.candidates[0].name == "peaks stays, exponential absences"
+    t = np.array([20.0, 45.0, 80.0, 100.0, 150.0])
+    n = learned.expected.counts[1].n_events
+    np.testing.assert_allclose(
+        np.exp(learned.model.stay.log_survival(t)), np.exp(stay.log_survival(t)), atol=4.0 * np.sqrt(0.25 / n)
+    )
+
+
+def test_durations_that_forget_their_age_are_found_to() -> None:
+    looks = looks_at(*truth(*PAIRS["exponential"], 5))
+    learned = learn(looks, families=("exponential", "weibull", "lognormal"))
+    assert learned.candidates[0].name == "exponential stays, exponential absences"
+
+
+def test_durations_that_do_not_are_found_not_to() -> None:
+    looks = looks_at(*truth(*PAIRS["weibull"], 6))
+    learned = learn(looks, families=("exponential", "weibull"))
+    assert learned.candidates[0].name == "weibull stays, weibull absences"
+    assert [c.score for c in learned.candidates] == sorted((c.score for c in learned.candidates), reverse=True)
+    assert learned.candidates[-1].name == "exponential stays, exponential absences"
+    assert learned.candidates[-1].freedom == 2.0
+
+
+def test_the_evidence_never_falls_from_round_to_round() -> None:
+    """Exponential lifetimes have their maximum in closed form, so every round climbs.
+
+    What climbs is the evidence with the half event that the rates are given beforehand; born at the first look, so that
+    what is believed there does not change with them.
+    """
+    data = Data.of(looks_at(*truth(*PAIRS["exponential"], 7, features=2)), STEP_S, np.inf, rhythm=False)
+    model = RunLength(Exponential(1.0 / 10.0), Exponential(1.0 / 2000.0), STEP_S, newborn=True)
+    climbed = []
+    for _ in range(25):
+        expected = data.expect(model)
+        rates = [prior.rate for prior in (model.absence, model.stay) if isinstance(prior, Exponential)]
+        climbed.append(expected.log_evidence + 0.5 * np.log(rates).sum())
+        absence, stay = (FAMILIES["exponential"](counts, None) for counts in expected.counts)
+        model = with_lifetimes(model, (absence, stay))
+    assert (np.diff(climbed) > -1e-6).all()
+    assert climbed[-1] - climbed[0] > 50.0
+    assert climbed[-1] - climbed[-2] < 1e-3
+
+
+def test_seen_without_error_rates_are_changes_by_time() -> None:
+    time, there = truth(*PAIRS["exponential"], 8)
+    learned = learn(looks_at(time, there, 1e-9), families=("exponential",))
+    changes = there[:, 1:] != there[:, :-1]
+    for prior, state in ((learned.model.stay, True), (learned.model.absence, False)):
+        assert isinstance(prior, Exponential)
+        ended = (changes & (there[:, :-1] == state)).sum()
+        # a change is in the middle of a step, and the half of it that follows tells nothing of the new state
+        spent = ((there[:, :-1] == state) * STEP_S * np.where(changes, 0.5, 1.0)).sum()
+        assert prior.rate == pytest.approx((ended + 0.5) / spent, rel=1e-3)
+
+
+def test_learning_twice_gives_the_same_numbers() -> None:
+    looks = looks_at(*truth(*PAIRS["lognormal"], 9, features=1))
+    one, two = (learn(looks, families=("exponential", "lognormal", "smooth")) for _ in range(2))
+    assert one.model.to_dict() == two.model.to_dict()
+    assert one.log_evidence == two.log_evidence
+
+
+def test_the_second_half_can_be_learned_later() -> None:
+    """A step of EM on the second half, with what is remembered of the first, comes near to all at once."""
+    time, there = truth(*PAIRS["lognormal"], 10)
+    half = len(time) // 2
+    looks = looks_at(time, there)
+    early = (looks.stamp_s - 1e6) < time[half]
+
+    def part(rows: BoolArray) -> Looks:
+        feature = np.repeat(np.arange(6), len(time))[rows]
+        return Looks.from_rows(feature, looks.stamp_s[rows], looks.detected[rows], ERROR, ERROR)
+
+    whole = learn(looks, families=("lognormal",))
+    first = learn(part(early), families=("lognormal",))
+    both = first.updated(part(~early))
+    assert both.last_s == whole.last_s
+    for which in (0, 1):
+        assert both.expected.counts[which].n_events == pytest.approx(whole.expected.counts[which].n_events, rel=0.05)
+    for found, expected in ((both.model.stay, whole.model.stay), (both.model.absence, whole.model.absence)):
+        assert isinstance(found, LogNormal)
+        assert isinstance(expected, LogNormal)
+        assert found.mu == pytest.approx(expected.mu, abs=0.05)
+        assert found.sigma == pytest.approx(expected.sigma, rel=0.1)
+
+
+def test_what_is_long_ago_counts_less() -> None:
+    """Stays of 20 s until a change of habits, then of 120 s: with a half life the later ones are learned."""
+    early = truth(Exponential(1.0 / 20.0), Exponential(1.0 / 60.0), 11, features=4)
+    late = truth(Exponential(1.0 / 120.0), Exponential(1.0 / 60.0), 12, features=4)
+    time = np.concatenate([early[0], early[0][-1] + STEP_S + late[0]])
+    looks = looks_at(time, np.hstack([early[1], late[1]]))
+    ever = learn(looks, families=("exponential",)).model.stay
+    lately = learn(looks, families=("exponential",), half_life_s=1000.0).model.stay
+    assert isinstance(ever, Exponential)
+    assert isinstance(lately, Exponential)
+    assert 1.0 / ever.rate < 80.0
+    # 4 features x 1000 s / ln 2 of memory, in cycles of 180 s: some 32 stays count
+    assert 1.0 / lately.rate == pytest.approx(120.0, rel=3.0 / np.sqrt(32.0))
+    assert lately.rate < ever.rate
+
+
+def test_evidence_of_learning_is_that_of_the_filter() -> None:
+    looks = looks_at(*truth(*PAIRS["weibull"], 13, features=3))
+    learned = learn(looks, families=("weibull",))
+    assert learned.log_evidence == pytest.approx(learned.model.track(looks).log_evidence.sum(), rel=1e-9)
+
+
+def test_a_rhythm_has_steps_within_its_ten_minutes() -> None:
+    """Looks every half an hour: learning takes the same steps as the filter."""
+    rng = np.random.default_rng(14)
+    n = 500
+    stamps = 1.8e9 + 1800.0 * np.arange(n)
+    there = (np.cumsum(rng.random(n) < 0.1) % 2).astype(bool)
+    looks = Looks.from_rows(np.zeros(n, int), stamps, there ^ (rng.random(n) < 0.1), 0.1, 0.1)
+    learned = learn(looks, rhythm=True, families=("exponential",))
+    # one week and a half: the levels of its weeks may differ, and are those of the last in the filter
+    data = Data.of(looks, learned.model.step_s, np.inf, rhythm=True)
+    found = data.expect(learned.model).log_evidence
+    assert found == pytest.approx(learned.model.track(looks).log_evidence.sum(), rel=1e-9)
+
+
+def test_progress_is_told_to_the_end() -> None:
+    told: list[float] = []
+    learn(looks_at(*truth(*PAIRS["exponential"], 15, features=1)), families=("exponential",), progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+def test_what_cannot_be_learned_from_is_refused() -> None:
+    one_look_each = Looks.from_rows([0, 1], [1.0, 2.0], [1, 0], 0.1, 0.1)
+    with pytest.raises(DataError, match="no feature was looked at twice"):
+        learn(one_look_each)
+    at_one_time = Looks.from_rows([0, 0], [1.0, 1.0], [1, 0], 0.1, 0.1)
+    with pytest.raises(DataError, match="no feature was looked at twice"):
+        learn(at_one_time)
+    looks = Looks.from_rows([0, 0], [1.0, 2.0], [1, 0], 0.1, 0.1)
+    with pytest.raises(ConfigError, match=r"families.*no family 'cauchy'.*exponential"):
+        learn(looks, families=("cauchy",))
+    with pytest.raises(ConfigError, match="no family 'weibull'"):
+        learn(looks, families=("weibull",), rhythm=True)

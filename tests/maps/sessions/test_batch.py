@@ -1,0 +1,84 @@
+"""Session after session against one estimate of all at once: poses that are marginalised are not lost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from evermap.geometry import se2
+from evermap.maps.living import LivingMap
+from evermap.maps.sessions.geometry import anchored
+from evermap.maps.sessions.own import own_landmarks
+from evermap.maps.sessions.session import laid
+from evermap.pipeline import Alone, bring_in, solve_alone
+from evermap.types import FloatArray, IntArray
+
+from .buildings import building, settings
+
+
+def own(alone: Alone) -> tuple[IntArray, FloatArray, FloatArray]:
+    """What a session says by itself: ids, positions in its own frame, and their joint covariance."""
+    outcome = alone.visit.outcome
+    assert outcome.log_scale_sigma == 0.0, "the metre is known here"
+    found = own_landmarks(outcome)
+    return alone.visit.prepared.landmark_id[found.row], found.position_m, found.covariance_m2
+
+
+def whitening(covariance_m2: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance_m2)))
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
+    """Least squares over all landmarks and the motion between the sessions, each by itself a joint Gaussian."""
+    world = building(seed, days=2, change_rate=0.0)
+    config = settings()
+    first, second = (solve_alone(one, LivingMap(clock=one.clock), config) for one in world.sessions)
+    begun = bring_in(first, LivingMap(clock=world.sessions[0].clock), config).living
+    after = bring_in(second, begun, config).living
+    names_a, at_a, spread_a = own(first)
+    names_b, at_b, spread_b = own(second)
+    everyone = np.union1d(names_a, names_b)
+    np.testing.assert_array_equal(begun.places.landmark_id[np.argsort(begun.places.landmark_id)], names_a)
+    where = laid(begun, begun.sites.p_here, second.visit, config.living)
+    assert where is not None
+    both = np.intersect1d(names_a, names_b)
+    assert (where.place[np.isin(where.landmark_id, both)] >= 0).all()
+
+    # unknown: where each landmark was on the first day, how far those met again are off on the second, and the motion
+    a, b = (np.searchsorted(everyone, names) for names in (names_a, names_b))
+    again = np.searchsorted(everyone, both)
+    gauge = np.finfo(np.float64).eps ** 0.5 * np.eye(2 * len(names_a))  # an anchored covariance has no inverse
+    white_a = whitening(anchored(at_a, spread_a) + gauge**2)
+    white_b = whitening(spread_b)
+    start = np.zeros((len(everyone), 2))
+    start[b] = se2.transform(where.pose_map_session, at_b)
+    start[a] = at_a
+    size = start.size
+
+    def residuals(x: FloatArray) -> FloatArray:
+        landmark, drift, motion = x[:size].reshape(-1, 2), x[size:-3].reshape(-1, 2), x[-3:]
+        now = landmark.copy()
+        now[again] += drift * where.drift_m
+        seen = se2.transform(se2.inverse(motion), now[b])
+        return np.concatenate([white_a @ (landmark[a] - at_a).ravel(), drift.ravel(), white_b @ (seen - at_b).ravel()])
+
+    guess = np.concatenate([start.ravel(), np.zeros(2 * len(both)), where.pose_map_session])
+    solution = least_squares(residuals, guess, x_scale="jac", xtol=1e-12, ftol=1e-12)
+    landmark, drift = solution.x[:size].reshape(-1, 2), solution.x[size:-3].reshape(-1, 2)
+    landmark[again] += drift * where.drift_m
+    covariance = np.linalg.inv(solution.jac.T @ solution.jac)
+    to_now = np.eye(size, len(guess))
+    to_now[np.column_stack([2 * again, 2 * again + 1]).ravel(), size + np.arange(2 * len(both))] = where.drift_m
+    covariance = to_now @ covariance @ to_now.T
+
+    order = np.argsort(after.places.landmark_id)
+    known = np.isin(everyone, after.places.landmark_id)
+    np.testing.assert_array_equal(after.places.landmark_id[order], everyone[known])
+    sigma = np.sqrt(np.diag(covariance)).reshape(-1, 2)[known]
+    off = (after.places.position_m[order] - landmark[known]) / sigma
+    assert np.abs(off).max() < 0.5
+    assert np.sqrt(np.mean(off**2)) < 0.15
+    mine = np.sqrt(np.diag(after.covariance_m2)).reshape(-1, 2)[order]
+    np.testing.assert_allclose(mine / sigma, 1.0, atol=0.1)

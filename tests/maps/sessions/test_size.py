@@ -1,0 +1,168 @@
+"""How long a map's metre is: the filter against dense conditioning, the similarity against an optimiser."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from evermap.geometry import se2
+from evermap.maps.sessions.size import WALK, log_ratio, settled
+from evermap.types import FloatArray
+
+
+def _by_all_sessions(ratio: list[float], shown: list[float], sigma: list[float]) -> FloatArray:
+    """(n,) metres of the map over the true one, as weights of the sessions' own errors, by hand.
+
+    Session 0 begins the map. A later one is weighed by the inverse variance of what it says of the map's metre; what
+    the map knows already fades by the walk.
+    """
+    information = 1.0 / sigma[0] ** 2
+    weight = np.zeros(len(sigma))
+    weight[0] = 1.0
+    for k in range(1, len(sigma)):
+        before, after = 1.0 / (1.0 / information + WALK**2), 1.0 / (sigma[k] ** 2 + shown[k] ** 2)
+        weight *= before / (before + after)
+        weight[k] = after / (before + after)
+        information = before + after
+    return weight
+
+
+@settings(max_examples=80)
+@given(
+    st.lists(
+        st.tuples(st.floats(-0.1, 0.1), st.floats(1e-4, 0.05), st.floats(1e-3, 0.1), st.floats(-0.05, 0.05)),
+        min_size=2,
+        max_size=7,
+    )
+)
+def test_the_metre_of_a_map_is_the_weighted_mean_of_those_of_its_sessions(
+    sessions: list[tuple[float, float, float, float]],
+) -> None:
+    """Sessions whose metres are `true` too long: what the map's is, and how unsure, by weights of all of them at once.
+
+    What one robot gets wrong of the metre it gets wrong in all sessions: standard deviations add up, not variances.
+    Errors of single comparisons are independent.
+    """
+    true, shown, sigma, own = (list(column) for column in zip(*sessions, strict=True))
+    metre = true[0]  # log of the map's metre over the true one, which nobody knows
+    variance, information = sigma[0] ** 2, 1.0 / sigma[0] ** 2
+    noise = 0.0
+    for k in range(1, len(sessions)):
+        # the session says by its priors that its metre is `own` short of the true one
+        found = settled(metre - true[k], shown[k] ** 2, (own[k], sigma[k]), variance, information)
+        innovation = metre - true[k] - own[k]
+        total = sigma[k] ** 2 + shown[k] ** 2 + 1.0 / information + WALK**2
+        weight = _by_all_sessions(true[: k + 1], shown[: k + 1], sigma[: k + 1])
+        metre += np.log(found.map_factor)
+        ours = np.array([true[0], *(true[j] + own[j] for j in range(1, k + 1))])
+        assert metre == pytest.approx(float(weight @ ours), abs=1e-12)
+        # the session's factor leads to the map's new metre, up to its share of what the comparison got wrong
+        misread = innovation * shown[k] ** 2 / total
+        assert np.log(found.session_factor) == pytest.approx(metre - true[k] - misread, abs=1e-12)
+        noise = noise * (1.0 - weight[k]) ** 2 + weight[k] ** 2 * shown[k] ** 2
+        common = float(weight @ np.array(sigma[: k + 1])) ** 2
+        assert common - 1e-15 <= found.variance <= (np.sqrt(common) + np.sqrt(noise)) ** 2 + 1e-15
+        variance, information = found.variance, found.information
+
+
+@settings(max_examples=50)
+@given(sigma=st.floats(1e-3, 0.1), sessions=st.integers(1, 40))
+def test_sessions_of_one_robot_do_not_make_the_metre_surer(sigma: float, sessions: int) -> None:
+    variance, information = sigma**2, 1.0 / sigma**2
+    gain = 1.0
+    for _ in range(sessions):
+        found = settled(0.01, 1e-12, (0.0, sigma), variance, information)
+        assert found.variance == pytest.approx(sigma**2, rel=1e-6)
+        # but what one of them says counts less and less, down to what the walk leaves
+        assert 0.0 < -np.log(found.map_factor) / 0.01 <= gain + 1e-12
+        gain = -np.log(found.map_factor) / 0.01
+        variance, information = found.variance, found.information
+    assert gain >= WALK / (sigma + WALK) * 0.5
+
+
+@pytest.mark.parametrize("sigma", [0.005, 0.02, 0.1])
+def test_a_session_that_knows_the_metre_settles_it(sigma: float) -> None:
+    """Another sensor, which knows it to 0.01 %: the map's metre is its metre."""
+    variance, information = sigma**2, 1.0 / sigma**2
+    for _ in range(5):
+        found = settled(0.0, 1e-8, (0.0, sigma), variance, information)
+        variance, information = found.variance, found.information
+    known = 1e-4
+    found = settled(0.03, 1e-10, (0.0, known), variance, information)
+    # weight of all that was known before: a walk's worth of information at the most
+    rest = known**2 / WALK**2
+    assert found.map_factor == pytest.approx(np.exp(-0.03), rel=0.03 * 2.0 * rest)
+    assert np.sqrt(found.variance) <= known + rest * sigma + 1e-5
+    # and the next that knows little does not spoil it by more than the walk
+    after = settled(0.05, 1e-10, (0.0, sigma), found.variance, found.information)
+    assert abs(np.log(after.map_factor)) <= 0.05 * 2.0 * (known**2 + WALK**2) / sigma**2
+    assert np.sqrt(after.variance) < 0.3 * sigma
+
+
+def test_a_session_that_shows_no_size_changes_nothing() -> None:
+    """One landmark: `log_ratio` says that it does not know."""
+    ratio, variance = log_ratio(np.zeros((1, 2)), np.eye(2), np.ones((1, 2)), np.eye(2))
+    assert (ratio, variance) == (0.0, np.inf)
+    found = settled(ratio, variance, (0.02, 0.01), 0.02**2, 1.0 / 0.02**2)
+    assert found.map_factor == 1.0
+    assert found.session_factor == pytest.approx(np.exp(0.02))  # its own priors
+    assert found.variance == pytest.approx(0.02**2)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_similarity_is_that_of_least_squares(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 8
+    session = rng.uniform(-5.0, 5.0, (count, 2))
+    root = 0.03 * rng.standard_normal((2 * count, 2 * count))
+    spread, of_map = root @ root.T + 1e-4 * np.eye(2 * count), 1e-4 * np.eye(2 * count)
+    true = np.array([3.0, -2.0, 2.5])
+    mapped = se2.transform(true, 1.07 * session) + 0.02 * rng.standard_normal((count, 2))
+
+    def cost(x: np.ndarray) -> float:
+        gap = (mapped - se2.transform(x[:3], np.exp(x[3]) * session)).ravel()
+        return float(gap @ np.linalg.solve(fixed, gap))
+
+    ratio, variance = log_ratio(session, spread, mapped, of_map)
+    turn = np.exp(ratio) * np.kron(np.eye(count), se2.rotation(true[2]))
+    best = None
+    for _ in range(3):  # the weights are those of the estimate, as of Gauss-Newton
+        fixed = turn @ spread @ turn.T + of_map
+        best = minimize(cost, np.append(true, ratio), method="BFGS", options={"gtol": 1e-10})
+        turn = np.exp(best.x[3]) * np.kron(np.eye(count), se2.rotation(best.x[2]))
+    assert best is not None
+    assert ratio == pytest.approx(best.x[3], abs=1e-4)
+    step, unit = 1e-4, np.eye(4)
+    hessian = np.array(
+        [
+            [
+                (cost(best.x + step * (a + b)) - cost(best.x + step * (a - b))
+                 - cost(best.x - step * (a - b)) + cost(best.x - step * (a + b))) / (4 * step**2)
+                for b in unit
+            ]
+            for a in unit
+        ]
+    )  # fmt: skip
+    assert variance == pytest.approx(np.linalg.inv(0.5 * hessian)[3, 3], rel=0.05)
+
+
+def test_a_comparison_that_shows_nothing_leaves_a_session_its_own_size() -> None:
+    for shown_variance, factor in ((1e-12, np.exp(2.0)), (1e12, 1.0)):
+        found = settled(2.0, shown_variance, (0.0, 0.1), 1e-12, 1e12)
+        assert found.session_factor == pytest.approx(factor, rel=1e-3)
+
+
+def test_a_bent_session_says_little_of_its_size() -> None:
+    """Half of the landmarks stand elsewhere than the rest has them: the residuals tell that, the covariances do not."""
+    rng = np.random.default_rng(0)
+    session_m = rng.uniform(0.0, 20.0, (20, 2))
+    map_m = session_m.copy()
+    covariance = 1e-4 * np.eye(40)
+    _, variance = log_ratio(session_m, covariance, map_m, covariance)
+    map_m[10:] += [6.0, -8.0]
+    size, bent_variance = log_ratio(session_m, covariance, map_m, covariance)
+    assert np.sqrt(variance) < 1e-3
+    assert abs(size) < 3.0 * np.sqrt(bent_variance)

@@ -1,0 +1,199 @@
+"""Small worlds in which a session is laid over a map, and the probability of every assignment, written down densely."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.geometry import se2
+from evermap.maps.sessions.overlay import (
+    DRIFTS_M,
+    ELSEWHERE,
+    FREE_MOTION,
+    LOG_P_COARSER,
+    NUDGE_M,
+    SHARE_NUDGED,
+    SMALLEST_ROOM_M2,
+    TURN_M,
+    Known,
+    Overlay,
+    Sighted,
+)
+from evermap.types import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A session and a map, and what is true.
+
+    Attributes:
+        sighted, known: what `lay_over` is given.
+        pose_map_session: (3,) the motion.
+        site: (C,) at which site every clique stands, `ELSEWHERE` for a new place.
+    """
+
+    sighted: Sighted
+    known: Known
+    pose_map_session: FloatArray
+    site: IntArray
+
+
+def world(
+    random: np.random.Generator,
+    sizes: list[int],
+    n_sites: list[int],
+    site: list[int],
+    *,
+    sigma_m: float = 0.03,
+    drift_m: float = 0.0,
+    p_site: list[float] | None = None,
+    shift_m: FloatArray | None = None,
+    room_m: float = 12.0,
+) -> World:
+    """Cliques at random places.
+
+    Args:
+        random: of everything.
+        sizes: landmarks of every clique.
+        n_sites: sites that the map knows of every clique.
+        site: (C,) which of its sites every clique truly stands at, `ELSEWHERE` for a new place.
+        sigma_m: of session and map, each correlated.
+        drift_m: by which landmarks that stand at a site are not quite there.
+        p_site: (S,) beliefs; None for even ones, with 0.1 for elsewhere.
+        shift_m: (2,) by which those elsewhere stand beside their first site; None for anywhere.
+        room_m: sides of the room.
+    """
+    clique = np.repeat(np.arange(len(sizes)), sizes)
+    shape = random.uniform(-0.6, 0.6, (len(clique), 2))
+
+    def pose() -> FloatArray:
+        return np.array([*random.uniform(0, room_m, 2), random.uniform(-np.pi, np.pi)])
+
+    rows: list[tuple[int, int]] = []
+    at: list[FloatArray] = []
+    truth = np.zeros((len(clique), 2))
+    names = np.full(len(sizes), ELSEWHERE)
+    for c, count in enumerate(n_sites):
+        mine = np.flatnonzero(clique == c)
+        poses = [pose() for _ in range(count)]
+        number = rows[-1][1] + 1 if rows else 0
+        for k, stands in enumerate(poses):
+            rows += [(int(n), number + k) for n in mine]
+            at += list(se2.transform(stands, shape[mine]))
+        if site[c] == ELSEWHERE:
+            new = pose() if shift_m is None else poses[0] + [*shift_m, 0.0]
+            truth[mine] = se2.transform(new, shape[mine])
+        else:
+            names[c] = number + site[c]
+            truth[mine] = se2.transform(poses[site[c]], shape[mine]) + drift_m * random.normal(size=(len(mine), 2))
+    landmark, of_site = (np.array(column) for column in zip(*rows, strict=True))
+    position = np.array(at)
+    map_covariance = _covariance(random, len(position), sigma_m)
+    session_covariance = _covariance(random, len(truth), sigma_m)
+    motion = np.array([*random.uniform(-30, 30, 2), random.uniform(-np.pi, np.pi)])
+    seen = se2.transform(se2.inverse(motion), truth)
+    seen = seen + random.multivariate_normal(np.zeros(seen.size), session_covariance).reshape(-1, 2)
+    position = position + random.multivariate_normal(np.zeros(position.size), map_covariance).reshape(-1, 2)
+    of = np.concatenate([[c] * count for c, count in enumerate(n_sites)]).astype(np.int64)
+    p = np.array([0.9 / n_sites[c] for c in of]) if p_site is None else np.array(p_site)
+    away = np.array([max(1.0 - p[of == c].sum(), 1e-6) for c in range(len(sizes))])
+    known = Known(position, map_covariance, landmark, of_site, np.log(p), np.log(away))
+    return World(Sighted(seen, session_covariance, clique), known, motion, names)
+
+
+def _covariance(random: np.random.Generator, points: int, sigma_m: float) -> FloatArray:
+    factor = random.normal(size=(2 * points, points)) / math.sqrt(points)
+    return np.asarray(sigma_m**2 * (0.7 * factor @ factor.T + 0.3 * np.eye(2 * points)))
+
+
+class Densely:
+    """The joint probability of an assignment and everything seen, from its definition (MATH.md section 5).
+
+    The difference between where the session sees a landmark and where the map has it is Gaussian: the session's errors,
+    the map's, drift, and an unknown motion. What stands elsewhere has the density of a move instead.
+    """
+
+    def __init__(self, sighted: Sighted, known: Known, motion: FloatArray) -> None:
+        self.sighted, self.known = sighted, known
+        self.at = se2.transform(motion, sighted.position_m)
+        turn = np.kron(np.eye(len(self.at)), se2.rotation(motion[2]))
+        middle = self.at.mean(axis=0)
+
+        def moved(step: FloatArray) -> FloatArray:
+            return np.asarray((middle + step[:2] + (self.at - middle) @ se2.rotation(step[2]).T).ravel())
+
+        slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(3)])
+        self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(np.square(FREE_MOTION)) @ slope.T
+        both = np.vstack([self.at, known.position_m])
+        self.room_m2 = max(float(np.prod(both.max(axis=0) - both.min(axis=0))), SMALLEST_ROOM_M2)
+        clique = sighted.clique[known.landmark]
+        self.sites = [sorted({int(s) for s in known.site[clique == c]}) for c in range(len(known.log_p_elsewhere))]
+
+    def assignments(self) -> Iterator[IntArray]:
+        for chosen in itertools.product(*([*sites, ELSEWHERE] for sites in self.sites)):
+            yield np.array(chosen)
+
+    def log_probability(self, chosen: IntArray, drift_m: float) -> float:
+        known = self.known
+        rows = np.flatnonzero(np.isin(known.site, chosen[chosen >= 0]))
+        total = 0.0
+        if len(rows):
+            pick = np.zeros((2 * len(rows), 2 * len(self.at)))
+            for k, landmark in enumerate(known.landmark[rows]):
+                pick[2 * k : 2 * k + 2, 2 * landmark : 2 * landmark + 2] = np.eye(2)
+            xy = np.column_stack([2 * rows, 2 * rows + 1]).ravel()
+            spread = pick @ self.spread @ pick.T + known.covariance_m2[np.ix_(xy, xy)] + drift_m**2 * np.eye(len(xy))
+            error = (self.at[known.landmark[rows]] - known.position_m[rows]).ravel()
+            _, log_volume = np.linalg.slogdet(2.0 * np.pi * spread)
+            total -= 0.5 * float(log_volume + error @ np.linalg.solve(spread, error))
+        for clique, site in enumerate(chosen):
+            if site >= 0:
+                total += float(known.log_p_site[site])
+            elif self.sites[clique]:
+                total += float(known.log_p_elsewhere[clique]) + max(self._moved(s) for s in self.sites[clique])
+        return total
+
+    def is_this_place(self, chosen: IntArray, drift_m: float) -> bool:
+        """Against another place, one session in a thousand, where what stands stands anywhere in the room."""
+        moved = sum(max(self._moved(s) for s in self.sites[c]) for c, site in enumerate(chosen) if site < 0)
+        standing = int(np.isin(self.known.site, chosen[chosen >= 0]).sum())
+        return self.log_probability(chosen, drift_m) - moved > math.log(1e-3) - standing * math.log(self.room_m2)
+
+    def best(self) -> tuple[IntArray, float, float]:
+        """The most probable assignment, the drift with it, and by how much the next one is less probable."""
+        scored = sorted(
+            (
+                (self.log_probability(chosen, drift) + k * LOG_P_COARSER, tuple(chosen), drift)
+                for chosen in self.assignments()
+                for k, drift in enumerate(DRIFTS_M)
+            ),
+            reverse=True,
+        )
+        value, chosen, drift = scored[0]
+        other = next(v for v, c, _ in scored if c != chosen)
+        return np.array(chosen), drift, value - other
+
+    def _moved(self, site: int) -> float:
+        """Density of a body's landmarks beside one of its sites: nudged or anywhere as a whole, turned a little."""
+        rows = np.flatnonzero(self.known.site == site)
+        step = self.at[self.known.landmark[rows]] - self.known.position_m[rows]
+        middle = step.mean(axis=0)
+        nudged = math.exp(-0.5 * float(middle @ middle) / NUDGE_M**2) / (2.0 * math.pi * NUDGE_M**2)
+        whole = math.log(SHARE_NUDGED * nudged + (1.0 - SHARE_NUDGED) / self.room_m2)
+        rest = step - middle
+        free = 2 * (len(rows) - 1)
+        return whole - 0.5 * float((rest**2).sum()) / TURN_M**2 - 0.5 * free * math.log(2.0 * math.pi * TURN_M**2)
+
+
+def sites_of(overlay: Overlay, known: Known, sighted: Sighted) -> IntArray:
+    """(C,) the site at which `overlay` has every clique; bodies that were taken apart count as elsewhere."""
+    site = np.where(overlay.place >= 0, known.site[overlay.place], ELSEWHERE)
+    found = np.full(len(known.log_p_elsewhere), ELSEWHERE)
+    for c in range(len(found)):
+        mine = np.unique(site[sighted.clique == c])
+        found[c] = mine[0] if len(mine) == 1 else ELSEWHERE
+    return found

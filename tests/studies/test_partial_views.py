@@ -1,0 +1,52 @@
+"""Maps of robots that see parts of a building: what they tell, in worlds small enough for a test."""
+
+from __future__ import annotations
+
+import pytest
+
+from evermap_studies.partial_views.study import HARD, Row, Settings, live
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", params=[(500, HARD), (501, HARD)], ids=["500", "501"])
+def still(request: pytest.FixtureRequest) -> Row:
+    """Patrols of mixed lengths, doors that are open or shut, a wing that opens; nothing that is seen ever changes."""
+    return live(Settings(sessions=6, change_rate=0.0), *request.param)
+
+
+def test_where_nothing_changes_no_change_is_told(still: Row, request: pytest.FixtureRequest) -> None:
+    if still["seed"] == 501:
+        why = "a shelf in a room whose door was shut has appeared, p .73: docs/results.md counts how often that happens"
+        request.applymarker(pytest.mark.xfail(reason=why))
+    assert len(still["after"]) == 6
+    assert all(session["found"] for session in still["after"])
+    assert still["after"][-1]["n_sure"] > 20
+    assert [row for row in still["told"] if row["p"] > 0.5] == []
+
+
+def test_where_nothing_changes_the_map_is_right_and_forecasts_it(still: Row) -> None:
+    last = still["after"][-1]
+    assert last["n_sure_right"] >= 0.98 * last["n_sure"]
+    p = [p for p, _ in still["forecasts"]]
+    assert all(stands for _, stands in still["forecasts"])
+    assert sum(p) / len(p) > 0.8
+
+
+@pytest.fixture(scope="module")
+def changing() -> Row:
+    """Patrols of a minute, which see part of the building, in which things come, move and go."""
+    return live(Settings(sessions=6), 502, 60)
+
+
+def test_nothing_is_told_of_what_never_changed_or_was_not_looked_at(changing: Row) -> None:
+    assert len(changing["told"]) > 5
+    assert [row for row in changing["told"] if row["never"]] == []
+    assert [row for row in changing["told"] if row["looks"] == 0] == []
+    right = [row["true"] for row in changing["told"]]
+    assert sum(right) >= 0.9 * len(right)
+
+
+def test_most_of_what_was_looked_at_before_and_after_is_told(changing: Row) -> None:
+    told = [row["told"] for row in changing["changes"]]
+    assert sum(told) >= 0.8 * len(told)
