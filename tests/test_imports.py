@@ -122,7 +122,8 @@ def test_starting_up_loads_nothing_heavy(module: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "part", ["types", "errors", "se2", "config", "io", "sim", "metrics", "viz", "pipeline", "runfolder", "slam", "demo"]
+    "part",
+    ["types", "errors", "geometry.se2", "config", "io", "sim", "metrics", "viz", "pipeline", "runs.folder", "slam"],
 )
 def test_importing_a_part_loads_no_plot_backend_or_compiler(part: str) -> None:
     assert not loaded_after(f"import evermap.{part}") & set(LAZY_EVERYWHERE)

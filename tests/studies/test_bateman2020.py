@@ -232,7 +232,7 @@ def test_command_runs_what_it_is_asked_for(tmp_path: Path) -> None:
         (["--filters", "jcf,kalman"], "field 'filters': there is no 'kalman' (try: iff, jff,"),
         (["--runs", "1"], "field 'runs': must be 2 at least"),
         (["--seed", "-1"], "field 'seed'"),
-        (["--data", "here"], "field '--data': bateman2020 has no such option"),
+        (["--data", "here"], "No such option: --data"),
     ],
 )
 def test_mistake_of_the_command_is_one_line(

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from evermap.errors import ConfigError, InputError
+from evermap_studies import commands
 from evermap_studies.mrclam import study as mrclam
 
 Table = dict[str, Any]
@@ -221,8 +222,6 @@ def test_one_real_robot(shared_data: Path, tmp_path: Path) -> None:
 def test_command_prints_the_table(
     made_up_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from evermap.cli.reproduce import Experiment, reproduce
-
     table = {"rows": [], "means": [], "expected": []}
     asked: dict[str, Any] = {}
 
@@ -231,7 +230,7 @@ def test_command_prints_the_table(
         return table
 
     monkeypatch.setattr(mrclam, "reproduce", fake)
-    reproduce(Experiment.MRCLAM, made_up_data, tmp_path / "out", everything=True, as_json=True)
+    commands.mrclam(made_up_data, tmp_path / "out", everything=True, as_json=True)
     assert json.loads(capsys.readouterr().out) == table
     assert asked["everything"] is True
     assert asked["data"] == made_up_data

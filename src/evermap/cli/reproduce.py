@@ -8,6 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import plugins
+from evermap.errors import ConfigError, suggestion
 
 
 class Studies(TyperGroup):
@@ -19,8 +20,15 @@ class Studies(TyperGroup):
         return list(plugins.found("evermap.studies"))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Load a study's command; None where there is none of this name."""
+        """Load a study's command.
+
+        Raises:
+            ConfigError: no study has this name.
+        """
         del ctx
+        found = plugins.found("evermap.studies")
+        if found and cmd_name not in found:
+            raise ConfigError(f"unknown study '{cmd_name}'", hint=suggestion(cmd_name, found))
         return command("evermap.studies", cmd_name)
 
 
@@ -43,7 +51,7 @@ app = typer.Typer(cls=Studies, name="reproduce", no_args_is_help=True, rich_mark
 
 @app.callback()
 def reproduce() -> None:
-    """Compute a table of the documents again; each study has its own options.
+    """Compute the tables of the documents again.
 
     \b
     Example:

@@ -34,7 +34,7 @@ GOLDEN = Path("../shared/golden")
 
 Out = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<study>")]
 Data = Annotated[Path, typer.Option(help="Folder with the recordings.")]
-Seed = Annotated[int, typer.Option(min=0, help="Same seed, same numbers.")]
+Seed = Annotated[int, typer.Option(help="Same seed, same numbers.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Runs at a time; 1 for timings that mean something.")]
 Quick = Annotated[bool, typer.Option("--quick", help="A little of everything, minutes instead of hours.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
