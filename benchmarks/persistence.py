@@ -218,7 +218,7 @@ _BATCH = ("exponential", "general_purpose")
 
 
 def as_markdown(shown: dict[str, Any]) -> str:
-    """The table of docs/results.md."""
+    """The table of docs/results/persistence-speed.md."""
     threads = shown["cores"]
     head = ["one update and belief", "expected [ns]", "1 thread [ns]", "floor [ns]", "time / floor"]
     head += [f"{threads} threads [ns]", "[millions a second]", "floor [ns]", "time / floor", "Rosen's algorithm [ns]"]

@@ -5,7 +5,7 @@ faults of `evermap_studies.worlds.faults`, and with none. After every session al
 through, and
 the memory of the process is read.
 
-    python -m benchmarks.soak              # 24 h, as in docs/results.md
+    python -m benchmarks.soak              # 24 h, as in docs/results/soak.md
     python -m benchmarks.soak --hours 1
 """
 

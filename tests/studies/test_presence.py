@@ -391,7 +391,7 @@ SHORT = {
     "door (b)": ("Brier",),
     "door (c)": ("Brier", "log loss"),
 }
-"""By less than 0.002; docs/results.md says by how much."""
+"""By less than 0.002; docs/results/presence.md says by how much."""
 
 
 def is_short(what: str) -> bool:
