@@ -24,8 +24,7 @@ import numpy as np
 from evermap.errors import DataError, EvermapError, NumericalError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.metrics.alignment import align_points, interpolate
-from evermap.metrics.trajectory import scored_stamps
+from evermap.metrics.trajectory import align_points, interpolate, scored_stamps
 from evermap.pipeline import Session, run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.types import FloatArray, Landmarks, Recording

@@ -81,9 +81,9 @@ def test_what_cannot_be_scored_is_nan() -> None:
 @pytest.mark.parametrize(
     ("belief", "there", "message"),
     [
-        ([0.5, 1.5], [1, 0], r"row 1: 1\.5 is no probability"),
-        ([np.nan], [1], "row 0: nan is no probability"),
-        ([0.5], [2], r"row 0: 2\.0 is no truth"),
+        ([0.5, 1.5], [1, 0], r"row 1: 1\.5 is not a probability"),
+        ([np.nan], [1], "row 0: nan is not a probability"),
+        ([0.5], [2], r"row 0: 2\.0 is not a truth value"),
         ([0.5], [1, 0], "shape"),
     ],
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.metrics.identity import identity_scores
+from evermap.metrics.landmarks import identity_scores
 from evermap.types import UNKNOWN
 
 

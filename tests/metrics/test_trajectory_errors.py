@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from evo.core import metrics, sync
+from evo.core import geometry, metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,8 +12,7 @@ from synthetic_run import figure_eight, trajectory
 
 from evermap.errors import DataError
 from evermap.geometry import se2
-from evermap.metrics.alignment import align_points, interpolate
-from evermap.metrics.trajectory import drift_per_metre, evaluate_trajectory, scored_stamps
+from evermap.metrics.trajectory import align_points, drift_per_metre, evaluate_trajectory, interpolate, scored_stamps
 
 STAMPS = np.arange(0.0, 100.0, 0.1)
 
@@ -51,6 +50,32 @@ def test_alignment_equals_the_closed_form_and_a_numerical_minimum():
 
     best = minimize(cost, [0.5, -1.5, 2.5], tol=1e-12)
     np.testing.assert_allclose(found, best.x, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [2, 3, 50])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_alignment_equals_evo(count, mirrored):
+    rng = np.random.default_rng(count)
+    source = rng.normal(size=(count, 2)) * [7.0, 3.0] + [100.0, -40.0]
+    target = se2.transform(np.array([-3.0, 8.0, -2.6]), source * [1.0, -1.0 if mirrored else 1.0])
+    target = target + rng.normal(0, 0.3, (count, 2))
+    rotation, shift, _ = geometry.umeyama_alignment(source.T, target.T)
+    found = align_points(source, target)
+    np.testing.assert_allclose(se2.rotation(found[2]), rotation, atol=1e-11)
+    np.testing.assert_allclose(found[:2], shift, atol=1e-9)
+
+
+def test_alignment_is_refused_where_evo_refuses_it():
+    rng = np.random.default_rng(5)
+    for spread in (0.0, 1e-9, 1e-8, 1e-7, 1.0):
+        source = np.ones((6, 2)) + spread * rng.normal(size=(6, 2))
+        try:
+            geometry.umeyama_alignment(source.T, (2.0 * source).T)
+        except geometry.GeometryException:
+            with pytest.raises(DataError, match="coincide"):
+                align_points(source, 2.0 * source)
+        else:
+            align_points(source, 2.0 * source)
 
 
 def test_alignment_of_a_straight_drive_and_of_standing_still():
@@ -193,6 +218,19 @@ def test_anchoring_recovers_what_alignment_takes_from_nees():
         aligned.append(np.mean(errors.nees))
     assert np.mean(anchored) == pytest.approx(2.0, abs=0.2)
     assert np.mean(aligned) < 1.6
+
+
+def test_drift_equals_evo_relative_error():
+    rng = np.random.default_rng(6)
+    stamps = np.arange(400.0)
+    truth = np.column_stack([stamps / 8, np.zeros(400), np.zeros(400)])  # 10 m are 80 poses, exactly
+    estimate = se2.compose(np.array([1.0, 2.0, 0.4]), se2.compose(truth, rng.normal(size=(400, 3)) * 0.02))
+    theirs = metrics.RPE(
+        metrics.PoseRelation.translation_part, delta=80, delta_unit=metrics.Unit.frames, all_pairs=True
+    )
+    theirs.process_data((as_evo(stamps, truth), as_evo(stamps, estimate)))
+    median = theirs.get_statistic(metrics.StatisticsType.median)
+    assert drift_per_metre(estimate, truth) == pytest.approx(median / 10.0, abs=1e-9)
 
 
 def test_drift_per_metre_of_a_scale_error():

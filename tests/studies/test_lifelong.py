@@ -18,7 +18,7 @@ from evermap.config import LivingConfig
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, Members, Places, Sites
-from evermap.metrics.alignment import interpolate
+from evermap.metrics.trajectory import interpolate
 from evermap.types import ChangeKind, Landmarks, MapChange, Trajectory
 from evermap_studies.lifelong import runs as lifelong_runs
 from evermap_studies.lifelong import study as lifelong

@@ -1,1 +1,1 @@
-"""How good an estimate is: poses, landmarks and consistency, against truth where there is any."""
+"""Metrics: poses, landmarks, changes, beliefs and consistency, against truth where there is any."""

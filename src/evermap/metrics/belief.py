@@ -1,7 +1,7 @@
-"""How good probabilities of presence are: proper scores, hard decisions, and whether they mean what they say.
+"""Scores of probabilities of presence: proper scores, hard decisions, calibration.
 
-The Brier score and the log loss are proper: only the honest probability makes them smallest. Mean absolute error and
-balanced accuracy are reported because others report them; a forecaster can do well in both by being overconfident.
+The Brier score and the log loss are proper: only the honest probability minimises their expectation. Mean absolute
+error and balanced accuracy are reported because others report them; an overconfident forecast can do well in both.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from evermap.errors import InputError
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SURE = 1e-9
-"""The log loss takes a belief as at most this far from certain: one wrong certainty would make it infinite."""
+"""The log loss clips beliefs this far from 0 and 1: one wrong certainty would make it infinite."""
 BINS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Reliability:
-    """Beliefs against how often it was true, in bins of equal width.
+    """Mean belief and observed share, in bins of equal width (a reliability diagram).
 
     Attributes:
         edge: (B + 1,) borders of the bins, from 0 to 1.
@@ -37,7 +37,7 @@ class Reliability:
 
     @property
     def error(self) -> float:
-        """Expected calibration error: distance of belief and share, weighted by the count; nan without any belief."""
+        """Return the expected calibration error: |belief - share| weighted by count; nan without any belief."""
         if not self.count.sum():
             return float("nan")
         gap = np.where(self.count > 0, np.abs(self.belief - self.present), 0.0)
@@ -52,11 +52,11 @@ class BeliefScores:
         count: N.
         share_present: how often the feature was there.
         brier: mean squared error (Brier 1950).
-        log_loss: mean negative natural logarithm of the probability of what was so.
+        log_loss: mean negative natural logarithm of the probability given to the outcome.
         calibration_error: of `Reliability` with ten bins.
         mae: mean absolute error.
         accuracy: share of right decisions at 0.5.
-        balanced_accuracy: mean of the shares among present and among absent; nan where one of them never was so.
+        balanced_accuracy: mean of the shares among present and among absent; nan where one of them is empty.
     """
 
     count: int
@@ -70,7 +70,7 @@ class BeliefScores:
 
 
 def belief_scores(p_present: ArrayLike, present: ArrayLike) -> BeliefScores:
-    """Scores of beliefs against truth.
+    """Score beliefs against truth.
 
     Args:
         p_present: (N,) probabilities.
@@ -99,7 +99,7 @@ def belief_scores(p_present: ArrayLike, present: ArrayLike) -> BeliefScores:
 
 
 def reliability(p_present: ArrayLike, present: ArrayLike, *, bins: int = BINS) -> Reliability:
-    """Beliefs and truth in bins of equal width; the last bin includes 1.
+    """Sort beliefs and truth into bins of equal width; the last bin includes 1.
 
     Args:
         p_present: (N,) probabilities.
@@ -126,9 +126,9 @@ def _checked(p_present: ArrayLike, present: ArrayLike) -> tuple[FloatArray, Bool
         raise InputError(f"shape {truth.shape} where the beliefs have {belief.shape}", field="present")
     wrong = np.flatnonzero(~((belief >= 0.0) & (belief <= 1.0)))
     if wrong.size:
-        problem = f"row {wrong[0]}: {belief[wrong[0]]} is no probability"
+        problem = f"row {wrong[0]}: {belief[wrong[0]]} is not a probability"
         raise InputError(problem, field="p_present", hint="a number between 0 and 1")
     wrong = np.flatnonzero((truth != 0.0) & (truth != 1.0))
     if wrong.size:
-        raise InputError(f"row {wrong[0]}: {truth[wrong[0]]} is no truth", field="present", hint="1 or 0")
+        raise InputError(f"row {wrong[0]}: {truth[wrong[0]]} is not a truth value", field="present", hint="1 or 0")
     return belief, truth == 1.0

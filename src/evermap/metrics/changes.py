@@ -1,4 +1,4 @@
-"""Found changes against true ones: which landmarks, how far, when. Pure."""
+"""Scores of the changes that were found: which landmarks, how far, when."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from evermap.types import ChangeKind, FloatArray, IntArray, MapChange, SlamResul
 
 @dataclass(frozen=True, slots=True)
 class ChangeErrors:
-    """How well the changes of a run are found; G groups are matched, each true one with at most one found.
+    """Errors of the changes of a run; G groups are matched, each true one with at most one found.
 
     Attributes:
-        exact: the same groups of landmarks were found, no more and no fewer; two that exchanged identities are
-            another finding than two that moved.
+        exact: the same groups of landmarks were found, no more and no fewer; two that exchanged identities differ
+            from two that moved.
         precision: share of the landmarks found changed that did change; None where none was found.
         recall: share of the changed landmarks that were found; None where nothing changed.
-        true_row, found_row: (G,) which true change was matched with which found one: those with the most landmarks in
-            common; groups without a common landmark are not matched.
-        displacement_error_m: (G,) distance between true and found displacement of the centroid. Where a group turned
-            and was found with other members, its centroid is another point, and part of this error.
+        true_row, found_row: (G,) which true change was matched with which found one: the pairs with the most landmarks
+            in common; groups without a common landmark are not matched.
+        displacement_error_m: (G,) distance between true and found displacement of the centroid; it includes the
+            difference of the centroids where a group that turned was found with other members.
         rotation_error_rad: (G,) absolute difference of the turns, wrapped.
         time_error_s: (G,) between `time_of_change` of both.
     """
@@ -40,7 +40,7 @@ class ChangeErrors:
 
 
 def compare_changes(found: Sequence[MapChange], true: Sequence[MapChange]) -> ChangeErrors:
-    """Errors of the found changes. The probabilities of neither are looked at."""
+    """Compare the found changes with the true ones; probabilities are ignored."""
     claimed, changed = _landmarks(found), _landmarks(true)
     right = len(claimed & changed)
     true_row, found_row = _matched(found, true)
@@ -59,11 +59,11 @@ def compare_changes(found: Sequence[MapChange], true: Sequence[MapChange]) -> Ch
 
 @dataclass(frozen=True, slots=True)
 class ChangeCounts:
-    """Changes by landmark and kind, of one session or sums of many.
+    """Changes counted by landmark and kind, of one session or sums of many.
 
     Attributes:
-        n_found, n_true: landmarks that are said to have changed, and that did.
-        n_right: landmarks of both, with the same kind of change.
+        n_found, n_true: landmarks that are reported as changed, and that did change.
+        n_right: landmarks in both, with the same kind of change.
     """
 
     n_found: int = 0
@@ -75,23 +75,23 @@ class ChangeCounts:
 
     @property
     def precision(self) -> float | None:
-        """Share of the found that are right; None where nothing was found."""
+        """Return the share of the found that are right; None where nothing was found."""
         return self.n_right / self.n_found if self.n_found else None
 
     @property
     def recall(self) -> float | None:
-        """Share of the true that were found; None where nothing changed."""
+        """Return the share of the true that were found; None where nothing changed."""
         return self.n_right / self.n_true if self.n_true else None
 
 
 def count_changes(
     found: Sequence[MapChange], true: Sequence[MapChange], kind: ChangeKind | None = None
 ) -> ChangeCounts:
-    """Counts by landmark and kind; groups do not matter, and what turned has moved.
+    """Count changes by landmark and kind; groups do not matter, and a rotation counts as a move.
 
     Args:
-        found: what is said to have changed.
-        true: what did.
+        found: reported changes.
+        true: those that happened.
         kind: only changes of this kind; None for all, with the kind as part of what must be right.
     """
     claimed, changed = (
@@ -108,14 +108,14 @@ def _by_landmark(changes: Sequence[MapChange]) -> Iterator[tuple[int, ChangeKind
 
 
 def rank_of_truth(result: SlamResult, true: Sequence[MapChange]) -> int | None:
-    """0 where the run's changes are exactly the true groups, k where its k-th alternative is, None where none is."""
+    """Return 0 if the run's changes are exactly the true groups, k if its k-th alternative is, None if none is."""
     explanations = [result.changes, *(alternative.changes for alternative in result.alternatives)]
     wanted = _groups(true)
     return next((rank for rank, changes in enumerate(explanations) if _groups(changes) == wanted), None)
 
 
 def time_of_change(change: MapChange) -> float:
-    """The middle of its interval [s]; the first stamp of the session for a change before it."""
+    """Return the middle of its interval [s]; the first stamp of the session for a change before it."""
     if math.isnan(change.stamp_from_s):
         return change.stamp_to_s
     return 0.5 * (change.stamp_from_s + change.stamp_to_s)
@@ -126,18 +126,18 @@ def _landmarks(changes: Sequence[MapChange]) -> set[int]:
 
 
 def _groups(changes: Sequence[MapChange]) -> list[tuple[list[int], bool]]:
-    """Members and whether they exchanged identities, in one order; a group that moved twice counts twice."""
+    """Return members and whether they exchanged identities, sorted; a group that moved twice counts twice."""
     return sorted((sorted(change.landmark_ids), change.kind is ChangeKind.SWAPPED) for change in changes)
 
 
 def _matched(found: Sequence[MapChange], true: Sequence[MapChange]) -> tuple[IntArray, IntArray]:
-    """Pairs of rows (true, found) with the most landmarks in common over all; ties go to the nearer displacement."""
+    """Pair rows (true, found) with the most landmarks in common over all; ties go to the nearer displacement."""
     from scipy.optimize import linear_sum_assignment
 
     common = np.array([[len({*t.landmark_ids} & {*f.landmark_ids}) for f in found] for t in true], dtype=np.float64)
     common = common.reshape(len(true), len(found))
     apart = np.array([[math.dist(t.displacement_m, f.displacement_m) for f in found] for t in true])
-    # never worth a landmark, however far: below one in all, over as many pairs as there can be
+    # the ties of all pairs together weigh less than one landmark
     tie = (apart / (1.0 + apart)).reshape(common.shape) / (1.0 + max(common.shape))
     true_row, found_row = linear_sum_assignment(common - tie, maximize=True)
     paired = common[true_row, found_row] > 0

@@ -1,4 +1,4 @@
-"""Does the estimator know how wrong it is? Normalised squared errors against the chi-square law.
+"""Consistency of estimates with their covariances: normalised squared errors against the chi-square law.
 
 NEES compares errors with truth, NIS compares detections with predictions (Bar-Shalom, Li, Kirubarajan 2001,
 section 5.4). Both are chi-square with as many degrees of freedom as components if the covariances are honest;
@@ -17,7 +17,7 @@ CONFIDENCE = 0.95
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """`e^T P^-1 e` per row; nan where the covariance is singular (an exact pose has no NEES).
+    """Return `e^T P^-1 e` per row; nan where the covariance is singular (an exact pose has no NEES).
 
     Args:
         error: (N, D), in the frame of the covariance.
@@ -35,7 +35,7 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def chi2_interval(dof: float, count: int = 1, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Two-sided interval of the mean of `count` independent chi-square variables with `dof` degrees of freedom."""
+    """Return the two-sided interval of the mean of `count` independent chi-square variables with `dof` degrees."""
     from scipy.stats import chi2
 
     tail = (1.0 - confidence) / 2.0
@@ -44,7 +44,7 @@ def chi2_interval(dof: float, count: int = 1, confidence: float = CONFIDENCE) ->
 
 
 def share_in_band(values: FloatArray, dof: float = 2, confidence: float = CONFIDENCE) -> float | None:
-    """Share of finite values below the one-sided chi-square quantile; `confidence` if consistent, None if no value."""
+    """Return the share of finite values below the chi-square quantile, `confidence` if consistent; None if no value."""
     from scipy.stats import chi2
 
     finite = values[np.isfinite(values)]
@@ -52,7 +52,7 @@ def share_in_band(values: FloatArray, dof: float = 2, confidence: float = CONFID
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:
-    """Mean over the last `window` values, nan until there are that many. Shape (N,)."""
+    """Return the mean (N,) over the last `window` values, nan until there are that many."""
     out = np.full(len(values), np.nan)
     if window < 1 or len(values) < window:
         return out
@@ -62,10 +62,10 @@ def running_mean(values: FloatArray, window: int) -> FloatArray:
 
 
 def lag1_autocorrelation(values: FloatArray, group: FloatArray) -> float | None:
-    """Correlation between successive values of the same group, pooled over the groups; None with too few pairs.
+    """Correlate successive values of the same group, pooled over the groups; None with fewer than ten pairs.
 
     NIS values are first made normal through their chi-square law, so that a few large ones do not decide. Near 0
-    where errors are independent from one detection to the next; positive where something persistent is not modelled.
+    where errors are independent from one detection to the next; positive where a persistent error is not modelled.
 
     Args:
         values: (N,) squared distances with 2 degrees of freedom, in order of time.
@@ -112,7 +112,7 @@ class NisSummary:
 
 
 def summarise_nis(innovations: Innovations) -> NisSummary:
-    """NIS statistics. Leaving out the outliers trims the tail a little, so both means are given."""
+    """Summarise the NIS. Leaving out the outliers trims the tail a little, so both means are given."""
     finite = np.isfinite(innovations.nis)
     inlier = finite & (innovations.p_inlier >= 0.5)
     nis = innovations.nis[inlier]

@@ -1,16 +1,16 @@
-"""Landmark errors against surveyed positions, matched by id."""
+"""Landmark errors against surveyed positions, and identities of a run against those of the recording."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evermap.errors import DataError
 from evermap.geometry import se2
-from evermap.metrics.alignment import align_points, rotate_covariance
 from evermap.metrics.consistency import nees
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap.metrics.trajectory import align_points, rotate_covariance
+from evermap.types import UNKNOWN, BoolArray, FloatArray, Innovations, IntArray, Landmarks, Recording, rows_of
 
 MIN_SIGHTINGS = 10
 
@@ -41,12 +41,12 @@ class LandmarkErrors:
 
     @property
     def rmse_m(self) -> float | None:
-        """Root mean square error [m] over the scored landmarks; None if there is none."""
+        """Return the root mean square error [m] of the scored landmarks; None if there is none."""
         return float(np.sqrt(np.mean(self.error_m[self.scored] ** 2))) if np.any(self.scored) else None
 
     @property
     def max_m(self) -> float | None:
-        """Largest error [m] of the scored landmarks; None if there is none."""
+        """Return the largest error [m] of the scored landmarks; None if there is none."""
         return float(np.max(self.error_m[self.scored])) if np.any(self.scored) else None
 
 
@@ -57,13 +57,13 @@ def evaluate_landmarks(
     *,
     min_sightings: int = MIN_SIGHTINGS,
 ) -> LandmarkErrors | None:
-    """Errors after the given alignment (usually the trajectory's), or after the landmarks' own where it is None.
+    """Compute errors after the given alignment (usually the trajectory's), or after the landmarks' own.
 
     Args:
         estimate: the map.
         truth: surveyed landmarks.
         pose_truth_estimate: (3,) motion from the map's frame to the truth's; None aligns the scored landmarks
-            themselves, which is kinder: it needs no pose truth and hides a rotation between poses and map.
+            themselves, which needs no truth of poses and hides a rotation between poses and map.
         min_sightings: landmarks seen less often are listed but not scored.
 
     Returns:
@@ -93,3 +93,65 @@ def evaluate_landmarks(
         pose_truth_estimate=np.asarray(pose_truth_estimate, dtype=np.float64),
         unmapped=int(len(truth) - len(ids)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class IdentityScores:
+    """How well the landmarks of a run that numbered them itself match those of the recording.
+
+    Attributes:
+        purity: share of assigned detections that have the commonest identity of their landmark.
+        completeness: share of detections that are in the landmark which holds most of their identity.
+        n_landmarks, n_identities: numbers of distinct ids.
+    """
+
+    purity: float
+    completeness: float
+    n_landmarks: int
+    n_identities: int
+
+
+def identity_scores(landmark_id: IntArray, true_id: IntArray) -> IdentityScores:
+    """Score the landmark ids of detections (M,) against true ones; `UNKNOWN` where one was given to no landmark."""
+    table, landmarks, identities = _table(landmark_id, true_id)
+    if len(identities) == 0:
+        return IdentityScores(0.0, 0.0, 0, 0)
+    given = max(float(table.sum()), 1.0)
+    return IdentityScores(
+        float(table.max(axis=1, initial=0).sum() / given),
+        float(table.max(axis=0, initial=0).sum() / len(true_id)),
+        len(landmarks),
+        len(identities),
+    )
+
+
+def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recording: Recording) -> Landmarks:
+    """Rename the landmarks of a map by the id that the recording gives to most of their detections, for scoring.
+
+    Nothing changes where the run used the recording's ids. Where two landmarks claim one id, the one with more
+    detections gets it; landmarks that get none are left out.
+    """
+    kept_rows = innovations.detection < len(recording.detections)  # a run may be compared with a part of its recording
+    recorded = recording.detections.landmark_id[innovations.detection[kept_rows]]
+    given = innovations.landmark_id[kept_rows]
+    if np.array_equal(recorded, given):
+        return landmarks
+    table, mine, theirs = _table(given, recorded)
+    claims: dict[int, int] = {}
+    for k in np.argsort(-table.max(axis=1, initial=0), kind="stable"):
+        claims.setdefault(int(theirs[table[k].argmax()]), int(mine[k]))
+    names = {landmark: identity for identity, landmark in claims.items()}
+    rows = np.flatnonzero(np.isin(landmarks.landmark_id, list(names)))
+    ids = np.array([names[int(k)] for k in landmarks.landmark_id[rows]], dtype=np.int64)
+    order = np.argsort(ids)
+    return replace(rows_of(landmarks, rows[order]), landmark_id=ids[order])
+
+
+def _table(landmark_id: IntArray, true_id: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Count detections (L, I) by landmark and identity; return both lists of ids, too."""
+    given = (landmark_id != UNKNOWN) & (true_id != UNKNOWN)
+    landmarks, row = np.unique(landmark_id[given], return_inverse=True)
+    identities, column = np.unique(true_id[given], return_inverse=True)
+    table = np.zeros((len(landmarks), len(identities)))
+    np.add.at(table, (row, column), 1.0)
+    return table, landmarks, identities

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
-from evermap.metrics.identity import by_recorded_identity
-from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, evaluate_landmarks
+from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.types import BoolArray, FloatArray, Recording, SlamResult
 
@@ -22,7 +21,7 @@ ONLINE_MAX_GAP_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """A run compared with what is known about the truth; None where nothing is.
+    """Comparison of a run with the truth; None where the truth is not known.
 
     Attributes:
         poses: smoothed trajectory, after its own alignment.
@@ -48,7 +47,7 @@ class Evaluation:
 
 
 def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> Evaluation:
-    """All comparisons that the recording's truth allows, poses at `rate_hz`. Deterministic."""
+    """Compare a run with all that the recording knows of the truth, poses at `rate_hz`."""
     poses = online = dead_reckoning = landmarks = anchored = own = None
     if recording.truth is not None:
         poses = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=rate_hz)
@@ -67,9 +66,9 @@ def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: flo
 
 
 def in_view(recording: Recording, stamp_s: FloatArray) -> BoolArray:
-    """(K,) whether a landmark was seen within `IN_VIEW_S` before or after each stamp.
+    """Return (K,) whether a landmark was seen within `IN_VIEW_S` before or after each stamp.
 
-    Where none was, only odometry speaks, and what it says wrongly no map can mend.
+    Elsewhere the pose rests on odometry alone, whose errors no map can correct.
     """
     seen = recording.frames.stamp_s[np.unique(recording.detections.frame)]
     if len(seen) == 0:
@@ -82,7 +81,7 @@ def in_view(recording: Recording, stamp_s: FloatArray) -> BoolArray:
 
 
 def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """The stable keys of `metrics` in `summary.json`: plain floats, None where there is no truth, no key missing."""
+    """Return the stable keys of `metrics` in `summary.json`: plain floats, None without truth, no key missing."""
     poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
     landmarks, own, nis = evaluation.landmarks, evaluation.landmarks_own, evaluation.nis
     anchored, view = evaluation.landmarks_anchored, evaluation.in_view
@@ -123,12 +122,12 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def evaluate(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> dict[str, Any]:
-    """`metrics_dict(compare_with_truth(...))`: what the run is worth, ready for JSON."""
+    """Return `metrics_dict(compare_with_truth(...))`, ready for JSON."""
     return metrics_dict(compare_with_truth(recording, result, rate_hz=rate_hz))
 
 
 def _alignment(evaluation: Evaluation) -> dict[str, Any]:
-    """How estimates were brought into the frame of the truth, and how much truth was scored."""
+    """Return how estimates were aligned with the truth, and how much truth was scored."""
     out: dict[str, Any] = {
         "purpose": "evaluation only; nothing of it flows back into the estimate",
         "rate_hz": evaluation.rate_hz,
@@ -173,7 +172,7 @@ def _mean(values: FloatArray | None) -> float | None:
 
 
 def _number(value: Any) -> float | None:
-    """A JSON number: a finite float, or None."""
+    """Return a JSON number: a finite float, or None."""
     if value is None:
         return None
     number = float(value)
@@ -181,7 +180,7 @@ def _number(value: Any) -> float | None:
 
 
 def _view(poses: PoseErrors | None, view: BoolArray | None) -> dict[str, float | None]:
-    """Errors while landmarks were in view, and the share of that time."""
+    """Return the errors while landmarks were in view, and the share of that time."""
     if poses is None or view is None or not view.any():
         return {"pose_rmse_in_view_m": None, "heading_rmse_in_view_deg": None, "in_view_share": None}
     return {

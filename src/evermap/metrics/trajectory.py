@@ -1,21 +1,97 @@
-"""Pose errors against a reference trajectory."""
+"""Pose errors against a reference trajectory, and the alignment of frames that they need.
+
+A map made from an unknown start lives in the frame of its first pose. Comparing it with surveyed coordinates needs
+one planar motion, `pose_truth_estimate`, without scale. It serves evaluation only: nothing of it flows back.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.errors import DataError
 from evermap.geometry import se2
-from evermap.metrics.alignment import align_poses, interpolate
+from evermap.geometry.rigid import rigid
 from evermap.metrics.consistency import nees
 from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
 
-_ANCHOR_SLACK_S = 1.0
-"""The truth must begin this close to the first pose for errors to be anchored there."""
+ANCHOR_SLACK_S = 1.0
+"""Errors can be anchored at the first pose if the truth begins within this of it."""
+DRIFT_DISTANCE_M = 10.0
 
-_DRIFT_DISTANCE_M = 10.0
+
+def align_points(source_m: FloatArray, target_m: FloatArray) -> FloatArray:
+    """Return the motion (x, y, theta) that brings points onto others with the least squared distance, without scale.
+
+    The planar case of Umeyama (PAMI 1991, equations 38 to 43), in closed form. As there, the rotation is undefined
+    where the cross-covariance vanishes.
+
+    Args:
+        source_m: (N, 2) points, N >= 2.
+        target_m: (N, 2) where each should come to lie.
+
+    Raises:
+        DataError: fewer than two points, or all coincide.
+    """
+    if len(source_m) < 2:
+        raise DataError("an SE(2) alignment needs at least two points", hint="evaluate over a longer stretch")
+    cross = (target_m - target_m.mean(axis=0)).T @ (source_m - source_m.mean(axis=0)) / len(source_m)
+    if np.linalg.norm(cross, 2) <= np.finfo(np.float64).eps:
+        raise DataError("all points coincide: their alignment has no rotation", hint="evaluate while moving")
+    return rigid(source_m, target_m)
+
+
+def align_poses(source: FloatArray, target: FloatArray) -> tuple[FloatArray, str]:
+    """Align the positions of poses (N, 3) as `align_points`; by their headings where the robot stands still.
+
+    Returns:
+        the motion (x, y, theta) and how it was found: 'umeyama_se2' or 'mean_heading'.
+    """
+    try:
+        return align_points(source[:, :2], target[:, :2]), "umeyama_se2"
+    except DataError:
+        turns = target[:, 2] - source[:, 2]
+        turn = float(np.arctan2(np.sin(turns).sum(), np.cos(turns).sum()))
+        shift = np.mean(target[:, :2] - source[:, :2] @ se2.rotation(turn).T, axis=0)
+        return np.array([shift[0], shift[1], turn]), "mean_heading"
+
+
+def rotate_covariance(covariance: FloatArray, angle_rad: FloatArray | float) -> FloatArray:
+    """Turn covariances (..., 2, 2) by `angle_rad` (broadcast): `R P R^T`."""
+    turn = se2.rotation(angle_rad)
+    return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2), dtype=np.float64)
+
+
+def moved(trajectory: Trajectory, pose_target_world: FloatArray, frame: str = "truth") -> Trajectory:
+    """Return the trajectory in another frame; covariances are in the robot's own frame and stay as they are."""
+    return replace(
+        trajectory, pose_world_robot=se2.compose(pose_target_world, trajectory.pose_world_robot), frame=frame
+    )
+
+
+def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Interpolate poses on the SE(2) geodesic between the two neighbours; exact at the stamps themselves.
+
+    Args:
+        trajectory: at least one pose.
+        stamp_s: (K,) within the trajectory's span.
+
+    Returns:
+        poses (K, 3); covariances (K, 3, 3), mixed linearly, which is fair only where the neighbours are close; and
+        the time between the two neighbours (K,) [s], 0 at the stamps themselves.
+    """
+    knots = trajectory.stamp_s
+    after = np.clip(np.searchsorted(knots, stamp_s, side="left"), 0, len(knots) - 1)
+    before = np.where(knots[after] <= stamp_s, after, np.maximum(after - 1, 0))
+    gap_s = knots[after] - knots[before]
+    share = np.where(gap_s > 0, (stamp_s - knots[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0)
+    start = trajectory.pose_world_robot[before]
+    twist = se2.log(se2.between(start, trajectory.pose_world_robot[after]))
+    poses = se2.compose(start, se2.exp(share[:, None] * twist))
+    mix = share[:, None, None]
+    covariance = (1.0 - mix) * trajectory.covariance[before] + mix * trajectory.covariance[after]
+    return poses, covariance, gap_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,32 +135,32 @@ class PoseErrors:
 
     @property
     def rmse_m(self) -> float:
-        """Translation root mean square error [m]."""
+        """Return the root mean square position error [m], the absolute error of Sturm et al. (IROS 2012)."""
         return float(np.sqrt(np.mean(self.position_error_m**2)))
 
     @property
     def mean_m(self) -> float:
-        """Mean translation error [m]."""
+        """Return the mean position error [m]."""
         return float(np.mean(self.position_error_m))
 
     @property
     def median_m(self) -> float:
-        """Median translation error [m]."""
+        """Return the median position error [m]."""
         return float(np.median(self.position_error_m))
 
     @property
     def max_m(self) -> float:
-        """Largest translation error [m]."""
+        """Return the largest position error [m]."""
         return float(np.max(self.position_error_m))
 
     @property
     def heading_rmse_deg(self) -> float:
-        """Root mean square heading error [degrees], mean offset included."""
+        """Return the root mean square heading error [degrees], mean offset included."""
         return float(np.degrees(np.sqrt(np.mean(self.heading_error_rad**2))))
 
 
 def scored_stamps(truth: Trajectory, first_s: float, last_s: float, rate_hz: float) -> IntArray:
-    """Rows of the truth to score: for every tick of a regular clock the nearest truth stamp, within half a tick.
+    """Return the rows of the truth to score: at every tick of a regular clock the nearest stamp, within half a tick.
 
     Truth is never interpolated; where it has holes nothing is scored.
     """
@@ -113,7 +189,7 @@ def evaluate_trajectory(
     align: bool = True,
     max_gap_s: float = float("inf"),
 ) -> PoseErrors | None:
-    """Pose errors at stamps of the truth, after an SE(2) alignment without scale; None where they share too little.
+    """Compute pose errors at stamps of the truth, after an SE(2) alignment; None where fewer than two can be scored.
 
     Args:
         estimate: poses with covariance, dense enough to be interpolated.
@@ -137,15 +213,14 @@ def evaluate_trajectory(
     pose_truth_estimate, how = align_poses(raw, reference) if align else (np.zeros(3), "none")
     aligned = se2.compose(pose_truth_estimate, raw)
     anchor = None
-    if align and estimate.frame == "first_pose" and stamps[0] - estimate.stamp_s[0] <= _ANCHOR_SLACK_S:
+    if align and estimate.frame == "first_pose" and stamps[0] - estimate.stamp_s[0] <= ANCHOR_SLACK_S:
         anchor = se2.compose(reference[0], se2.inverse(raw[0]))
-    position_error_m = _ape(aligned, reference)
     return PoseErrors(
         stamp_s=stamps,
         truth=reference,
         estimate=aligned,
         covariance=covariance,
-        position_error_m=position_error_m,
+        position_error_m=np.linalg.norm(aligned[:, :2] - reference[:, :2], axis=1),
         heading_error_rad=se2.wrap(aligned[:, 2] - reference[:, 2]),
         pose_truth_estimate=pose_truth_estimate,
         alignment=how,
@@ -157,37 +232,17 @@ def evaluate_trajectory(
     )
 
 
-def _ape(estimate: FloatArray, truth: FloatArray) -> FloatArray:
-    """Absolute position errors (K,) by evo."""
-    from evo.core import metrics
-
-    ape = metrics.APE(metrics.PoseRelation.translation_part)
-    ape.process_data((_evo_path(truth), _evo_path(estimate)))
-    return np.asarray(ape.error, dtype=np.float64)
-
-
-def _evo_path(poses: FloatArray) -> Any:
-    from evo.core.trajectory import PosePath3D
-
-    half = 0.5 * poses[:, 2]
-    zero = np.zeros(len(poses))
-    return PosePath3D(
-        positions_xyz=np.stack([poses[:, 0], poses[:, 1], zero], axis=1),
-        orientations_quat_wxyz=np.stack([np.cos(half), zero, zero, np.sin(half)], axis=1),
-    )
-
-
 def _position_nees(estimate: FloatArray, truth: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Position NEES (K,): the error is turned into the robot's frame, where the covariance lives."""
+    """Return the NEES (K,) of positions; the error is turned into the robot's frame, where the covariance is."""
     error_world = estimate[:, :2] - truth[:, :2]
     error_robot = np.einsum("kji,kj->ki", se2.rotation(estimate[:, 2]), error_world)
     return nees(error_robot, covariance[:, :2, :2])
 
 
-def drift_per_metre(estimate: FloatArray, truth: FloatArray, distance_m: float = _DRIFT_DISTANCE_M) -> float | None:
-    """Median relative translation error over stretches of `distance_m` of the true path, per metre.
+def drift_per_metre(estimate: FloatArray, truth: FloatArray, distance_m: float = DRIFT_DISTANCE_M) -> float | None:
+    """Return the median relative pose error (Sturm et al., IROS 2012) over `distance_m` of the true path, per metre.
 
-    Needs no alignment (relative pose error). None if the path is shorter than the distance.
+    It needs no alignment. None if the path is shorter than the distance.
     """
     travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1))])
     end = np.searchsorted(travelled, travelled + distance_m)

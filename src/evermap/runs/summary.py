@@ -137,7 +137,7 @@ def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict
 def versions() -> dict[str, str]:
     """Versions of what the numbers depend on."""
     found = {"python": platform.python_version()}
-    for name in ("numpy", "scipy", "gtsam", "numba", "evo", "pyarrow", "matplotlib"):
+    for name in ("numpy", "scipy", "gtsam", "numba", "pyarrow", "matplotlib"):
         try:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

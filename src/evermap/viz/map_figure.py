@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.alignment import rotate_covariance
 from evermap.metrics.summary import Evaluation
+from evermap.metrics.trajectory import rotate_covariance
 from evermap.types import FloatArray, Recording, SlamResult
 from evermap.viz.change_layer import draw_moves, moves
 from evermap.viz.style import ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, NamedFigure, new_figure

@@ -9,7 +9,7 @@ import pytest
 from problems import World, make_world
 from recordings import building
 
-from evermap.metrics.identity import identity_scores
+from evermap.metrics.landmarks import identity_scores
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator

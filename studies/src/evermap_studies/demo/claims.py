@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.existence import NEAR_M
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray
 from evermap_studies.demo.truth import Truth
+from evermap_studies.worlds.scores import NEAR_M
 
 if TYPE_CHECKING:
     from evermap_studies.demo.study import Visit

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.existence import NEAR_M, stands_at
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 from evermap.viz.style import ALERT, INK, MUTED, PAPER, NamedFigure, house_style, new_figure, settle
 from evermap_studies.demo.claims import Claims
@@ -15,6 +14,7 @@ from evermap_studies.demo.looks import CLASS_LOOKS, METHOD_LOOKS
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.numbers import Line, ratios
 from evermap_studies.demo.study import Study
+from evermap_studies.worlds.scores import NEAR_M, stands_at
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

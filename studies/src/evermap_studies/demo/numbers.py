@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from evermap.metrics.existence import NEAR_M
 from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
 from evermap_studies.demo.claims import Claims, claim_numbers, claims_of
 from evermap_studies.demo.lifetimes import LearnedLife
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scores import Counts, alignment_of, map_counts, pose_counts
 from evermap_studies.demo.study import Study
+from evermap_studies.worlds.scores import NEAR_M
 
 WEEK_DAYS = 7
 POSE_RATIO_BOUND, EXISTENCE_BOUND, COST_BOUND = 1.15, 0.98, 1.2

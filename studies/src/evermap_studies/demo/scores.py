@@ -2,7 +2,7 @@
 
 Poses are compared with the true path in the map's frame, which one SE(2) alignment on the path of the first session
 ties to the truth for good; a map that creeps away is wrong. A second number aligns every path by itself. The rest is
-counted as in `metrics.existence`: claims, and the statements 'the landmark stands where it was last detected', about
+counted as in `worlds.scores`: claims, and the statements 'the landmark stands where it was last detected', about
 now, and as a forecast about the next session.
 """
 
@@ -13,11 +13,10 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.alignment import align_poses, interpolate
-from evermap.metrics.existence import Existence, existence_score, stands_at, statement_score
-from evermap.metrics.trajectory import scored_stamps
+from evermap.metrics.trajectory import align_poses, interpolate, scored_stamps
 from evermap.types import FloatArray, IntArray, Landmarks, Trajectory
 from evermap_studies.demo.truth import Truth
+from evermap_studies.worlds.scores import Existence, existence_score, stands_at, statement_score
 
 SCORED_HZ = 2.0
 SURE = 0.9

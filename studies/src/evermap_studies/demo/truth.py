@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.metrics.existence import NEAR_M
 from evermap.sim import BuildingSimulation, LookedAt, looked_at
 from evermap.sim.world import positions_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks
+from evermap_studies.worlds.scores import NEAR_M
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.existence import NEAR_M
 from evermap.sim import CLUTTER
 from evermap.sim.building import SceneObject
 from evermap.types import IntArray
@@ -17,6 +16,7 @@ from evermap_studies.demo.claims_figure import TELLING
 from evermap_studies.demo.looks import CLASS_LOOKS, METHOD_LOOKS
 from evermap_studies.demo.numbers import Line, week_of
 from evermap_studies.demo.study import Study
+from evermap_studies.worlds.scores import NEAR_M
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.metrics.existence import Existence
 from evermap.types import FloatArray, IntArray
 from evermap.viz.style import ALERT, ESTIMATE, GROUP, INK, MUTED, ODOMETRY, ONLINE, house_style, new_figure, settle
 from evermap_studies.lifelong.runs import CONTENDERS, WHOLE
+from evermap_studies.worlds.scores import Existence
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

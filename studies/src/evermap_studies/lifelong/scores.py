@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.alignment import align_points
 from evermap.metrics.changes import ChangeCounts, count_changes
-from evermap.metrics.existence import existence_score, statement_score
 from evermap.metrics.summary import RATE_HZ
-from evermap.metrics.trajectory import evaluate_trajectory
+from evermap.metrics.trajectory import align_points, evaluate_trajectory
 from evermap.types import ChangeKind, FloatArray, Landmarks
 from evermap_studies.demo.study import snapshot_of
 from evermap_studies.lifelong.world import World
+from evermap_studies.worlds.scores import existence_score, statement_score
 
 if TYPE_CHECKING:
     from evermap.config import LivingConfig
@@ -114,7 +113,7 @@ def _common(estimate: Landmarks, truth: Landmarks) -> tuple[FloatArray, FloatArr
 
 def _fixed(session: Session, world: World, number: int, pose_truth_map: FloatArray) -> float | None:
     """Pose RMSE in the map's frame."""
-    from evermap.metrics.alignment import moved
+    from evermap.metrics.trajectory import moved
 
     truth = world.recordings[number].truth
     assert truth is not None

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from evermap.metrics.existence import Existence
 from evermap_studies.lifelong.runs import ABLATIONS, CONTENDERS, WHOLE
 from evermap_studies.lifelong.scores import KINDS, change_counts
 from evermap_studies.markdown import markdown_table, number
+from evermap_studies.worlds.scores import Existence
 
 Row = dict[str, Any]
 

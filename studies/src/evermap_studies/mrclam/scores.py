@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.metrics.alignment import interpolate
 from evermap.metrics.summary import RATE_HZ, Evaluation, in_view, metrics_dict
-from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory, scored_stamps
+from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory, interpolate, scored_stamps
 from evermap.types import FloatArray, Recording, SlamResult, Trajectory
 
 _MAX_TRUTH_GAP_S = 0.5

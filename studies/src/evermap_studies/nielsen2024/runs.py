@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.errors import DataError, NumericalError
 from evermap.io.shifts import Shift, shifted
-from evermap.metrics.alignment import interpolate
+from evermap.metrics.trajectory import interpolate
 from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult, Trajectory
 from evermap_studies.mrclam.study import PRIOR_SIGMA_M, find_dataset
 from evermap_studies.nielsen2024.scores import change_scores, run_scores

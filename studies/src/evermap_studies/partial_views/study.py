@@ -22,7 +22,6 @@ from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.metrics.existence import stands_at
 from evermap.sim import (
     CLUTTER,
     DEFAULT_CLASSES,
@@ -36,6 +35,7 @@ from evermap.sim import (
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 from evermap_studies.mrclam.study import machine
 from evermap_studies.partial_views.table import as_markdown
+from evermap_studies.worlds.scores import stands_at
 
 __all__ = ["QUICK", "Settings", "as_markdown", "reproduce"]
 

@@ -9,8 +9,8 @@ import pytest
 
 from evermap.geometry import se2
 from evermap.metrics.belief import belief_scores
-from evermap.metrics.existence import Existence, existence_score, p_near, stands_at, statement_score
 from evermap.types import Landmarks
+from evermap_studies.worlds.scores import Existence, existence_score, p_near, stands_at, statement_score
 
 TRUTH = Landmarks.at([1, 2, 3, 5], [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0)])
 MAP = replace(

@@ -1,8 +1,8 @@
-"""How right a map is about what stands where: precision and recall of what it claims, Brier score of how sure it is.
+"""Scores of a map in a world whose whole truth is known: what it claims to be where, and how sure it is.
 
-Everything is counted, without exceptions for what the robot could not know. Counts of sessions add up; the ratios are
-taken of the sums. The statements of the Brier score do not depend on the map, so that maps can be compared by it:
-'landmark i stands where it stood last', for every landmark that was ever detected, true or not.
+Claims and statements are all counted, without exceptions for what the robot could not know. Counts of sessions add up;
+ratios are taken of the sums. The statements do not depend on the map, so that maps can be compared by their Brier
+score: 'landmark i stands where it stood last', for every landmark that was ever detected, true or not.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
 NEAR_M = 0.25
-"""A landmark stands where the map has it, up to this; less than the smallest move."""
+"""A landmark stands where the map has it up to this distance, which is less than the smallest move."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +39,17 @@ class Existence:
 
     @property
     def precision(self) -> float | None:
-        """Share of the claims that are right; None without a claim."""
+        """Return the share of the claims that are right; None without a claim."""
         return self.n_right / self.n_claims if self.n_claims else None
 
     @property
     def recall(self) -> float | None:
-        """Share of what is there that is rightly claimed; None where nothing is there."""
+        """Return the share of what is there that is rightly claimed; None where nothing is there."""
         return self.n_right / self.n_there if self.n_there else None
 
     @property
     def brier(self) -> float | None:
-        """Mean squared error of the probabilities (Brier 1950); None without a statement."""
+        """Return the mean squared error of the probabilities (Brier 1950); None without a statement."""
         return self.squared_error / self.n_statements if self.n_statements else None
 
 
@@ -61,7 +61,7 @@ def existence_score(
     within_m: float = NEAR_M,
     p_least: float = 0.5,
 ) -> Existence:
-    """Claims against what is there; no statements.
+    """Count the claims of a map against what is there; no statements.
 
     Args:
         claimed: the map; every landmark at its most probable place.
@@ -78,7 +78,7 @@ def existence_score(
 def stands_at(
     claimed: Landmarks, truth: Landmarks, pose_truth_map: FloatArray | None = None, within_m: float = NEAR_M
 ) -> BoolArray:
-    """(C,) whether the landmarks of a map stand where it has them; False for those that are not there at all."""
+    """Return (C,) whether the landmarks of a map stand where it has them; False for those that are absent."""
     position_m = _in_truth(claimed.position_m, pose_truth_map)
     _, mine, theirs = np.intersect1d(claimed.landmark_id, truth.landmark_id, return_indices=True)
     right = np.zeros(len(claimed), dtype=np.bool_)
@@ -96,13 +96,13 @@ def statement_score(
     pose_truth_map: FloatArray | None = None,
     within_m: float = NEAR_M,
 ) -> Existence:
-    """The statements 'landmark i stands at q', with the probabilities that a map has for them; no claims.
+    """Score the statements 'landmark i stands at q' with the probabilities that a map has for them; no claims.
 
     Args:
-        asked: the statements: a landmark each, and where it stood last.
+        asked: the statements: one landmark each, and where it stood last.
         truth: all landmarks that are there at the instant that the statements are about.
         place_id: (P,) landmark of every place that the map knows.
-        place_m: (P, 2) where that is.
+        place_m: (P, 2) position of each place.
         p_here: (P,) probability that the landmark stands there at that instant.
         pose_truth_map: (3,) pose of the map in the frame of the truth; None where they share one.
         within_m: how far off 'there' may be.
@@ -115,7 +115,7 @@ def statement_score(
 def p_near(
     asked: Landmarks, place_id: IntArray, place_m: FloatArray, p_here: FloatArray, within_m: float = NEAR_M
 ) -> FloatArray:
-    """(A,) probability of each landmark to stand near where it is asked for: that of all its places there together."""
+    """Return (A,) probability that each landmark stands near where it is asked for, summed over its places there."""
     row = np.searchsorted(asked.landmark_id, place_id)
     known = row < len(asked)
     known[known] = asked.landmark_id[row[known]] == place_id[known]
