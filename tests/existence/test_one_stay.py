@@ -11,7 +11,16 @@ from evermap.errors import ConfigError, NumericalError
 from evermap.existence.one import PersistenceFilter
 from evermap.existence.one_stay import OneStay, births
 from evermap.existence.protocol import Instants, Looks, PresenceModel
-from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Mixture, Uniform, Weibull, never_leaves
+from evermap.survival import (
+    CallableHazard,
+    Exponential,
+    GeneralPurpose,
+    LifetimePrior,
+    Mixture,
+    Uniform,
+    Weibull,
+    never_leaves,
+)
 
 PRIORS: dict[str, LifetimePrior] = {
     "exponential": Exponential(0.02),
@@ -122,5 +131,5 @@ def test_it_is_stored_as_it_was_written() -> None:
     model = OneStay.of_text("exponential:half-life=2d")
     assert OneStay.from_dict(model.to_dict()) == model
     assert model.prior == Exponential.from_half_life(2 * 86400.0)
-    with pytest.raises(ConfigError, match="no text to store"):
-        OneStay(Exponential(1.0)).to_dict()
+    with pytest.raises(ConfigError, match="cannot be written as text"):
+        OneStay(CallableHazard(lambda t: t, 10.0)).to_dict()

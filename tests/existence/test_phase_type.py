@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.existence import phase_belief
-from evermap.existence.exponentials import exponential_mixture_of
+from evermap.existence.lifetimes import exponential_mixture_of
 from evermap.existence.one import PersistenceFilter
 from evermap.existence.phase_kernels import leap, transition
 from evermap.existence.phase_times import time_to_leave, time_to_return

@@ -7,12 +7,13 @@ from typing import Any, Self
 
 import numpy as np
 
-from evermap.errors import ConfigError, NumericalError
+from evermap.errors import NumericalError
 from evermap.existence.checks import impossible, likelihoods
 from evermap.existence.death import log_death_odds
+from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Instants, Looks, Track
-from evermap.survival.protocol import LifetimePrior
-from evermap.survival.text import parse_prior
+from evermap.survival import LifetimePrior, never_leaves, parse_prior
+from evermap.survival.as_text import prior_text
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _HALVINGS = 60
@@ -29,7 +30,7 @@ class OneStay:
 
     Attributes:
         prior: how long such features stay.
-        text: how the prior is written (`survival.text`), '' for one that has no text; only written ones can be stored.
+        text: how the user wrote the prior (`survival.text`); '' for one made in Python.
     """
 
     prior: LifetimePrior
@@ -43,6 +44,11 @@ class OneStay:
             ConfigError: no prior is written like this.
         """
         return cls(parse_prior(text), text)
+
+    @property
+    def lifetimes(self) -> Lifetimes:
+        """The prior; an absence never ends."""
+        return Lifetimes(self.prior, never_leaves())
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks in one compiled pass; see `PresenceModel.track`.
@@ -85,14 +91,12 @@ class OneStay:
         return Track(p_present, evidence, np.zeros(looks.n_features))
 
     def to_dict(self) -> dict[str, Any]:
-        """The prior as it is written, for JSON.
+        """Return the prior as text, for JSON.
 
         Raises:
-            ConfigError: this prior has no text.
+            ConfigError: this prior cannot be written as text, as a hazard that is a function.
         """
-        if not self.text:
-            raise ConfigError("this prior has no text to store", field="prior", hint="OneStay.of_text(...)")
-        return {"kind": "one-stay", "prior": self.text}
+        return {"kind": "one-stay", "prior": self.text or prior_text(self.prior)}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:

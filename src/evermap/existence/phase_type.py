@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.existence.exponentials import exponential_mixture_of
+from evermap.existence.lifetimes import Lifetimes, exponential_mixture_of, lifetime_of_phases
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
 from evermap.survival.protocol import LifetimePrior
@@ -108,6 +108,21 @@ class PhaseType:
         rates[:k, k:] = np.outer([c.rate for c in away.components], there.weights)
         rates[k:, :k] = np.outer([c.rate for c in there.components], away.weights)
         return cls(np.arange(k + m) >= k, rates)
+
+    @property
+    def lifetimes(self) -> Lifetimes:
+        """Time spent in the phases that are there, and in those that are not; a rhythm counts with its mean rates."""
+        rates = self.rates_by_bin.mean(0)
+        stay, absence = (lifetime_of_phases(rates, i, self._entered(rates, i)) for i in (self.present, ~self.present))
+        return Lifetimes(stay, absence)
+
+    def _entered(self, rates: FloatArray, inside: BoolArray) -> FloatArray:
+        """(n,) the phases in which a stay (or an absence) begins: in the long run, else as the start has them."""
+        long_run = _stationary(rates)
+        flow = np.zeros(self.n_phases) if long_run is None else np.where(inside, 0.0, long_run) @ rates * inside
+        if flow.sum() == 0.0 and self.start is not None:
+            flow = self.start * inside
+        return np.asarray(flow / flow.sum() if flow.sum() > 0.0 else inside / inside.sum(), dtype=np.float64)
 
     @property
     def n_phases(self) -> int:
@@ -237,3 +252,20 @@ class PhaseType:
         for matrix in chain.whole[:-1]:
             rows.append(rows[-1] @ matrix)
         return np.array(rows)
+
+
+def _stationary(rates: FloatArray) -> FloatArray | None:
+    """(n,) long run of constant rates without a difference (Grassmann, Taksar and Heyman 1985); None if there is none.
+
+    None where some phase is never left for those before it, so that the beginning may matter.
+    """
+    a = rates.copy()
+    for k in range(len(a) - 1, 0, -1):
+        if not (exits := a[k, :k].sum()) > 0.0:
+            return None
+        a[:k, k] /= exits
+        a[:k, :k] += np.outer(a[:k, k], a[k, :k])
+    weight = np.ones(len(a))
+    for k in range(1, len(a)):
+        weight[k] = weight[:k] @ a[:k, k]
+    return np.asarray(weight / weight.sum(), dtype=np.float64)

@@ -9,6 +9,7 @@ import numpy as np
 
 from evermap.errors import InputError, NumericalError
 from evermap.existence import checks
+from evermap.existence.lifetimes import Lifetimes
 from evermap.types import FloatArray, IntArray
 
 
@@ -137,9 +138,8 @@ class Track:
     merged_mass: FloatArray
 
 
-@runtime_checkable
-class PresenceModel(Protocol):
-    """How features come and go. Immutable; one model serves any number of features."""
+class PresenceFilter(Protocol):
+    """Whatever turns looks into probabilities of presence: a model, or several models of different features."""
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks; asked at the looks themselves where `instants` is None.
@@ -147,6 +147,16 @@ class PresenceModel(Protocol):
         Raises:
             NumericalError: a look that is impossible, whether the feature is there or not.
         """
+        ...
+
+
+@runtime_checkable
+class PresenceModel(PresenceFilter, Protocol):
+    """How features come and go. Immutable; one model serves any number of features."""
+
+    @property
+    def lifetimes(self) -> Lifetimes:
+        """How long a stay lasts, and an absence; hazards that follow the hours count with their mean over the week."""
         ...
 
     def to_dict(self) -> dict[str, Any]:

@@ -15,7 +15,8 @@ import numpy as np
 from evermap.errors import ConfigError, NumericalError
 from evermap.existence import checks
 from evermap.existence.checks import impossible
-from evermap.existence.hazard_table import HazardTable, tabulate
+from evermap.existence.hazard_table import HazardTable, edges, tabulate
+from evermap.existence.lifetimes import Lifetimes, proportional
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
 from evermap.survival.protocol import LifetimePrior
@@ -64,6 +65,26 @@ class RunLength:
         if self.hypotheses > _MOST_HYPOTHESES:
             problem = f"{self.hypotheses} hypotheses are too many"
             raise ConfigError(problem, field="hypotheses", hint=f"at most {_MOST_HYPOTHESES}")
+
+    @classmethod
+    def from_lifetimes(cls, lifetimes: Lifetimes, *, step_s: float | None = None) -> RunLength:
+        """Return the model of two lifetimes, such as a map has learned.
+
+        Args:
+            lifetimes: of stays and absences.
+            step_s: longest step of time; a hundredth of the shorter median where None.
+        """
+        medians = [float(prior.quantile(0.5)) for prior in lifetimes]
+        shortest = min((median for median in medians if 0.0 < median < np.inf), default=100.0)
+        return cls(lifetimes.stay, lifetimes.absence, step_s or 0.01 * shortest)
+
+    @property
+    def lifetimes(self) -> Lifetimes:
+        """Stay and absence; a rhythm counts with its mean over the week."""
+        pairs = ((self.stay, self.stay_rhythm), (self.absence, self.absence_rhythm))
+        factors = [float(rhythm.factor.mean()) if rhythm else 1.0 for _, rhythm in pairs]
+        _, edge_s = edges(self.step_s)
+        return Lifetimes(*(proportional(prior, f, edge_s) for (prior, _), f in zip(pairs, factors, strict=True)))
 
     def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks; asked at the looks themselves where `instants` is None.

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from evermap.errors import EvermapError, InputError
-from evermap.existence.storage import SCHEMA_VERSION, model_of, read_model_file
-from evermap.io.atomic import write_atomic
+from evermap.errors import InputError
+from evermap.existence import storage
 from evermap.io.text import quote
 from evermap.runs.persist.models import ModelOfEach
 from evermap.runs.persist.table import LookTable
 from evermap.types import UNKNOWN, IntArray
-
-SEVERAL = "several"
 
 
 def save_models(models: ModelOfEach, per: str, path: str | Path) -> Path:
@@ -27,14 +22,8 @@ def save_models(models: ModelOfEach, per: str, path: str | Path) -> Path:
         per: 'all', 'class' or 'feature': what the names are of.
         path: the file.
     """
-    if per == "all":
-        content: dict[str, Any] = models.models[0].to_dict()
-    else:
-        named = {name: model.to_dict() for name, model in zip(models.names, models.models, strict=True)}
-        content = {"kind": SEVERAL, "per": per, "models": named}
-    return write_atomic(
-        path, json.dumps({"schema_version": SCHEMA_VERSION, **content}, indent=1, allow_nan=False) + "\n"
-    )
+    named = dict(zip(models.names, models.models, strict=True)) if per != "all" else {"": models.models[0]}
+    return storage.save_models(storage.NamedModels(named, per), path)
 
 
 def load_models(path: str | Path, table: LookTable) -> ModelOfEach:
@@ -43,19 +32,11 @@ def load_models(path: str | Path, table: LookTable) -> ModelOfEach:
     Raises:
         InputError: a file that cannot be read, or that has no model for a feature of the table.
     """
-    data = read_model_file(path)
-    try:
-        if data.get("kind") != SEVERAL:
-            return ModelOfEach((model_of(data),), ("",), np.zeros(table.n_features, dtype=np.int64))
-        if not isinstance(data["models"], dict):
-            raise InputError("is no table of models", field="models")
-        names = tuple(data["models"])
-        models = tuple(model_of(model) for model in data["models"].values())
-    except KeyError as error:
-        raise InputError("is missing", path=path, field=str(error.args[0])) from error
-    except EvermapError as error:
-        raise InputError(error.problem, path=path, field=error.field, hint=error.hint) from error
-    return ModelOfEach(models, names, _of_feature(path, names, str(data.get("per")), table))
+    models, per = storage.load_models(path)
+    names = tuple(models)
+    if per == "all":
+        return ModelOfEach(tuple(models.values()), names, np.zeros(table.n_features, dtype=np.int64))
+    return ModelOfEach(tuple(models.values()), names, _of_feature(path, names, per, table))
 
 
 def _of_feature(path: str | Path, names: tuple[str, ...], per: str, table: LookTable) -> IntArray:

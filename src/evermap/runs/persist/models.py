@@ -10,7 +10,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, EvermapError
 from evermap.existence.one_stay import OneStay
-from evermap.existence.protocol import Instants, Looks, PresenceModel, Track
+from evermap.existence.protocol import Instants, Looks, PresenceFilter, PresenceModel, Track
 from evermap.io.text import quote
 from evermap.runs.persist.config import NO_RECURRENCE, PersistConfig
 from evermap.runs.persist.table import LookTable
@@ -104,7 +104,7 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
     return ModelOfEach(tuple(models), tuple(texts), of_class[table.class_of_feature])
 
 
-def ask(model: PresenceModel, looks: Looks, *questions: tuple[IntArray, FloatArray]) -> tuple[list[FloatArray], Track]:
+def ask(model: PresenceFilter, looks: Looks, *questions: tuple[IntArray, FloatArray]) -> tuple[list[FloatArray], Track]:
     """Answers to several lists of (feature, time) in one pass over the looks.
 
     Args:

@@ -1,0 +1,137 @@
+"""What a model of presence knows of a class: how long its stays last, and its absences; as distributions of `survival`.
+
+A living map, a forecast or a report needs no more of a model than these two. Every `PresenceModel` has `lifetimes`;
+`storage.lifetimes_of` reads them from the text of a prior or from a file of models.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from evermap.errors import ConfigError
+from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Mixture, PiecewiseConstantHazard, never_leaves
+from evermap.types import BoolArray, FloatArray
+
+NODES = 12
+"""Rates that stand for an unknown one."""
+AGES_PER_DOUBLING = 16
+DOUBLINGS = 24
+"""Of age, in a table of phases: from a thousandth of the fastest change to some thousands of the slowest phase."""
+CERTAIN = 700.0
+"""Integrated hazard that nobody survives."""
+
+
+class Lifetimes(NamedTuple):
+    """How long the stays of a class last, and its absences.
+
+    Attributes:
+        stay: lifetime of a stay, from arrival on.
+        absence: lifetime of an absence, from departure on; its `p_never_leaves` is the share that never returns.
+    """
+
+    stay: LifetimePrior
+    absence: LifetimePrior
+
+    def p_leave(self, age_s: ArrayLike, gap_s: ArrayLike) -> FloatArray:
+        """Return the probability that a feature which has stayed for `age_s` leaves within the next `gap_s`."""
+        return _ends(self.stay, age_s, gap_s)
+
+    def p_return(self, age_s: ArrayLike, gap_s: ArrayLike) -> FloatArray:
+        """Return the probability that a feature which has been away for `age_s` returns within the next `gap_s`."""
+        return _ends(self.absence, age_s, gap_s)
+
+
+def _ends(prior: LifetimePrior, age_s: ArrayLike, gap_s: ArrayLike) -> FloatArray:
+    age, gap = np.asarray(age_s, dtype=np.float64), np.asarray(gap_s, dtype=np.float64)
+    return np.asarray(np.exp(prior.log_conditional_death(age, age + gap)), dtype=np.float64)
+
+
+def proportional(prior: LifetimePrior, factor: float, edges_s: FloatArray) -> LifetimePrior:
+    """Return the lifetime whose hazard is `factor` times that of `prior`.
+
+    Args:
+        prior: a lifetime.
+        factor: positive.
+        edges_s: (B,) ages from 0 on between which other hazards than constant ones are replaced by their means.
+    """
+    if factor == 1.0:
+        return prior
+    if isinstance(prior, Exponential):
+        return Exponential(prior.rate * factor)
+    if isinstance(prior, PiecewiseConstantHazard):
+        return PiecewiseConstantHazard(prior.edges_s, tuple(rate * factor for rate in prior.rates))
+    ends = np.append(edges_s, 2.0 * edges_s[-1])
+    integrated = np.minimum(-prior.log_conditional_survival(ends[:-1], ends[1:]), CERTAIN)
+    return PiecewiseConstantHazard(tuple(edges_s), tuple(factor * integrated / np.diff(ends)))
+
+
+def lifetime_of_phases(rates_hz: FloatArray, inside: BoolArray, entered: FloatArray) -> LifetimePrior:
+    """Return the time that a Markov chain spends in some phases before it leaves them (Neuts 1981, phase type).
+
+    A mixture of exponentials where no change leads from one of these phases to another of them. Otherwise the hazard is
+    constant over narrow bins of age; survival is exact at their edges.
+
+    Args:
+        rates_hz: (n, n) rates of changes, the diagonal zero.
+        inside: (n,) phases to be left.
+        entered: (n,) probability of each at the beginning; sums to 1 over those inside.
+    """
+    first = np.asarray(entered[inside], dtype=np.float64)
+    exits = rates_hz[inside].sum(1)
+    within = rates_hz[np.ix_(inside, inside)]
+    if not within.any():
+        parts = [(never_leaves() if rate == 0.0 else Exponential(float(rate))) for rate in exits[first > 0.0]]
+        return parts[0] if len(parts) == 1 else Mixture.of(parts, [float(p) for p in first[first > 0.0]])
+    from scipy.linalg import expm
+
+    fastest = float(exits.max())
+    edges = 1e-3 / fastest * 2.0 ** (np.arange(AGES_PER_DOUBLING * DOUBLINGS) / AGES_PER_DOUBLING)
+    edge = np.append(0.0, edges)
+    spans = np.append(np.diff(edge), edge[-1])
+    steps = expm((within - np.diag(exits)) * spans[:, None, None])
+    hazards, row = np.empty(len(edge)), first / first.sum()
+    for k, step in enumerate(steps):
+        row = row @ step
+        left = float(row.sum())
+        hazards[k] = min(-math.log(left) if left > 0.0 else CERTAIN, CERTAIN) / spans[k]
+        row = row / left if left > 0.0 else row
+    return PiecewiseConstantHazard(tuple(edge), tuple(np.maximum(hazards, 0.0)))
+
+
+class ExponentialMixture(NamedTuple):
+    """A mixture of exponentials: the components and their probabilities."""
+
+    components: tuple[Exponential, ...]
+    weights: tuple[float, ...]
+
+
+def exponential_mixture_of(prior: LifetimePrior, n: int = NODES) -> ExponentialMixture:
+    """Return a lifetime prior as a mixture of exponentials, which is what a Markov chain can hold.
+
+    Exact for exponentials and mixtures of them; the general-purpose prior (unknown rate, Rosen 2016 eqs. 25-29) by
+    Gauss-Legendre quadrature with `n` nodes over the logarithm of the rate.
+
+    Raises:
+        ConfigError: any other prior.
+    """
+    if isinstance(prior, Exponential):
+        return ExponentialMixture((prior,), (1.0,))
+    if isinstance(prior, GeneralPurpose):
+        nodes, weights = np.polynomial.legendre.leggauss(n)
+        rates = prior.low * np.exp(math.log(prior.high / prior.low) * 0.5 * (nodes + 1.0))
+        return ExponentialMixture(tuple(Exponential(float(r)) for r in rates), tuple((0.5 * weights).tolist()))
+    if isinstance(prior, Mixture):
+        parts = [exponential_mixture_of(component, n) for component in prior.components]
+        return ExponentialMixture(
+            tuple(c for part in parts for c in part.components),
+            tuple(w * v for w, part in zip(prior.weights, parts, strict=True) for v in part.weights),
+        )
+    raise ConfigError(
+        f"{type(prior).__name__} is not a mixture of exponentials",
+        field="prior",
+        hint="Exponential, GeneralPurpose, a Mixture of them, or the run-length filter",
+    )
