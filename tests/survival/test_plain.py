@@ -10,8 +10,7 @@ import pytest
 
 from evermap.errors import ConfigError
 from evermap.survival import CallableHazard, LifetimePrior, Mixture, StepLifetime, Uniform, never_leaves, parse_prior
-from evermap.survival.plain import KINDS, prior_from_dict, prior_to_dict
-from evermap.survival.text import FORMS
+from evermap.survival.text import CLASSES, FORMS, prior_from_dict, prior_to_dict
 
 PRIORS: list[LifetimePrior] = [
     *(parse_prior(form.example) for form in FORMS.values()),
@@ -27,7 +26,7 @@ def test_json_and_back_is_the_same_prior(prior: LifetimePrior) -> None:
 
 
 def test_every_kind_that_is_made_of_numbers_was_tried() -> None:
-    assert {type(prior).__name__ for prior in PRIORS} == set(KINDS)
+    assert {type(prior).__name__ for prior in PRIORS} == set(CLASSES)
 
 
 def test_a_function_cannot_be_written_down() -> None:
@@ -38,10 +37,10 @@ def test_a_function_cannot_be_written_down() -> None:
 @pytest.mark.parametrize(
     ("content", "named"),
     [
-        ({}, "no lifetime is called None"),
-        ({"lifetime": "Weibul"}, "no lifetime is called 'Weibul'"),
+        ({}, "unknown lifetime None"),
+        ({"lifetime": "Weibul"}, "unknown lifetime 'Weibul'"),
         ({"lifetime": "Uniform"}, "'limit_s': is missing"),
-        ({"lifetime": "Uniform", "limit_s": 3.0, "x": 1}, "'x': is no value of Uniform"),
+        ({"lifetime": "Uniform", "limit_s": 3.0, "x": 1}, "'x': unknown field of Uniform"),
         ({"lifetime": "Uniform", "limit_s": -3.0}, "limit_s"),
         ({"lifetime": "Uniform", "limit_s": "three"}, "not what is expected"),
         ({"lifetime": "Uniform", "limit_s": [3.0]}, "not what is expected"),

@@ -27,9 +27,8 @@ from evermap.survival import (
     never_leaves,
     parse_prior,
 )
-from evermap.survival.as_text import prior_text
 from evermap.survival.durations import UNITS_S, duration_text, parse_duration_s, parse_hour, parse_rate_hz
-from evermap.survival.text import FORMS
+from evermap.survival.text import FORMS, prior_text
 
 DAY_S = 86400.0
 
@@ -103,7 +102,7 @@ def test_mixtures_mix_what_their_parts_say(weights: list[int], means: list[int])
     ("text", "named"),
     [
         ("", ["empty"]),
-        ("exponental:half-life=2d", ["no lifetime is called 'exponental'", "try: exponential"]),
+        ("exponental:half-life=2d", ["unknown lifetime 'exponental'", "try: exponential"]),
         ("foo", ["one of exponential, unknown"]),
         ("exponential:halflife=2d", ["no 'halflife'", "try: half-life"]),
         ("exponential:half-life=2d,mean=3d", ["one of half-life, mean and rate"]),
@@ -114,20 +113,20 @@ def test_mixtures_mix_what_their_parts_say(weights: list[int], means: list[int])
         ("exponential:half-life=-2d", ["positive"]),
         ("exponential:half-life=1e999d", ["finite"]),
         ("exponential:rate=0/d", ["rate: must be finite and positive"]),
-        ("exponential:rate=0.5", ["no rate", "0.5/d"]),
+        ("exponential:rate=0.5", ["not a rate", "0.5/d"]),
         ("weibull:scale=2d", ["needs shape", "weibull:scale=2d,shape=0.7"]),
         ("weibull:scale=2d,shape=-1", ["shape: must be positive"]),
-        ("weibull:scale=2d,shape=two", ["shape: 'two' is no number"]),
-        ("uniform:3d", ["'3d' is no key=value", "uniform:limit=3d"]),
+        ("weibull:scale=2d,shape=two", ["shape: 'two' is not a number"]),
+        ("uniform:3d", ["'3d' is not of the form key=value", "uniform:limit=3d"]),
         ("uniform:limit=3d,limit=4d", ["limit: given twice"]),
-        ("unknown:1h", ["'1h' is no range"]),
+        ("unknown:1h", ["'1h' is not a range"]),
         ("unknown:1d..1h", ["shorter mean stay comes first"]),
         ("never-leaves:ever=1d", ["never-leaves has no 'ever'"]),
-        ("gone-overnight:p=0.3,seen=25:00", ["seen: '25:00' is no time of day", "18:30"]),
+        ("gone-overnight:p=0.3,seen=25:00", ["seen: '25:00' is not a time of day", "18:30"]),
         ("gone-overnight:p=1,seen=9", ["probability: must lie above 0 and below 1"]),
         ("hazard:0s=-1/d", ["0s: a rate must be finite and not negative"]),
         ("lognormal:median=2d,spread=0", ["spread: must be positive"]),
-        ("hazard:1d=2/d", ["time before the first rate", "hazard:0s="]),
+        ("hazard:1d=2/d", ["the first rate must start at 0", "hazard:0s="]),
         ("hazard:0s=2/d,2d=1/d,1d=0/d", ["increase strictly"]),
         ("hazard:", ["needs rates"]),
         ("periodic:0s=1/d", ["needs period"]),
@@ -174,5 +173,5 @@ def test_printed_durations_read_back_to_three_digits(seconds: float) -> None:
 def test_hours() -> None:
     assert [parse_hour(text) for text in ("0", "7:30", " 23:59 ")] == pytest.approx([0.0, 7.5, 24.0 - 1 / 60])
     for wrong in ("24", "7:60", "-1", "", "7.5"):
-        with pytest.raises(ConfigError, match="no time of day"):
+        with pytest.raises(ConfigError, match="not a time of day"):
             parse_hour(wrong)

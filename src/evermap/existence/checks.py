@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError, NumericalError
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 SHIFT = 46

@@ -13,7 +13,7 @@ from evermap.existence.death import log_death_odds
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.survival import LifetimePrior, never_leaves, parse_prior
-from evermap.survival.as_text import prior_text
+from evermap.survival.text import prior_text
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _HALVINGS = 60

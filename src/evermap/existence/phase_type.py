@@ -17,7 +17,7 @@ from evermap.errors import ConfigError
 from evermap.existence.lifetimes import Lifetimes, exponential_mixture_of, lifetime_of_phases
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:

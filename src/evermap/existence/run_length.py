@@ -19,7 +19,7 @@ from evermap.existence.hazard_table import HazardTable, edges, tabulate
 from evermap.existence.lifetimes import Lifetimes, proportional
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ class RunLength:
 
     def to_dict(self) -> dict[str, Any]:
         """The model as plain numbers and words, for JSON."""
-        from evermap.survival.plain import prior_to_dict
+        from evermap.survival.text import prior_to_dict
 
         return {
             "kind": "run-length",
@@ -175,7 +175,7 @@ class RunLength:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> RunLength:
         """What `to_dict` wrote."""
-        from evermap.survival.plain import prior_from_dict
+        from evermap.survival.text import prior_from_dict
 
         rhythms = (data["stay_rhythm"], data["absence_rhythm"])
         stay_rhythm, absence_rhythm = (Rhythm.from_dict(rhythm) if rhythm else None for rhythm in rhythms)

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.existence.death import log_death_odds
 from evermap.existence.state import LOG_LARGEST
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 

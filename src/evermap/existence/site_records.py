@@ -10,7 +10,7 @@ import numpy as np
 from evermap.errors import InputError
 from evermap.existence import checks
 from evermap.sensing.sightlines import Lines
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 

@@ -17,7 +17,7 @@ from evermap.existence.hazard_table import CERTAIN
 from evermap.existence.rhythm import Rhythm
 from evermap.existence.smooth_rates import HALF_AN_EVENT, SmoothRates, age_basis, constant, fit, week_basis
 from evermap.survival import Exponential, Gamma, LogNormal, Mixture, PiecewiseConstantHazard, Weibull
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray
 
 KNOTS_PER_DOUBLING = 2

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.existence.checks import as_prior
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 SMALLEST = 1e-300

@@ -22,7 +22,7 @@ from evermap.survival.class_lifetimes import (
     stay_log_likelihood,
     stay_posterior,
 )
-from evermap.survival.piecewise import PiecewiseConstantHazard
+from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import UNKNOWN, FloatArray, IntArray, rows_of
 
 LEAST_ENDED = 5

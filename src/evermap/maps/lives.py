@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from evermap.survival.base import LifetimePrior
 from evermap.survival.general_purpose import GeneralPurpose
-from evermap.survival.protocol import LifetimePrior
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 DAY_S = 86_400.0

@@ -1,16 +1,19 @@
 """Lifetime priors: how long features stay (MATH.md section 1, Rosen 2016 section V)."""
 
-from evermap.survival.callable import CallableHazard
-from evermap.survival.exponential import Exponential
+from evermap.survival.base import LifetimePrior, Seed
+from evermap.survival.exponential import Exponential, half_life, mean_stay
 from evermap.survival.gamma import Gamma
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.general_purpose import GeneralPurpose, somewhere_between
+from evermap.survival.hazards import (
+    CallableHazard,
+    PeriodicHazard,
+    PiecewiseConstantHazard,
+    gone_by_day,
+    gone_overnight,
+)
 from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
-from evermap.survival.named import gone_by_day, gone_overnight, half_life, mean_stay, never_leaves, somewhere_between
-from evermap.survival.periodic import PeriodicHazard
-from evermap.survival.piecewise import PiecewiseConstantHazard
-from evermap.survival.protocol import LifetimePrior, Seed
-from evermap.survival.step import StepLifetime
+from evermap.survival.step import StepLifetime, never_leaves
 from evermap.survival.text import parse_prior
 from evermap.survival.uniform import Uniform
 from evermap.survival.weibull import Weibull

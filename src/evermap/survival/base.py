@@ -1,76 +1,142 @@
-"""What all lifetime models share: a model supplies its hazard and the integral of it, the rest follows.
+"""The protocol of a lifetime prior, the checks of its arguments, and the base class that all models share.
 
-The primitive is `log H(a, b)`, the logarithm of the integrated hazard between two times. From it,
-`log q = -H(a, b)` and `log(1 - q) = log(1 - exp(-H(a, b)))` lose no digit, however close `a` and `b` are and however
-little is left of `S(a)`. The logarithm matters: `1 - q` may be 1e-800, whose logarithm is an ordinary number.
+A model supplies mathematics only (see `weibull`): the hazard and the logarithm of its integral between two times,
+`log H(a, b)`. From it, `log q = -H(a, b)` and `log(1 - q) = log(1 - exp(-H(a, b)))` lose no digit, however close `a`
+and `b` are and however small `S(a)` is. The logarithm matters: `1 - q` may be 1e-800, whose logarithm is an ordinary
+number.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.survival import checks
+from evermap.errors import ConfigError
 from evermap.survival.logmath import log_one_minus_exp_of_minus_exp
-from evermap.survival.protocol import Seed
-from evermap.types import FloatArray
+from evermap.types import BoolArray, FloatArray
 
+Seed = np.random.Generator | int
+"""A generator, or the seed of a new one."""
 _LOG_TIME_RANGE = (-690.0, 690.0)
 """Natural logarithms of the times between which quantiles are sought."""
 
 
+@runtime_checkable
+class LifetimePrior(Protocol):
+    """Distribution of the survival time `T` of a feature that is first seen at t = 0 (MATH.md section 1).
+
+    Times are seconds, finite and not negative; arrays broadcast, and scalars give numpy scalars.
+    `S(t) = P(T > t)`, and `q(a, b) = S(b) / S(a)` is the probability to see `b` for one that saw `a`.
+    Where `S(a) = 0` the condition is void: then `q(a, b) = 0` for `b > a`, and `q(a, a) = 1` always.
+
+    Raises (all methods): ConfigError for a time that is NaN, infinite or negative, or for `a > b`.
+    """
+
+    @property
+    def p_never_leaves(self) -> float:
+        """Return `P(T = inf)`: positive where the hazard has a finite integral."""
+        ...
+
+    def log_survival(self, t: ArrayLike) -> FloatArray:
+        """Return `log S(t)`."""
+        ...
+
+    def log_conditional_survival(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
+        """Return `log q(a, b)`, for `a <= b`."""
+        ...
+
+    def log_conditional_death(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
+        """Return `log(1 - q(a, b))`, for `a <= b`; `-inf` where `a = b`."""
+        ...
+
+    def hazard(self, t: ArrayLike) -> FloatArray:
+        """Return `h(t) = p(t) / S(t)` in 1/s; `inf` on a point of positive mass and where `S(t) = 0`."""
+        ...
+
+    def cumulative_hazard(self, t: ArrayLike) -> FloatArray:
+        """Return `H(t) = -log S(t)`."""
+        ...
+
+    def log_density(self, t: ArrayLike) -> FloatArray:
+        """Return `log p(t)`, `p` in 1/s; `+inf` on a point of positive mass."""
+        ...
+
+    def sample(self, rng: Seed, size: int | tuple[int, ...] | None = None) -> FloatArray:
+        """Draw survival times in seconds, `inf` for features that never leave."""
+        ...
+
+    def mean(self) -> float:
+        """Return `E[T]` in seconds, possibly `inf`."""
+        ...
+
+    def quantile(self, p: ArrayLike) -> FloatArray:
+        """Return the smallest `t` with `P(T <= t) >= p`, for `p` in [0, 1]; `inf` where there is none."""
+        ...
+
+
 class Lifetime(ABC):
-    """Base of the lifetime models: implements `LifetimePrior` on top of two formulas."""
+    """Base of the lifetime models: implements `LifetimePrior` on top of two formulas.
+
+    A model overrides `_log_hazard`, `mean`, and at least one of `_log_integrated_hazard` and `_integrated_hazard`;
+    any other method where it has a closed form.
+    """
 
     __slots__ = ()
 
     @abstractmethod
-    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """`log int_a^b h`, for checked `a <= b` of one shape; `-inf` where `a = b`, `+inf` for certain death."""
-
-    @abstractmethod
     def _log_hazard(self, t: FloatArray) -> FloatArray:
-        """`log h(t)` for checked times; `+inf` where `S(t) = 0`."""
+        """Return `log h(t)` for checked times; `+inf` where `S(t) = 0`."""
 
     @abstractmethod
     def mean(self) -> float:
-        """`E[T]` in seconds, possibly `inf`."""
+        """Return `E[T]` in seconds, possibly `inf`."""
+
+    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return `log int_a^b h`, for checked `a <= b` of one shape; `-inf` where `a = b`, `+inf` for certain death."""
+        return np.asarray(np.log(self._integrated_hazard(a, b)))
+
+    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        """Return `int_a^b h`, likewise."""
+        return np.asarray(np.exp(self._log_integrated_hazard(a, b)))
 
     @property
     def p_never_leaves(self) -> float:
-        """`P(T = inf)`."""
         return 0.0
 
     def log_survival(self, t: ArrayLike) -> FloatArray:
         return 0.0 - self.cumulative_hazard(t)
 
     def log_conditional_survival(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
-        first, last = checks.intervals(a, b)
+        first, last = check_intervals(a, b)
         with np.errstate(all="ignore"):
             return _plain(0.0 - self._integrated_hazard(first, last))
 
     def log_conditional_death(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
-        first, last = checks.intervals(a, b)
+        first, last = check_intervals(a, b)
         with np.errstate(all="ignore"):
             return _plain(log_one_minus_exp_of_minus_exp(self._log_integrated_hazard(first, last)))
 
     def hazard(self, t: ArrayLike) -> FloatArray:
-        values = checks.times(t)
+        values = check_times(t)
         with np.errstate(all="ignore"):
             return _plain(np.exp(self._log_hazard(values)))
 
     def cumulative_hazard(self, t: ArrayLike) -> FloatArray:
-        values = checks.times(t)
+        values = check_times(t)
         with np.errstate(all="ignore"):
             return _plain(self._integrated_hazard(np.zeros_like(values), values))
 
     def log_density(self, t: ArrayLike) -> FloatArray:
-        values = checks.times(t)
+        values = check_times(t)
         with np.errstate(all="ignore"):
             cumulative = self._integrated_hazard(np.zeros_like(values), values)
-            # Where nobody is left the hazard is infinite and the density is zero.
+            # Where S(t) = 0 the hazard is infinite and the density is zero.
             return _plain(np.where(np.isinf(cumulative), -np.inf, self._log_hazard(values) - cumulative))
 
     def sample(self, rng: Seed, size: int | tuple[int, ...] | None = None) -> FloatArray:
@@ -80,16 +146,12 @@ class Lifetime(ABC):
             return _plain(self._time_of_log_hazard(np.log(np.asarray(generator.standard_exponential(size)))))
 
     def quantile(self, p: ArrayLike) -> FloatArray:
-        values = checks.probabilities(p)
+        values = check_probabilities(p)
         with np.errstate(all="ignore"):
             return _plain(self._time_of_log_hazard(np.log(-np.log1p(-values))))
 
-    def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        """`int_a^b h`; overridden where it has a form that needs no logarithm."""
-        return np.asarray(np.exp(self._log_integrated_hazard(a, b)))
-
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
-        """Smallest `t` with `log H(t) >= log_target`; by bisection in log t unless overridden."""
+        """Return the smallest `t` with `log H(t) >= log_target`; by bisection in log t unless overridden."""
         low = np.full(log_target.shape, _LOG_TIME_RANGE[0])
         high = np.full(log_target.shape, _LOG_TIME_RANGE[1])
         zero = np.zeros_like(log_target)
@@ -102,5 +164,70 @@ class Lifetime(ABC):
 
 
 def _plain(values: FloatArray) -> FloatArray:
-    """An array of no dimensions as a numpy scalar, any other as it is."""
+    """Return an array of no dimensions as a numpy scalar, any other unchanged."""
     return np.asarray(values, dtype=np.float64)[()]
+
+
+def check_times(t: ArrayLike, name: str = "t") -> FloatArray:
+    """Return `t` as float64; raise a ConfigError if any is NaN, infinite or negative."""
+    values = np.asarray(t, dtype=np.float64)
+    good = (values >= 0.0) & np.isfinite(values)
+    if not good.all():
+        _refuse(values, good, name, "a time since the first sighting must be finite and not negative, in seconds")
+    return values
+
+
+def check_intervals(a: ArrayLike, b: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Broadcast `a` and `b` against each other; raise a ConfigError if any time is invalid or `a > b`."""
+    first, last = np.broadcast_arrays(check_times(a, "a"), check_times(b, "b"))
+    good = first <= last
+    if not good.all():
+        _refuse(last, good, "b", f"time goes back from a = {float(first[~good].flat[0])!r}", hint="a <= b")
+    return first, last
+
+
+def check_probabilities(p: ArrayLike) -> FloatArray:
+    """Return `p` as float64; raise a ConfigError if any is outside [0, 1]."""
+    values = np.asarray(p, dtype=np.float64)
+    good = (values >= 0.0) & (values <= 1.0)
+    if not good.all():
+        _refuse(values, good, "p", "a probability must lie in [0, 1]")
+    return values
+
+
+def check_open_share(value: float, name: str = "confidence") -> None:
+    """Raise a ConfigError unless `value` lies in (0, 1)."""
+    if not 0.0 < value < 1.0:
+        raise ConfigError(f"must lie in (0, 1), not {value!r}", field=name)
+
+
+def check_positive(value: float, name: str) -> None:
+    """Raise a ConfigError unless `value` is finite and positive."""
+    if not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"must be finite and positive, not {value!r}", field=name)
+
+
+def check_rates(rates: Sequence[float], name: str = "rates") -> None:
+    """Raise a ConfigError unless every rate is finite and not negative."""
+    for row, rate in enumerate(rates):
+        if not (math.isfinite(rate) and rate >= 0.0):
+            raise ConfigError(
+                f"a hazard must be finite and not negative, row {row} is {rate!r}",
+                field=name,
+                hint="a rate of 0 where nothing ever leaves",
+            )
+
+
+def check_edges(edges: Sequence[float], name: str = "edges_s") -> None:
+    """Raise a ConfigError unless `edges` start at 0 and increase strictly."""
+    if len(edges) == 0 or edges[0] != 0.0:
+        raise ConfigError("edges must start at 0", field=name)
+    for row, (left, right) in enumerate(itertools.pairwise(edges), start=1):
+        if not (math.isfinite(right) and right > left):
+            raise ConfigError(f"edges must be finite and increase strictly, row {row} is {right!r}", field=name)
+
+
+def _refuse(values: FloatArray, good: BoolArray, name: str, problem: str, hint: str | None = None) -> None:
+    where = tuple(int(i) for i in np.argwhere(~good)[0])
+    row = "" if not where else f", row {where[0] if len(where) == 1 else where}"
+    raise ConfigError(f"{problem}: found {float(values[where])!r}{row}", field=name, hint=hint)

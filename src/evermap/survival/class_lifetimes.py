@@ -23,7 +23,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.survival.piecewise import PiecewiseConstantHazard
+from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import FloatArray
 
 LOG_MEAN = np.arange(math.log(1200.0), math.log(1.5e9), 0.25)

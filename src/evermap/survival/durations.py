@@ -27,22 +27,14 @@ _SOME_UNITS = ", ".join(UNITS_S)
 
 
 def parse_number(text: str) -> float:
-    """A plain finite number.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    """Read a plain finite number, or raise a ConfigError."""
     if not re.fullmatch(_NUMBER, text.strip()) or not math.isfinite(float(text)):
-        raise ConfigError(f"'{text}' is no number")
+        raise ConfigError(f"'{text}' is not a number")
     return float(text)
 
 
 def parse_positive(text: str) -> float:
-    """A plain positive number.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    """Read a plain positive number, or raise a ConfigError."""
     number = parse_number(text)
     if not number > 0.0:
         raise ConfigError(f"must be positive, not '{text}'")
@@ -50,14 +42,14 @@ def parse_positive(text: str) -> float:
 
 
 def parse_duration_s(text: str) -> float:
-    """`90s`, `10min`, `2h`, `3d`, `4w`, `1y` (of 365.25 days), `20ms` in seconds. A unit is needed.
+    """Read `90s`, `10min`, `2h`, `3d`, `4w`, `1y` (of 365.25 days) or `20ms` in seconds. A unit is needed.
 
     Raises:
-        ConfigError: no number with a unit, or not positive.
+        ConfigError: not a number with a unit, or not positive.
     """
     found = _DURATION.fullmatch(text.strip())
     if found is None:
-        raise ConfigError(f"'{text}' is no duration", hint="a number and a unit, as 90s, 10min, 2h, 3d, 4w or 1y")
+        raise ConfigError(f"'{text}' is not a duration", hint="a number and a unit, as 90s, 10min, 2h, 3d, 4w or 1y")
     number, unit = found.groups()
     if not unit:
         raise ConfigError(f"'{text}' has no unit", hint=f"{number}s, {number}min, {number}h or {number}d")
@@ -68,14 +60,14 @@ def parse_duration_s(text: str) -> float:
 
 
 def parse_rate_hz(text: str) -> float:
-    """`0.5/d`, `2/h`, `1e-3/s`: a hazard in 1/s, which may be 0.
+    """Read a hazard, `0.5/d`, `2/h`, `1e-3/s`, in 1/s; it may be 0.
 
     Raises:
-        ConfigError: no number per unit of time, or negative.
+        ConfigError: not a number per unit of time, or negative.
     """
     found = _RATE.fullmatch(text.strip())
     if found is None:
-        raise ConfigError(f"'{text}' is no rate", hint="a number per unit of time, as 0.5/d, 2/h or 1e-3/s")
+        raise ConfigError(f"'{text}' is not a rate", hint="a number per unit of time, as 0.5/d, 2/h or 1e-3/s")
     rate = float(found[1]) / _unit_s(found[2])
     if not (math.isfinite(rate) and rate >= 0.0):
         raise ConfigError(f"a rate must be finite and not negative, not '{text}'")
@@ -83,20 +75,16 @@ def parse_rate_hz(text: str) -> float:
 
 
 def parse_hour(text: str) -> float:
-    """A time of day, `18` or `18:30`, in hours.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    """Read a time of day, `18` or `18:30`, in hours, or raise a ConfigError."""
     found = _HOUR.fullmatch(text.strip())
     hour = -1.0 if found is None else int(found[1]) + int(found[2] or 0) / 60.0
     if not 0.0 <= hour < 24.0:
-        raise ConfigError(f"'{text}' is no time of day", hint="hours and minutes from 0:00 to 23:59, as 18:30")
+        raise ConfigError(f"'{text}' is not a time of day", hint="hours and minutes from 0:00 to 23:59, as 18:30")
     return hour
 
 
 def duration_text(seconds: float) -> str:
-    """Three digits in the unit that suits: `2 d`, `90 s`, `1.5 h`; `never` for infinity."""
+    """Write a duration with three digits in a suitable unit: `2 d`, `90 s`, `1.5 h`; `never` for infinity."""
     if math.isinf(seconds):
         return "never"
     fitting = [(name, size) for name, size in UNITS_S.items() if name != "w" and abs(seconds) >= size]

@@ -1,4 +1,4 @@
-"""Constant hazard: the past says nothing about how long a feature will stay (Rosen 2016 eqs. 21-24)."""
+"""Constant hazard: how long a feature has stayed says nothing about how long it will (Rosen 2016 eqs. 21-24)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, check_positive
 from evermap.types import FloatArray
 
 
@@ -24,18 +23,18 @@ class Exponential(Lifetime):
     rate: float
 
     def __post_init__(self) -> None:
-        checks.positive(self.rate, "rate")
+        check_positive(self.rate, "rate")
 
     @classmethod
     def from_half_life(cls, seconds: float) -> Self:
-        """Half of the features are gone after `seconds`."""
-        checks.positive(seconds, "half_life")
+        """Return the prior by which half of the features are gone after `seconds`."""
+        check_positive(seconds, "half_life")
         return cls(math.log(2.0) / seconds)
 
     @classmethod
     def from_mean(cls, seconds: float) -> Self:
-        """Features stay for `seconds` on average."""
-        checks.positive(seconds, "mean_stay")
+        """Return the prior by which features stay for `seconds` on average."""
+        check_positive(seconds, "mean_stay")
         return cls(1.0 / seconds)
 
     def mean(self) -> float:
@@ -52,3 +51,13 @@ class Exponential(Lifetime):
 
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
         return np.asarray(np.exp(log_target) / self.rate)
+
+
+def half_life(seconds: float) -> Exponential:
+    """Return the prior by which half of what is there now is gone after `seconds`."""
+    return Exponential.from_half_life(seconds)
+
+
+def mean_stay(seconds: float) -> Exponential:
+    """Return the prior of stays of `seconds` on average, of which nothing else is known."""
+    return Exponential.from_mean(seconds)

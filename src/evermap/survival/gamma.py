@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, check_positive
 from evermap.survival.logmath import log_integral_of_smooth_hazard
 from evermap.types import FloatArray
 
@@ -29,8 +28,8 @@ class Gamma(Lifetime):
     shape: float
 
     def __post_init__(self) -> None:
-        checks.positive(self.scale_s, "scale_s")
-        checks.positive(self.shape, "shape")
+        check_positive(self.scale_s, "scale_s")
+        check_positive(self.shape, "shape")
 
     def mean(self) -> float:
         return self.scale_s * self.shape

@@ -1,4 +1,4 @@
-"""The least that one can know: a constant hazard of unknown size (Rosen 2016 eqs. 25-29)."""
+"""A constant hazard of unknown size: the least informative lifetime prior (Rosen 2016 eqs. 25-29)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from typing import Self
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, Seed, check_positive
 from evermap.survival.logmath import (
     entire_exponential_integral,
     gauss_legendre,
@@ -19,18 +18,17 @@ from evermap.survival.logmath import (
     log_one_minus_exp,
     scaled_e1,
 )
-from evermap.survival.protocol import Seed
 from evermap.types import BoolArray, FloatArray
 
 _NARROW = 2.0
-"""`log(high / low)` below which the integral over the rate is taken numerically while its integrand is tame."""
+"""Below this `log(high / low)` the integral over the rate is taken numerically where its integrand is smooth."""
 
 
 @dataclass(frozen=True, slots=True)
 class GeneralPurpose(Lifetime):
     """`S(t) = (E1(low t) - E1(high t)) / log(high / low)`: an exponential whose rate is log-uniform.
 
-    Three forms, each where it loses nothing, with `D(t) = int_low^high exp(-(rate - low) t) / rate d rate`:
+    Three forms, each where it keeps all digits, with `D(t) = int_low^high exp(-(rate - low) t) / rate d rate`:
     quadrature over a narrow range of rates, `Ein` (E1 without its logarithm) for early times, scaled E1 for the rest.
 
     Attributes:
@@ -42,16 +40,16 @@ class GeneralPurpose(Lifetime):
     high: float
 
     def __post_init__(self) -> None:
-        checks.positive(self.low, "low")
-        checks.positive(self.high, "high")
+        check_positive(self.low, "low")
+        check_positive(self.high, "high")
         if not self.high > self.low:
             raise ConfigError(f"rates must satisfy low < high, not {self.low!r} and {self.high!r}", field="high")
 
     @classmethod
     def from_mean_stays(cls, shortest_s: float, longest_s: float) -> Self:
-        """Mean stays between `shortest_s` and `longest_s` seconds are thought possible."""
-        checks.positive(shortest_s, "shortest_s")
-        checks.positive(longest_s, "longest_s")
+        """Return the prior of mean stays between `shortest_s` and `longest_s` seconds."""
+        check_positive(shortest_s, "shortest_s")
+        check_positive(longest_s, "longest_s")
         return cls(1.0 / longest_s, 1.0 / shortest_s)
 
     def mean(self) -> float:
@@ -64,7 +62,7 @@ class GeneralPurpose(Lifetime):
 
     @property
     def _span(self) -> float:
-        """`log(high / low)`."""
+        """Return `log(high / low)`."""
         return math.log1p((self.high - self.low) / self.low)
 
     def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -80,31 +78,38 @@ class GeneralPurpose(Lifetime):
         later = log_one_minus_exp((self.high - self.low) * t) - np.log(t) - np.log(self._d(t))
         return np.where(t > 0.0, later, math.log((self.high - self.low) / self._span))
 
-    def _is_tame(self, t: FloatArray) -> BoolArray:
+    def _is_smooth(self, t: FloatArray) -> BoolArray:
         return np.asarray(((self.high - self.low) * t < 2.0) & (self._span < _NARROW))
 
     def _died(self, t: FloatArray) -> FloatArray:
-        """`1 - S(t)`."""
+        """Return `1 - S(t)`."""
         wide = np.asarray(entire_exponential_integral(self.high * t) - entire_exponential_integral(self.low * t))
         wide /= self._span
-        tame = self._is_tame(t)
-        if tame.any():
-            wide[tame] = -self._mean_over_rates(lambda rate: np.expm1(-rate * t[tame][:, None]))
+        smooth = self._is_smooth(t)
+        if smooth.any():
+            wide[smooth] = -self._mean_over_rates(lambda rate: np.expm1(-rate * t[smooth][:, None]))
         return wide
 
     def _d(self, t: FloatArray) -> FloatArray:
-        """`S(t) span exp(low t)`."""
+        """Return `S(t) span exp(low t)`."""
         value = np.asarray(scaled_e1(self.low * t) - np.exp(-(self.high - self.low) * t) * scaled_e1(self.high * t))
         early = self.high * t < 1.0
         if early.any():
             value[early] = np.exp(self.low * t[early]) * self._span * (1.0 - self._died(t[early]))
-        tame = self._is_tame(t)
-        if tame.any():
-            value[tame] = self._span * self._mean_over_rates(lambda rate: np.exp(-(rate - self.low) * t[tame][:, None]))
+        smooth = self._is_smooth(t)
+        if smooth.any():
+            value[smooth] = self._span * self._mean_over_rates(
+                lambda rate: np.exp(-(rate - self.low) * t[smooth][:, None])
+            )
         return value
 
     def _mean_over_rates(self, function: Callable[[FloatArray], FloatArray]) -> FloatArray:
-        """Mean over the log-uniform rate of a function that varies little over a narrow range; garbage else."""
+        """Average a smooth function over the log-uniform rate; meaningless unless the range of rates is narrow."""
         nodes, weights = gauss_legendre(24)
         rate = self.low * np.exp(min(self._span, _NARROW) * nodes)
         return np.asarray(function(rate) @ weights)
+
+
+def somewhere_between(shortest_s: float, longest_s: float) -> GeneralPurpose:
+    """Return the prior of a mean stay between the two, every order of magnitude equally probable."""
+    return GeneralPurpose.from_mean_stays(shortest_s, longest_s)

@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, NumericalError
-from evermap.survival import checks
+from evermap.survival.base import check_times
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.piecewise import PiecewiseConstantHazard
+from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import BoolArray, FloatArray, IntArray
 
 STRETCHES = 24
@@ -108,7 +108,7 @@ class HazardDraws:
         """
         if not 0.0 < confidence < 1.0:
             raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
-        times = checks.times(t)
+        times = check_times(t)
         survives = np.exp(-overlaps(np.zeros(times.size), times.ravel(), self.edges_s) @ self.rates.T)
         tail = 0.5 - 0.5 * confidence
         lower, upper = np.quantile(survives, [tail, 1.0 - tail], axis=1)

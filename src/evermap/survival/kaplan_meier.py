@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError
-from evermap.survival import checks
+from evermap.survival.base import check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
@@ -71,7 +71,7 @@ class KaplanMeier:
         return StepLifetime.at_points((*self.time_s.tolist(), np.inf), masses.tolist())
 
     def _at(self, t: ArrayLike, values: FloatArray, first: float) -> FloatArray:
-        rows = np.searchsorted(self.time_s, checks.times(t), side="right")
+        rows = np.searchsorted(self.time_s, check_times(t), side="right")
         return np.asarray(np.concatenate(([first], values))[rows])
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError, NumericalError
-from evermap.survival import checks
+from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import ParametricFit, fit
 from evermap.types import IntArray
@@ -92,7 +92,7 @@ def chunks_of(place_m: ArrayLike, size_m: float) -> IntArray:
         ConfigError: a size that is not positive.
         DataError: a place that is not finite, or not two numbers.
     """
-    checks.positive(size_m, "size_m")
+    check_positive(size_m, "size_m")
     places = np.asarray(place_m, dtype=np.float64)
     if places.ndim != 2 or places.shape[1] != 2:
         raise DataError(f"must be x and y of each thing, not of shape {places.shape}", field="place_m")
@@ -120,7 +120,7 @@ def ring_query(
         DataError: no lifetime has an end, or the index holds none.
         NumericalError: even all samples do not determine a model.
     """
-    checks.positive(variance_bound, "variance_bound")
+    check_positive(variance_bound, "variance_bound")
     rows = np.zeros(0, dtype=np.int64)
     farthest = index.farthest(chunk)
     for radius in range(farthest + 1):

@@ -9,8 +9,7 @@ from typing import Self
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, check_positive
 from evermap.survival.logmath import log_integral_of_smooth_hazard
 from evermap.types import FloatArray
 
@@ -30,12 +29,12 @@ class LogNormal(Lifetime):
     def __post_init__(self) -> None:
         if not math.isfinite(self.mu):
             raise ConfigError(f"must be finite, not {self.mu!r}", field="mu")
-        checks.positive(self.sigma, "sigma")
+        check_positive(self.sigma, "sigma")
 
     @classmethod
     def from_half_life(cls, seconds: float, sigma: float) -> Self:
         """Half of the features are gone after `seconds`, their logarithms spread by `sigma`."""
-        checks.positive(seconds, "half_life")
+        check_positive(seconds, "half_life")
         return cls(math.log(seconds), sigma)
 
     def mean(self) -> float:

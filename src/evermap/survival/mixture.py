@@ -10,9 +10,8 @@ from typing import Self
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, LifetimePrior, Seed
 from evermap.survival.logmath import log_sum_exp
-from evermap.survival.protocol import LifetimePrior, Seed
 from evermap.types import FloatArray
 
 

@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError, NumericalError
+from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
-from evermap.survival.named import never_leaves
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.step import never_leaves
 from evermap.survival.weibull import Weibull
 from evermap.types import FloatArray
 

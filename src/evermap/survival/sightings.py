@@ -31,9 +31,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError
+from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import Kind, ParametricFit, fit_likelihood
-from evermap.survival.protocol import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 

@@ -1,4 +1,4 @@
-"""Mass on points and intervals, as estimates from censored lifetimes give it (MATH.md section 6)."""
+"""Probability mass on points and intervals, the form of nonparametric estimates (MATH.md section 6)."""
 
 from __future__ import annotations
 
@@ -11,21 +11,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
-from evermap.survival.protocol import Seed
+from evermap.survival.base import Lifetime, Seed, check_times
 from evermap.types import FloatArray
 
 _CHUNK = 1_000_000
-"""Most products of rows and steps that are held at once."""
+"""Rows times steps that are computed at once, at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class StepLifetime(Lifetime):
     """`P(starts_s[i] < T <= ends_s[i]) = masses[i]`, spread evenly; a point where start and end agree.
 
-    An end of `inf` means that this mass never leaves, whatever its start: nothing is known of when it would.
-    `S(t) = P(T > t)` has already dropped at a point of mass. Intervals may overlap and come in any order.
+    An end of `inf` means that this mass never leaves, whatever its start. `S(t) = P(T > t)` has already dropped at a
+    point of mass. Intervals may overlap and come in any order.
 
     Attributes:
         starts_s: in seconds, finite or not, none negative; points lie above 0.
@@ -54,7 +52,7 @@ class StepLifetime(Lifetime):
 
     @classmethod
     def at_points(cls, times_s: Sequence[float], masses: Sequence[float]) -> Self:
-        """All the mass on points; `inf` is the point of those that never leave."""
+        """Put all mass on points; `inf` is the point of what never leaves."""
         return cls(tuple(times_s), tuple(times_s), tuple(masses))
 
     @property
@@ -77,7 +75,7 @@ class StepLifetime(Lifetime):
         return np.asarray(starts[row] + widths[row] * share)[()]
 
     def log_density(self, t: ArrayLike) -> FloatArray:
-        values = checks.times(t)
+        values = check_times(t)
         with np.errstate(all="ignore"):
             return np.asarray(np.log(self._density(values)))[()]
 
@@ -100,11 +98,8 @@ class StepLifetime(Lifetime):
         value = np.where((alive > 0.0) & (later > 0.0), value, np.inf)
         return np.where(a == b, 0.0, value)
 
-    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        return np.asarray(np.log(self._integrated_hazard(a, b)))
-
     def _alive_and_dying(self, a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """`S(a)` and `P(a < T <= b)`, each as a sum of parts of the masses, so nothing cancels."""
+        """Return `S(a)` and `P(a < T <= b)`, each as a sum of parts of the masses, so that nothing cancels."""
         starts, ends, masses = np.array((self.starts_s, self.ends_s, self.masses))
         starts = np.where(np.isfinite(ends), starts, np.inf)
         point = starts == ends
@@ -120,9 +115,14 @@ class StepLifetime(Lifetime):
         return alive.reshape(a.shape), dying.reshape(a.shape)
 
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
-        # A probability may equal a sum of masses but for its last digit: that is the point, not the next one.
+        # A probability that equals a sum of masses up to its last digit belongs to that point, not to the next one.
         rough = Lifetime._time_of_log_hazard(self, log_target - 1e-13)
         corners = np.unique([t for t in (*self.starts_s, *self.ends_s) if math.isfinite(t)] or [0.0])
         nearest = corners[np.argmin(np.abs(rough[..., None] - corners), axis=-1)]
-        # Bisection ends a few last digits beside a point of mass; the quantile is the point itself.
+        # Bisection ends a few last digits away from a point of mass; the quantile is the point itself.
         return np.where(np.abs(rough - nearest) <= 1e-12 * nearest, nearest, rough)
+
+
+def never_leaves() -> StepLifetime:
+    """Return the prior of things that never leave, as walls."""
+    return StepLifetime.at_points((math.inf,), (1.0,))

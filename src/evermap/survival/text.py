@@ -1,7 +1,7 @@
-"""Lifetime priors as text, for command lines and files: `exponential:half-life=2d`, or a mixture of such.
+"""Lifetime priors as text, for command lines and files, and as plain values, for JSON; both are read back exactly.
 
-A form is a name and, after a colon, values: `name:key=value,key=value`. Weighted forms are added to a mixture:
-`0.3*exponential:half-life=1h + 0.7*never-leaves`. `FORMS` lists all of them with an example each.
+A form is a name and, after a colon, values: `exponential:half-life=2d`, `name:key=value,key=value`. Weighted forms are
+added to a mixture: `0.3*exponential:half-life=1h + 0.7*never-leaves`. `FORMS` lists all of them with an example each.
 """
 
 from __future__ import annotations
@@ -9,21 +9,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from evermap.errors import ConfigError, suggestion
+from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
-from evermap.survival.general_purpose import GeneralPurpose
+from evermap.survival.general_purpose import GeneralPurpose, somewhere_between
+from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_by_day, gone_overnight
 from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
-from evermap.survival.named import gone_by_day, gone_overnight, never_leaves, somewhere_between
-from evermap.survival.periodic import PeriodicHazard
-from evermap.survival.piecewise import PiecewiseConstantHazard
-from evermap.survival.protocol import LifetimePrior
-from evermap.survival.step import StepLifetime
+from evermap.survival.step import StepLifetime, never_leaves
 from evermap.survival.uniform import Uniform
 from evermap.survival.weibull import Weibull
 
@@ -38,9 +36,9 @@ class Form:
     Attributes:
         example: text that `parse_prior` takes.
         meaning: half a line for people.
-        build: makes the prior of the values read.
-        needed: keys that must be given, with the reader of each.
-        optional: keys that may be.
+        build: makes the prior from the values.
+        needed: required keys, with the reader of each.
+        optional: keys that may be given.
         bare: key whose value stands alone, without `key=`.
         steps: whether further keys are times at which a hazard begins.
         spans: whether further keys are times, spans of time or `never`, with the share that leaves then.
@@ -57,18 +55,18 @@ class Form:
 
     @property
     def keys(self) -> dict[str, Reader]:
-        """All keys with their readers."""
+        """Return all keys with their readers."""
         return {**self.needed, **self.optional}
 
 
 def parse_prior(text: str) -> LifetimePrior:
-    """The prior that a text stands for.
+    """Read a prior from text.
 
     Args:
         text: a form of `FORMS`, or weighted forms added: `0.3*exponential:half-life=1h + 0.7*never-leaves`.
 
     Raises:
-        ConfigError: in one line what is wrong with which part, and the nearest word that is known.
+        ConfigError: says in one line which part is wrong, and the nearest known word.
     """
     try:
         parts = [part.strip() for part in re.split(r"(?<![0-9][eE])\+", text)]
@@ -99,7 +97,7 @@ def _parse_form(text: str) -> LifetimePrior:
     name, _, body = text.partition(":")
     form = FORMS.get(name.strip())
     if form is None:
-        raise ConfigError(f"no lifetime is called '{name}'", hint=suggestion(name.lower(), FORMS))
+        raise ConfigError(f"unknown lifetime '{name}'", hint=suggestion(name.lower(), FORMS))
     values: dict[str, Any] = {}
     steps: list[tuple[float, float]] = []
     spans: list[tuple[float, float, float]] = []
@@ -108,7 +106,7 @@ def _parse_form(text: str) -> LifetimePrior:
         if not equals and form.bare is not None:
             key, value = form.bare, entry
         elif not equals:
-            raise ConfigError(f"'{entry}' is no key=value", hint=form.example)
+            raise ConfigError(f"'{entry}' is not of the form key=value", hint=form.example)
         if key in values:
             raise ConfigError("given twice", field=key)
         if key in form.keys:
@@ -125,7 +123,7 @@ def _parse_form(text: str) -> LifetimePrior:
     if missing or (form.steps and not steps) or (form.spans and not spans):
         raise ConfigError(f"needs {missing[0] if missing else 'rates' if form.steps else 'shares'}", hint=form.example)
     if steps and steps[0][0] > 0.0:
-        raise ConfigError("nothing is said of the time before the first rate", hint=form.example)
+        raise ConfigError("the first rate must start at 0", hint=form.example)
     if steps:
         values["edges_s"], values["rates"] = zip(*steps, strict=True)
     if spans:
@@ -134,12 +132,12 @@ def _parse_form(text: str) -> LifetimePrior:
 
 
 def _time_s(text: str) -> float:
-    """A duration, which may be 0."""
+    """Read a duration, which may be 0."""
     return 0.0 if re.fullmatch(r"0(\.0)?[a-z]*", text) else parse_duration_s(text)
 
 
 def _span_s(text: str) -> tuple[float, float]:
-    """Start and end of `1h..2h`, of `never`, and of a single time."""
+    """Read start and end of `1h..2h`, of `never`, or of a single time."""
     if text == "never":
         return math.inf, math.inf
     start, dots, end = text.partition("..")
@@ -154,12 +152,12 @@ def _read(reader: Reader, key: str, value: str) -> Any:
 
 
 def _between(reader: Reader) -> Reader:
-    """Reader of `from..to`."""
+    """Return a reader of `from..to`."""
 
     def read(text: str) -> tuple[Any, Any]:
         low, dots, high = text.partition("..")
         if not dots:
-            raise ConfigError(f"'{text}' is no range", hint="two values with two dots between them")
+            raise ConfigError(f"'{text}' is not a range", hint="two values with two dots between them")
         return reader(low), reader(high)
 
     return read
@@ -228,7 +226,7 @@ FORMS: Mapping[str, Form] = {
     ),
     "gamma": Form(
         "gamma:scale=2d,shape=2",
-        "two exponential stages of 2 days one after the other",
+        "two exponential stages of 2 days each, in sequence",
         lambda v: Gamma(v["scale"], v["shape"]),
         needed={"scale": parse_duration_s, "shape": parse_positive},
     ),
@@ -268,4 +266,108 @@ FORMS: Mapping[str, Form] = {
         steps=True,
     ),
 }
-"""What may be written, by name."""
+"""All forms, by name."""
+
+
+def prior_text(prior: LifetimePrior) -> str:
+    """Write a prior as text, in seconds and with all digits, for `parse_prior`.
+
+    Raises:
+        ConfigError: it has no form, as a hazard that is a function.
+    """
+    match prior:
+        case Exponential():
+            return f"exponential:rate={prior.rate!r}/s"
+        case Weibull():
+            return f"weibull:scale={prior.scale_s!r}s,shape={prior.shape!r}"
+        case LogNormal():
+            return f"lognormal:median={math.exp(prior.mu)!r}s,spread={prior.sigma!r}"
+        case Gamma():
+            return f"gamma:scale={prior.scale_s!r}s,shape={prior.shape!r}"
+        case Uniform():
+            return f"uniform:limit={prior.limit_s!r}s"
+        case GeneralPurpose():
+            return f"general-purpose:low={prior.low!r}/s,high={prior.high!r}/s"
+        case PiecewiseConstantHazard():
+            steps = zip(prior.edges_s, prior.rates, strict=True)
+            return "hazard:" + ",".join(f"{float(edge)!r}s={float(rate)!r}/s" for edge, rate in steps)
+        case StepLifetime():
+            return "mass:" + ",".join(_shares(prior))
+        case Mixture():
+            parts = zip(prior.weights, prior.components, strict=True)
+            return "+".join(f"{float(weight)!r}*{prior_text(part)}" for weight, part in parts)
+    raise ConfigError(f"a {type(prior).__name__} cannot be written as text", field="prior")
+
+
+def _shares(prior: StepLifetime) -> list[str]:
+    """Return `when=share` for every mass; those of equal points, of equal spans and of `never` are added."""
+    total: dict[str, float] = {}
+    for start, end, mass in zip(prior.starts_s, prior.ends_s, prior.masses, strict=True):
+        when = "never" if math.isinf(end) else f"{end!r}s" if start == end else f"{start!r}s..{end!r}s"
+        total[when] = total.get(when, 0.0) + mass
+    return [f"{when}={mass!r}" for when, mass in total.items()]
+
+
+CLASSES: Mapping[str, type[Any]] = {
+    kind.__name__: kind
+    for kind in (
+        Exponential,
+        Gamma,
+        GeneralPurpose,
+        LogNormal,
+        Mixture,
+        PeriodicHazard,
+        PiecewiseConstantHazard,
+        StepLifetime,
+        Uniform,
+        Weibull,
+    )
+}
+"""Models that consist of numbers, by name: all but a hazard that is a function of the user's."""
+
+
+def prior_to_dict(prior: LifetimePrior) -> dict[str, Any]:
+    """Return `{"lifetime": name, field: value, ...}` of JSON's own types; infinity is the word 'inf'.
+
+    Raises:
+        ConfigError: the prior does not consist of numbers.
+    """
+    name = type(prior).__name__
+    if CLASSES.get(name) is not type(prior):
+        raise ConfigError(f"{name} cannot be written down", field="prior", hint=f"one of {', '.join(CLASSES)}")
+    values: Any = prior
+    return {"lifetime": name} | {item.name: _plain(getattr(values, item.name)) for item in fields(values)}
+
+
+def prior_from_dict(content: Mapping[str, Any]) -> LifetimePrior:
+    """Read a prior that `prior_to_dict` wrote.
+
+    Raises:
+        ConfigError: an unknown name, unknown or missing fields, or invalid values.
+    """
+    kind = CLASSES.get(str(content.get("lifetime")))
+    if kind is None:
+        raise ConfigError(f"unknown lifetime {content.get('lifetime')!r}", field="lifetime", hint=", ".join(CLASSES))
+    known = {item.name for item in fields(kind)}
+    for name in sorted(known ^ (content.keys() - {"lifetime"})):
+        problem = "is missing" if name in known else f"unknown field of {kind.__name__}"
+        raise ConfigError(problem, field=name)
+    try:
+        prior: LifetimePrior = kind(**{name: _value(content[name]) for name in known})
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ConfigError(f"is not what is expected: {error}", field=kind.__name__) from error
+    return prior
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | int):
+        return "inf" if value == float("inf") else float(value)
+    return prior_to_dict(value)
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_value(item) for item in value)
+    return prior_from_dict(value) if isinstance(value, Mapping) else float(value)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import NumericalError
-from evermap.survival import checks
+from evermap.survival.base import check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
@@ -65,7 +65,7 @@ class Npmle:
 
     def survival(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Lower and upper bound of `P(T > t)`, which differ inside a cell, for times in seconds."""
-        values = checks.times(t)
+        values = check_times(t)
         above = np.append(np.cumsum(self.mass[::-1])[::-1], 0.0)
         certain = np.searchsorted(self.support_right, values, side="right")
         possible = np.maximum(certain, np.searchsorted(self.support_left, values, side="left"))

@@ -1,4 +1,4 @@
-"""Any lifetime up to a limit is equally likely, and none is longer."""
+"""Lifetimes uniform up to a limit."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, check_positive
 from evermap.types import FloatArray
 
 
@@ -22,7 +21,7 @@ class Uniform(Lifetime):
     limit_s: float
 
     def __post_init__(self) -> None:
-        checks.positive(self.limit_s, "limit_s")
+        check_positive(self.limit_s, "limit_s")
 
     def mean(self) -> float:
         return 0.5 * self.limit_s
@@ -33,9 +32,6 @@ class Uniform(Lifetime):
         # Both differences are exact to the last digit; which form keeps it depends on how much is left.
         value = np.where(gone < 0.5, -np.log1p(-gone), -np.log((self.limit_s - b) / left))
         return np.where(a == b, 0.0, np.where(b >= self.limit_s, np.inf, value))
-
-    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        return np.asarray(np.log(self._integrated_hazard(a, b)))
 
     def _log_hazard(self, t: FloatArray) -> FloatArray:
         return np.where(t < self.limit_s, -np.log(self.limit_s - t), np.inf)

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.survival import checks
-from evermap.survival.base import Lifetime
+from evermap.survival.base import Lifetime, check_positive
 from evermap.survival.logmath import log_one_minus_exp, log_ratio
 from evermap.types import FloatArray
 
@@ -26,8 +25,8 @@ class Weibull(Lifetime):
     shape: float
 
     def __post_init__(self) -> None:
-        checks.positive(self.scale_s, "scale_s")
-        checks.positive(self.shape, "shape")
+        check_positive(self.scale_s, "scale_s")
+        check_positive(self.shape, "shape")
 
     def mean(self) -> float:
         return self.scale_s * math.gamma(1.0 + 1.0 / self.shape)

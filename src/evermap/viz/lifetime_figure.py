@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray
 from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, ODOMETRY, ONLINE, house_style, new_figure, settle
 from evermap.viz.time_axis import TimeUnit, label_durations, unit_for

@@ -13,7 +13,7 @@ from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.sensing.sightlines import BLOCKED_P, CLEAR, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import detection_probability
-from evermap.survival.named import never_leaves
+from evermap.survival.step import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
 WORTH_A_LOOK = 0.3

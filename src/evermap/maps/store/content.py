@@ -24,8 +24,8 @@ from evermap.errors import EvermapError
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap
 from evermap.sensing.sightlines import P_HIDDEN
-from evermap.survival.plain import prior_from_dict, prior_to_dict
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
+from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.types import UNKNOWN, FloatArray
 
 FORMAT = 2

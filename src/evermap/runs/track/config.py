@@ -8,7 +8,7 @@ from typing import Any
 
 from evermap.errors import ConfigError, suggestion
 from evermap.io.text import quote
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.survival.text import parse_prior
 from evermap.tracking.settings import TrackerSettings
 

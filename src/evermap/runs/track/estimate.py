@@ -11,9 +11,9 @@ import numpy as np
 
 from evermap.errors import ConfigError, EvermapError
 from evermap.runs.track.lifetimes import Group, LifetimeTable
-from evermap.survival.as_text import prior_text
+from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.text import prior_text
 from evermap.types import FloatArray
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.existence import single
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 from evermap_studies.worlds.revisits import Revisits
 

@@ -13,7 +13,7 @@ import numpy as np
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.existence.death import log_death_odds
 from evermap.survival import Exponential
-from evermap.survival.protocol import LifetimePrior
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
