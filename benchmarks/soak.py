@@ -24,8 +24,9 @@ import numpy as np
 from evermap.errors import DataError, EvermapError, NumericalError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
+from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import align_points, interpolate, scored_stamps
-from evermap.pipeline import Session, run_session
+from evermap.pipeline import run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.types import FloatArray, Landmarks, Recording
 from evermap_studies.worlds.faults import FAULTLESS, FaultConfig, with_faults

@@ -8,10 +8,10 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.intake import prepare
 from evermap.slam.kernels import integrate_odometry
 from evermap.slam.noise import START
 from evermap.slam.problem import Noise, Problem
-from evermap.slam.session import prepare
 from evermap.types import UNKNOWN, Detections, FloatArray, Frames, IntArray, Odometry, Recording
 
 N_LANDMARKS = 15

@@ -29,13 +29,13 @@ RULES = {
     "sensing": "errors compiled types geometry",
     "sim": "errors types geometry",
     "existence": "errors compiled types survival io sensing",
-    "slam": "errors interrupts compiled plugins types geometry valid sensing",
+    "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors types config geometry survival sensing existence slam",
     "tracking": "errors compiled types survival existence",
     "viz": "errors types geometry survival metrics existence",
-    "pipeline": "errors interrupts plugins types config valid sensing slam maps",
+    "pipeline": "errors types config valid slam maps",
     "runs": "errors interrupts types config survival valid io metrics existence maps tracking viz pipeline",
-    "cli": "errors interrupts plugins types config survival io sim existence maps viz pipeline runs",
+    "cli": "errors interrupts plugins types config survival io sim existence slam maps viz pipeline runs",
 }
 
 # loaded by the functions that need them, never by starting up

@@ -15,7 +15,8 @@ from hypothesis import strategies as st
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import DataError
 from evermap.maps.living import LivingMap
-from evermap.pipeline import Session, run_session
+from evermap.maps.sessions.session import Session
+from evermap.pipeline import run_session
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.types import Recording
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults

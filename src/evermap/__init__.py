@@ -23,13 +23,15 @@ if TYPE_CHECKING:
     from evermap.errors import EvermapError
     from evermap.io import read_recording, write_native
     from evermap.maps.living import LivingMap
+    from evermap.maps.sessions.session import Session
     from evermap.maps.store import open_store
-    from evermap.pipeline import Session, check_recording, run_localization, run_session, run_slam
+    from evermap.pipeline import run_localization, run_session, run_slam
     from evermap.runs.folder import write_run
     from evermap.runs.persist.config import PersistConfig
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.table import read_looks
     from evermap.runs.sessions import Entered, enter_session
+    from evermap.slam.check import check_recording
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
 _HOME = {
@@ -38,7 +40,9 @@ _HOME = {
     "evermap.io": ("read_recording", "write_native"),
     "evermap.maps.living": ("LivingMap",),
     "evermap.maps.store": ("open_store",),
-    "evermap.pipeline": ("Session", "check_recording", "run_localization", "run_session", "run_slam"),
+    "evermap.maps.sessions.session": ("Session",),
+    "evermap.slam.check": ("check_recording",),
+    "evermap.pipeline": ("run_localization", "run_session", "run_slam"),
     "evermap.runs.persist.config": ("PersistConfig",),
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),

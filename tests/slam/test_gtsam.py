@@ -15,9 +15,9 @@ from recordings import building, first_seconds
 from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
+from evermap.slam.intake import prepare
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.session import prepare
 from evermap.slam.solver import Motion, compare
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import Recording

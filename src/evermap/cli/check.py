@@ -40,7 +40,7 @@ def check(
     """
     from evermap.config import load_config
     from evermap.io import read_recording
-    from evermap.pipeline import check_recording
+    from evermap.slam.check import check_recording
 
     config = load_config(config_file, settings or [])
     found = check_recording(read_recording(recording_path, robot=robot), config)

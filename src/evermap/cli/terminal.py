@@ -102,7 +102,7 @@ def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *
 def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
     """Compile the kernels (of the pipeline if not told which), or load them; says so where that takes a while."""
     if compile_kernels is None:
-        from evermap.pipeline import warm_up as of_the_pipeline
+        from evermap.slam.warmup import warm_up as of_the_pipeline
 
         compile_kernels = of_the_pipeline
     note = "compiling the kernels, once on this machine; this takes about half a minute"

@@ -19,7 +19,7 @@ from evermap.maps.store import Attachment, MapStore, Revision, RevisionKind
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.living import LivingMap
-    from evermap.pipeline import Session
+    from evermap.maps.sessions.session import Session
     from evermap.types import MapChange, Recording
 
 Progress = Callable[[float, float], None]

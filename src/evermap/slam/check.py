@@ -13,15 +13,17 @@ metres in a hundred and by tenths of a second: no mistake on the list is near en
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from math import inf, log, pi
 from typing import Any
 
 import numpy as np
 
+from evermap.config import Config, SensorConfig
 from evermap.errors import DataError
 from evermap.geometry import se2
-from evermap.types import UNKNOWN, FloatArray, IntArray, Odometry, ParameterEstimate, Recording
+from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Odometry, ParameterEstimate, Recording
+from evermap.valid import check_landmarks, validate
 
 LAGS_S = (1.0, 4.0)
 """Pairs of sightings are at least so far apart in time, and at most twice as far."""
@@ -511,3 +513,33 @@ def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArra
     x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
     y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
     return np.stack([x, y, turned])
+
+
+def valid(recording: Recording, sensor: SensorConfig, prior_map: Landmarks | None = None) -> Recording:
+    """Return the recording with the sensor that the configuration states.
+
+    Raises:
+        InputError: no `Recording`, or values that cannot be, in it or in the prior map.
+        DataError: nothing can be estimated from it.
+    """
+    validate(recording)
+    if prior_map is not None:
+        check_landmarks(prior_map, "prior_map")
+    return replace(recording, sensor=sensor.applied_to(recording.sensor))
+
+
+def check_recording(recording: Recording, config: Config | None = None) -> Check:
+    """Tell what a recording holds, and what is odd about it: units, signs, clocks, identities, limits, gaps.
+
+    `run_slam`, `run_session` and `run_localization` tell the same in the warnings of their results.
+
+    Args:
+        recording: what a reader returned; its truth is not looked at.
+        config: settings; None for the defaults. Its section `sensor` may correct the sensor's limits.
+
+    Raises:
+        InputError: no `Recording`, or one with values that cannot be.
+        DataError: nothing can be estimated from it.
+    """
+    config = config or Config()
+    return Check.of(valid(recording, config.sensor), identities=not config.slam.unknown_ids)

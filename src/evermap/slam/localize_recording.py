@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -12,14 +11,14 @@ import numpy as np
 
 from evermap.errors import DataError
 from evermap.geometry import se2
-from evermap.interrupts import watched
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.estimate import fed
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import Localizer, Located, Sightings
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.session import described
+from evermap.slam.result import described
 from evermap.types import (
     UNKNOWN,
     BoolArray,
@@ -180,30 +179,19 @@ def _feed(
     seen, stamps = recording.detections, recording.frames.stamp_s
     first, last = np.searchsorted(seen.frame, frame), np.searchsorted(seen.frame, frame, side="right")
     located: list[Located] = []
-    step_s: list[float] = []
-    began = time.perf_counter()
-    try:
-        with watched() as watch:
-            for row, low, high in zip(frame.tolist(), first, last, strict=True):
-                passed_s = float(stamps[row] - stamps[frame[0]])
-                if realtime:
-                    watch.sleep(passed_s - (time.perf_counter() - began))
-                start = time.perf_counter()
-                sightings = Sightings(
-                    seen.landmark_id[low:high],
-                    np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
-                    np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
-                )
-                located.append(localizer.step(stamps[row] - recording.odometry.stamp_s[0], drive, sightings))
-                step_s.append(time.perf_counter() - start)
-                if progress is not None:
-                    progress(passed_s, float(stamps[frame[-1]] - stamps[frame[0]]))
-                watch.stop_if_asked()
-    except KeyboardInterrupt:
-        if not step_s:
-            raise
+
+    def step(row: int) -> None:
+        low, high = first[row], last[row]
+        sightings = Sightings(
+            seen.landmark_id[low:high],
+            np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
+            np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
+        )
+        located.append(localizer.step(stamps[frame[row]] - recording.odometry.stamp_s[0], drive, sightings))
+
+    step_s, interrupted = fed(stamps[frame], step, realtime=realtime, progress=progress)
     done = len(step_s)
-    return _Run(frame[:done], first[:done], located[:done], np.array(step_s), done < len(frame))
+    return _Run(frame[:done], first[:done], located[:done], step_s, interrupted)
 
 
 @functools.cache

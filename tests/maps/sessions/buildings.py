@@ -10,7 +10,8 @@ import numpy as np
 from evermap.config import CalibrationConfig, Config, LivingConfig, SlamConfig
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.pipeline import Session, run_session
+from evermap.maps.sessions.session import Session
+from evermap.pipeline import run_session
 from evermap.sim import BuildingConfig, BuildingSimulation, Duration, ObjectClass, SensorConfig, simulate_building
 from evermap.sim.world import positions_at
 from evermap.types import FloatArray, IntArray, Recording

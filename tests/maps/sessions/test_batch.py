@@ -11,18 +11,19 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.geometry import anchored
 from evermap.maps.sessions.own import own_landmarks
 from evermap.maps.sessions.session import laid
-from evermap.pipeline import Alone, bring_in, solve_alone
+from evermap.pipeline import bring_in, solve_alone
+from evermap.slam.estimate import Solved
 from evermap.types import FloatArray, IntArray
 
 from .buildings import building, settings
 
 
-def own(alone: Alone) -> tuple[IntArray, FloatArray, FloatArray]:
+def own(alone: Solved) -> tuple[IntArray, FloatArray, FloatArray]:
     """What a session says by itself: ids, positions in its own frame, and their joint covariance."""
-    outcome = alone.visit.outcome
+    outcome = alone.outcome
     assert outcome.log_scale_sigma == 0.0, "the metre is known here"
     found = own_landmarks(outcome)
-    return alone.visit.prepared.landmark_id[found.row], found.position_m, found.covariance_m2
+    return alone.prepared.landmark_id[found.row], found.position_m, found.covariance_m2
 
 
 def whitening(covariance_m2: FloatArray) -> FloatArray:

@@ -12,15 +12,16 @@ from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.own import own_landmarks
 from evermap.maps.sessions.refit import refitted
-from evermap.pipeline import Alone, solve_alone
+from evermap.pipeline import solve_alone
 from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
+from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate
 from evermap.slam.streaming import Outcome
 from evermap.types import FloatArray, IntArray
 
 
 @pytest.fixture(scope="module")
-def alone() -> Alone:
+def alone() -> Solved:
     """One lap of a small building."""
     config = BuildingConfig(
         days=1,
@@ -34,16 +35,16 @@ def alone() -> Alone:
     return solve_alone(simulate_building(config, seed=1).sessions[0], LivingMap(), Config())
 
 
-def in_map(alone: Alone, outcome: Outcome, row: IntArray, place_m: FloatArray) -> tuple[Outcome, bool]:
+def in_map(alone: Solved, outcome: Outcome, row: IntArray, place_m: FloatArray) -> tuple[Outcome, bool]:
     """Solved with places that are known to a centimetre, in the frame of the session."""
     covariance = 1e-4 * np.eye(2 * len(row))
     return refitted(outcome, alone.prior, np.zeros(3), 1.0, row, place_m, covariance, robust=True)
 
 
 @pytest.mark.parametrize("bend", [(0.0, 0.0, 0.6), (4.0, -3.0, 0.0), (-6.0, 5.0, 2.5)])
-def test_a_bent_session_is_straightened(alone: Alone, bend: tuple[float, float, float]) -> None:
+def test_a_bent_session_is_straightened(alone: Solved, bend: tuple[float, float, float]) -> None:
     """From its middle on everything is turned and shifted, as after a blind stretch; most landmarks are in the map."""
-    outcome = alone.visit.outcome
+    outcome = alone.outcome
     row = own_landmarks(outcome).row[::2]
     place_m = outcome.graph_estimate.landmark[row]
     straight, was_bent = in_map(alone, outcome, row, place_m)

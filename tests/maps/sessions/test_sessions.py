@@ -14,7 +14,8 @@ from evermap.geometry.rigid import rigid
 from evermap.maps.lives import Lives
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import predicted
-from evermap.pipeline import Session, run_session
+from evermap.maps.sessions.session import Session
+from evermap.pipeline import run_session
 from evermap.sim import BuildingSimulation, looked_at
 from evermap.sim.world import positions_at
 from evermap.types import ChangeKind, Clock, FloatArray, Recording

@@ -20,11 +20,10 @@ from evermap.maps.sessions.overlaying import Laid, all_at_home, laid_over, unben
 from evermap.maps.sessions.own import of_unknown_size, own_landmarks
 from evermap.maps.sessions.refit import MOST_LOST, refitted
 from evermap.maps.sessions.size import log_ratio, settled
-from evermap.slam import session as of_slam
-from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.session import Prepared
+from evermap.slam import result as of_slam
+from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
-from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, rows_of
+from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, SlamResult, rows_of
 
 INLIER = 0.5
 LEAST_FIT = 0.75
@@ -36,22 +35,25 @@ GLIMPSE_M = 0.4
 
 
 @dataclass(frozen=True, slots=True)
-class Visit:
-    """A session as it was recorded, as the estimator wants it, and what the estimator made of it."""
+class Session:
+    """What a session made of a map.
 
+    Attributes:
+        living: the map after it.
+        found: False where the session could not be found in the map, which then stays as it was.
+        recording: as it was used: repaired, with the map's class numbers, without deleted landmarks; rows of `slam`
+            that name detections and frames are rows of it.
+        slam: trajectory, landmarks and all else, in the map's frame.
+        changes: what appeared, vanished, moved, was exchanged or returned since the session before.
+        evidence: what was seen of every clique, frame by frame.
+    """
+
+    living: LivingMap
+    found: bool
     recording: Recording
-    prepared: Prepared
-    outcome: Outcome
-
-    @property
-    def start_s(self) -> float:
-        """Stamp of the first frame that has a pose."""
-        return float(self.recording.frames.stamp_s[self.prepared.pose_frame[0]])
-
-    @property
-    def end_s(self) -> float:
-        """Stamp of the last frame that was processed."""
-        return self.prepared.start_s + float(self.outcome.problem.stamp_s[-1])
+    slam: SlamResult
+    changes: tuple[MapChange, ...]
+    evidence: Evidence
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +109,7 @@ def check_in_order(recording: Recording, living: LivingMap) -> None:
         )
 
 
-def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConfig) -> Laid | None:
+def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
     """Where the session lies in the map; None where it shows nothing that stands as in the map."""
     own = own_landmarks(alone.outcome)
     names = alone.prepared.landmark_id[own.row]
@@ -122,8 +124,8 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Visit, config: LivingConf
 
 
 def refit(
-    living: LivingMap, p_site: FloatArray, where: Laid, alone: Visit, prior: CalibrationPrior, *, robust: bool
-) -> tuple[LivingMap, Laid, Visit]:
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, *, robust: bool
+) -> tuple[LivingMap, Laid, Solved]:
     """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized.
 
     A session that had to be straightened for that is asked again what stands where it stood.
@@ -151,7 +153,7 @@ def refit(
         position = living.places.position_m[where.place[stand]]
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
         covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
-        return refitted(outcome, prior, motion, size, row, position, covariance, robust=robust)
+        return refitted(outcome, alone.prior, motion, size, row, position, covariance, robust=robust)
 
     solved, straightened = in_map(where)
     if where.assumed.any() and solved.inlier.mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
@@ -174,12 +176,37 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def fits(visit: Visit, alone: Visit) -> bool:
+def fits(visit: Solved, alone: Solved) -> bool:
     """False for a session that the map contradicts: what fits together by itself does not fit once it is held there."""
     return bool(visit.outcome.inlier.mean() >= LEAST_FIT * alone.outcome.inlier.mean())
 
 
-def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Visit, config: LivingConfig) -> Extended:
+def judged(
+    living: LivingMap, where: Laid | None, visit: Solved, config: LivingConfig, known: LivingMap | None = None
+) -> tuple[LivingMap, tuple[MapChange, ...], Evidence]:
+    """Return the map after the session, what changed, and what was seen of every clique.
+
+    What was found goes into the map, then hits and misses into beliefs, and those into decisions.
+
+    Args:
+        living: the map before the session, resized to it.
+        where: the session lies in the map; None for a map's first.
+        visit: the session, solved with the map as its prior.
+        config: which parts of the engine are on.
+        known: a map that knows how long things stay, with what the session found; None for nothing.
+    """
+    if known is not None:
+        living = replace(living, lives=replace(known.lives, looks_s=living.lives.looks_s))
+    aged = believe.aged(living, config, visit.start_s)
+    living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
+    entry = entered(living, aged.p_here, where, visit, config)
+    seen, eye = looks(entry, visit, config)
+    now = believed(entry, seen, visit, config)
+    after, changes = decided(entry.before, now, seen, visit, config, known)
+    return learned(after, seen, replace(entry, living=now.living), eye, config), changes, now.evidence
+
+
+def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Solved, config: LivingConfig) -> Extended:
     """The map with the places and sites that the session found."""
     in_place = None
     if where is None:
@@ -214,7 +241,7 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Vi
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
-def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, FloatArray]:
+def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[Looks, FloatArray]:
     """Which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor poses."""
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = of_slam.trajectory(prepared, outcome, recording, "")
@@ -233,7 +260,7 @@ def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[Looks, F
     return seen, believe.sensor_poses(sighting, recording.sensor)
 
 
-def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Visit) -> None:
+def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
     """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
     living, estimate = entry.living, visit.outcome.estimate
     names = visit.prepared.landmark_id
@@ -245,7 +272,7 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Visit) -> None:
     place_of[row[near]] = place[near]
 
 
-def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -> Believed:
+def believed(entry: Extended, seen: Looks, visit: Solved, config: LivingConfig) -> Believed:
     """The map with the beliefs and the counts of the session."""
     living, rows = entry.living, seen.rows
     hit, missed = rows.hit, seen.counts & ~rows.hit
@@ -281,7 +308,7 @@ def believed(entry: Extended, seen: Looks, visit: Visit, config: LivingConfig) -
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Visit, config: LivingConfig, known: LivingMap | None = None
+    before: LivingMap, now: Believed, seen: Looks, visit: Solved, config: LivingConfig, known: LivingMap | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date and without what is forgotten, and what changed since the session before.
 
@@ -319,7 +346,27 @@ def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, con
     return after
 
 
-def _inliers(visit: Visit) -> tuple[IntArray, IntArray]:
+def told(
+    after: LivingMap, where: Laid | None, visit: Solved, changes: tuple[MapChange, ...], evidence: Evidence
+) -> Session:
+    """Return the session that made a map of another."""
+    frame, names = "first_pose" if where is None else "prior_map", visit.recording.landmark_names
+    landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)
+    changes = tuple(change.named(names) for change in changes)
+    slam = replace(of_slam.result(visit, frame, landmarks), changes=changes)
+    return Session(after, True, visit.recording, slam, changes, evidence)
+
+
+def lost(alone: Solved, living: LivingMap, reason: str) -> Session:
+    """Return a session that cannot be found in the map: it stands by itself, and the map as it was."""
+    frame = "first_pose"
+    landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, frame)
+    slam = of_slam.result(alone, frame, landmarks)
+    slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason}"))
+    return Session(living, False, alone.recording, slam, (), Evidence.empty())
+
+
+def _inliers(visit: Solved) -> tuple[IntArray, IntArray]:
     """Rows of the detections that fit, and of their landmarks."""
     good = np.flatnonzero(visit.outcome.inlier >= INLIER)
     return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]

@@ -24,7 +24,7 @@ from evermap_studies.demo.truth import Truth, truth_of
 if TYPE_CHECKING:
     from evermap.config import Config, LivingConfig
     from evermap.maps.living import LivingMap
-    from evermap.pipeline import Session
+    from evermap.maps.sessions.session import Session
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 Progress = Callable[[float, float], None]

@@ -15,7 +15,7 @@ from evermap_studies.lifelong.world import World
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.living import LivingMap
-    from evermap.pipeline import Alone
+    from evermap.slam.estimate import Solved
     from evermap.types import FloatArray, Recording
 
 P_CLAIMED = 0.5
@@ -128,9 +128,9 @@ class _Halves:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._known: dict[str, tuple[Alone, float]] = {}
+        self._known: dict[str, tuple[Solved, float]] = {}
 
-    def alone(self, life: _Life) -> tuple[Alone, float]:
+    def alone(self, life: _Life) -> tuple[Solved, float]:
         """The session, and processor time that it took [s]."""
         from evermap.pipeline import solve_alone
 

@@ -24,7 +24,7 @@ from evermap_studies.worlds.scores import existence_score, statement_score
 if TYPE_CHECKING:
     from evermap.config import LivingConfig
     from evermap.maps.living import LivingMap
-    from evermap.pipeline import Session
+    from evermap.maps.sessions.session import Session
 
 Row = dict[str, Any]
 

@@ -159,7 +159,7 @@ def jobs(settings: Settings) -> list[Job]:
 
 
 def _run_all(settings: Settings, data: Path, progress: Progress | None) -> Iterator[Row]:
-    from evermap.pipeline import warm_up
+    from evermap.slam.warmup import warm_up
 
     warm_up()  # compiling is no part of the first session
     planned = jobs(settings)

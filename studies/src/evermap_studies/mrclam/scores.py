@@ -105,9 +105,9 @@ def odometry_between_true_poses(recording: Recording, result: SlamResult) -> Pos
     """
     from evermap.slam.bridge import bridged
     from evermap.slam.calibration import NAMES
+    from evermap.slam.intake import prepare
     from evermap.slam.kernels import NOISE_NAMES
     from evermap.slam.problem import Noise
-    from evermap.slam.session import prepare
 
     truth = recording.truth
     if truth is None:

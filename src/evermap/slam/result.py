@@ -1,21 +1,21 @@
-"""Between recordings and estimators: what goes into a session's problem, and what comes out as plain arrays."""
+"""What comes out of the estimator, as plain arrays with the recording's ids and stamps, in metres."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
-from evermap.errors import DataError
 from evermap.geometry import se2
+from evermap.sensing.visibility import find_misses
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
-from evermap.slam.changes.explain import GivenMap
+from evermap.slam.check import far_off
+from evermap.slam.estimate import Solved
+from evermap.slam.intake import Prepared
 from evermap.slam.kernels import NOISE_NAMES
 from evermap.slam.noise import START, NoiseFit
-from evermap.slam.problem import Drive, Problem, independent
-from evermap.slam.streaming import Outcome, PriorMap, StreamingSlam
+from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.types import (
     UNKNOWN,
     Alternative,
@@ -27,97 +27,65 @@ from evermap.types import (
     Misses,
     ParameterEstimate,
     Recording,
+    SlamResult,
     Trajectory,
 )
 
-FIRST_POSE_INFORMATION = 1e8
-"""The first pose is the origin, to 0.1 mm."""
 TRAJECTORY_STEP_S = 0.1
 """Longest step between poses of the trajectory that is written."""
 LONGEST_PAUSE_S = 60.0
 """Longer pauses are divided no further: a clock that was set forward by a day would make a million poses of it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """A recording as the estimator wants it.
-
-    Attributes:
-        problem: stamps count from `start_s`.
-        start_s: stamp of the first odometry row.
-        pose_frame: (N,) rows of `Recording.frames` that get a pose: those with a usable detection.
-        used: (M,) rows of `Recording.detections` that are used.
-        landmark_id: (L,) ids behind the problem's landmark rows.
-        prior_map: the map to localise in, in those rows.
-        warnings: what was left out, counted.
-        names: texts behind landmark ids.
-    """
-
-    problem: Problem
-    start_s: float
-    pose_frame: IntArray
-    used: IntArray
-    landmark_id: IntArray
-    prior_map: PriorMap | None
-    warnings: tuple[str, ...]
-    names: Mapping[int, str] = field(default_factory=dict)
-
-    def given_map(self) -> GivenMap | None:
-        """The prior map as the joint search compares with it: landmark by landmark, with covariances."""
-        if self.prior_map is None:
-            return None
-        given, rows = self.prior_map.given, np.arange(len(self.landmark_id))
-        blocks = self.prior_map.information.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
-        covariance = np.linalg.inv(np.where(given[:, None, None], blocks, np.eye(2)))
-        return GivenMap(self.prior_map.mean, covariance, given)
-
-
-def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: tuple[str, ...] = ()) -> Prepared:
-    """Sort out what can be used: detections of known identity, while there is odometry.
-
-    `remarks` on the recording come before those on what was left out.
-
-    Raises:
-        DataError: fewer than two frames with a landmark of known identity.
-    """
-    odometry, detections = recording.odometry, recording.detections
-    if len(odometry) == 0:
-        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
-    stamps = recording.frames.stamp_s
-    warnings = list(remarks)
-    anonymous = detections.landmark_id == UNKNOWN
-    if anonymous.any():
-        warnings.append(f"{int(anonymous.sum())} detections without identity not used")
-    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1])
-    outside = ~anonymous & ~moving[detections.frame]
-    if outside.any():
-        warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
-    used = np.flatnonzero(~anonymous & ~outside)
-    pose_frame, pose_row = np.unique(detections.frame[used], return_inverse=True)
-    if len(pose_frame) < 2:
-        raise DataError(
-            f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
-            hint="check landmark ids, and that detections and odometry share one clock",
+def concluded(solved: Solved) -> SlamResult:
+    """Return trajectory and map, what moved, and what may have moved instead."""
+    prepared, outcome, recording = solved.prepared, solved.outcome, solved.recording
+    frame = "prior_map" if outcome.aligned else "first_pose"
+    found = result(solved, frame, landmarks(prepared, outcome, recording, frame))
+    warnings = list(found.warnings)
+    if prepared.prior_map is not None and not outcome.aligned:
+        warnings.append(
+            "cannot localise in the prior map: too few of its landmarks were seen standing to each other as it says; "
+            "the map is in the frame of the first pose"
         )
-    landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
-    start_s = float(odometry.stamp_s[0])
-    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    problem = Problem(
-        stamp_s=stamps[pose_frame] - start_s,
-        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity),
-        pose_row=pose_row.astype(np.int64),
-        landmark_row=landmark_row.astype(np.int64),
-        reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
-        sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
-        mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
-        prior=CalibrationPrior.from_settings(calibrated=False, fix={}),
-        start_pose=np.zeros(3),
-        start_information=FIRST_POSE_INFORMATION,
-        landmark_mean=np.zeros((len(landmark_id), 2)),
-        landmark_information=np.zeros((2 * len(landmark_id), 2 * len(landmark_id))),
+    return replace(
+        found,
+        warnings=(*warnings, *outcome.revision.warnings),
+        changes=changes(prepared, outcome, outcome.revision.changes),
+        alternatives=alternatives(prepared, outcome, recording, frame),
     )
-    in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
-    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
+
+
+def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
+    """Bridge the blind stretches and count the misses.
+
+    Args:
+        solved: the recording and its estimate.
+        frame: in which the estimate is: 'first_pose' or 'prior_map'.
+        in_map: landmarks that are told, with what is to be seen of them.
+    """
+    recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
+    path = trajectory(prepared, outcome, recording, frame)
+    rows = np.flatnonzero(recording.frames.stamp_s <= path.stamp_s[-1] + 1e-9).astype(np.int64)
+    poses = path.pose_world_robot[rows_at(path, recording, rows)]
+    misses = find_misses(rows, poses, recording.detections, in_map, recording.frames.stamp_s, recording.sensor)
+    states = described(outcome.estimate.states, outcome.states_covariance, outcome.noise, solved.prior)
+    warnings = [*prepared.warnings, *far_off(states)]
+    if solved.interrupted:
+        done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
+        warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
+    return SlamResult(
+        trajectory=path,
+        online=online(prepared, solved.slam, recording, frame),
+        landmarks=with_misses(in_map, misses),
+        parameters=states,
+        innovations=innovations(prepared, solved.slam, outcome, recording),
+        misses=misses,
+        step_s=solved.step_s,
+        dead_reckoning=dead_reckoning(prepared, path),
+        warnings=tuple(warnings),
+        interrupted=solved.interrupted,
+    )
 
 
 def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Trajectory:
@@ -245,11 +213,6 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
     )
 
 
-def parameters(outcome: Outcome, prior: CalibrationPrior) -> tuple[ParameterEstimate, ...]:
-    """Calibration states and noise levels with their uncertainty and what was believed before."""
-    return described(outcome.estimate.states, outcome.states_covariance, outcome.noise, prior)
-
-
 def described(
     states: FloatArray, covariance: FloatArray, fit: NoiseFit, prior: CalibrationPrior
 ) -> tuple[ParameterEstimate, ...]:
@@ -294,21 +257,6 @@ def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
     pose, covariance = dead_reckoned(trajectory.stamp_s - prepared.start_s, prepared.problem.drive, plain.mean, START)
     pose = se2.compose(trajectory.pose_world_robot[0], pose)
     return Trajectory(trajectory.stamp_s, pose, covariance, frame=trajectory.frame, clock=trajectory.clock)
-
-
-def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
-    """The prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
-    rows = {int(identity): k for k, identity in enumerate(prior_map.landmark_id)}
-    mean = np.zeros((len(landmark_id), 2))
-    information = np.zeros((len(landmark_id), 2, 2))
-    given = np.zeros(len(landmark_id), dtype=bool)
-    for k, identity in enumerate(landmark_id):
-        if int(identity) in rows:
-            row = rows[int(identity)]
-            given[k] = True
-            mean[k] = prior_map.position_m[row]
-            information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
-    return PriorMap(mean, independent(information), given)
 
 
 def _dense_stamps(recording: Recording, outcome: Outcome, start_s: float) -> FloatArray:

@@ -1,0 +1,156 @@
+"""A recording through the estimator, frame after frame, and what the estimator makes of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap import plugins
+from evermap.config import SlamConfig
+from evermap.interrupts import watched
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.changes.joint import Joint
+from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.intake import Prepared
+from evermap.slam.method import Method, Static
+from evermap.slam.problem import Noise
+from evermap.slam.streaming import Outcome, StreamingSlam
+from evermap.slam.warmup import warm_up
+from evermap.types import FloatArray, Recording, Sensor
+
+Progress = Callable[[float, float], None]
+"""Called with seconds of the recording that are done, and seconds in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A recording by itself, in a frame of its own or in that of a prior map.
+
+    Attributes:
+        recording: as it was used.
+        prepared: as the estimator wants it.
+        outcome: smoothed values with their covariances.
+        slam: the estimator, for what it knew at the time of each frame.
+        prior: of the calibration states.
+        step_s: (F,) seconds per processed frame.
+        interrupted: True where it was stopped before its end.
+    """
+
+    recording: Recording
+    prepared: Prepared
+    outcome: Outcome
+    slam: StreamingSlam
+    prior: CalibrationPrior
+    step_s: FloatArray
+    interrupted: bool
+
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first frame that has a pose."""
+        return float(self.recording.frames.stamp_s[self.prepared.pose_frame[0]])
+
+    @property
+    def end_s(self) -> float:
+        """Stamp of the last frame that was processed."""
+        return self.prepared.start_s + float(self.outcome.problem.stamp_s[-1])
+
+
+def solve(
+    recording: Recording,
+    prepared: Prepared,
+    prior: CalibrationPrior,
+    noise: Noise,
+    settings: SlamConfig,
+    *,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> Solved:
+    """Estimate poses, landmarks, calibration and noise of a recording.
+
+    Args:
+        recording: cleaned, with known identities.
+        prepared: the same as the estimator wants it.
+        prior: of the calibration states.
+        noise: levels to start from.
+        settings: of the estimator.
+        realtime: process at the recording's pace.
+        progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
+
+    Raises:
+        NumericalError: no finite optimum.
+    """
+    warm_up()
+    slam = StreamingSlam(
+        prepared.problem,
+        noise,
+        prior,
+        prior_map=prepared.prior_map,
+        robust=settings.robust,
+        estimate_noise=settings.estimate_noise,
+        solver=settings.solver,
+        method=_method(prepared, prior, recording.sensor, settings),
+    )
+    step_s, interrupted = fed(
+        prepared.problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress
+    )
+    return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted)
+
+
+def fed(
+    stamp_s: FloatArray,
+    step: Callable[[int], None],
+    *,
+    least: int = 1,
+    realtime: bool = False,
+    progress: Progress | None = None,
+) -> tuple[FloatArray, bool]:
+    """Process frame after frame, at the recording's pace if wanted, until the end or an interrupt.
+
+    Args:
+        stamp_s: (F,) of the frames.
+        step: processes the frame of a row.
+        least: frames without which an interrupt leaves nothing, and is raised.
+        realtime: wait until each frame is due.
+        progress: told after every frame.
+
+    Returns:
+        (F',) seconds per processed frame, and whether it was interrupted.
+    """
+    step_s = np.zeros(len(stamp_s))
+    began = time.perf_counter()
+    done = 0
+    try:
+        with watched() as watch:  # Ctrl-C waits for the end of a frame: the estimator is whole then
+            for row, stamp in enumerate(stamp_s):
+                if realtime:
+                    watch.sleep((stamp - stamp_s[0]) - (time.perf_counter() - began))
+                start = time.perf_counter()
+                step(row)
+                step_s[row] = time.perf_counter() - start
+                done = row + 1
+                if progress is not None:
+                    progress(float(stamp - stamp_s[0]), float(stamp_s[-1] - stamp_s[0]))
+                watch.stop_if_asked()
+    except KeyboardInterrupt:
+        if done < least:
+            raise
+    return step_s[:done], done < len(stamp_s)
+
+
+def _method(prepared: Prepared, prior: CalibrationPrior, sensor: Sensor, settings: SlamConfig) -> Method:
+    """Return what explains landmarks that moved, by its name."""
+    n_landmarks = len(prepared.landmark_id)
+    if settings.method == "nohyp":
+        return Static(n_landmarks)
+    if settings.method == "joint":
+        changes = ChangePrior(
+            p_moved=settings.changes.p_moved,
+            move_sigma_m=settings.changes.move_sigma_m,
+            p_rotated=settings.changes.p_rotated,
+        )
+        return Joint(n_landmarks, prior, prepared.given_map(), changes, robust=settings.robust)
+    method: Method = plugins.load("evermap.methods", settings.method)(n_landmarks, settings, sensor)
+    return method

@@ -1,0 +1,130 @@
+"""What goes into the estimator: the usable part of a recording, and what is believed before its first frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from evermap.config import SlamConfig
+from evermap.errors import DataError
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.changes.explain import GivenMap
+from evermap.slam.noise import START
+from evermap.slam.problem import Drive, Noise, Problem, independent
+from evermap.slam.streaming import PriorMap
+from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
+
+FIRST_POSE_INFORMATION = 1e8
+"""The first pose is the origin, to 0.1 mm."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A recording as the estimator wants it.
+
+    Attributes:
+        problem: stamps count from `start_s`.
+        start_s: stamp of the first odometry row.
+        pose_frame: (N,) rows of `Recording.frames` that get a pose: those with a usable detection.
+        used: (M,) rows of `Recording.detections` that are used.
+        landmark_id: (L,) ids behind the problem's landmark rows.
+        prior_map: the map to localise in, in those rows.
+        warnings: what was left out, counted.
+        names: texts behind landmark ids.
+    """
+
+    problem: Problem
+    start_s: float
+    pose_frame: IntArray
+    used: IntArray
+    landmark_id: IntArray
+    prior_map: PriorMap | None
+    warnings: tuple[str, ...]
+    names: Mapping[int, str] = field(default_factory=dict)
+
+    def given_map(self) -> GivenMap | None:
+        """The prior map as the joint search compares with it: landmark by landmark, with covariances."""
+        if self.prior_map is None:
+            return None
+        given, rows = self.prior_map.given, np.arange(len(self.landmark_id))
+        blocks = self.prior_map.information.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
+        covariance = np.linalg.inv(np.where(given[:, None, None], blocks, np.eye(2)))
+        return GivenMap(self.prior_map.mean, covariance, given)
+
+
+def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: tuple[str, ...] = ()) -> Prepared:
+    """Sort out what can be used: detections of known identity, while there is odometry.
+
+    `remarks` on the recording come before those on what was left out.
+
+    Raises:
+        DataError: fewer than two frames with a landmark of known identity.
+    """
+    odometry, detections = recording.odometry, recording.detections
+    if len(odometry) == 0:
+        raise DataError(f"{recording.name}: no odometry", hint="velocities or increments in odometry.csv")
+    stamps = recording.frames.stamp_s
+    warnings = list(remarks)
+    anonymous = detections.landmark_id == UNKNOWN
+    if anonymous.any():
+        warnings.append(f"{int(anonymous.sum())} detections without identity not used")
+    moving = (stamps >= odometry.stamp_s[0]) & (stamps <= odometry.stamp_s[-1])
+    outside = ~anonymous & ~moving[detections.frame]
+    if outside.any():
+        warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
+    used = np.flatnonzero(~anonymous & ~outside)
+    pose_frame, pose_row = np.unique(detections.frame[used], return_inverse=True)
+    if len(pose_frame) < 2:
+        raise DataError(
+            f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
+            hint="check landmark ids, and that detections and odometry share one clock",
+        )
+    landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
+    start_s = float(odometry.stamp_s[0])
+    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    problem = Problem(
+        stamp_s=stamps[pose_frame] - start_s,
+        drive=Drive.from_rows(odometry.stamp_s - start_s, velocity),
+        pose_row=pose_row.astype(np.int64),
+        landmark_row=landmark_row.astype(np.int64),
+        reading=np.column_stack([detections.range_m[used], detections.bearing_rad[used]]),
+        sigma_given=np.column_stack([detections.sigma_range_m[used], detections.sigma_bearing_rad[used]]),
+        mount=np.array(recording.sensor.mount_robot_sensor, dtype=np.float64),
+        prior=CalibrationPrior.from_settings(calibrated=False, fix={}),
+        start_pose=np.zeros(3),
+        start_information=FIRST_POSE_INFORMATION,
+        landmark_mean=np.zeros((len(landmark_id), 2)),
+        landmark_information=np.zeros((2 * len(landmark_id), 2 * len(landmark_id))),
+    )
+    in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
+    return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
+
+
+def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:
+    """Return the prior of the calibration states and the noise levels before the first frame."""
+    prior = CalibrationPrior.from_settings(
+        calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix
+    )
+    nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
+    detection = np.array(
+        [default if given is None else given for given, default in zip(nominal, START.detection, strict=True)]
+    )
+    odometry = START.odometry * settings.odometry_noise_factor
+    return prior, replace(START, detection=detection, odometry=odometry, outlier_log_odds=settings.outlier_log_odds)
+
+
+def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
+    """The prior map in the order of this session's landmarks; a sigma of zero means 1 mm."""
+    rows = {int(identity): k for k, identity in enumerate(prior_map.landmark_id)}
+    mean = np.zeros((len(landmark_id), 2))
+    information = np.zeros((len(landmark_id), 2, 2))
+    given = np.zeros(len(landmark_id), dtype=bool)
+    for k, identity in enumerate(landmark_id):
+        if int(identity) in rows:
+            row = rows[int(identity)]
+            given[k] = True
+            mean[k] = prior_map.position_m[row]
+            information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
+    return PriorMap(mean, independent(information), given)
