@@ -18,9 +18,9 @@ from benchmarks import persistence, rosen
 from evermap.existence import joint, single
 from evermap.existence.state import Belief
 from evermap.sensing import learned
-from evermap.sensing.field import LIDAR
 from evermap.sensing.learned import CliqueLook, Learned
 from evermap.sensing.profile import Assumed
+from evermap.sensing.space import LIDAR
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
 

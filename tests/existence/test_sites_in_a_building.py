@@ -15,7 +15,7 @@ import pytest
 from evermap.existence.sites import SiteDynamics, SiteLooks, follow_sites
 from evermap.geometry import se2
 from evermap.sensing.sightlines import CLEAR, P_HIDDEN, Lines, SightLines, nominal_lines
-from evermap.sensing.visibility import detection_probability
+from evermap.sensing.visibility import NominalField
 from evermap.sim.classes import Duration
 from evermap.sim.config import BuildingConfig
 from evermap.sim.world import BuildingSimulation, simulate_building
@@ -100,7 +100,7 @@ def follow(simulation: BuildingSimulation, known_lines: KnownLines) -> tuple[Sco
         of_place = [k for k, site in enumerate(sites) for _ in objects[site.object_id].landmark_ids]
         identity = [i for site in sites for i in objects[site.object_id].landmark_ids]
         place_m = np.concatenate([objects[site.object_id].landmarks_at(site.pose) for site in sites])
-        nominal = detection_probability(pose, place_m, recording.sensor)
+        nominal = NominalField(recording.sensor).p_detect(pose, place_m)
         hit = np.zeros(nominal.shape, dtype=np.bool_)
         for column, name in enumerate(identity):
             hit[detections.frame[hits(detections, seen_m, name, place_m[column])], column] = True

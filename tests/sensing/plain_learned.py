@@ -10,9 +10,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import logsumexp
 
-from evermap.sensing.field import Field
 from evermap.sensing.profile import Profile, facing_middles, range_middles
-from evermap.sensing.sight import InField, sight
+from evermap.sensing.space import Field, InField, sight
 
 FACES = np.concatenate([[axis, -axis] for axis in np.eye(3)])
 HIGHEST = 0.98

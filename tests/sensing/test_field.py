@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import CAMERA, LIDAR, Field, Projection
+from evermap.sensing.space import CAMERA, LIDAR, Field, Projection
 
 
 def in_annulus(point, sensor: Field) -> bool:

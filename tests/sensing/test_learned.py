@@ -13,10 +13,9 @@ from scipy.special import log_softmax
 from evermap.errors import DataError, InputError
 from evermap.existence import joint, single
 from evermap.sensing import learned
-from evermap.sensing.field import CAMERA, LIDAR, Field, Projection
 from evermap.sensing.learned import Learned
 from evermap.sensing.profile import Assumed, Profile
-from evermap.sensing.sight import sight
+from evermap.sensing.space import CAMERA, LIDAR, Field, Projection, sight
 from evermap.survival import Exponential
 
 from .plain_learned import FACES, PlainModel, chance_in_field

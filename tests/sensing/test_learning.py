@@ -10,10 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from evermap.existence import single
 from evermap.sensing import learned
-from evermap.sensing.field import LIDAR
 from evermap.sensing.learned import Learned
 from evermap.sensing.profile import Assumed, Profile, facing_middles, range_middles
-from evermap.sensing.sight import sight
+from evermap.sensing.space import LIDAR, sight
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray
 

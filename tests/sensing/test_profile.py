@@ -10,8 +10,8 @@ import pytest
 from scipy.linalg import expm
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import CAMERA, LIDAR
 from evermap.sensing.profile import Assumed, Profile, facing_middles, range_middles
+from evermap.sensing.space import CAMERA, LIDAR
 
 
 def test_a_sensor_that_saw_nothing_detects_as_assumed():

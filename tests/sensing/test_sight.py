@@ -10,8 +10,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import CAMERA, LIDAR, Field, Projection
-from evermap.sensing.sight import Fading, InField, Product, Sight, ViewingAngle, sight
+from evermap.sensing.space import (
+    CAMERA,
+    LIDAR,
+    Fading,
+    Field,
+    InField,
+    Projection,
+    Sight,
+    SpatialModel,
+    ViewingAngle,
+    sight,
+)
 
 DRAWS = 100_000
 FIELDS = {
@@ -119,9 +129,9 @@ def test_causes_multiply():
     angle = [1.0 / (1.0 + math.exp(-(1.0 - 0.5) / 0.1)), 0.5]
     np.testing.assert_allclose(Fading(10.0).probability(view), fading)
     np.testing.assert_allclose(ViewingAngle(math.radians(60.0)).probability(view), angle)
-    both = Product((Fading(10.0), ViewingAngle(math.radians(60.0))), p_0=0.9)
+    both = SpatialModel((Fading(10.0), ViewingAngle(math.radians(60.0))), p_0=0.9)
     np.testing.assert_allclose(both.probability(view), 0.9 * np.multiply(fading, angle))
-    np.testing.assert_array_equal(Product((), p_0=0.25).probability(view), 0.25)
+    np.testing.assert_array_equal(SpatialModel((), p_0=0.25).probability(view), 0.25)
     np.testing.assert_array_equal(Fading(math.inf).probability(view), 1.0)
 
 
@@ -146,8 +156,8 @@ def test_a_sharper_edge_has_the_same_middle():
         (lambda: InField(LIDAR, math.inf), "sigma_position_m"),
         (lambda: InField(LIDAR, 0.05, -0.1), "sigma_attitude_rad"),
         (lambda: InField(LIDAR, 0.05, math.nan), "sigma_attitude_rad"),
-        (lambda: Product((), p_0=1.1), "p_0"),
-        (lambda: Product((), p_0=math.nan), "p_0"),
+        (lambda: SpatialModel((), p_0=1.1), "p_0"),
+        (lambda: SpatialModel((), p_0=math.nan), "p_0"),
     ],
 )
 def test_models_that_cannot_be_are_said_in_one_line(make, said):

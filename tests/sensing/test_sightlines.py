@@ -26,7 +26,7 @@ from evermap.sensing.sightlines import (
     nominal_lines,
     offsets,
 )
-from evermap.sensing.visibility import detection_probability
+from evermap.sensing.visibility import NominalField
 from evermap.sim.config import BuildingConfig
 from evermap.sim.world import simulate_building
 from evermap.types import BoolArray, FloatArray, IntArray, Recording
@@ -336,7 +336,7 @@ def looks_of(recording: Recording) -> tuple[FloatArray, FloatArray, FloatArray, 
     assert truth is not None
     row = np.clip(np.searchsorted(truth.stamp_s, recording.frames.stamp_s), 0, len(truth) - 1)
     pose = truth.pose_world_robot[row]
-    p = detection_probability(pose, landmarks.position_m, recording.sensor)
+    p = NominalField(recording.sensor).p_detect(pose, landmarks.position_m)
     hit = np.zeros(p.shape, dtype=np.bool_)
     known = np.isin(d.landmark_id, landmarks.landmark_id)
     hit[d.frame[known], np.searchsorted(landmarks.landmark_id, d.landmark_id[known])] = True

@@ -21,7 +21,7 @@ from drives import (
 )
 
 from evermap.geometry import se2
-from evermap.sensing.visibility import detection_probability
+from evermap.sensing.visibility import NominalField
 from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces, Neighbourhood
@@ -255,7 +255,7 @@ def test_expected_is_what_is_in_view_of_the_whole_map():
     places = replace(places, position_m=np.vstack([true.landmark, places.position_m[COUNT:]]))
     _, located = run(true, places)
     for one in located[5::20]:
-        p = detection_probability(one.pose[None], places.position_m, SENSOR)[0]
+        p = NominalField(SENSOR).p_detect(one.pose[None], places.position_m)[0]
         well = np.flatnonzero(p >= 0.1)
         assert np.isin(well, one.expected).all()
         assert one.p_detect == pytest.approx(p[one.expected])

@@ -7,7 +7,7 @@ taken of products of many ratios at a time.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -85,34 +85,64 @@ def between(value: float, count: int) -> tuple[int, float]:
     return low, shifted - low
 
 
+class SensorFrame(NamedTuple):
+    """One frame: (3,) position and (3, 3) rotation of the sensor, limits as `learned` packs them, and what was seen.
+
+    Attributes:
+        position_m, rotation, limits: of the sensor.
+        detected: (K,) which landmarks were detected.
+        active: (C,) which cliques are looked at.
+        elapsed_s: (C,) since each was last in the field.
+    """
+
+    position_m: FloatArray
+    rotation: FloatArray
+    limits: FloatArray
+    detected: BoolArray
+    active: BoolArray
+    elapsed_s: FloatArray
+
+
+class SensorLaw(NamedTuple):
+    """What the profile says; names as in `profile.Profile` and `profile.Occlusion`."""
+
+    range_rate: FloatArray
+    facing_rate: FloatArray
+    p_false: float
+    come_hz: FloatArray
+    go_hz: FloatArray
+    log_weight: FloatArray
+
+
+class CliqueRows(NamedTuple):
+    """Landmarks and cliques, names as in `learned.Learned`; all but the first three are changed in place."""
+
+    first: IntArray
+    landmark_m: FloatArray
+    outward: FloatArray
+    hits: Any
+    expected: Any
+    occluded: FloatArray
+    log_chain: FloatArray
+    pending: FloatArray
+
+
+class LookRows(NamedTuple):
+    """What the frame says, names as in `learned.CliqueLook`; filled in."""
+
+    log_there: FloatArray
+    log_gone: FloatArray
+    p_occluded: FloatArray
+    looked: IntArray
+
+
 @kernel
-def look(
-    position_m: FloatArray,
-    rotation: FloatArray,
-    limits: FloatArray,
-    detected: BoolArray,
-    active: BoolArray,
-    elapsed_s: FloatArray,
-    first: IntArray,
-    landmark_m: FloatArray,
-    outward: FloatArray,
-    hits: Any,
-    expected: Any,
-    occluded: FloatArray,
-    log_chain: FloatArray,
-    pending: FloatArray,
-    range_rate: FloatArray,
-    facing_rate: FloatArray,
-    p_false: float,
-    come_hz: FloatArray,
-    go_hz: FloatArray,
-    log_weight: FloatArray,
-    log_there: FloatArray,
-    log_gone: FloatArray,
-    p_occluded: FloatArray,
-    looked: IntArray,
-) -> None:
-    """Fill the last four arrays (C,), and update `hits` to `pending` in place; names as in `learned.Learned`."""
+def look(frame: SensorFrame, law: SensorLaw, rows: CliqueRows, out: LookRows) -> None:
+    """Fill `out`, and update what changes of `rows` in place."""
+    position_m, rotation, limits, detected, active, elapsed_s = frame
+    range_rate, facing_rate, p_false, come_hz, go_hz, log_weight = law
+    first, landmark_m, outward, hits, expected, occluded, log_chain, pending = rows
+    log_there, log_gone, p_occluded, looked = out
     chains, ranges, facings = len(come_hz), len(range_rate), len(facing_rate)
     largest = 0
     for c in range(len(first) - 1):

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import DataError, InputError
-from evermap.sensing.field import Projection
-from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile
+from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile, facing_middles, range_middles
+from evermap.sensing.space import Projection, sights
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FACES = 6
@@ -69,6 +69,37 @@ class Learned:
     def __len__(self) -> int:
         return len(self.stamp_s)
 
+    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
+        """Return (F, K) probabilities to detect the landmarks, where they are and by no mistake.
+
+        A clique is taken to be occluded for its usual share of the time: `P_D = P(field) R V G (1 - share)`.
+
+        Args:
+            pose: (F, 4, 4) from the sensor's frame to the world's.
+            position_m: (K, 3) positions of the landmarks of this model, which may have moved a little.
+
+        Raises:
+            InputError: another number of landmarks than the model knows.
+        """
+        if len(position_m) != len(self.landmark_m):
+            problem = f"{len(position_m)} positions of {len(self.landmark_m)} landmarks"
+            raise InputError(problem, field="position_m")
+        from evermap.sensing.kernels import HIGHEST, OUT_OF_FIELD
+
+        profile, own = self.profile, self.hits / self.expected
+        middles = range_middles(profile.assumed.field.range_max_m), facing_middles()
+        rows = sights(pose, position_m, self.outward)
+        p = np.empty((len(rows), len(self.landmark_m)))
+        for out, row in zip(p, rows, strict=True):
+            inside = profile.assumed.in_field.probability(row)
+            rate = np.interp(row.range_m, middles[0], profile.range_rate)
+            rate *= np.interp(row.facing, middles[1], profile.facing_rate)
+            axis = np.argmax(np.abs(row.direction), axis=1)
+            face = 2 * axis + (np.take_along_axis(row.direction, axis[:, None], 1)[:, 0] <= 0.0)
+            rate *= own[np.arange(len(own)), face]
+            out[:] = np.where(inside < OUT_OF_FIELD, 0.0, inside * np.minimum(rate, HIGHEST))
+        return p * (1.0 - profile.occlusion.share)
+
 
 @dataclass(frozen=True, slots=True)
 class CliqueLook:
@@ -89,7 +120,7 @@ class CliqueLook:
 
 
 def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -> Learned:
-    """A model of landmarks that nothing is known of but their places.
+    """Return a model of landmarks of which nothing is known but their positions.
 
     Args:
         landmark_m: (K, 3) in the world, sorted by clique.
@@ -105,7 +136,8 @@ def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -
         raise InputError(f"shapes {point.shape} and {member.shape} instead of (K, 3) and (K,)", field="landmark_m")
     wrong = np.flatnonzero(~np.isfinite(point).all(axis=1))
     if wrong.size:
-        raise InputError(f"row {wrong[0]}: {point[wrong[0]]} is no place", field="landmark_m", hint="finite metres")
+        problem = f"row {wrong[0]}: not a position: {point[wrong[0]]}"
+        raise InputError(problem, field="landmark_m", hint="finite metres")
     if member.dtype.kind not in "iu":
         raise InputError(f"{member.dtype} instead of whole numbers", field="clique", hint="cliques numbered from 0")
     step = np.diff(member.astype(np.int64), prepend=-1)
@@ -144,7 +176,7 @@ def look(
     *,
     active: BoolArray | None = None,
 ) -> tuple[Learned, CliqueLook]:
-    """Take in one frame.
+    """Process one frame: what it says of each clique, and what it teaches.
 
     Args:
         model: so far.
@@ -158,27 +190,20 @@ def look(
         The model after the frame, and what the frame says of each clique.
 
     Raises:
-        InputError: shapes, a pose that is none, or time running back.
+        InputError: wrong shapes, an invalid pose, or time running backwards.
     """
     from evermap.sensing import kernels
 
-    place, turn = np.asarray(position_m, dtype=np.float64), np.ascontiguousarray(rotation, dtype=np.float64)
-    hit, k, c = np.asarray(detected), len(model.landmark_m), len(model)
-    if hit.shape != (k,) or hit.dtype != np.bool_:
-        raise InputError(f"{hit.dtype} of shape {hit.shape} instead of bool of ({k},)", field="detected")
-    if place.shape != (3,) or not np.isfinite(place).all():
-        raise InputError(f"{position_m} is no place", field="position_m", hint="three finite numbers")
-    if turn.shape != (3, 3) or not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 or np.linalg.det(turn) < 0.0:
-        raise InputError("is no rotation", field="rotation", hint="an orthonormal matrix (3, 3), not mirrored")
+    c = len(model)
+    place, turn = _sensor(position_m, rotation)
+    hit = _flags(detected, len(model.landmark_m), "detected")
+    chosen = np.ones(c, dtype=np.bool_) if active is None else _flags(active, c, "active")
     if not math.isfinite(stamp_s):
-        raise InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
+        raise InputError(f"not a finite time: {stamp_s}", field="stamp_s", hint="seconds")
     late = np.flatnonzero(model.stamp_s > stamp_s)
     if late.size:
         problem = f"time {stamp_s} s lies before the last look at clique {late[0]} at {model.stamp_s[late[0]]} s"
         raise InputError(problem, field="stamp_s", hint="sort by time")
-    chosen = np.ones(c, dtype=np.bool_) if active is None else np.asarray(active)
-    if chosen.shape != (c,) or chosen.dtype != np.bool_:
-        raise InputError(f"{chosen.dtype} of shape {chosen.shape} instead of bool of ({c},)", field="active")
 
     after = replace(
         model,
@@ -190,31 +215,13 @@ def look(
     )
     profile, chain = model.profile, model.profile.occlusion
     seen = CliqueLook(np.empty(c), np.empty(c), np.empty(c), np.empty(c), np.empty(c, dtype=np.int64))
+    rates = profile.range_rate, profile.facing_rate, profile.p_false
+    changing = after.hits, after.expected, after.occluded, after.log_chain, after.pending
     kernels.look(
-        place,
-        turn,
-        _limits(profile.assumed),
-        hit,
-        chosen,
-        np.nan_to_num(stamp_s - model.stamp_s),
-        model.first,
-        model.landmark_m,
-        model.outward,
-        after.hits,
-        after.expected,
-        after.occluded,
-        after.log_chain,
-        after.pending,
-        profile.range_rate,
-        profile.facing_rate,
-        profile.p_false,
-        chain.come_hz,
-        chain.go_hz,
-        profile.log_weight,
-        seen.log_there,
-        seen.log_gone,
-        seen.p_occluded,
-        seen.expected,
+        kernels.SensorFrame(place, turn, _limits(profile.assumed), hit, chosen, np.nan_to_num(stamp_s - model.stamp_s)),
+        kernels.SensorLaw(*rates, chain.come_hz, chain.go_hz, profile.log_weight),
+        kernels.CliqueRows(model.first, model.landmark_m, model.outward, *changing),
+        kernels.LookRows(seen.log_there, seen.log_gone, seen.p_occluded, seen.expected),
     )
     in_view = seen.expected > 0
     return (
@@ -224,7 +231,7 @@ def look(
 
 
 def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learned:
-    """Let the profile learn from the cliques that the last look has made sure of.
+    """Learn the profile from the cliques whose presence the last look has made certain.
 
     Args:
         model: after `look`.
@@ -233,7 +240,7 @@ def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learne
 
     Raises:
         InputError: probabilities of another shape.
-        DataError: a probability that is none, of a clique that was looked at.
+        DataError: an invalid probability of a clique that was looked at.
     """
     from evermap.sensing import kernels
 
@@ -243,7 +250,8 @@ def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learne
     in_view = seen.expected > 0
     wrong = np.flatnonzero(in_view & ~((belief >= 0.0) & (belief <= 1.0)))
     if wrong.size:
-        raise DataError(f"row {wrong[0]}: {belief[wrong[0]]} is no probability", field="probability", hint="0 to 1")
+        problem = f"row {wrong[0]}: not a probability: {belief[wrong[0]]}"
+        raise DataError(problem, field="probability", hint="0 to 1")
     there = in_view & (belief > SURELY_THERE) & (seen.p_occluded < MOSTLY_FREE)
     gone = in_view & (belief < SURELY_GONE)
     profile = model.profile
@@ -274,8 +282,26 @@ def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learne
     return replace(model, profile=learned, pending=pending, log_chain=log_chain)
 
 
+def _sensor(position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a position (3,) and a rotation (3, 3), checked."""
+    place, turn = np.asarray(position_m, dtype=np.float64), np.ascontiguousarray(rotation, dtype=np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise InputError(f"not a position: {position_m}", field="position_m", hint="three finite numbers")
+    if turn.shape != (3, 3) or not np.abs(turn @ turn.T - np.eye(3)).max() < 1e-6 or np.linalg.det(turn) < 0.0:
+        raise InputError("not a rotation", field="rotation", hint="an orthonormal matrix (3, 3), not mirrored")
+    return place, turn
+
+
+def _flags(values: BoolArray, count: int, field: str) -> BoolArray:
+    """Return booleans (count,), checked."""
+    flags = np.asarray(values)
+    if flags.shape != (count,) or flags.dtype != np.bool_:
+        raise InputError(f"{flags.dtype} of shape {flags.shape} instead of bool of ({count},)", field=field)
+    return flags
+
+
 def _limits(assumed: Assumed) -> FloatArray:
-    """The field and its softness as the kernels take them."""
+    """Return the field and its softness as the kernels take them."""
     field = assumed.field
     return np.array(
         [

@@ -13,8 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import Field
-from evermap.sensing.sight import Fading, InField, Sight, ViewingAngle
+from evermap.sensing.space import Fading, Field, InField, Sight, ViewingAngle
 from evermap.types import FloatArray
 
 RANGE_BINS = 16

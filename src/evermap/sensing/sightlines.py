@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.geometry import se2
+from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray
 
 MOST_LOOKS = 200.0
@@ -27,6 +29,8 @@ NOMINAL_LOOKS = 20.0
 """Looks that the nominal rate is worth against those along all lines of a length; one line counts no more than that."""
 BLOCKED = 0.03
 """Detection rate along blocked lines: round corners, and because places are not quite known."""
+OUT_OF_VIEW = 0.01
+"""Nominal detection rate below which lines of sight do not matter."""
 RATES = (0.002, 0.98)
 """No kind of line has a rate outside: nothing is certain."""
 NEIGHBOUR = 0.35
@@ -140,7 +144,7 @@ class SightLines:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
             place: (N,) row of the place of each line.
             cell: (N,) cell of the sensor.
-            p_detect: (N,) what the nominal field of view says (`visibility.detection_probability`): the rate along
+            p_detect: (N,) what the nominal field of view says (`visibility.NominalField`): the rate along
                 clear lines that is started from, and by how much it is less at the field's edge.
 
         Returns:
@@ -247,6 +251,33 @@ def nominal_lines(p_detect: FloatArray) -> Lines:
     """Lines of a sensor whose nominal field of view (N,) is taken for the truth."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
     return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), BLOCKED)
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedField:
+    """The nominal field of view with what was learned of lines of sight; a `visibility.DetectionModel`.
+
+    Attributes:
+        nominal: where nothing is in the way.
+        lines: hits and looks along lines of sight.
+        places: (L,) sites and (L,) landmarks of the places, sorted by both.
+    """
+
+    nominal: NominalField
+    lines: SightLines
+    places: tuple[IntArray, IntArray]
+
+    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
+        """Return (F, L) probabilities of places at (L, 2) from robot poses (F, 3); 0 far out of the field of view."""
+        nominal = self.nominal.p_detect(pose, position_m)
+        eye = se2.compose(pose, np.asarray(self.nominal.sensor.mount_robot_sensor))
+        frame, place = np.nonzero(nominal >= OUT_OF_VIEW)
+        cell = self.lines.cells(eye[frame, :2], position_m[place])
+        along = nominal[frame, place]
+        lines, p_clear, _ = self.lines.lines(self.places, place, cell, along)
+        p = np.zeros(nominal.shape)
+        p[frame, place] = p_clear * lines.p_detect + (1.0 - p_clear) * np.minimum(BLOCKED, along)
+        return p
 
 
 @dataclass(frozen=True, slots=True)

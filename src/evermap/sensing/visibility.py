@@ -1,41 +1,111 @@
-"""Which landmarks a sensor should have seen, and with what probability: the other half of a detection is a miss."""
+"""What a look is, what a hit and what a miss, and with what probability landmarks are detected that are there.
+
+A *look* is a landmark, or one of the places where it may stand, in a frame in which it should be detected:
+`P(detect | there)` is at least `WORTH_A_LOOK` of what the sensor does at best. A detection is a look too, wherever the
+field of view is said to end. A look with a detection is a *hit*, one without is a *miss*. Whether a miss says anything
+depends on the line of sight (`sightlines`); whoever knows of none takes every line for clear.
+
+`P(detect | there)` comes from a `DetectionModel`: `NominalField` here, what was learned of lines of sight in
+`sightlines`, sensors in space in `space`, and what is learned of these in `learned`.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from evermap.geometry import se2
-from evermap.types import Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
+from evermap.types import BoolArray, Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
 
 RANGE_MARGIN_M = 0.2
 BEARING_MARGIN_RAD = 0.05
 """Softness of the field of view's edge, where pose and map errors decide."""
-WORTH_A_MISS = 0.5
-"""Share of the sensor's detection probability below which not seeing a landmark is no miss."""
+WORTH_A_LOOK = 0.3
+"""Share of the sensor's detection probability from which on a landmark counts as looked at."""
+AT_ONCE = 2_000_000
+"""Pairs of poses and landmarks that are held in memory at a time."""
 
 
-def detection_probability(pose_world_robot: FloatArray, position_m: FloatArray, sensor: Sensor) -> FloatArray:
-    """P(detect | it is there) of every landmark from every pose.
+class DetectionModel(Protocol):
+    """What is known of a sensor: the probability to detect a landmark that is there.
+
+    Poses are (F, 3) in the plane, or (F, 4, 4) in space; landmarks (L, 2) or (L, 3) in the same frame. Models that
+    know each landmark by itself are asked of all of these, in their order.
+    """
+
+    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
+        """Return (F, L) probabilities: of every landmark from every pose."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class NominalField:
+    """The field of view as the sensor's data sheet has it, with soft edges.
 
     The limits of range and bearing are smoothed by normal distribution functions (`P_D0 P(r < r_max) P(|b| < b_max)`,
     Nielsen 2024 section 7.2, with both limits of each).
 
-    Args:
-        pose_world_robot: (F, 3) poses.
-        position_m: (L, 2) landmarks, in the same frame.
+    Attributes:
         sensor: limits, mounting and detection probability.
-
-    Returns:
-        (F, L) probabilities.
     """
-    pose = se2.compose(pose_world_robot, np.asarray(sensor.mount_robot_sensor))
-    offset = position_m[None, :, :] - pose[:, None, :2]
-    range_m = np.hypot(offset[..., 0], offset[..., 1])
-    bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - pose[:, None, 2])
-    return sensor.p_detect * np.exp(log_in_view(range_m, bearing, sensor))
+
+    sensor: Sensor
+
+    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
+        """Return (F, L) probabilities of landmarks (L, 2) from robot poses (F, 3) in the same frame."""
+        eye = se2.compose(pose, np.asarray(self.sensor.mount_robot_sensor))
+        offset = position_m[None, :, :] - eye[:, None, :2]
+        range_m = np.hypot(offset[..., 0], offset[..., 1])
+        bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - eye[:, None, 2])
+        return self.sensor.p_detect * np.exp(log_in_view(range_m, bearing, self.sensor))
+
+    def worth_a_look(self, p_detect: FloatArray) -> BoolArray:
+        """Return which probabilities of any shape are large enough for a look."""
+        return np.asarray(p_detect >= WORTH_A_LOOK * self.sensor.p_detect)
+
+
+class LooksAt(NamedTuple):
+    """Looks at L landmarks from F poses: (N,) rows sorted by pose, then by landmark.
+
+    Attributes:
+        pose, landmark: (N,) rows of poses and landmarks.
+        p_detect: (N,) nominal probability of a detection, were the landmark there.
+        hit: (N,) whether it was detected.
+    """
+
+    pose: IntArray
+    landmark: IntArray
+    p_detect: FloatArray
+    hit: BoolArray
+
+    def rows(self, some: IntArray | BoolArray) -> LooksAt:
+        """Return some looks, by number, in that order, or by a mask."""
+        return LooksAt(self.pose[some], self.landmark[some], self.p_detect[some], self.hit[some])
+
+
+def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray]) -> LooksAt:
+    """List the looks at landmarks, hits and misses.
+
+    Args:
+        sensor: its nominal field of view.
+        pose: (F, 3) of the robot.
+        position_m: (L, 2) landmarks in the same frame, taken to be there.
+        seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
+    """
+    field, step = NominalField(sensor), max(1, AT_ONCE // max(len(position_m), 1))
+    parts = []
+    for start in range(0, max(len(pose), 1), step):
+        p = field.p_detect(pose[start : start + step], position_m)
+        mine = (seen[0] >= start) & (seen[0] < start + len(p))
+        hit = np.zeros(p.shape, dtype=np.bool_)
+        hit[seen[0][mine] - start, seen[1][mine]] = True
+        row, landmark = np.nonzero(field.worth_a_look(p) | hit)
+        parts.append((row + start, landmark, p[row, landmark], hit[row, landmark]))
+    return LooksAt(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
 def log_in_view(
@@ -46,7 +116,7 @@ def log_in_view(
     range_margin_m: FloatArray | float = RANGE_MARGIN_M,
     bearing_margin_rad: FloatArray | float = BEARING_MARGIN_RAD,
 ) -> FloatArray:
-    """`log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
+    """Return `log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
 
     Args:
         range_m: from the sensor, of any shape.
@@ -69,42 +139,30 @@ def find_misses(
     frame_stamp_s: FloatArray,
     sensor: Sensor,
 ) -> Misses:
-    """Landmarks that should have been detected and were not, from the first time on that each was seen.
+    """Find landmarks that were looked at and not detected, from the first time on that each was seen.
 
     Args:
-        frame: (F,) rows of frames that have a pose.
+        frame: (F,) rows of frames that have a pose, increasing.
         pose_world_robot: (F, 3) poses at those frames.
         detections: what was seen.
         landmarks: what is there to be seen.
         frame_stamp_s: stamps of all frames.
         sensor: limits, mounting and detection probability.
     """
-    rows: list[IntArray] = []
-    ids: list[IntArray] = []
-    probabilities: list[FloatArray] = []
-    column = {int(identity): k for k, identity in enumerate(landmarks.landmark_id)}
-    seen_column = np.array([column.get(int(i), -1) for i in detections.landmark_id], dtype=np.int64)
-    chunk = max(1, 2_000_000 // max(len(landmarks), 1))
-    for start in range(0, len(frame), chunk):
-        part = frame[start : start + chunk]
-        p = detection_probability(pose_world_robot[start : start + chunk], landmarks.position_m, sensor)
-        expected = p >= WORTH_A_MISS * sensor.p_detect
-        expected &= frame_stamp_s[part][:, None] > landmarks.first_seen_s[None, :]
-        hit = np.isin(detections.frame, part) & (seen_column >= 0)
-        expected[np.searchsorted(part, detections.frame[hit]), seen_column[hit]] = False
-        missed_frame, missed_column = np.nonzero(expected)
-        rows.append(part[missed_frame].astype(np.int64))
-        ids.append(landmarks.landmark_id[missed_column])
-        probabilities.append(p[missed_frame, missed_column])
-    if not rows:
-        return Misses(np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
-    return Misses(
-        np.concatenate(rows).astype(np.int64), np.concatenate(ids).astype(np.int64), np.concatenate(probabilities)
-    )
+    order = np.argsort(landmarks.landmark_id, kind="stable")
+    at = np.searchsorted(landmarks.landmark_id, detections.landmark_id, sorter=order)
+    column = np.append(order, -1)[at]  # the last row for ids beyond the largest one
+    used = np.isin(detections.frame, frame) & np.isin(detections.landmark_id, landmarks.landmark_id)
+    seen = np.searchsorted(frame, detections.frame[used]), column[used]
+    looks = looks_at(sensor, pose_world_robot, landmarks.position_m, seen)
+    known = frame_stamp_s[frame[looks.pose]] > landmarks.first_seen_s[looks.landmark]
+    missed = ~looks.hit & known
+    row, of = looks.pose[missed], looks.landmark[missed]
+    return Misses(frame[row].astype(np.int64), landmarks.landmark_id[of].astype(np.int64), looks.p_detect[missed])
 
 
 def _log_within(value: FloatArray, low: float, high: float, margin: FloatArray | float) -> FloatArray:
-    """`log P(low < x)` and `log P(x < high)` in sum, of a value known to `margin`."""
+    """Return `log P(low < x) + log P(x < high)` of a value known to `margin`."""
     inside = np.zeros_like(value)
     if low > -math.inf:
         inside += log_ndtr((value - low) / margin)

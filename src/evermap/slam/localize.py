@@ -14,11 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sensing.visibility import (
-    RANGE_MARGIN_M,
-    WORTH_A_MISS,
-    detection_probability,
-)
+from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
 from evermap.slam.border import drive_on
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import AT_PLACES
@@ -106,7 +102,7 @@ class Localizer:
         start: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         self.places = places
-        self._sensor, self._prior, self._noise = sensor, prior, noise
+        self._field, self._prior, self._noise = NominalField(sensor), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._log_p = np.log(np.maximum(places.p_here, LEAST_BELIEF))
         self._believed = self._log_p.copy()
@@ -299,9 +295,9 @@ class Localizer:
         if not self._is_placed or self._track is not None or sigma > EXPECTING_SIGMA_M:
             return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.bool_)
         rows = self._near(se2.compose(self._pose, self._mount)[:2])
-        p = detection_probability(self._pose[None], self.places.position_m[rows], self._sensor)[0]
+        p = self._field.p_detect(self._pose[None], self.places.position_m[rows])[0]
         rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
-        well = self._believed_there[rows] & (p >= WORTH_A_MISS * self._sensor.p_detect)
+        well = self._believed_there[rows] & self._field.worth_a_look(p)
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
 
 

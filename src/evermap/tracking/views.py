@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from evermap.errors import InputError
 from evermap.types import FloatArray
+
+if TYPE_CHECKING:
+    from evermap.sensing.visibility import DetectionModel
 
 SURE_NATS = float(np.log(1e3))
 """Misses that make a place empty: together they happen to one object in a thousand."""
@@ -23,12 +26,18 @@ class View:
     Attributes:
         centre_m: (3,) where the sensor is, in the world.
         reach_m: beyond this distance nothing is detected.
-        p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there: a sensing model.
+        p_detect: for positions (N, 3) in the world, (N,) probabilities to detect an object there.
     """
 
     centre_m: FloatArray
     reach_m: float
     p_detect: Callable[[FloatArray], FloatArray]
+
+    @classmethod
+    def of(cls, model: DetectionModel, pose_world_sensor: FloatArray, reach_m: float) -> Self:
+        """Return what a detection model in space says of a pose (4, 4), as far as `reach_m` from the sensor."""
+        pose = np.asarray(pose_world_sensor, dtype=np.float64)
+        return cls(pose[:3, 3], reach_m, lambda position_m: model.p_detect(pose[None], position_m)[0])
 
     @classmethod
     def ball(cls, centre_m: FloatArray, reach_m: float, p_detect: float) -> Self:

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import CAMERA, LIDAR, Field, Projection
+from evermap.sensing.space import CAMERA, LIDAR, Field, Projection
 from evermap_studies.worlds.cliques import CliqueRun, CliqueWorld, named_world, simulate_cliques
 
 SENSORS = {"lidar": LIDAR, "camera": CAMERA}

@@ -18,7 +18,7 @@ import numpy as np
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import ALONG_M, Looks, class_of, clique_rows, site_middles
 from evermap.sensing.sightlines import HEADINGS, Views, offsets
-from evermap.sensing.visibility import detection_probability
+from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 NEAR_M = 0.6
@@ -121,11 +121,11 @@ def _empty_looks(
     near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf) <= NEAR_M
     near |= rays.pass_by(pose[:, :2], place_m)
     pose = pose[near]
-    half = np.pi / HEADINGS
+    half, field = np.pi / HEADINGS, NominalField(sensor)
     rate = np.min(
-        [detection_probability(pose + np.array([0, 0, turn]), place_m[None], sensor)[:, 0] for turn in (-half, half)],
+        [field.p_detect(pose + np.array([0, 0, turn]), place_m[None])[:, 0] for turn in (-half, half)],
         axis=0,
         initial=1.0,
     )
-    good = rate >= 0.3 * sensor.p_detect
+    good = field.worth_a_look(rate)
     return views.frames[near][good], rate[good], views.stamp_s[near][good]

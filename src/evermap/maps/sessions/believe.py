@@ -12,12 +12,10 @@ from evermap.geometry import se2
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites
 from evermap.sensing.sightlines import BLOCKED_P, CLEAR, Lines, SightLines, nominal_lines
-from evermap.sensing.visibility import detection_probability
+from evermap.sensing.visibility import looks_at
 from evermap.survival.step import never_leaves
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
-WORTH_A_LOOK = 0.3
-"""Share of the sensor's detection probability from which on a place counts as looked at."""
 SETTLED_S = 300.0
 """What is seen within this time of a look was there at that look."""
 BESIDE_M, BESIDE_RAD = 1.0, 0.15
@@ -31,7 +29,6 @@ SIDES, MOST_SIDES = 6, 3
 TOGETHER_M = 2.0
 """Cliques that are missed from places this close to each other may be hidden by the same thing."""
 ROUNDS = 5
-AT_ONCE = 2_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,34 +146,20 @@ def looked_at(
     """
     places = living.places
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
-    in_view: list[IntArray] = []
-    seen_from: list[IntArray] = []
-    nominal: list[FloatArray] = []
-    step = max(1, AT_ONCE // max(len(places), 1))
-    hit = np.zeros((len(sighting.stamp_s), 0), dtype=np.bool_)
-    for start in range(0, len(sighting.stamp_s), step):
-        poses = sighting.pose_map_robot[start : start + step]
-        p = detection_probability(poses, places.position_m, sensor)
-        mine = (sighting.frame >= start) & (sighting.frame < start + len(poses))
-        hit = np.zeros(p.shape, dtype=np.bool_)
-        hit[sighting.frame[mine] - start, sighting.place[mine]] = True
-        frame, place = np.nonzero(((p >= WORTH_A_LOOK * sensor.p_detect) | hit) & used)
-        in_view.append(place)
-        seen_from.append(frame + start)
-        nominal.append(np.where(hit, 1.0, -1.0)[frame, place] * np.maximum(p[frame, place], 1e-3))
-    place, frame, signed = np.concatenate(in_view), np.concatenate(seen_from), np.concatenate(nominal)
-    site = np.searchsorted(living.sites.site_id, places.site_id[place])
-    order = np.lexsort((place, site, frame, clique_rows(living.sites)[1][site]))
-    place, frame, signed, site = place[order], frame[order], signed[order], site[order]
+    listed = looks_at(sensor, sighting.pose_map_robot, places.position_m, (sighting.frame, sighting.place))
+    listed = listed.rows(used[listed.landmark])
+    site = np.searchsorted(living.sites.site_id, places.site_id[listed.landmark])
+    order = np.lexsort((listed.landmark, site, listed.pose, clique_rows(living.sites)[1][site]))
+    (frame, place, nominal, hit), site = listed.rows(order), site[order]
     clique = clique_rows(living.sites)[1][site]
     eye = sensor_poses(sighting, sensor)
     cell = living.sightlines.cells(eye[frame, :2], places.position_m[place])
     line, key = np.unique(np.column_stack([place, cell]), axis=0, return_inverse=True)
     key = key.ravel().astype(np.int64)
-    p_nominal = np.bincount(key, np.abs(signed), minlength=len(line)) / np.maximum(
+    p_nominal = np.bincount(key, np.maximum(nominal, 1e-3), minlength=len(line)) / np.maximum(
         np.bincount(key, minlength=len(line)), 1
     )
-    rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, signed > 0.0)
+    rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, hit)
     settled = surely_there(rows)
     if not learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)

@@ -9,7 +9,7 @@ from importlib import resources
 from typing import Any
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import CAMERA, LIDAR, Field
+from evermap.sensing.space import CAMERA, LIDAR, Field
 from evermap_studies.worlds.cliques import CliqueWorld, named_world
 
 SENSORS: dict[str, Field] = {"lidar": LIDAR, "camera": CAMERA}

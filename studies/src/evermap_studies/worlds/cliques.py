@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.sensing.field import LIDAR, Field
+from evermap.sensing.space import LIDAR, Field
 from evermap.types import BoolArray, FloatArray, IntArray
 
 HARMONICS = 3

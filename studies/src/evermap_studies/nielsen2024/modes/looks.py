@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.sensing.visibility import WORTH_A_MISS, detection_probability
+from evermap.sensing.visibility import NominalField
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 from evermap_studies.nielsen2024.modes.places import FREE, Modes
@@ -19,6 +19,8 @@ from evermap_studies.nielsen2024.selectors.likelihood import Readings, log_psi, 
 
 LONGEST_SEQUENCE_GAP_S = 5.0
 """Looks at a landmark further apart than this say nothing about how consecutive misses depend on each other."""
+IN_VIEW = 0.5
+"""Share of the sensor's detection probability from which on a mode is in view: inside of the limits."""
 MISS = -1
 """Detection of a look that missed."""
 
@@ -159,11 +161,11 @@ def news_in_a_miss(problem: Problem, estimate: Estimate, modes: Modes, sensor: S
 
 def _in_view(estimate: Estimate, places: IntArray, sensor: Sensor) -> BoolArray:
     """(N, S) from which poses one of the places (S, K) of each landmark should have been detected."""
-    expected = np.zeros((len(estimate.pose), len(places)), dtype=np.bool_)
+    expected, field = np.zeros((len(estimate.pose), len(places)), dtype=np.bool_), NominalField(sensor)
     for column in places.T:
         there = np.flatnonzero(column != FREE)
-        p = detection_probability(estimate.pose, estimate.landmark[column[there]], sensor)
-        expected[:, there] |= p >= WORTH_A_MISS * sensor.p_detect
+        p = field.p_detect(estimate.pose, estimate.landmark[column[there]])
+        expected[:, there] |= p >= IN_VIEW * sensor.p_detect
     return expected
 
 
