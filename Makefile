@@ -1,6 +1,7 @@
 # Everything starts here; nothing is needed but python3 (3.11 or newer) and make.
 #   make demo    set up and run the demonstration       make test    set up and run the tests
 #   make lint    style, formatting and types            make docs-check    run the commands of the documents
+#   make docs    set up and build the documentation as a site, into out/site
 #   make bench   compare with the committed baseline    make clean   remove what make made
 #   make experiments    whole experiments on the recordings in ../shared/data, minutes long
 # Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
@@ -14,12 +15,13 @@ PYTEST = OPENBLAS_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(PR
 PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development
+DOCUMENTATION = $(VENV)/.stamp-documentation
 
 .DEFAULT_GOAL := help
-.PHONY: help setup setup-dev demo test test-slow test-all experiments lint format docs-check bench lock clean
+.PHONY: help setup setup-dev demo test test-slow test-all experiments lint format docs docs-check bench lock clean
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 6
+	@sed -n 's/^# \{0,1\}//p' Makefile | head -n 7
 
 setup: $(RUNTIME)
 setup-dev: $(DEVELOPMENT)
@@ -48,6 +50,10 @@ lint: $(DEVELOPMENT)
 format: $(DEVELOPMENT)
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
+
+# Open out/site/index.html; its search needs a server: python3 -m http.server --directory out/site
+docs: $(RUNTIME) $(DOCUMENTATION)
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
 docs-check: $(DEVELOPMENT)
 	$(VENV)/bin/python -m pytest tests/docs -m "slow or not slow"
@@ -78,6 +84,10 @@ $(DEVELOPMENT): requirements-dev.lock pyproject.toml studies/pyproject.toml | $(
 	$(PIP_INSTALL) --no-deps --no-build-isolation --editable . --editable ./studies
 	@touch $(RUNTIME) $@
 
+$(DOCUMENTATION): requirements-docs.lock | $(VENV)/bin/python
+	$(PIP_INSTALL) --requirement requirements-docs.lock
+	@touch $@
+
 # For maintainers: renew the pins. Index addresses are kept out of the files: they are the machine's business.
 COMPILE = $(VENV)/bin/pip-compile --quiet --upgrade --strip-extras --no-header --annotation-style=line \
           --no-emit-index-url --no-emit-find-links --no-emit-trusted-host
@@ -85,6 +95,8 @@ lock: $(DEVELOPMENT)
 	$(PIP_INSTALL) pip-tools
 	$(COMPILE) --extra rerun --extra dev --build-deps-for editable --output-file requirements-dev.lock pyproject.toml studies/pyproject.toml
 	$(COMPILE) --extra rerun --build-deps-for editable --constraint requirements-dev.lock --output-file requirements.lock pyproject.toml studies/pyproject.toml
+	$(VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"], sep="\n")' \
+	  | $(COMPILE) --constraint requirements-dev.lock --output-file requirements-docs.lock -
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

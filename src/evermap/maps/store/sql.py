@@ -470,7 +470,7 @@ class SqlStore:
             problem = (
                 f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.SCHEMA_VERSION}"
             )
-            raise InputError(problem, path=self._where, hint="a newer evermap: pip install --upgrade evermap")
+            raise InputError(problem, path=self._where, hint="open it with a newer evermap")
         return version
 
     def _known(self, connection: Connection, revision: int | None) -> int:
