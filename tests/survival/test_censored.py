@@ -22,7 +22,7 @@ NAN, INF = float("nan"), float("inf")
         ({"left_s": [NAN], "right_s": [2]}, "left_s.*nan, row 0"),
         ({"left_s": [1], "right_s": [NAN]}, "right_s.*nan, row 0"),
         ({"left_s": [0], "right_s": [0]}, "right_s.*positive.*row 0"),
-        ({"left_s": [1, 2], "right_s": [1, 2], "entry_s": [0.5, 2]}, "entry_s.*after its right_s.*row 1"),
+        ({"left_s": [1, 2], "right_s": [1, 2], "entry_s": [0.5, 2]}, "entry_s.*at or after its right_s.*row 1"),
         ({"left_s": [1], "right_s": [2], "entry_s": [-1]}, "entry_s.*row 0"),
         ({"left_s": [1], "right_s": [2], "entry_s": [NAN]}, "entry_s.*row 0"),
         ({"left_s": [1, 2], "right_s": [1, 2], "weight": [1, -1]}, "weight.*row 1"),

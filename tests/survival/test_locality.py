@@ -15,10 +15,10 @@ from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.existence import single
 from evermap.survival import Weibull
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.locality import ChunkIndex, chunks_of, ring_query
 from evermap.survival.parametric_fit import fit, log_likelihood
-from evermap.survival.pooling import pooled_fit
+from evermap.survival.pooling import chunks_of, pooled_fit
 from evermap.types import FloatArray, IntArray
+from evermap_studies.lifetimes.rings import ChunkIndex, ring_query
 
 INF = float("inf")
 SIDE_M = 10.0

@@ -10,9 +10,8 @@ from scipy.stats import chi2
 
 from evermap.errors import ConfigError, DataError
 from evermap.survival import Exponential, LifetimePrior
-from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.parametric_fit import fit
-from evermap.survival.sightings import fit_sightings, lifetimes_of_sightings, settled_samples
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
+from evermap.survival.parametric_fit import fit, fit_sightings
 
 
 def test_bounds_by_hand() -> None:

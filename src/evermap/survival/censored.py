@@ -1,14 +1,39 @@
-"""Lifetimes of which only bounds are known (MATH.md section 6)."""
+"""Lifetimes of which only bounds are known, given as such or by sightings (MATH.md section 6).
+
+```
+            elsewhere      arrival b       first ........... last       gone
+  looks  ------|--------------?--------------|-------|---------|----------|------
+                                left = last - b      right = gone - b
+                                entry = first - b
+```
+
+A stay that begins and ends between two looks is never observed, so the observed ones are longer on average: a stay is
+known only because it lasted until the first look, `T > first - b`. To take `(last - first, gone - elsewhere]` for a
+plain interval ignores that, and overestimates lifetimes, the more the rarer the looks.
+
+The arrival is unknown, too. Arrivals are uniform in time, so every instant b since the look before is equally probable,
+and the likelihood of a stay is
+
+    sum_b [ S(last - b) - S(gone - b) ]  /  sum_b S(first - b)
+
+which `parametric_fit.fit_sightings` maximises. Estimators that take plain samples get several rows for each stay, one
+an instant, whose bounds and entries are exact, and which share its weight in proportion to `S(last - b) - S(gone - b)`.
+As long as lifetimes are not known the shares are equal; with an estimate the samples can be made again, and the
+estimate with them. At the fixed point the score of the likelihood has mean 0 at the truth, but bands ignore that the
+instants are unknown, and are a little too narrow.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.errors import DataError
+from evermap.errors import ConfigError, DataError
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -17,22 +42,22 @@ class CensoredLifetimes:
     """N samples `left < T <= right`, each known only because `T > entry`.
 
     ```
-    exact            left = right          the end was watched
-    interval         left < right          there at left, gone at right
+    exact            left = right          the end was observed
+    interval         left < right          present at left, gone at right
     right censored   right = inf           never seen gone
     left censored    left = 0              gone at the first look
-    left truncated   entry > 0             had it been gone by then, nobody would have heard of it
+    left truncated   entry > 0             it would not be in the sample, had it gone by then
     ```
 
     Attributes:
         left_s: (N,) in seconds, not negative.
         right_s: (N,) in seconds, positive, `>= left`, possibly `inf`.
-        entry_s: (N,) in seconds, not negative, `< right`; 0 where nothing is truncated. A `left` below it says no more
-            than the entry does.
-        weight: (N,) how many lifetimes each stands for; not negative, not all 0. Rows of weight 0 say nothing.
+        entry_s: (N,) in seconds, not negative, `< right`; 0 where nothing is truncated. A `left` below it adds nothing
+            to the entry.
+        weight: (N,) number of lifetimes that each stands for; not negative, not all 0. Rows of weight 0 are ignored.
 
     Raises:
-        DataError: for anything else; names row (from 0) and field.
+        DataError: anything else; names row (from 0) and field.
     """
 
     left_s: FloatArray
@@ -46,32 +71,32 @@ class CensoredLifetimes:
             if getattr(self, name).shape != (np.size(self.left_s),):
                 raise DataError(f"must be as long as left_s, {self.left_s.size} rows in one dimension", field=name)
         if self.left_s.size == 0:
-            raise DataError("no lifetimes at all", field="left_s", hint="at least one row")
+            raise DataError("no lifetimes", field="left_s", hint="at least one row")
         left, right, entry, weight = self.left_s, self.right_s, self.entry_s, self.weight
         _refuse(~((left >= 0.0) & (left < np.inf)), left, "left_s", "must be finite and not negative")
         _refuse(~(right > 0.0), right, "right_s", "must be positive, `inf` for never seen gone")
         _refuse(right < left, right, "right_s", "ends before its left_s")
         _refuse(~((entry >= 0.0) & (entry < np.inf)), entry, "entry_s", "must be finite and not negative")
-        _refuse(entry >= right, entry, "entry_s", "known only because it was there after its right_s")
+        _refuse(entry >= right, entry, "entry_s", "is at or after its right_s")
         _refuse(~((weight >= 0.0) & (weight < np.inf)), weight, "weight", "must be finite and not negative")
         if not weight.any():
             raise DataError("all weights are 0", field="weight", hint="a weight of 1 for a lifetime seen once")
 
     @classmethod
     def of(cls, left_s: ArrayLike, right_s: ArrayLike, entry_s: ArrayLike = 0.0, weight: ArrayLike = 1.0) -> Self:
-        """From anything that numpy takes for (N,) numbers; a single entry or weight holds for all rows."""
+        """Make samples from anything that numpy takes for (N,) numbers; a single entry or weight holds for all rows."""
         left = np.asarray(left_s, dtype=np.float64)
         right, entry, counts = (np.asarray(column, dtype=np.float64) for column in (right_s, entry_s, weight))
         entry, counts = (np.full(left.shape, c) if c.ndim == 0 else c for c in (entry, counts))
         return cls(left, right, entry, counts)
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
-        """The samples in some rows, by number or by a mask, at least one of positive weight."""
+        """Return the samples in some rows, by number or by a mask, at least one of positive weight."""
         return type(self)(self.left_s[rows], self.right_s[rows], self.entry_s[rows], self.weight[rows])
 
     @property
     def exact(self) -> BoolArray:
-        """(N,) whether the end was watched."""
+        """Return (N,) whether the end was observed."""
         return np.asarray(self.left_s == self.right_s)
 
 
@@ -79,3 +104,94 @@ def _refuse(bad: BoolArray, values: FloatArray, field: str, problem: str) -> Non
     if bad.any():
         row = int(np.argmax(bad))
         raise DataError(f"{problem}: found {float(values[row])!r}, row {row}", field=field)
+
+
+def lifetimes_of_sightings(
+    elsewhere_s: ArrayLike,
+    first_s: ArrayLike,
+    last_s: ArrayLike,
+    gone_s: ArrayLike,
+    *,
+    given: LifetimePrior | None = None,
+    instants: int = 5,
+    least_stay_s: float = 0.0,
+) -> tuple[CensoredLifetimes, IntArray]:
+    """Make censored samples from the sightings of stays.
+
+    Stays without a look before are left out: their age at the first look is unknown.
+
+    Args:
+        elsewhere_s: (K,) last look before the first sighting, at which it was not there; -inf if there was none.
+        first_s: (K,) first sighting.
+        last_s: (K,) last sighting.
+        gone_s: (K,) first look after the last sighting, at which it was not there; inf if there was none.
+        given: an estimate of lifetimes, by which instants of arrival are weighted; None for equal weights.
+        instants: number of instants of arrival for each stay.
+        least_stay_s: a stay is counted only if it is seen to last this long.
+
+    Returns:
+        the samples, `instants` rows for each stay, and (N,) the stay that each row belongs to.
+
+    Raises:
+        ConfigError: `instants` is not positive.
+        DataError: columns of different lengths or out of order in time, or no stay with a look before it.
+    """
+    if instants < 1:
+        raise ConfigError(f"must be positive, not {instants}", field="instants")
+    columns = {"elsewhere_s": elsewhere_s, "first_s": first_s, "last_s": last_s, "gone_s": gone_s}
+    elsewhere, first, last, gone = (np.asarray(values, dtype=np.float64) for values in columns.values())
+    for name, column in zip(columns, (elsewhere, first, last, gone), strict=True):
+        if column.shape != (first.size,):
+            raise DataError(f"shape {column.shape} instead of ({first.size},)", field=name)
+    wrong = ~((elsewhere < first) & (first <= last) & (last < gone) & np.isfinite(first) & np.isfinite(last))
+    if wrong.any():
+        problem = f"not in order, row {int(np.argmax(wrong))}"
+        raise DataError(problem, field="first_s", hint="elsewhere_s < first_s <= last_s < gone_s")
+    stay = np.flatnonzero(np.isfinite(elsewhere) & (last - first >= least_stay_s))
+    if stay.size == 0:
+        hint = "look at the places more than once"
+        raise DataError("every stay began before the first look", field="elsewhere_s", hint=hint)
+    rows = np.repeat(stay, instants)
+    share = np.tile((np.arange(instants) + 0.5) / instants, stay.size)
+    arrival = elsewhere[rows] + share * (first[rows] - elsewhere[rows])
+    left, right = last[rows] - arrival, gone[rows] - arrival
+    weight = _weights(left, right, instants, given)
+    return CensoredLifetimes.of(left, right, first[rows] + least_stay_s - arrival, weight), rows
+
+
+def settled_samples(
+    estimate: Callable[[CensoredLifetimes], LifetimePrior],
+    samples_given: Callable[[LifetimePrior | None], CensoredLifetimes],
+    rounds: int = 4,
+) -> CensoredLifetimes:
+    """Iterate samples and estimate until the weights agree with the lifetimes estimated from them.
+
+    Args:
+        estimate: lifetimes from samples; a rough one is enough, since it only weights the instants of arrival.
+        samples_given: samples with weights by an estimate, or None: `lifetimes_of_sightings` for some stays.
+        rounds: number of iterations.
+    """
+    samples = samples_given(None)
+    for _ in range(rounds):
+        samples = samples_given(estimate(samples))
+    return samples
+
+
+def log_sighting(prior: LifetimePrior, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return `log(S(left) - S(right))` (N,)."""
+    ended = np.isfinite(right)
+    value = np.asarray(prior.log_survival(left)).copy()
+    value[ended] += prior.log_conditional_death(left[ended], right[ended])
+    return value
+
+
+def _weights(left: FloatArray, right: FloatArray, instants: int, given: LifetimePrior | None) -> FloatArray:
+    """Return the shares (N,) of the instants of every stay: `S(left) - S(right)`, of sum 1 for each."""
+    if given is None:
+        return np.full(left.size, 1.0 / instants)
+    log_share = log_sighting(given, left, right)
+    table = log_share.reshape(-1, instants)
+    most = table.max(axis=1, keepdims=True)
+    share = np.exp(table - np.where(np.isfinite(most), most, 0.0))
+    total = share.sum(axis=1, keepdims=True)
+    return np.asarray(np.where(total > 0.0, share / np.where(total > 0.0, total, 1.0), 1.0 / instants)).ravel()

@@ -1,17 +1,17 @@
-"""Lifetimes of several classes learned together, so that one or two stays make no wild curve.
+"""Lifetimes of several classes learned together, so that one or two stays of a class suffice.
 
     T of class c      Weibull with mean and shape of its own
     log mean_c        normal about a level that all classes share, level and spread unknown
-    log shape_c       normal about 0: constant hazard, until the data say otherwise
+    log shape_c       normal about 0: constant hazard, unless the data differ
 
-Every unknown lives on a grid, so posteriors are sums: nothing is searched, nothing can fail to converge, and the same
-numbers come out every time. The curve of a class is the mean of its posterior, which is what forecasts need. A class
-of which there are no stays gets what its fellows have in common; without any data that is a constant hazard of
-unknown size, as the general-purpose prior (Rosen 2016, eq. 26).
+Every unknown is on a grid, so posteriors are sums: nothing is searched, nothing can fail to converge, and results are
+reproducible. The curve of a class is the mean of its posterior, which forecasts need. A class without stays gets what
+the classes have in common; without any data that is a constant hazard of unknown size, as the general-purpose prior
+(Rosen 2016, eq. 26).
 
-The likelihood of a stay is that of `sightings`, with the arrival marginalised between the look before and the first
-sighting. A stay of which the look before is missing came any time before: then the same sum over arrivals is the law
-of what is left of a stay that one comes upon, `int_r^inf S / mean`.
+The likelihood of a stay is that of `censored`, with the arrival marginalised between the look before and the first
+sighting. A stay without a look before began any time before: then the same sum over arrivals is the law of the residual
+life of a stationary renewal process, `int_r^inf S / mean`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from evermap.types import FloatArray
 LOG_MEAN = np.arange(math.log(1200.0), math.log(1.5e9), 0.25)
 """Logarithms of mean durations in seconds, 20 minutes to 45 years."""
 LOG_SHAPE = np.arange(-1.0, 1.3, 0.25)
-"""Of Weibull shapes, 0.37 to 3.5."""
+"""Logarithms of Weibull shapes, 0.37 to 3.5."""
 LOGIT_RETURN = np.arange(-4.5, 4.6, 1.0)
-"""Of the probability that what went away ever returns."""
+"""Logits of the probability that a landmark that left ever returns."""
 FINE = 4
-"""Likelihoods are smooth: they are computed on the grid above and interpolated to one this many times finer."""
+"""Likelihoods are smooth: they are computed on the grids above and interpolated to ones this many times finer."""
 SHAPE_SPREAD = 0.5
 """Standard deviation of the logarithms of shapes."""
 _LEVELS = np.linspace(math.log(3600.0), math.log(3650.0 * 86400.0), 12)
@@ -42,17 +42,17 @@ _SPREADS = np.array([0.5, 1.0, 2.0, 4.0])
 _EDGES_S = np.concatenate([[0.0], np.geomspace(1800.0, 1e9, 23)])
 """Curves have constant hazards between these ages."""
 _INSTANTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
-"""Gauss-Legendre: where between two looks something arrived, as shares of the gap."""
+"""Gauss-Legendre nodes of the arrival between two looks, as shares of the gap."""
 _LEAST = 1e-300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClassPosterior:
-    """What is known of the durations of C classes, and of a class that was never seen.
+    """Posterior of the durations of C classes, and of a class without data.
 
     Attributes:
         weight: (C + 1, M, A) posterior probabilities of `mean_s` and `second`; the last row for a new class.
-        mean_s: (M,) mean durations of those that end.
+        mean_s: (M,) mean durations of stays or absences that end.
         second: (A,) Weibull shapes of stays, probabilities of return of absences.
         improper: whether `second` are probabilities of return.
     """
@@ -63,7 +63,7 @@ class ClassPosterior:
     improper: bool
 
     def curve(self, row: int) -> PiecewiseConstantHazard:
-        """Posterior mean of the survival function of a class; -1 for one that was never seen."""
+        """Return the posterior mean of the survival function of a class; -1 for one without data."""
         survival = _survival_table(self.improper) @ self.weight[row].ravel()
         known = survival > 1e-9
         log_s = np.log(survival[known])
@@ -72,7 +72,7 @@ class ClassPosterior:
         return PiecewiseConstantHazard(tuple(_EDGES_S[known]), (*rates, last))
 
     def band(self, row: int, ages_s: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Posterior mean of `P(T > age)` at each age (N,), and the bounds of its central credible interval."""
+        """Return the posterior mean of `P(T > age)` at each age (N,), and the bounds of its credible interval."""
         survival = _survival(np.asarray(ages_s, dtype=np.float64), self.mean_s, self.second, self.improper)
         weight = self.weight[row].ravel()
         order = np.argsort(survival, axis=1)
@@ -87,14 +87,14 @@ class ClassPosterior:
 
 
 def stay_posterior(log_likelihood: FloatArray) -> ClassPosterior:
-    """Of stays, from the (C, M, A) log likelihoods of C classes on `LOG_MEAN` and `LOG_SHAPE`."""
+    """Compute the posterior of stays from log likelihoods (C, M, A) of C classes on `LOG_MEAN` and `LOG_SHAPE`."""
     second = _finer(LOG_SHAPE)
     weight = _posterior(log_likelihood, -0.5 * np.square(second / SHAPE_SPREAD))
     return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), np.exp(second), improper=False)
 
 
 def absence_posterior(log_likelihood: FloatArray) -> ClassPosterior:
-    """Of absences, from the (C, M, A) log likelihoods of C classes on `LOG_MEAN` and `LOGIT_RETURN`."""
+    """Compute the posterior of absences from log likelihoods (C, M, A) on `LOG_MEAN` and `LOGIT_RETURN`."""
     share = 1.0 / (1.0 + np.exp(-_finer(LOGIT_RETURN)))
     weight = _posterior(log_likelihood, np.log(share * (1.0 - share)))  # even over probabilities
     return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), share, improper=True)
@@ -102,14 +102,13 @@ def absence_posterior(log_likelihood: FloatArray) -> ClassPosterior:
 
 @dataclass(frozen=True, slots=True)
 class Sightings:
-    """K stays as they were seen, and how what was not seen may have interrupted them.
+    """K stays as they were seen, and what may have interrupted them between looks.
 
     Attributes:
-        elsewhere_s, first_s, last_s, gone_s: (K,) as of `sightings.lifetimes_of_sightings`.
-        gap_s: (K, 2) lengths of the gaps between the looks at a stay; half of the gaps have the one, half the other;
-            positive.
-        back_by_stay: (K,) probability that who leaves is elsewhere for one more stay, and then back.
-        back_rate: (K,) rate in 1/s at which others come back.
+        elsewhere_s, first_s, last_s, gone_s: (K,) as of `censored.lifetimes_of_sightings`.
+        gap_s: (K, 2) two positive lengths of the gaps between the looks at a stay; half of the gaps have each.
+        back_by_stay: (K,) probability that a landmark that leaves is elsewhere for one more stay, and then back.
+        back_rate: (K,) rate in 1/s at which other landmarks return.
     """
 
     elsewhere_s: FloatArray
@@ -122,7 +121,7 @@ class Sightings:
 
 
 def stay_log_likelihood(seen: Sightings) -> FloatArray:
-    """(K, M, A) log probabilities of what was seen of K stays, on `LOG_MEAN` and `LOG_SHAPE`."""
+    """Return log probabilities (K, M, A) of the sightings of K stays, on `LOG_MEAN` and `LOG_SHAPE`."""
     result = np.empty((len(seen.first_s), len(LOG_MEAN), len(LOG_SHAPE)))
     came, ended = np.isfinite(seen.elsewhere_s), np.isfinite(seen.gone_s)
     watched_s, both_gaps_s = seen.last_s - seen.first_s, seen.gap_s.sum(axis=1)
@@ -150,25 +149,25 @@ def stay_log_likelihood(seen: Sightings) -> FloatArray:
         leave = np.maximum((gone - last)[ended], _LEAST)
         change = (1.0 + back[ended]) * leave + (rate[ended] * left_s)[:, None, None]
         log_seen[ended] += np.log(leave / change * -np.expm1(-change))
-        # less the probability to be there at the first look, relative to which both instants are taken
+        # given presence at the first look, relative to which both instants are taken
         result[:, :, a] = _log_sum(log_seen) - _log_sum(-first)
     return result
 
 
 def _log_there_again(leave: FloatArray, come: FloatArray) -> FloatArray:
-    """Of being found again where one was, by the mean numbers of goings and comings in a gap."""
+    """Return the log probability of presence after a gap, by the mean numbers of departures and returns in it."""
     both = leave + come
     return np.asarray(np.log(np.maximum((come + leave * np.exp(-both)) / both, _LEAST)))
 
 
 def _log_sum(log_values: FloatArray) -> FloatArray:
-    """(K, M) over two instants."""
+    """Return the log of the sum (K, M) over two instants."""
     one, other = log_values[:, 0], log_values[:, 1]
     return np.asarray(np.maximum(one, other) + np.log1p(np.exp(-np.abs(one - other))))
 
 
 def _of_found(hazard: FloatArray, shape: float) -> FloatArray:
-    """Cumulative hazard of what is left of stays that one comes upon: `-log R(r)`, `R(r) = int_r^inf S / mean`."""
+    """Return the cumulative hazard of a residual life: `-log R(r)`, `R(r) = int_r^inf S / mean`."""
     from scipy.special import gammaincc, gammaln
 
     order = 1.0 / shape
@@ -180,7 +179,7 @@ def _of_found(hazard: FloatArray, shape: float) -> FloatArray:
 def absence_log_likelihood(
     there_s: FloatArray, first_s: FloatArray, last_s: FloatArray, back_s: FloatArray
 ) -> FloatArray:
-    """(K, M, A) of absences on `LOG_MEAN` and `LOGIT_RETURN`.
+    """Return log probabilities (K, M, A) of K absences on `LOG_MEAN` and `LOGIT_RETURN`.
 
     Args:
         there_s: (K,) last sighting before.
@@ -197,20 +196,20 @@ def absence_log_likelihood(
 
 
 def _away(ages: FloatArray) -> FloatArray:
-    """(K, 2, M) probability that one that returns is still away."""
+    """Return the probability (K, 2, M) that a landmark that returns is still away."""
     return np.asarray(np.exp(-ages[..., None] * np.exp(-LOG_MEAN)))
 
 
 def _ages(
     before: FloatArray, first: FloatArray, last: FloatArray, after: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(K, 2) ages at the three later stamps, for two instants of beginning."""
+    """Return ages (K, 2) at the three later stamps, for two instants of beginning."""
     begin = before[:, None] + _INSTANTS * (first - before)[:, None]
     return first[:, None] - begin, last[:, None] - begin, after[:, None] - begin
 
 
 def _posterior(log_likelihood: FloatArray, log_second: FloatArray) -> FloatArray:
-    """(C + 1, M, A) on the finer grid, with level and spread of the classes summed over."""
+    """Return the posterior (C + 1, M, A) on the finer grid, with level and spread of the classes summed over."""
     fine = _cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T
     fine = np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
     second = np.exp(log_second - log_second.max())
@@ -237,7 +236,7 @@ def _finer(nodes: FloatArray) -> FloatArray:
 
 @lru_cache
 def _cubic(n: int) -> FloatArray:
-    """(N, n) from values at n nodes to those at N finer ones: Lagrange through the four nodes around each."""
+    """Return the matrix (N, n) that interpolates n nodes to N finer ones: cubic Lagrange through four nodes."""
     at = np.arange(FINE * (n - 1) + 1) / FINE
     start = np.clip(np.floor(at).astype(np.int64) - 1, 0, n - 4)
     matrix = np.zeros((len(at), n))
@@ -251,7 +250,7 @@ def _cubic(n: int) -> FloatArray:
 
 
 def _survival(ages_s: FloatArray, mean_s: FloatArray, second: FloatArray, improper: bool) -> FloatArray:
-    """(N, M A) of every member at every age."""
+    """Return the survival (N, M A) of every member of the grid at every age."""
     if improper:
         left = np.exp(-ages_s[:, None, None] / mean_s[:, None])
         return np.asarray(1.0 - second * (1.0 - left)).reshape(len(ages_s), -1)
@@ -261,7 +260,7 @@ def _survival(ages_s: FloatArray, mean_s: FloatArray, second: FloatArray, improp
 
 @lru_cache
 def _survival_table(improper: bool) -> FloatArray:
-    """(J, M A) at the edges of curves."""
+    """Return the survival (J, M A) at the edges of curves."""
     nodes = LOGIT_RETURN if improper else LOG_SHAPE
     second = 1.0 / (1.0 + np.exp(-_finer(nodes))) if improper else np.exp(_finer(nodes))
     return _survival(_EDGES_S, np.exp(_finer(LOG_MEAN)), second, improper)

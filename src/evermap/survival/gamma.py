@@ -1,4 +1,4 @@
-"""Sum of `shape` exponential stages; with a shape below 1, a hazard that falls towards a floor."""
+"""Gamma lifetimes: the sum of `shape` exponential stages; with a shape below 1, a hazard that falls to a floor."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Gamma(Lifetime):
         return log_integral_of_smooth_hazard(a, b, self._log_cumulative, self._log_hazard)
 
     def _log_cumulative(self, t: FloatArray) -> FloatArray:
-        """`log H(t) = log(-log Q(shape, x))`."""
+        """Return `log H(t) = log(-log Q(shape, x))`."""
         from scipy.special import gammainc, gammaincc
 
         x = np.asarray(t / self.scale_s)
@@ -60,11 +60,11 @@ class Gamma(Lifetime):
         return log_hazard - math.log(self.scale_s)
 
     def _is_far(self, x: FloatArray) -> FloatArray:
-        """Where the continued fraction converges in a few dozen steps."""
+        """Return where the continued fraction converges in a few dozen steps."""
         return np.asarray(x > self.shape + 10.0 + 3.0 * math.sqrt(self.shape))
 
     def _continued_fraction(self, x: FloatArray) -> FloatArray:
-        """`Gamma(shape, x) exp(x) x^-shape` (Legendre's continued fraction, DLMF 8.9.2), from its tail back."""
+        """Return `Gamma(shape, x) exp(x) x^-shape` (Legendre's continued fraction, DLMF 8.9.2), from its tail back."""
         x = np.where(self._is_far(x), x, self.shape + 10.0 + 3.0 * math.sqrt(self.shape))
         value = np.zeros_like(x)
         for n in range(200, 0, -1):
@@ -77,7 +77,7 @@ class Gamma(Lifetime):
         )
 
     def _log_lower_series(self, x: FloatArray) -> FloatArray:
-        """`log P(shape, x)` where it underflows, so `x` is far below `shape` or tiny (DLMF 8.7.1)."""
+        """Return `log P(shape, x)` where it underflows, so `x` is far below `shape` or tiny (DLMF 8.7.1)."""
         ratio = np.minimum(x, self.shape)
         term = np.ones_like(x)
         total = np.ones_like(x)
@@ -95,7 +95,7 @@ class Gamma(Lifetime):
 
 
 def _log_or_else(values: FloatArray, x: FloatArray, series: Callable[[FloatArray], FloatArray]) -> FloatArray:
-    """`log values`, or `series(x)` where they underflow; series are long, and hardly ever needed."""
+    """Return `log values`, or `series(x)` where they underflow; series are long and rarely needed."""
     tiny = np.asarray(values <= _UNDERFLOW)
     result = np.asarray(np.log(np.where(tiny, 1.0, values)))
     if tiny.any():

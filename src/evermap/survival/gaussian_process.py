@@ -2,13 +2,12 @@
 
     h(t | x) = h0(t) exp(f(t, x)),     f = level + time + class + class x time + sum of smooth covariates
 
-`h0` is the Weibull model fitted to all samples, towards which the hazard goes back where data are few; every term is a
-Gaussian process with its own scale, the sum of two of them where smoothness is to be learned. Kept of the paper are the
+`h0` is the Weibull model fitted to all samples, to which the hazard reverts where data are few; every term is a
+Gaussian process with its own scale, the sum of two of them where smoothness is to be learned. From the paper come the
 parametric baseline, the process with additive covariates and the likelihood of censored lifetimes; there every
-covariate changes the curve over time, here classes do and numbers multiply the hazard. What differs is the
-computation: rates are constant over stretches of log time, so that the likelihood is exact without thinning, the
-posterior is Laplace's instead of Monte Carlo's, and the link is an exponential instead of a sigmoid, which the
-thinning needed as a bound.
+covariate changes the curve over time, here classes do and numbers multiply the hazard. The computation differs: rates
+are constant over stretches of log time, so that the likelihood is exact without thinning, the posterior is Laplace's
+instead of Monte Carlo's, and the link is an exponential instead of a sigmoid, which the thinning needed as a bound.
 """
 
 from __future__ import annotations
@@ -36,19 +35,19 @@ from evermap.types import FloatArray, IntArray
 LEVEL_SCALE = 1.0
 """Standard deviation of the log hazard's level around the fitted baseline."""
 TREND_SCALE = 0.3
-"""Standard deviation of its slope over log time: of how far a Weibull model's shape is from the baseline's."""
+"""Standard deviation of its slope over log time: of a Weibull model's shape around the baseline's."""
 LONG, SHORT = 3.0, 0.7
-"""Lengths of the processes over time, in natural logarithms of it: a factor of 20, and of 2."""
+"""Lengths of the processes over time, in natural logarithms: a factor of 20, and of 2."""
 DAY_S = 86400.0
 _KNOTS = 10
 _HOURS = 12
 _NEGLECTED = 1e-4
-"""Share of a process' variance that may be left out to have fewer directions."""
+"""Share of a process' variance that is dropped to have fewer directions."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Covariates:
-    """What is known of N things besides their lifetimes; None where it is not.
+    """Covariates of N things, each None where unknown.
 
     Attributes:
         class_id: (N,) whole numbers.
@@ -58,7 +57,7 @@ class Covariates:
         time_of_day_s: (N,) seconds since midnight when each was first seen.
 
     Raises:
-        DataError: a column of another length, or a value that is not finite.
+        DataError: columns of different lengths, or a value that is not finite.
     """
 
     class_id: IntArray | None = None
@@ -82,22 +81,22 @@ class Covariates:
 
     @classmethod
     def one(cls, **values: Any) -> Self:
-        """Of a single thing: `Covariates.one(class_id=3, place_m=(1.0, 2.0))`."""
+        """Make the covariates of a single thing: `Covariates.one(class_id=3, place_m=(1.0, 2.0))`."""
         return cls(**values)
 
     def columns(self) -> dict[str, Any]:
-        """Those that are known, by name."""
+        """Return those that are known, by name."""
         return {item.name: value for item in fields(self) if (value := getattr(self, item.name)) is not None}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GpHazard:
-    """A hazard learned over age and covariates.
+    """Posterior of a hazard over age and covariates.
 
     Attributes:
         edges_s: (K,) starts of the stretches of constant hazard, in seconds.
-        baseline: (K,) rates in 1/s around which the process moves.
-        class_ids: (G,) that were seen, increasing; none where classes were not given.
+        baseline: (K,) rates in 1/s, the mean of the process.
+        class_ids: (G,) in the samples, increasing; empty where classes were not given.
         posterior: of the process, in the order of the terms.
         scales: standard deviation of the log hazard that each term contributes.
     """
@@ -112,19 +111,19 @@ class GpHazard:
 
     @property
     def scales(self) -> dict[str, float]:
-        """Standard deviation of each term of the log hazard, by its name."""
+        """Return the standard deviation of each term of the log hazard, by its name."""
         return dict(zip(self._names, self.posterior.scales.tolist(), strict=True))
 
     @property
     def log_evidence(self) -> float:
-        """Laplace's approximation of the log marginal likelihood, to compare sets of covariates by."""
+        """Return the log marginal likelihood (Laplace), to compare sets of covariates by."""
         return self.posterior.log_evidence
 
     def at(self, **covariates: Any) -> HazardDraws:
-        """The hazard of one thing, given by the same covariates as were learned from: `at(class_id=3)`.
+        """Return the hazard of one thing by the covariates that were learned from: `at(class_id=3)`.
 
         Raises:
-            DataError: a covariate is missing or was not learned from, or a class was never seen.
+            DataError: a missing or unknown covariate, or a class without samples.
         """
         row = Covariates.one(**covariates)
         wanted = {smooth.name for smooth in self._smooth} | ({"class_id"} if len(self.class_ids) else set())
@@ -143,9 +142,9 @@ class GpHazard:
 
 
 def gp_fit(data: CensoredLifetimes, covariates: Covariates | None = None) -> GpHazard:
-    """The hazard over age and covariates, with scales by marginal likelihood.
+    """Learn the hazard over age and covariates, with scales by marginal likelihood.
 
-    One core learns 10,000 samples of some classes and places in seconds; time grows with the samples.
+    One core learns 10,000 samples of some classes and places in seconds; time is linear in the samples.
 
     Raises:
         DataError: covariates of another length, or no lifetime has an end.
@@ -170,7 +169,7 @@ def gp_fit(data: CensoredLifetimes, covariates: Covariates | None = None) -> GpH
 
 
 def weibull_baseline(data: CensoredLifetimes, edges_s: FloatArray) -> FloatArray:
-    """(K,) rates of the Weibull, or else exponential, model of all samples, averaged over each stretch of time."""
+    """Return rates (K,) of the Weibull, or else exponential, model of all samples, averaged over each stretch."""
     try:
         prior = fit("weibull", data).prior
     except NumericalError:
@@ -180,7 +179,7 @@ def weibull_baseline(data: CensoredLifetimes, edges_s: FloatArray) -> FloatArray
 
 
 def curve_terms(edges_s: FloatArray, groups: int) -> dict[str, Term]:
-    """Level, curve over time, and each group's own level and curve, by name."""
+    """Return the terms of level and curve over time, and of each group's own level and curve, by name."""
     ends = np.append(edges_s[1:], 2.0 * edges_s[-1])
     log_age = np.log(np.sqrt(np.maximum(edges_s, 0.25 * edges_s[1]) * ends))[:, None]
     stretches = len(edges_s)
@@ -215,8 +214,8 @@ class _Smooth:
     Attributes:
         name: of the covariate.
         label: of the term.
-        middle, spread: of the covariate; spread 0 for hours, which go round a circle.
-        points: (M, d) where the process is held, in spreads.
+        middle, spread: of the covariate; spread 0 for times of day, which lie on a circle.
+        points: (M, d) support points of the process, in spreads.
         root: (M, M) that makes its values independent.
         length: of the process, in spreads.
     """
@@ -230,7 +229,7 @@ class _Smooth:
     length: float
 
     def features(self, covariates: Covariates) -> FloatArray:
-        """(N, M) columns whose coefficients are independent."""
+        """Return columns (N, M) whose coefficients are independent."""
         here = _coordinates(np.asarray(getattr(covariates, self.name)), self.middle, self.spread)
         return np.asarray(_kernel(here, self.points, self.length) @ self.root)
 
@@ -260,7 +259,7 @@ def _smooth_terms(known: Covariates) -> list[_Smooth]:
 
 
 def _coordinates(values: ArrayLike, middle: FloatArray, spread: float) -> FloatArray:
-    """(N, d) in units of the spread; hours as points of the unit circle."""
+    """Return coordinates (N, d) in units of the spread; times of day as points of the unit circle."""
     table = np.asarray(values, dtype=np.float64)
     table = table.reshape(len(table), -1)
     if spread > 0.0:
@@ -270,7 +269,7 @@ def _coordinates(values: ArrayLike, middle: FloatArray, spread: float) -> FloatA
 
 
 def _points_near(here: FloatArray) -> FloatArray:
-    """Points of a square grid of at most 10 x 10 that have data next to them."""
+    """Return the points of a square grid of at most 10 x 10 that are next to data."""
     low, high = here.min(axis=0), here.max(axis=0)
     spacing = max(float((high - low).max()) / 9.0, 1e-9)
     cells = np.unique(np.rint((here - low) / spacing), axis=0)
@@ -278,14 +277,14 @@ def _points_near(here: FloatArray) -> FloatArray:
 
 
 def _directions(points: FloatArray, length: float) -> FloatArray:
-    """(K, r) columns that sum up a process of variance 1 at K points, the weakest left out."""
+    """Return columns (K, r) that span a process of variance 1 at K points, without the weakest directions."""
     size, vectors = np.linalg.eigh(_kernel(points, points, length))
     kept = size > _NEGLECTED * size[-1]
     return np.asarray(vectors[:, kept] * np.sqrt(size[kept]))
 
 
 def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
-    """Squared exponential."""
+    """Return the squared exponential kernel."""
     distance = np.square(a[:, None, :] - b[None, :, :]).sum(axis=-1)
     return np.asarray(np.exp(-0.5 * distance / length**2))
 

@@ -6,9 +6,9 @@ bound (MATH.md section 6; Rasmussen and Williams 2006, section 3.4, for the appr
 
     log p(sample i) = -sum_k E_ik h_ik + log(1 - exp(-sum_k W_ik h_ik))
 
-without the second term where the right bound is infinite, and with `log h` at the end instead where that was watched.
-Scales are found by MacKay's (1992) fixed point, which climbs the marginal likelihood: `scale^2 = u'Qu / gamma`, where
-gamma is how many directions of `u` the data determine.
+without the second term where the right bound is infinite, and with `log h` at the end instead where that was observed.
+Scales are found by MacKay's (1992) fixed point, which ascends the marginal likelihood: `scale^2 = u'Qu / gamma`, where
+gamma is the number of directions of `u` that the data determine.
 """
 
 from __future__ import annotations
@@ -21,34 +21,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.errors import ConfigError, NumericalError
-from evermap.survival.base import check_times
+from evermap.errors import NumericalError
+from evermap.survival.base import check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import BoolArray, FloatArray, IntArray
 
 STRETCHES = 24
 DRAWS = 2000
-"""From the posterior, half of them mirror images of the other half."""
+"""Number of draws from the posterior, half of them mirror images of the other half."""
 TAIL = 10
-"""Stretches of a prior beyond the last of the hazard, each as long as all before: doubt makes hazards fall there."""
+"""Stretches of a prior beyond the hazard's last, each as long as all before: uncertainty makes hazards fall there."""
 GUESS, GUESS_COUNTS = 1.0, 1.0
-"""A scale before data, and as how many directions it counts; it keeps scales of few directions from 0."""
+"""Prior guess of a scale, and its weight in directions; it keeps scales of few directions away from 0."""
 _ROUNDS, _SETTLED = 60, 0.02
 _NEWTON, _STEP = 30, 3.0
 _MOSTLY_EMPTY = 0.05
-"""Share of entries that are not 0 below which a sparse matrix is the faster one."""
+"""Below this share of nonzero entries a sparse matrix is faster."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """One sum of the log hazard: `curves @ u` for all samples of a group, or `levels @ u` at all times.
+    """One term of the log hazard: `curves @ u` for all samples of a group, or `levels @ u` at all times.
 
     Attributes:
         curves: (G, K, d) for G groups and K stretches; or None.
         levels: (N, d), a sparse matrix or an array; or None.
         precision: (d, d) of `u` at scale 1.
-        scale: of u; None where it is learned.
+        scale: of `u`; None where it is learned.
     """
 
     curves: FloatArray | None = None
@@ -58,20 +58,20 @@ class Term:
 
     @property
     def size(self) -> int:
-        """Length d of `u`."""
+        """Return the length d of `u`."""
         columns = self.curves if self.curves is not None else self.levels
         return int(columns.shape[-1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """What is known of all `u`, one after the other.
+    """Laplace's approximation of the posterior of all `u`, concatenated.
 
     Attributes:
         mean: (D,) most probable values.
         covariance: (D, D) around them.
         scales: of each term.
-        log_evidence: Laplace's approximation of the log marginal likelihood.
+        log_evidence: the log marginal likelihood.
     """
 
     mean: FloatArray
@@ -80,7 +80,7 @@ class Posterior:
     log_evidence: float
 
     def draws(self, columns: FloatArray, unknown: float = 0.0, seed: int = 0) -> FloatArray:
-        """(DRAWS, K) values of `columns @ u` for (K, D) columns, plus a level of which only its variance is known."""
+        """Draw (DRAWS, K) values of `columns @ u` for (K, D) columns, plus a level of variance `unknown`."""
         spread = columns @ self.covariance @ columns.T + unknown
         values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -90,7 +90,7 @@ class Posterior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HazardDraws:
-    """A piecewise constant hazard that is known with uncertainty: equally probable ones.
+    """An uncertain piecewise constant hazard, as equally probable draws.
 
     Attributes:
         edges_s: (K,) starts of the stretches in seconds, the first 0; the last rate holds for ever.
@@ -101,13 +101,12 @@ class HazardDraws:
     rates: FloatArray
 
     def survival(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Expected `P(T > t)`, and its lower and upper credible bound at each time by itself.
+        """Return the expected `P(T > t)`, and its pointwise lower and upper credible bounds.
 
         Raises:
-            ConfigError: `confidence` is not in (0, 1), or a time cannot be.
+            ConfigError: `confidence` is not in (0, 1), or an invalid time.
         """
-        if not 0.0 < confidence < 1.0:
-            raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
+        check_open_share(confidence)
         times = check_times(t)
         survives = np.exp(-overlaps(np.zeros(times.size), times.ravel(), self.edges_s) @ self.rates.T)
         tail = 0.5 - 0.5 * confidence
@@ -117,14 +116,13 @@ class HazardDraws:
         return expected, lower, upper
 
     def quantile(self, p: float, confidence: float = 0.95) -> tuple[float, float, float]:
-        """Time by which a share `p` has gone: median of the draws, and lower and upper credible bound, in seconds.
+        """Return the time by which a share `p` is gone: median of the draws and credible bounds, in seconds.
 
         Raises:
             ConfigError: `p` or `confidence` is not in (0, 1).
         """
-        for name, value in (("p", p), ("confidence", confidence)):
-            if not 0.0 < value < 1.0:
-                raise ConfigError(f"must lie in (0, 1), not {value!r}", field=name)
+        check_open_share(p, "p")
+        check_open_share(confidence)
         target = -np.log1p(-p)
         reached = np.concatenate([np.zeros((len(self.rates), 1)), self._cumulative()], axis=1)
         stretch = (reached < target).sum(axis=1) - 1
@@ -136,7 +134,7 @@ class HazardDraws:
         return float(middle), float(lower), float(upper)
 
     def prior(self) -> PiecewiseConstantHazard:
-        """The lifetime prior whose survival is the expected one at every edge, and at later times for the tail."""
+        """Return the lifetime prior whose survival is the expected one at every edge and at later times of the tail."""
         reach_s = self.edges_s[-1] if len(self.edges_s) > 1 else 1.0 / self.rates.max()
         edges_s = np.concatenate([self.edges_s, reach_s * 2.0 ** np.arange(1, TAIL + 1)])
         steps = np.diff(edges_s)
@@ -153,33 +151,33 @@ class HazardDraws:
 
 
 def overlaps(first_s: FloatArray, last_s: FloatArray, edges_s: FloatArray) -> FloatArray:
-    """(N, K) seconds that each interval spends in each stretch; the last stretch has no end."""
+    """Return the seconds (N, K) that each interval spends in each stretch; the last stretch has no end."""
     ends = np.append(edges_s[1:], np.inf)
     spent = np.minimum(last_s[:, None], ends) - np.maximum(first_s[:, None], edges_s)
     return np.asarray(np.maximum(spent, 0.0))
 
 
 def stretches_for(data: CensoredLifetimes, count: int = STRETCHES) -> FloatArray:
-    """(count,) edges in seconds, even in log time over all but the earliest of the times that say something."""
+    """Choose edges (count,) in seconds, even in log time over all but the earliest informative times."""
     seen = data.weight > 0.0
     finite = np.where(np.isfinite(data.right_s), data.right_s, data.left_s)[seen]
     high = float(max(finite.max(), data.left_s[seen].max()))
     low = float(np.quantile(finite[finite > 0.0], 0.02))
-    # The latest of all ends within the last stretch: at its start there would be an end without any exposure.
+    # The latest end lies within the last stretch: at its start it would be an end without any exposure.
     return np.concatenate([[0.0], np.geomspace(min(low, 0.1 * high), high, count)[:-1]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposures:
-    """The samples as the likelihood asks for them, times in units of the baseline's integral.
+    """The samples in the form of the likelihood, times in units of the baseline's integral.
 
     Attributes:
         before, within: (N, K) integrals of the baseline over each stretch, `E` and `W` above times the baseline.
-        ends: (N, K) 1 in the stretch of an end that was watched.
+        ends: (N, K) 1 in the stretch of an observed end.
         log_baseline: (N,) at that end; 0 elsewhere.
         bounded: (N,) whether the end is known to lie in an interval.
         weight: (N,) of the samples.
-        group: (N,) whose curve a sample follows.
+        group: (N,) of each sample, which has a curve.
     """
 
     before: FloatArray
@@ -192,7 +190,7 @@ class Exposures:
 
     @classmethod
     def of(cls, data: CensoredLifetimes, edges_s: FloatArray, baseline: FloatArray, group: IntArray) -> Exposures:
-        """For (K,) rates of the baseline in 1/s."""
+        """Prepare samples, for baseline rates (K,) in 1/s."""
         since = np.maximum(data.left_s, data.entry_s)
         bounded = np.isfinite(data.right_s) & ~data.exact
         stretch = np.searchsorted(edges_s, data.left_s, side="right") - 1
@@ -207,7 +205,7 @@ class Exposures:
         )
 
     def log_likelihood(self, f: FloatArray) -> FloatArray:
-        """(N,) of samples with (N, K) log hazards over the baseline; weights are left to the caller."""
+        """Return it (N,) for log hazards (N, K) relative to the baseline; weights are not applied."""
         ratio = np.exp(f)
         within = np.where(self.bounded, (self.within * ratio).sum(axis=1), np.inf)
         with np.errstate(divide="ignore"):
@@ -216,14 +214,14 @@ class Exposures:
 
 
 def learn(samples: Exposures, terms: Sequence[Term]) -> Posterior:
-    """Most probable terms and scales, and how well the terms are known.
+    """Learn the most probable terms and scales, and the covariance of the terms.
 
     Raises:
         NumericalError: no maximum is found.
     """
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1, user_api="blas"):  # matrices of some hundreds: threads only wait for each other
+    with threadpool_limits(limits=1, user_api="blas"):  # matrices of some hundreds are faster on one thread
         return _learn(samples, terms)
 
 
@@ -248,7 +246,7 @@ def _learn(samples: Exposures, terms: Sequence[Term]) -> Posterior:
 
 
 class _Model:
-    """Derivatives of the log likelihood by all u."""
+    """The log posterior and its derivatives by all u."""
 
     def __init__(self, samples: Exposures, terms: Sequence[Term]) -> None:
         from scipy import sparse
@@ -272,7 +270,7 @@ class _Model:
         self.log_determinants = [float(np.linalg.slogdet(precision)[1]) for precision in self.precisions]
 
     def laplace(self, start: FloatArray, scales: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Most probable u at given scales, covariance, log evidence."""
+        """Return the most probable u at given scales, its covariance and the log evidence."""
         from scipy.linalg import cho_factor, cho_solve, cholesky
 
         penalty = np.zeros((self.size, self.size))
@@ -315,12 +313,12 @@ class _Model:
         return u, covariance, best + 0.5 * float(volume) - float(np.log(np.diag(root)).sum())
 
     def f(self, u: FloatArray) -> FloatArray:
-        """(N, K) log hazards over the baseline."""
+        """Return log hazards (N, K) relative to the baseline."""
         return np.asarray((self.curves @ u)[self.samples.group] + (self.levels @ u)[:, None])
 
     @np.errstate(over="ignore")
     def derivatives(self, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Slope, minus the second derivative, and a positive definite bound of it."""
+        """Return the gradient, minus the second derivative, and a positive definite bound of it."""
         samples, weight = self.samples, self.samples.weight[:, None]
         ratio = np.exp(self.f(u))
         before, within = samples.before * ratio, samples.within * ratio
@@ -340,7 +338,7 @@ class _Model:
         return np.asarray(np.einsum("gkd,gk->d", self.curves, by_group) + self.levels.T @ by_sample.sum(axis=1))
 
     def _second(self, diagonal: FloatArray, within: FloatArray, curvature: FloatArray) -> FloatArray:
-        """`sum_i X_i' (diag(diagonal_i) + curvature_i within_i within_i') X_i`."""
+        """Return `sum_i X_i' (diag(diagonal_i) + curvature_i within_i within_i') X_i`."""
         total = within.sum(axis=1)
         result = _gram(self.levels, diagonal.sum(axis=1) + curvature * total**2)
         mixed = diagonal + (curvature * total)[:, None] * within
@@ -353,7 +351,7 @@ class _Model:
 
 
 def _gram(columns: Any, weight: FloatArray) -> FloatArray:
-    """`columns' diag(weight) columns`, dense."""
+    """Return `columns' diag(weight) columns`, dense."""
     if isinstance(columns, np.ndarray):
         return np.asarray(columns.T @ (weight[:, None] * columns))
     from scipy import sparse

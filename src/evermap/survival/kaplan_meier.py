@@ -1,7 +1,7 @@
 """The product-limit estimate of right censored lifetimes (Kaplan and Meier 1958), with delayed entry.
 
-It is what the nonparametric maximum likelihood comes to where every end was either watched or never seen, and there
-its uncertainty has closed forms.
+It equals the nonparametric maximum likelihood estimate where every end was either observed or never seen, and its
+uncertainty has closed forms.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import ArrayLike
 
-from evermap.errors import ConfigError, DataError
-from evermap.survival.base import check_times
+from evermap.errors import DataError
+from evermap.survival.base import check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
@@ -21,14 +21,14 @@ from evermap.types import FloatArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KaplanMeier:
-    """A survival function that falls at D times.
+    """A survival function with D steps.
 
     Attributes:
-        time_s: (D,) in seconds, increasing; none where nobody was seen to go.
-        at_risk: (D,) weight of those known to be there just before, who had entered by then.
-        deaths: (D,) weight of those that went.
+        time_s: (D,) in seconds, increasing; empty where no end was observed.
+        at_risk: (D,) weight of the samples known to be present just before, and entered by then.
+        deaths: (D,) weight of the samples that ended.
         survives: (D,) `P(T > time)`.
-        log_variance: (D,) Greenwood's variance of `log P(T > time)`; `inf` once nobody is left.
+        log_variance: (D,) Greenwood's variance of `log P(T > time)`; `inf` where none is left.
     """
 
     time_s: FloatArray
@@ -38,25 +38,24 @@ class KaplanMeier:
     log_variance: FloatArray
 
     def survival(self, t: ArrayLike) -> FloatArray:
-        """`P(T > t)` for times in seconds."""
+        """Return `P(T > t)` for times in seconds."""
         return np.asarray(self._at(t, self.survives, 1.0))[()]
 
     def variance(self, t: ArrayLike) -> FloatArray:
-        """Greenwood's variance of `P(T > t)`; 0 before the first death and once nobody is left."""
+        """Return Greenwood's variance of `P(T > t)`; 0 before the first death and where none is left."""
         values = np.where(self.survives > 0.0, np.square(self.survives), 0.0)
         spread = np.where(values > 0.0, self.log_variance, 0.0)
         return np.asarray(self._at(t, values * spread, 0.0))[()]
 
     def band(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bound of `P(T > t)` at each time by itself, on the scale of `log(-log S)`.
+        """Return pointwise lower and upper bounds of `P(T > t)`, on the scale of `log(-log S)`.
 
-        Both are 1 before the first death, and both 0 once nobody is left: this scale says nothing there.
+        Both are 1 before the first death, and both 0 where none is left: this scale has no width there.
 
         Raises:
             ConfigError: `confidence` is not in (0, 1).
         """
-        if not 0.0 < confidence < 1.0:
-            raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
+        check_open_share(confidence)
         some = (self.survives > 0.0) & (self.survives < 1.0)
         log_survival = np.log(np.where(some, self.survives, 0.5))
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * np.sqrt(np.where(some, self.log_variance, 0.0))
@@ -65,7 +64,7 @@ class KaplanMeier:
         return lower[()], upper[()]
 
     def prior(self) -> StepLifetime:
-        """As a lifetime prior; what is left after the last death never leaves."""
+        """Return it as a lifetime prior; what is left after the last death never leaves."""
         left = np.append(self.survives, 0.0)
         masses = -np.diff(np.concatenate(([1.0], left)))
         return StepLifetime.at_points((*self.time_s.tolist(), np.inf), masses.tolist())
@@ -76,7 +75,7 @@ class KaplanMeier:
 
 
 def kaplan_meier(data: CensoredLifetimes) -> KaplanMeier:
-    """The product-limit estimate; those censored or entering at the time of a death count as after it.
+    """Compute the product-limit estimate; samples censored or entering at the time of a death count as after it.
 
     Raises:
         DataError: a lifetime is neither exact nor right censored; names the row (from 0).
@@ -90,7 +89,7 @@ def kaplan_meier(data: CensoredLifetimes) -> KaplanMeier:
             field="right_s",
             hint="the Turnbull estimate, which takes intervals",
         )
-    # One who entered after a right censored sample's last sighting was seen at the entry.
+    # A right censored sample that entered after its last sighting was seen at the entry.
     seen_until = np.maximum(data.left_s, data.entry_s)
     died = exact & counted
     time_s, which = np.unique(data.right_s[died], return_inverse=True)
@@ -98,14 +97,14 @@ def kaplan_meier(data: CensoredLifetimes) -> KaplanMeier:
     at_risk = _weight_at_least(seen_until, data.weight, time_s) - _weight_at_least(data.entry_s, data.weight, time_s)
     at_risk = np.asarray(np.maximum(at_risk, deaths))
     left = at_risk - deaths
-    left = np.where(left > 1e-12 * at_risk, left, 0.0)  # when all go, it is rounding
+    left = np.where(left > 1e-12 * at_risk, left, 0.0)  # where all end, what is left is rounding
     with np.errstate(divide="ignore"):
         log_variance = np.asarray(np.cumsum(deaths / (at_risk * left)), np.float64)
     return KaplanMeier(time_s, at_risk, deaths, np.asarray(np.cumprod(left / at_risk), np.float64), log_variance)
 
 
 def _weight_at_least(values: FloatArray, weight: FloatArray, times: FloatArray) -> FloatArray:
-    """For each time, the weight of all values that are not smaller."""
+    """Return, for each time, the weight of all values that are not smaller."""
     order = np.argsort(values)
     total = np.append(np.cumsum(weight[order][::-1])[::-1], 0.0)
     return np.asarray(total[np.searchsorted(values[order], times, side="left")])

@@ -1,4 +1,4 @@
-"""Logarithms, integrals and special functions that keep their digits where the plain forms do not."""
+"""Logarithms, integrals and special functions in forms that do not cancel or overflow."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ _SMOOTH_RATIO = 0.1
 
 
 def log_one_minus_exp(x: FloatArray) -> FloatArray:
-    """`log(1 - exp(-x))` for `x >= 0`; `-inf` at 0."""
+    """Return `log(1 - exp(-x))` for `x >= 0`; `-inf` at 0."""
     return np.where(x < np.log(2.0), np.log(-np.expm1(-x)), np.log1p(-np.exp(-x)))
 
 
 def log_one_minus_exp_of_minus_exp(y: FloatArray) -> FloatArray:
-    """`log(1 - exp(-exp(y)))`, also where `exp(y)` underflows."""
+    """Return `log(1 - exp(-exp(y)))`, also where `exp(y)` underflows."""
     x = np.exp(y)
     # 1 - exp(-x) = x (1 - x/2 + ...): below 1e-17 the bracket is 1 in double precision.
     return np.where(y < -40.0, y, log_one_minus_exp(x))
 
 
 def log_sum_exp(x: FloatArray) -> FloatArray:
-    """`log sum exp(x)` over the last axis; `-inf` where all are, `+inf` where any is."""
+    """Return `log sum exp(x)` over the last axis; `-inf` where all are, `+inf` where any is."""
     top = np.max(x, axis=-1)
     shift = np.where(np.isfinite(top), top, 0.0)
     total = np.log(np.sum(np.exp(x - shift[..., None]), axis=-1)) + shift
@@ -36,13 +36,13 @@ def log_sum_exp(x: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights of Gauss-Legendre quadrature on [0, 1], each (count,)."""
+    """Return nodes and weights of Gauss-Legendre quadrature on [0, 1], each (count,)."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (nodes + 1.0), 0.5 * weights
 
 
 def log_ratio(a: FloatArray, b: FloatArray) -> FloatArray:
-    """`log(b / a)` for `0 <= a <= b`, exact also where they nearly agree."""
+    """Return `log(b / a)` for `0 <= a <= b`, exact also where they nearly agree."""
     return np.where(b < 2.0 * a, np.log1p((b - a) / a), np.log(b) - np.log(a))
 
 
@@ -52,10 +52,10 @@ def log_integral_of_smooth_hazard(
     log_cumulative: Callable[[FloatArray], FloatArray],
     log_hazard: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """`log int_a^b h` of a hazard that is smooth in log t, with full relative precision.
+    """Return `log int_a^b h` of a hazard that is smooth in log t, with full relative precision.
 
     Where `H` grows by more than a tenth between `a` and `b` the difference of its two values is exact enough;
-    where it grows by less, its hazard is as good as a polynomial there and twelve nodes in log t integrate it.
+    where it grows by less, its hazard is close to a polynomial, which twelve nodes in log t integrate.
     """
     at_a, at_b = log_cumulative(a), log_cumulative(b)
     growth = at_b - at_a
@@ -71,7 +71,7 @@ def log_integral_of_smooth_hazard(
 
 
 def scaled_e1(x: FloatArray) -> FloatArray:
-    """`exp(x) E1(x)` for `x >= 0`."""
+    """Return `exp(x) E1(x)` for `x >= 0`."""
     from scipy.special import exp1
 
     large = x > 50.0
@@ -85,7 +85,7 @@ def scaled_e1(x: FloatArray) -> FloatArray:
 
 
 def entire_exponential_integral(x: FloatArray) -> FloatArray:
-    """`Ein(x) = int_0^x (1 - exp(-s)) / s ds = E1(x) + log x + gamma`, with full relative precision near 0."""
+    """Return `Ein(x) = int_0^x (1 - exp(-s)) / s ds = E1(x) + log x + gamma`, to full relative precision near 0."""
     from scipy.special import exp1
 
     small = x < 1.0

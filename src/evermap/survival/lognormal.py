@@ -1,4 +1,4 @@
-"""The logarithm of the lifetime is normal: one typical stay, and a long tail."""
+"""Log-normal lifetimes: one typical stay, and a long tail."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LogNormal(Lifetime):
 
     @classmethod
     def from_half_life(cls, seconds: float, sigma: float) -> Self:
-        """Half of the features are gone after `seconds`, their logarithms spread by `sigma`."""
+        """Return the prior by which half of the features are gone after `seconds`."""
         check_positive(seconds, "half_life")
         return cls(math.log(seconds), sigma)
 
@@ -48,7 +48,7 @@ class LogNormal(Lifetime):
         return np.asarray((np.log(t) - self.mu) / self.sigma)
 
     def _log_cumulative(self, t: FloatArray) -> FloatArray:
-        """`log H(t) = log(-log Phi(-z))`."""
+        """Return `log H(t) = log(-log Phi(-z))`."""
         from scipy.special import erfcx, log_ndtr, ndtr
 
         z = self._standard(t)
@@ -74,6 +74,6 @@ class LogNormal(Lifetime):
         from scipy.special import ndtri_exp
 
         hazard = np.exp(log_target)
-        # From whichever tail is the smaller: z = -Phi^-1(S), or Phi^-1(F).
+        # From the smaller tail: z = -Phi^-1(S), or Phi^-1(F).
         early = ndtri_exp(np.log(-np.expm1(-hazard)))
         return np.asarray(np.exp(self.mu + self.sigma * np.where(hazard < 0.5, early, -ndtri_exp(-hazard))))

@@ -1,4 +1,4 @@
-"""Several kinds of features under one name: some chairs move every hour, some never."""
+"""Mixtures of lifetimes: some chairs move every hour, some never."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Mixture(Lifetime):
     """`S(t) = sum_i weights[i] S_i(t)`; every sum below is of positive terms, so nothing cancels.
 
     Attributes:
-        components: the priors that are mixed, at least one.
+        components: the priors, at least one.
         weights: their probabilities, positive, of sum 1.
     """
 
@@ -37,7 +37,7 @@ class Mixture(Lifetime):
 
     @classmethod
     def of(cls, components: Sequence[LifetimePrior], shares: Sequence[float]) -> Self:
-        """Mixture in proportion to `shares`, which need not sum to 1."""
+        """Mix priors in proportion to `shares`, which need not sum to 1."""
         total = math.fsum(shares)
         if not (math.isfinite(total) and total > 0.0):
             raise ConfigError(f"shares must be positive, not {tuple(shares)}", field="shares")
@@ -70,18 +70,18 @@ class Mixture(Lifetime):
 
     def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
         died = self._log_died(self._log_weights_at(a), a, b)
-        # Where almost nobody died, H = 1 - q to the last digit, and only the logarithm of it may be representable.
+        # Where 1 - q is tiny, H = 1 - q to the last digit, and only its logarithm may be representable.
         return np.where(died < -40.0, died, np.log(self._integrated_hazard(a, b)))
 
     def _log_hazard(self, t: FloatArray) -> FloatArray:
         hazards = np.stack([np.log(c.hazard(t)) for c in self.components], axis=-1)
         weights = self._log_weights_at(t)
-        # A component of which nobody is left has an infinite hazard, and no say.
+        # A component with S(t) = 0 has an infinite hazard, and weight 0.
         alive = np.where(np.isneginf(weights), -np.inf, weights + hazards)
         return np.where(np.isneginf(weights).all(axis=-1), np.inf, log_sum_exp(alive))
 
     def _log_weights_at(self, t: FloatArray) -> FloatArray:
-        """Log probability of each component given survival until `t`, (..., components); all -inf if `S(t) = 0`."""
+        """Return log probabilities (..., components) given survival until `t`; all -inf if `S(t) = 0`."""
         joint = np.stack([np.asarray(c.log_survival(t)) for c in self.components], axis=-1) + np.log(self.weights)
         total = log_sum_exp(joint)
         return np.where(np.isneginf(total)[..., None], -np.inf, joint - total[..., None])

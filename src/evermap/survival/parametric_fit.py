@@ -5,7 +5,7 @@ A sample `left < T <= right`, known because `T > entry`, has the log likelihood
     log q(entry, a) + log(1 - q(a, right))      a = max(left, entry); the second term only where right is finite
     log p(T) - log S(entry)                     an exact one
 
-and a prior answers each term without cancellation, so any model that can be built from real numbers can be fitted.
+and a prior computes each term without cancellation, so any model that can be built from real numbers can be fitted.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.survival.base import LifetimePrior
-from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.base import LifetimePrior, check_open_share
+from evermap.survival.censored import CensoredLifetimes, log_sighting
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
 from evermap.survival.general_purpose import GeneralPurpose
@@ -30,14 +30,14 @@ from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import never_leaves
 from evermap.survival.weibull import Weibull
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 _IMPOSSIBLE = 1e10
-"""Stands for an infinite mean of minus the log likelihood, which the search could not step back from."""
+"""Replaces an infinite mean of minus the log likelihood, from which the search could not step back."""
 _GRADIENT_STEP, _HESSIAN_STEP = 1e-5, 1e-3
-"""For central differences; parameters are logarithms, so these are relative changes."""
+"""Steps of central differences; parameters are logarithms, so these are relative changes."""
 _FARTHEST = 12.0
-"""How far from its start, in logarithms, a parameter is sought: what settles there has no maximum."""
+"""How far from its start, in logarithms, a parameter is sought; at that bound there is no maximum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +45,9 @@ class Kind:
     """A family of lifetimes with P real parameters.
 
     Attributes:
-        names: of the parameters, P words; times in seconds.
-        build: the prior with given (P,) parameters.
-        starts: where to search from, given a rough mean stay in seconds; the best maximum counts.
+        names: P names of the parameters; times are in seconds.
+        build: makes the prior with given (P,) parameters.
+        starts: gives starting points for a rough mean stay in seconds; the best maximum is taken.
     """
 
     names: tuple[str, ...]
@@ -94,18 +94,18 @@ KINDS: Mapping[str, Kind] = {
         lambda mean: [[math.log(2.0 / mean), 0.0]],
     ),
 }
-"""What can be fitted by name; a `Kind` of your own as well."""
+"""Families by name; `fit` takes a `Kind` of your own as well."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ParametricFit:
-    """The member of a family under which the samples are most probable.
+    """Maximum likelihood estimate within a family.
 
     Attributes:
         kind: the family's name.
-        family: itself.
+        family: the family.
         prior: its most probable member.
-        parameters: (P,) real numbers that it was built from, named by `names`.
+        parameters: (P,) numbers that it was built from, named by `names`.
         covariance: (P, P) inverse of the observed information.
         loglik: `sum w log P(left < T <= right | T > entry)`; densities in 1/s for exact samples.
         n_samples: sum of the weights.
@@ -121,47 +121,45 @@ class ParametricFit:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
+        """Return the names of the parameters."""
         return self.family.names
 
     @property
     def n_parameters(self) -> int:
-        """How many numbers were fitted."""
+        """Return the number of parameters."""
         return len(self.parameters)
 
     @property
     def standard_errors(self) -> FloatArray:
-        """(P,) of the parameters."""
+        """Return the standard errors (P,) of the parameters."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def aic(self) -> float:
-        """Akaike's criterion, `2 P - 2 loglik`; smaller is better."""
+        """Return Akaike's criterion, `2 P - 2 loglik`; smaller is better."""
         return 2.0 * self.n_parameters - 2.0 * self.loglik
 
     @property
     def bic(self) -> float:
-        """The Bayesian criterion, `P log n - 2 loglik`."""
+        """Return the Bayesian criterion, `P log n - 2 loglik`."""
         return self.n_parameters * math.log(self.n_samples) - 2.0 * self.loglik
 
     def band(self, t: ArrayLike, confidence: float = 0.95) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bound of `P(T > t)` at each time by itself, if the family is right.
+        """Return pointwise lower and upper bounds of `P(T > t)`, valid if the family is right.
 
         By the delta method on the scale of `log(-log S)`, on which the bounds stay in [0, 1].
 
         Raises:
-            ConfigError: `confidence` is not in (0, 1), or a time cannot be.
+            ConfigError: `confidence` is not in (0, 1), or an invalid time.
         """
-        if not 0.0 < confidence < 1.0:
-            raise ConfigError(f"must lie in (0, 1), not {confidence!r}", field="confidence")
-
+        check_open_share(confidence)
         middle, spread = self._log_hazard(self.parameters, t), self._spread(t)
         half_width = NormalDist().inv_cdf(0.5 + 0.5 * confidence) * spread
         lower, upper = (np.exp(-np.exp(middle + sign * half_width)) for sign in (1.0, -1.0))
         return lower[()], upper[()]
 
     def variance(self, t: ArrayLike) -> FloatArray:
-        """Of the estimated `P(T > t)`, by the delta method."""
+        """Return the variance of the estimated `P(T > t)`, by the delta method."""
         cumulative = np.asarray(self.prior.cumulative_hazard(t))
         finite = np.where(np.isfinite(cumulative), cumulative, 0.0)
         return np.asarray(np.square(np.exp(-finite) * finite * self._spread(t)))[()]
@@ -171,7 +169,7 @@ class ParametricFit:
             return np.asarray(np.log(self.family.build(parameters).cumulative_hazard(t)))
 
     def _spread(self, t: ArrayLike) -> FloatArray:
-        """Standard deviation of the logarithm of the cumulative hazard."""
+        """Return the standard deviation of the logarithm of the cumulative hazard."""
         steps = _GRADIENT_STEP * np.eye(self.n_parameters)
         with np.errstate(invalid="ignore"):
             changes = np.stack(
@@ -182,28 +180,28 @@ class ParametricFit:
 
 
 def log_likelihood(prior: LifetimePrior, data: CensoredLifetimes) -> FloatArray:
-    """(N,) log probability of each sample, in 1/s for exact ones; weights are left to the caller."""
+    """Return the log probability (N,) of each sample, in 1/s for exact ones; weights are not applied."""
     exact, ends = data.exact, np.isfinite(data.right_s)
     since = np.maximum(data.left_s, data.entry_s)
     result = np.asarray(prior.log_conditional_survival(np.where(exact, 0.0, data.entry_s), np.where(exact, 0.0, since)))
     bounded = ends & ~exact
     result[bounded] += prior.log_conditional_death(since[bounded], data.right_s[bounded])
     result[exact] += prior.log_density(data.right_s[exact]) - prior.log_survival(data.entry_s[exact])
-    # -inf less -inf where even the entry is impossible
+    # -inf minus -inf where even the entry is impossible
     return np.where(np.isnan(result), -np.inf, result)
 
 
 def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
-    """Most probable parameters of one family.
+    """Fit one family by maximum likelihood.
 
     Args:
         kind: one of `KINDS`, by name or itself.
-        data: N samples; rows of weight 0 say nothing.
+        data: N samples; rows of weight 0 are ignored.
 
     Raises:
-        ConfigError: no family has this name.
+        ConfigError: an unknown family.
         DataError: no lifetime has an end.
-        NumericalError: the likelihood has no maximum in this family, or one that a parameter makes no difference to.
+        NumericalError: the likelihood has no clear maximum in this family.
     """
     data = _counted(data)
 
@@ -216,17 +214,17 @@ def fit(kind: str | Kind, data: CensoredLifetimes) -> ParametricFit:
 def fit_likelihood(
     kind: str | Kind, log_likelihood_of: Callable[[LifetimePrior], float], rough_mean_s: float, n_samples: float
 ) -> ParametricFit:
-    """Most probable parameters of one family, whatever the likelihood is made of.
+    """Fit one family by any likelihood.
 
     Args:
         kind: one of `KINDS`, by name or itself.
         log_likelihood_of: of all samples together under a prior; -inf or NaN where they are impossible.
-        rough_mean_s: about how long a stay is, to start from.
-        n_samples: how many there are.
+        rough_mean_s: rough mean stay to start from, in seconds.
+        n_samples: number of samples.
 
     Raises:
-        ConfigError: no family has this name.
-        NumericalError: the likelihood has no maximum in this family, or one that a parameter makes no difference to.
+        ConfigError: an unknown family.
+        NumericalError: the likelihood has no clear maximum in this family.
     """
     name, family = _named(kind)
 
@@ -234,9 +232,9 @@ def fit_likelihood(
         try:
             with np.errstate(all="ignore"):
                 value = -log_likelihood_of(family.build(parameters)) / n_samples
-        except (ConfigError, OverflowError):  # parameters beyond what numbers can hold
+        except (ConfigError, OverflowError):  # parameters out of range
             return _IMPOSSIBLE
-        return min(_IMPOSSIBLE, value)  # which NaN is not less than either
+        return min(_IMPOSSIBLE, value)  # also where it is NaN
 
     found, least = min((_search(cost, np.array(s)) for s in family.starts(rough_mean_s)), key=lambda r: r[1])
     hessian = _hessian(cost, found)
@@ -250,11 +248,40 @@ def fit_likelihood(
     return ParametricFit(name, family, family.build(found), found, covariance, -least * n_samples, n_samples)
 
 
-def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)) -> ParametricFit:
-    """The family of least AIC among those whose likelihood has a maximum.
+def fit_sightings(kind: str | Kind, samples: CensoredLifetimes, stay: IntArray) -> ParametricFit:
+    """Fit one family to stays of unknown arrival; its bands account for that.
+
+    Args:
+        kind: as of `parametric_fit.fit`.
+        samples: of `lifetimes_of_sightings`; their weights are ignored.
+        stay: (N,) stay of each sample, as it returns them.
 
     Raises:
-        ConfigError: no family to choose from, or one of unknown name.
+        ConfigError: an unknown family.
+        DataError: no stay has an end.
+        NumericalError: the likelihood has no clear maximum in this family.
+    """
+    ended = np.isfinite(samples.right_s)
+    if not ended.any():
+        raise DataError("no stay has an end", field="gone_s", hint="look again later, or state a prior")
+    instants = int(np.argmax(np.append(stay, -1) != stay[0]))
+    n_stays = stay.size // instants
+
+    def of_stays(prior: LifetimePrior) -> float:
+        seen = log_sighting(prior, samples.left_s, samples.right_s)
+        known = np.asarray(prior.log_survival(samples.entry_s))
+        return float(_log_sums(seen, instants).sum() - _log_sums(known, instants).sum())
+
+    watched_s = float((samples.left_s - samples.entry_s).sum() / instants)
+    n_ended = float(ended.sum() / instants)
+    return fit_likelihood(kind, of_stays, max(watched_s / n_ended, float(np.median(samples.left_s))), float(n_stays))
+
+
+def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)) -> ParametricFit:
+    """Fit several families, and return that of least AIC among those whose likelihood has a maximum.
+
+    Raises:
+        ConfigError: no family to choose from, or an unknown one.
         DataError: no lifetime has an end.
         NumericalError: none has a maximum.
     """
@@ -275,24 +302,24 @@ def _named(kind: str | Kind) -> tuple[str, Kind]:
     if isinstance(kind, Kind):
         return "/".join(kind.names), kind
     if kind not in KINDS:
-        raise ConfigError(f"no kind of lifetime is called '{kind}'", field="kind", hint=", ".join(KINDS))
+        raise ConfigError(f"unknown kind of lifetime '{kind}'", field="kind", hint=", ".join(KINDS))
     return kind, KINDS[kind]
 
 
 def _counted(data: CensoredLifetimes) -> CensoredLifetimes:
-    """The rows that say something."""
+    """Return the rows of positive weight."""
     rows = data.weight > 0.0
     if not np.isfinite(data.right_s[rows]).any():
         raise DataError(
-            "no lifetime has an end, so the longer the stays of a model the better it fits",
+            "no lifetime has an end, so longer stays always fit better",
             field="right_s",
-            hint="look again later, or state a prior in words",
+            hint="look again later, or state a prior",
         )
     return data[rows]
 
 
 def _rough_mean(data: CensoredLifetimes) -> float:
-    """Time watched over ends seen; an end in an interval counts at its middle."""
+    """Return the time observed over the number of ends; an end in an interval counts at its middle."""
     ends = np.isfinite(data.right_s)
     since = np.maximum(data.left_s, data.entry_s)
     last = np.where(ends, 0.5 * (since + np.where(ends, data.right_s, 0.0)), since)
@@ -300,7 +327,7 @@ def _rough_mean(data: CensoredLifetimes) -> float:
 
 
 def _search(cost: Callable[[FloatArray], float], start: FloatArray) -> tuple[FloatArray, float]:
-    """Least cost from one start; NaN where it lies at the end of what is searched."""
+    """Minimise the cost from one start; NaN where the minimum lies at a bound."""
     from scipy.optimize import minimize
 
     limits: Any = [(value - _FARTHEST, value + _FARTHEST) for value in start]
@@ -323,3 +350,8 @@ def _hessian(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
     steps = _HESSIAN_STEP * np.eye(len(at))
     rows = [[cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b) for b in steps] for a in steps]
     return np.array(rows) / (4.0 * _HESSIAN_STEP**2)
+
+
+def _log_sums(log_values: FloatArray, instants: int) -> FloatArray:
+    """Return the logarithms (K,) of sums over the instants of each stay."""
+    return np.asarray(np.logaddexp.reduce(log_values.reshape(-1, instants), axis=1))

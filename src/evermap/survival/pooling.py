@@ -1,22 +1,23 @@
-"""Lifetimes of places by partial pooling: each chunk shrinks to its neighbours and its class as far as data are thin.
+"""Lifetimes of places by partial pooling: a chunk shrinks to its neighbours and its class as its data are few.
 
     log h(t | class, chunk) = curve of the class(t) + place(chunk) + own(chunk) + own(class, chunk)
 
 `place` is a Gaussian Markov random field over chunks that touch (Besag 1974; Rue and Held 2005), so neighbours are
-alike; `own` levels are independent, so a chunk may differ from all of them. How much each term says is learned by
-marginal likelihood, as in `hazard_regression`: many samples of a chunk speak for themselves, a chunk without any is
-what its neighbours and its class are, with the uncertainty that this has.
+alike; `own` levels are independent, so a chunk may differ from all of them. The scale of each term is learned by
+marginal likelihood, as in `hazard_regression`: many samples of a chunk decide alone, a chunk without any follows its
+neighbours and its class, with the uncertainty that this has.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError
+from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import curve_terms, weibull_baseline
 from evermap.survival.hazard_regression import (
@@ -27,27 +28,28 @@ from evermap.survival.hazard_regression import (
     learn,
     stretches_for,
 )
-from evermap.survival.locality import Chunk, ChunkIndex, chunks_of
 from evermap.types import FloatArray, IntArray
 
+Chunk = tuple[int, int]
+"""Column and row of a square of the ground plane; `(0, 0)` begins at the origin."""
 REACH = 0.1
-"""Precision of a chunk's own level over that of its difference from a neighbour: a range of some three chunks."""
+"""Precision of a chunk's own level relative to that of its difference from a neighbour: a range of three chunks."""
 MOST = 1500
-"""Chunks, with those beside them, that are learned together."""
+"""Largest number of chunks, with those beside them, that are learned together."""
 _CURVES = "curves"
 _PLACE, _OWN, _CLASS = "place", "own", "class x own"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PooledHazard:
-    """A hazard learned by class and chunk.
+    """Posterior of a hazard by class and chunk.
 
     Attributes:
         size_m: side of a chunk.
-        chunks: that held samples.
+        chunks: those that held samples.
         edges_s: (K,) starts of the stretches of constant hazard, in seconds.
         baseline: (K,) rates in 1/s around which the terms move.
-        class_ids: (G,) that were seen, increasing.
+        class_ids: (G,) in the samples, increasing.
         posterior: of the terms.
         scales: standard deviation of the log hazard that each term contributes, by name.
     """
@@ -63,10 +65,10 @@ class PooledHazard:
     _columns: Mapping[str, Mapping[tuple[int, ...], int]]
 
     def at(self, place_m: ArrayLike, class_id: int = 0) -> HazardDraws:
-        """The hazard at one place (2,) in metres for one class (0 where classes were not given).
+        """Return the hazard at one place (2,) in metres for one class (0 where classes were not given).
 
         Raises:
-            DataError: the class was never seen, or the place is no place.
+            DataError: a class without samples, or an invalid place.
         """
         found = np.flatnonzero(self.class_ids == class_id)
         if not found.size:
@@ -89,33 +91,49 @@ class PooledHazard:
         return HazardDraws(self.edges_s, self.baseline * np.exp(self.posterior.draws(columns, unknown)))
 
 
-def pooled_fit(
-    data: CensoredLifetimes, place_m: ArrayLike, size_m: float, class_id: IntArray | None = None
-) -> PooledHazard:
-    """The hazard by class and chunk.
-
-    Args:
-        data: N samples.
-        place_m: (N, 2) where each was, in metres.
-        size_m: side of the square chunks.
-        class_id: (N,) of what it was.
+def chunks_of(place_m: ArrayLike, size_m: float) -> IntArray:
+    """Return columns and rows (N, 2) of the chunks of (N, 2) places.
 
     Raises:
         ConfigError: a size that is not positive.
-        DataError: columns that do not fit, too many chunks, or no lifetime has an end.
+        DataError: a place that is not finite, or not two numbers.
+    """
+    check_positive(size_m, "size_m")
+    places = np.asarray(place_m, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 2:
+        raise DataError(f"must be x and y of each thing, not of shape {places.shape}", field="place_m")
+    if not np.isfinite(places).all():
+        raise DataError(f"must be finite: row {int(np.argwhere(~np.isfinite(places))[0][0])} is not", field="place_m")
+    return np.asarray(np.floor(places / size_m), dtype=np.int64)
+
+
+def pooled_fit(
+    data: CensoredLifetimes, place_m: ArrayLike, size_m: float, class_id: IntArray | None = None
+) -> PooledHazard:
+    """Learn the hazard by class and chunk.
+
+    Args:
+        data: N samples.
+        place_m: (N, 2) in metres.
+        size_m: side of the square chunks.
+        class_id: (N,) class of each; None for one class.
+
+    Raises:
+        ConfigError: a size that is not positive.
+        DataError: columns of different lengths, too many chunks, or no lifetime has an end.
         NumericalError: no maximum is found.
     """
     n = len(data.left_s)
-    index = ChunkIndex.of(place_m, size_m)
+    chunk_of_row = chunks_of(place_m, size_m)
     classes = np.zeros(n, dtype=np.int64) if class_id is None else np.asarray(class_id, dtype=np.int64)
-    for name, length in (("place_m", sum(map(len, index.rows.values()))), ("class_id", len(classes))):
+    for name, length in (("place_m", len(chunk_of_row)), ("class_id", len(classes))):
         if length != n:
             raise DataError(f"has {length} rows for {n} lifetimes", field=name)
     edges_s = stretches_for(data)
     baseline = weibull_baseline(data, edges_s)
     class_ids, group = np.unique(classes, return_inverse=True)
-    chunk_of_row = chunks_of(place_m, size_m)
-    around = _with_neighbours(index)
+    chunks: list[Chunk] = [(x, y) for x, y in np.unique(chunk_of_row, axis=0).tolist()]
+    around = _with_neighbours(chunks)
     if len(around) > MOST:
         raise DataError(f"are {len(around)} chunks, more than {MOST}", field="place_m", hint="larger chunks")
 
@@ -125,7 +143,7 @@ def pooled_fit(
     columns: dict[str, dict[tuple[int, ...], int]] = {}
     keys: dict[str, tuple[Sequence[tuple[int, ...]], IntArray, FloatArray | None]] = {
         _PLACE: (around, chunk_of_row, _field_precision(around)),
-        _OWN: (tuple(index.rows), chunk_of_row, None),
+        _OWN: (chunks, chunk_of_row, None),
     }
     if len(class_ids) > 1:
         pairs = np.column_stack([group, chunk_of_row])
@@ -140,7 +158,7 @@ def pooled_fit(
     posterior = learn(Exposures.of(data, edges_s, baseline, group.astype(np.int64)), terms)
     scales = {name: scale for name, scale in zip(names, posterior.scales.tolist(), strict=True) if name != _CURVES}
     curves = np.concatenate([term.curves for term in terms if term.curves is not None], axis=2)
-    return PooledHazard(size_m, tuple(index.rows), edges_s, baseline, class_ids, posterior, scales, curves, columns)
+    return PooledHazard(size_m, tuple(chunks), edges_s, baseline, class_ids, posterior, scales, curves, columns)
 
 
 def _one_hot(column: IntArray, count: int) -> object:
@@ -150,14 +168,14 @@ def _one_hot(column: IntArray, count: int) -> object:
     return sparse.csr_matrix((np.ones(n), column, np.arange(n + 1)), shape=(n, count))
 
 
-def _with_neighbours(index: ChunkIndex) -> list[tuple[int, ...]]:
-    """Chunks that hold something and the eight around each, sorted."""
+def _with_neighbours(chunks: Iterable[Chunk]) -> list[Chunk]:
+    """Return the chunks and the eight around each, sorted."""
     near = range(-1, 2)
-    return sorted({(x + i, y + j) for x, y in index.rows for i in near for j in near})
+    return sorted({(x + i, y + j) for x, y in chunks for i in near for j in near})
 
 
-def _field_precision(chunks: Sequence[tuple[int, ...]]) -> FloatArray:
-    """Of a Gaussian Markov random field over chunks with a common side, of variance 1 on the average."""
+def _field_precision(chunks: Sequence[Chunk]) -> FloatArray:
+    """Return the precision of a Gaussian Markov random field over touching chunks, of variance 1 on average."""
     number = {chunk: j for j, chunk in enumerate(chunks)}
     precision = REACH * np.eye(len(chunks))
     for (x, y), j in number.items():

@@ -1,18 +1,18 @@
 """Nonparametric maximum likelihood of censored lifetimes (Turnbull 1976), exact to its optimality conditions.
 
 1. **Cells.** Mass can only be on the maximal intersections of the samples; one sort and one sweep find them.
-2. **Rough.** Expectation maximisation and the iterative convex minorant in turn; a handful of steps, each linear in
-   samples and cells, tell which cells have mass.
-3. **Fine.** Newton steps on those cells and, as in Wang's (2007) constrained Newton method, on the best of the others
-   in every gap between them. In terms of the mass below each node a sample couples two numbers only, so the Hessian is
-   the Laplacian of a graph with the samples for edges: solved directly while the support is small or the band narrow,
-   else by conjugate gradients, which need few steps because it is exact samples that make a support large, and those
-   couple neighbours.
+2. **Rough steps.** Expectation maximisation and the iterative convex minorant alternate; a few steps, each linear in
+   samples and cells, find which cells have mass.
+3. **Newton steps** on those cells and, as in Wang's (2007) constrained Newton method, on the best of the others in
+   every gap between them. In terms of the mass below each node a sample couples two numbers only, so the Hessian is the
+   Laplacian of a graph with the samples for edges: solved directly while the support is small or the band narrow, else
+   by conjugate gradients. These need few steps, because only exact samples make a support large, and those couple
+   neighbours.
 
-Left truncation divides every probability by that of having been heard of. By the masses the likelihood is then not
-concave; by the cumulative hazards it is, as `log(exp(-x) - exp(-y))` is concave and what lies above a node linear, so a
-point where the conditions hold is the maximum there too. There may be none: where those at risk early are few and all
-of them may be gone, the likelihood grows for ever as the mass beyond goes to 0.
+Left truncation divides every probability by that of having entered. By the masses the likelihood is then not concave;
+by the cumulative hazards it is, as `log(exp(-x) - exp(-y))` is concave and terms of what lies above a node are linear,
+so a point where the conditions hold is the maximum there too. There may be none: where few are at risk early and all of
+them may be gone, the likelihood grows without bound as the mass beyond goes to 0.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
 
 ROUGH, ROUGH_STEPS = 0.02, 40
-"""Violation of the optimality conditions below which, and number of steps after which, Newton's method takes over."""
+"""Newton's method takes over below this violation of the optimality conditions, or after this many steps."""
 GOOD, GOOD_ENOUGH = 1e-11, 1e-8
-"""Violation that is sought, and the largest that is accepted where rounding stops it."""
+"""Violation that is sought, and the largest that is accepted where rounding stops the search."""
 STEPS = 300
 SHARE = 0.02
-"""Cells without mass join if their slope is at least this part of the violation."""
+"""Cells without mass join if their slope is at least this share of the violation."""
 VANISHING, VANISHING_SLOWLY = 1e-12, 1e-4
-"""Mass beyond the latest entry that is taken to go to 0: at any time, and where no maximum was found."""
+"""Mass beyond the latest entry that is taken to vanish: at any step, and where no maximum was found."""
 TRACE = 1e-10
-"""Mass that may as well be none."""
+"""Mass of a cell that is taken for 0 in the end."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Npmle:
-    """Mass on s cells in order of time.
+    """A nonparametric estimate: mass on s cells in order of time.
 
     Attributes:
         support_left, support_right: (s,) in seconds; `left < T <= right`, a point where equal, `right` possibly `inf`.
-            How mass is spread within a cell makes no difference to the likelihood.
+            The likelihood does not depend on how mass is spread within a cell.
         mass: (s,) positive, of sum 1.
         loglik: `sum w log P(left < T <= right | T > entry)`, exact samples with the mass of their point.
         kkt_violation: with `d_j` the derivative of `loglik` by the mass of cell j, less its own average weighted by
@@ -64,7 +64,7 @@ class Npmle:
     iterations: int
 
     def survival(self, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bound of `P(T > t)`, which differ inside a cell, for times in seconds."""
+        """Return lower and upper bound of `P(T > t)`, which differ inside a cell, for times in seconds."""
         values = check_times(t)
         above = np.append(np.cumsum(self.mass[::-1])[::-1], 0.0)
         certain = np.searchsorted(self.support_right, values, side="right")
@@ -72,19 +72,18 @@ class Npmle:
         return np.minimum(above[possible], 1.0), np.minimum(above[certain], 1.0)
 
     def prior(self) -> StepLifetime:
-        """As a lifetime prior; mass spread evenly in every cell, and that of an endless cell never leaving."""
+        """Return it as a lifetime prior, mass spread evenly in every cell; that of an endless cell never leaves."""
         return StepLifetime(tuple(self.support_left), tuple(self.support_right), tuple(self.mass / self.mass.sum()))
 
 
 def npmle(data: CensoredLifetimes) -> Npmle:
-    """The distribution under which the samples are most probable.
+    """Estimate the distribution under which the samples are most probable.
 
     Raises:
-        NumericalError: there is no maximum, which happens with truncation only, or it was not found.
+        NumericalError: there is no maximum, which happens only with truncation, or it was not found.
     """
     from evermap.survival.turnbull_kernels import best_between
-    from evermap.survival.turnbull_steps import newton_step, rough_step
-    from evermap.survival.turnbull_terms import Point, contract, from_samples, names
+    from evermap.survival.turnbull_steps import Point, contract, from_samples, names, newton_step, rough_step
 
     start, end, terms = from_samples(data)
     last_entry = int(np.flatnonzero(terms.entered)[-1])
@@ -113,7 +112,7 @@ def npmle(data: CensoredLifetimes) -> Npmle:
                 f"no maximum of the likelihood found in {steps} steps, {best.kkt_violation:.1g} from optimal"
             )
         )
-    # Where the conditions hold with equality and without mass, the last trace of it goes slowly.
+    # Where the conditions hold with equality and without mass, the last trace of mass vanishes slowly.
     tidy = np.where(best.mass > TRACE, best.mass, 0.0)
     tidied = Point(terms, tidy / tidy.sum())
     best = tidied if tidied.kkt_violation <= max(GOOD, best.kkt_violation) else best
@@ -124,7 +123,7 @@ def npmle(data: CensoredLifetimes) -> Npmle:
 def _no_maximum(data: CensoredLifetimes) -> NumericalError:
     return NumericalError(
         "the likelihood has no maximum: it grows as the mass beyond the latest entries "
-        f"(up to {float(data.entry_s.max()):g} s) goes to 0, because all who were at risk before may be gone by then",
+        f"(up to {float(data.entry_s.max()):g} s) goes to 0, because all samples at risk before may be gone by then",
         field="entry_s",
         hint="leave out the few samples of the earliest entries, or estimate given survival of a later time",
     )

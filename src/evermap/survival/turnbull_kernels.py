@@ -1,8 +1,12 @@
-"""Loops of the nonparametric maximum likelihood of censored lifetimes, compiled.
+"""Compiled loops of the nonparametric maximum likelihood of censored lifetimes.
 
 Nodes `0 .. m` lie between the `m` cells (the maximal intersections); node k is the time after cells `0 .. k - 1`.
 A sample is an edge between two nodes, and its probability is the mass between them. Masses below a node are `below`,
 those above it `above`; both are sums of positive numbers, so that neither tail cancels.
+
+In terms of the masses below the nodes the Hessian `H` of the log likelihood is a weighted Laplacian: an edge of weight
+w between nodes a and b adds `w (x_a - x_b)^2` to the quadratic form. Both end nodes are fixed, so an edge to one of
+them is on the diagonal alone.
 """
 
 from __future__ import annotations
@@ -19,17 +23,17 @@ drop_stale_code(__file__)
 kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 
 SMALLEST = 1e-300
-"""Instead of a mass of 0, where it is divided by or its logarithm is taken."""
+"""Replaces a mass of 0 in divisions and logarithms."""
 
 
 class Terms(NamedTuple):
-    """What the likelihood is made of; weights of samples, merged where their edges are the same by construction.
+    """Weights of the terms of the likelihood; samples with the same edge are merged.
 
     Attributes:
         within: (m,) weight of samples in this cell alone.
         before: (m + 1,) weight of samples below this node, that is in all cells before it.
         after: (m + 1,) weight of samples above it.
-        entered: (m + 1,) weight of samples that are known only because they lie above it.
+        entered: (m + 1,) weight of samples that are known only because they lie above it (left truncation).
         first, last: (E,) nodes of the other samples, `0 < first`, `first + 1 < last < m`.
         weight: (E,) their weights.
     """
@@ -47,7 +51,7 @@ class Terms(NamedTuple):
 def sort_together(keys: Any, rows: IntArray) -> None:
     """Sort rows by their keys (n,), bits of floats that are not negative, both in place: a radix sort, 11 bits a pass.
 
-    Bits of such floats are in the order of the floats. It takes a third of the time of a sort by comparisons.
+    The bits of such floats are in the order of the floats. It takes a third of the time of a sort by comparisons.
     """
     counts = np.zeros((6, 2048), np.int64)
     for i in range(keys.size):
@@ -66,41 +70,57 @@ def sort_together(keys: Any, rows: IntArray) -> None:
         from_keys, from_rows, to_keys, to_rows = to_keys, to_rows, from_keys, from_rows
 
 
+class Stamps(NamedTuple):
+    """Sorted times of samples, in seconds.
+
+    Attributes:
+        points: of exact samples.
+        ends: finite ends of the others.
+        entries: entries above 0.
+        starts: starts above 0.
+    """
+
+    points: FloatArray
+    ends: FloatArray
+    entries: FloatArray
+    starts: FloatArray
+
+
+class Cells(NamedTuple):
+    """Maximal intersections, and where every stamp lies among them.
+
+    Attributes:
+        start, end: of the cells, with room for one a point and a start, and one more; a point where they are equal.
+        point_cell: the cell of every point.
+        end_node, entry_node, start_node: the node of every end, entry and start.
+    """
+
+    start: FloatArray
+    end: FloatArray
+    point_cell: IntArray
+    end_node: IntArray
+    entry_node: IntArray
+    start_node: IntArray
+
+
 @kernel
-def sweep(
-    opened: bool,
-    points: FloatArray,
-    ends: FloatArray,
-    entries: FloatArray,
-    starts: FloatArray,
-    cell_start: FloatArray,
-    cell_end: FloatArray,
-    point_cell: IntArray,
-    end_node: IntArray,
-    entry_node: IntArray,
-    start_node: IntArray,
-) -> int:
+def sweep(opened: bool, stamps: Stamps, found: Cells) -> int:
     """Find the maximal intersections in one pass over sorted times, and where every sample lies among them.
 
     A cell is an opening with no other before the next closing. At one time: points open, then points, ends and entries
-    close, then starts open. An entry closes, since mass leaves the truncation sets by moving left (Frydman 1994).
+    close, then starts open. An entry closes, since mass leaves the truncation sets by moving left (Frydman 1994). An
+    infinite end closes what is still open.
 
     Args:
         opened: whether some sample starts at 0.
-        points: sorted times of exact samples.
-        ends: sorted finite ends of the others.
-        entries: sorted entries above 0.
-        starts: sorted starts above 0.
-        cell_start: filled, with room for a cell a point and a start, and one more.
-        cell_end: filled; a point is where they are equal, and an infinite end closes what is still open.
-        point_cell: filled, the cell of every point.
-        end_node: filled, for every end.
-        entry_node: filled, for every entry.
-        start_node: filled, for every start.
+        stamps: of the samples.
+        found: filled.
 
     Returns:
-        How many cells there are.
+        The number of cells.
     """
+    points, ends, entries, starts = stamps
+    cell_start, cell_end, point_cell, end_node, entry_node, start_node = found
     cells = 0
     start = 0.0
     i, j, k, q = 0, 0, 0, 0
@@ -146,22 +166,13 @@ def sweep(
 
 
 @kernel
-def contract(
-    terms: Terms,
-    node: IntArray,
-    within: FloatArray,
-    before: FloatArray,
-    after: FloatArray,
-    entered: FloatArray,
-    first: IntArray,
-    last: IntArray,
-    weight: FloatArray,
-) -> int:
-    """Merge nodes: `node[k]` is the new name of k, never decreasing. Adds to the weights, fills the edges.
+def contract(terms: Terms, node: IntArray, merged: Terms) -> int:
+    """Merge nodes: `node[k]` is the new number of k, never decreasing; add weights to `merged` and fill its edges.
 
     Returns:
-        How many edges there are still; others have become simpler kinds, or nothing where their ends are one.
+        The number of edges left; others have become simpler kinds, or nothing where their ends are one node.
     """
+    within, before, after, entered, first, last, weight = merged
     m = within.size
     for k in range(node.size):
         before[node[k]] += terms.before[k]
@@ -187,7 +198,7 @@ def contract(
 
 @kernel
 def merge_equal(first: IntArray, last: IntArray, weight: FloatArray, table: FloatArray) -> int:
-    """Merge equal edges in place, through a table (m + 1, m + 1) of zeros; returns how many are left."""
+    """Merge equal edges in place, through a table (m + 1, m + 1) of zeros; return the number left."""
     for i in range(first.size):
         table[first[i], last[i]] += weight[i]
     count = 0
@@ -201,7 +212,7 @@ def merge_equal(first: IntArray, last: IntArray, weight: FloatArray, table: Floa
 
 @kernel
 def spread(terms: Terms, mass: FloatArray, below: FloatArray, above: FloatArray, span: FloatArray) -> None:
-    """From masses (m,) the mass below and above every node (m + 1,), and that of every edge (E,)."""
+    """Fill the mass below and above every node (m + 1,), and that of every edge (E,), from masses (m,)."""
     m = mass.size
     below[0], above[m] = 0.0, 0.0
     for j in range(m):
@@ -210,7 +221,7 @@ def spread(terms: Terms, mass: FloatArray, below: FloatArray, above: FloatArray,
         above[j] = above[j + 1] + mass[j]
     for i in range(span.size):
         a, b = terms.first[i], terms.last[i]
-        # in the upper half the masses above are the smaller numbers, and their difference the more exact
+        # in the upper half the masses above are smaller, and their difference is more exact
         span[i] = above[a] - above[b] if below[a] > 0.5 else below[b] - below[a]
 
 
@@ -239,10 +250,10 @@ def slopes(
 
 @kernel
 def expectation_step(terms: Terms, above: FloatArray, slope: FloatArray, mass: FloatArray) -> None:
-    """One step of expectation maximisation, in place: Kaplan-Meier of the expected deaths, with delayed entry.
+    """Take a step of expectation maximisation, in place: Kaplan-Meier of the expected deaths, with delayed entry.
 
-    Without truncation this is Turnbull's self-consistency; with it, conditioning on the entry saves inventing those
-    that were never seen, which is what makes Turnbull's own version crawl.
+    Without truncation this is Turnbull's self-consistency; with it, conditioning on the entry avoids imputing the
+    samples that were never seen, which makes Turnbull's own version slow.
     """
     pull = 0.0
     at_risk = 0.0
@@ -255,7 +266,7 @@ def expectation_step(terms: Terms, above: FloatArray, slope: FloatArray, mass: F
         mass[j] = alive * min(deaths / at_risk, 1.0) if at_risk > 0.0 else 0.0
         at_risk -= deaths
         alive -= mass[j]
-    # whoever is left over by rounding
+    # what is left over by rounding
     total = mass.sum()
     for j in range(mass.size):
         mass[j] /= total
@@ -278,12 +289,12 @@ def best_between(slope: FloatArray, least: float, inside: BoolArray) -> None:
 
 @kernel
 def isotonic_step(slope: FloatArray, diag: FloatArray, below: FloatArray, mass: FloatArray) -> None:
-    """Masses (m,) of the iterative convex minorant's proposal: isotonic regression of a diagonal Newton step.
+    """Fill the proposal of the iterative convex minorant: isotonic regression of a diagonal Newton step.
 
     Args:
         slope: (m,) by the masses.
         diag: (m + 1,) negative second derivative by the masses below each node.
-        below: (m + 1,) present masses below.
+        below: (m + 1,) current masses below.
         mass: (m,) filled.
     """
     m = mass.size
@@ -307,3 +318,113 @@ def isotonic_step(slope: FloatArray, diag: FloatArray, below: FloatArray, mass: 
         last = value
         k += count[b]
     mass[k] = 1.0 - last
+
+
+@kernel
+def diagonal(terms: Terms, diag: FloatArray) -> None:
+    """Fill the diagonal (m + 1,) of `H`."""
+    m = terms.within.size
+    for k in range(m + 1):
+        diag[k] = terms.before[k] + terms.after[k]
+    for j in range(m):
+        diag[j] += terms.within[j]
+        diag[j + 1] += terms.within[j]
+    for i in range(terms.first.size):
+        diag[terms.first[i]] += terms.weight[i]
+        diag[terms.last[i]] += terms.weight[i]
+
+
+@kernel
+def product(terms: Terms, x: FloatArray, out: FloatArray) -> None:
+    """Fill `out = H x` over the nodes; `x` is 0 at both ends."""
+    m = terms.within.size
+    for k in range(m + 1):
+        out[k] = (terms.before[k] + terms.after[k]) * x[k]
+    for j in range(m):
+        force = terms.within[j] * (x[j + 1] - x[j])
+        out[j] -= force
+        out[j + 1] += force
+    for i in range(terms.first.size):
+        a, b = terms.first[i], terms.last[i]
+        force = terms.weight[i] * (x[b] - x[a])
+        out[a] -= force
+        out[b] += force
+
+
+@kernel
+def bandwidth(terms: Terms) -> int:
+    """Return the bandwidth of `H`."""
+    band = 1
+    for i in range(terms.first.size):
+        band = max(band, terms.last[i] - terms.first[i])
+    return band
+
+
+@kernel
+def banded(terms: Terms, band: FloatArray) -> None:
+    """Add the lower triangle of `H` for the inner nodes, `band[j, i] = H[i + j, i]`, to zeros."""
+    m = terms.within.size
+    for k in range(1, m):
+        band[0, k - 1] += terms.before[k] + terms.after[k] + terms.within[k - 1] + terms.within[k]
+        if k + 1 < m:
+            band[1, k - 1] -= terms.within[k]
+    for i in range(terms.first.size):
+        a, b, w = terms.first[i] - 1, terms.last[i] - 1, terms.weight[i]
+        band[0, a] += w
+        band[0, b] += w
+        band[b - a, a] -= w
+
+
+@kernel
+def conjugate_gradients(
+    terms: Terms, anchors: FloatArray, force: FloatArray, tolerance: float, most: int, x: FloatArray
+) -> int:
+    """Solve `H x = force` over the inner nodes, preconditioned by a tridiagonal matrix.
+
+    Args:
+        terms: the edges of `H`.
+        anchors: (m + 1,) edges to the fixed ends in the preconditioner; those between neighbours are as in `H`.
+        force: (m + 1,) right hand side.
+        tolerance: of the residual in the norm of the preconditioner's inverse, relative to that of `force`.
+        most: largest number of steps.
+        x: (m + 1,) filled, 0 at both ends.
+
+    Returns:
+        Steps taken, or -1 if `H` or the preconditioner is not positive definite.
+    """
+    m, chain = terms.within.size, terms.within
+    ratio, inverse = np.zeros(m + 1), np.zeros(m + 1)  # the preconditioner's factors, pivots inverted
+    for k in range(1, m):
+        ratio[k] = chain[k - 1] * inverse[k - 1]
+        inverse[k] = 1.0 / (chain[k - 1] * (1.0 - ratio[k]) + chain[k] + anchors[k])
+    residual, z, way, bent = force.copy(), np.zeros(m + 1), np.zeros(m + 1), np.empty(m + 1)
+    x[:] = 0.0
+    before, start, steps = 1.0, 0.0, 0
+    while True:
+        for k in range(1, m):
+            z[k] = residual[k] + ratio[k] * z[k - 1]
+        now = 0.0
+        for k in range(m - 1, 0, -1):
+            z[k] = z[k] * inverse[k] + ratio[k + 1] * z[k + 1]
+            now += residual[k] * z[k]
+        if now < 0.0:
+            return -1
+        if steps == 0:
+            start = now
+        if now <= tolerance * tolerance * start or steps == most:
+            return steps
+        share = now / before if steps > 0 else 0.0
+        for k in range(1, m):
+            way[k] = z[k] + share * way[k]
+        product(terms, way, bent)
+        curvature = 0.0
+        for k in range(1, m):
+            curvature += way[k] * bent[k]
+        if not curvature > 0.0:
+            return -1
+        length = now / curvature
+        for k in range(1, m):
+            x[k] += length * way[k]
+            residual[k] -= length * bent[k]
+        before = now
+        steps += 1

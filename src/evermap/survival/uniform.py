@@ -29,7 +29,7 @@ class Uniform(Lifetime):
     def _integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
         left = self.limit_s - a
         gone = (b - a) / left
-        # Both differences are exact to the last digit; which form keeps it depends on how much is left.
+        # Both differences are exact; which form keeps the last digit depends on how much is left.
         value = np.where(gone < 0.5, -np.log1p(-gone), -np.log((self.limit_s - b) / left))
         return np.where(a == b, 0.0, np.where(b >= self.limit_s, np.inf, value))
 

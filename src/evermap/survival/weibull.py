@@ -1,4 +1,4 @@
-"""Hazard that grows or falls as a power of time."""
+"""Weibull lifetimes: a hazard that grows or falls as a power of time."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Static spells: times at which objects stayed where they were, and what is known of their ends.
 
 An object was seen in a place from `first_s` to `last_s`. It came after `elsewhere_s`, when it was elsewhere or its
-place was empty, and was found moved or gone at `gone_s`. What that says of lifetimes is in `survival.sightings`.
+place was empty, and was found moved or gone at `gone_s`. What that says of lifetimes is in `survival.censored`.
 """
 
 from __future__ import annotations

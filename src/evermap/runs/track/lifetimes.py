@@ -170,7 +170,7 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[G
     """
     if not (np.isfinite(chunk_m) and chunk_m > 0.0):
         raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="--chunk-m", hint="10")
-    from evermap.survival.locality import chunks_of
+    from evermap.survival.pooling import chunks_of
 
     keys = np.zeros((len(table), 3), dtype=np.int64)  # class, chunk's column and row
     if BY_CLASS in by:

@@ -12,8 +12,7 @@ from evermap.errors import ConfigError, DataError
 from evermap.io.text import counted
 from evermap.runs.track.config import TrackConfig
 from evermap.runs.track.detections import DetectionTable, said_of
-from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.sightings import lifetimes_of_sightings
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.tracking.record import Recorder, Tracks
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
@@ -38,7 +37,7 @@ class TrackResult:
         track_of_detection: (M,) the object that each detection is of, `UNKNOWN` for one never confirmed.
         events: all that happened, in order.
         spells: times at which objects were seen to rest for at least `rest_for_s`.
-        lifetimes: samples of how long things stay, several rows a spell (see `survival.sightings`); None where the
+        lifetimes: samples of how long things stay, several rows a spell (see `survival.censored`); None where the
             beginning of no spell is bounded.
         spell_of_lifetime: (N,) the spell that each row of `lifetimes` belongs to.
         n_gaps: times at which nobody looked, between two frames.

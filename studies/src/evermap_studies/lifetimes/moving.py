@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.survival.parametric_fit import ParametricFit
-from evermap.survival.sightings import fit_sightings, lifetimes_of_sightings
+from evermap.survival.censored import lifetimes_of_sightings
+from evermap.survival.parametric_fit import ParametricFit, fit_sightings
 from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker

@@ -1,8 +1,8 @@
-"""Lifetimes of a place: square chunks of the ground, and a query that widens until it knows enough (Bateman 2020, 4.2).
+"""Lifetimes of a place as Bateman (2020, section 4.2) has them: a query that joins rings of chunks until it is certain.
 
 The thesis leaves the estimator open. Greenwood's variance needs ends that were watched, and the nonparametric estimate
-of intervals has none in closed form; a parametric model has one for every kind of censoring, so that is what widens
-here. Its variance is taken at its median, where a share is least certain.
+of intervals has none in closed form; a parametric model has one for every kind of censoring, so that is used here. Its
+variance is taken at its median, where a share is least certain. `evermap.survival.pooling` is compared with it.
 """
 
 from __future__ import annotations
@@ -17,19 +17,17 @@ from evermap.errors import DataError, NumericalError
 from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import ParametricFit, fit
+from evermap.survival.pooling import Chunk, chunks_of
 from evermap.types import IntArray
-
-Chunk = tuple[int, int]
-"""Column and row of a square of the ground plane; `(0, 0)` begins at the origin."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkIndex:
-    """Which of N things lie in which square chunk of the ground.
+    """Rows of N things by the square chunk of the ground that they lie in.
 
     Attributes:
         size_m: side of a chunk.
-        rows: for each chunk that holds something, the rows of what it holds.
+        rows: for each chunk that is not empty, the rows of what it holds.
     """
 
     size_m: float
@@ -37,7 +35,7 @@ class ChunkIndex:
 
     @classmethod
     def of(cls, place_m: ArrayLike, size_m: float) -> ChunkIndex:
-        """For (N, 2) places in metres.
+        """Index (N, 2) places in metres.
 
         Raises:
             ConfigError: a size that is not positive.
@@ -51,12 +49,12 @@ class ChunkIndex:
         return cls(size_m, {(int(x), int(y)): part for (x, y), part in zip(unique, parts, strict=True)})
 
     def chunk(self, place_m: ArrayLike) -> Chunk:
-        """The chunk of one place (2,)."""
+        """Return the chunk of one place (2,)."""
         column, row = chunks_of(np.asarray(place_m)[None, :], self.size_m)[0]
         return int(column), int(row)
 
     def ring(self, chunk: Chunk, radius: int) -> IntArray:
-        """Rows in the square ring of chunks `radius` steps away; 0 is the chunk itself."""
+        """Return the rows in the square ring of chunks `radius` steps away; 0 is the chunk itself."""
         x, y = chunk
         reach = range(-radius, radius + 1)
         here = ((x + i, y + j) for i in reach for j in reach if max(abs(i), abs(j)) == radius)
@@ -64,13 +62,13 @@ class ChunkIndex:
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
     def farthest(self, chunk: Chunk) -> int:
-        """Radius of the last ring that holds anything."""
+        """Return the radius of the last ring that holds anything."""
         return max((max(abs(x - chunk[0]), abs(y - chunk[1])) for x, y in self.rows), default=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RingEstimate:
-    """What the neighbourhood of a chunk says.
+    """Estimate from the neighbourhood of a chunk.
 
     Attributes:
         fitted: the model of all samples within `radius`.
@@ -85,33 +83,17 @@ class RingEstimate:
     rows: IntArray
 
 
-def chunks_of(place_m: ArrayLike, size_m: float) -> IntArray:
-    """(N, 2) columns and rows of the chunks of (N, 2) places.
-
-    Raises:
-        ConfigError: a size that is not positive.
-        DataError: a place that is not finite, or not two numbers.
-    """
-    check_positive(size_m, "size_m")
-    places = np.asarray(place_m, dtype=np.float64)
-    if places.ndim != 2 or places.shape[1] != 2:
-        raise DataError(f"must be x and y of each thing, not of shape {places.shape}", field="place_m")
-    if not np.isfinite(places).all():
-        raise DataError(f"must be finite: row {int(np.argwhere(~np.isfinite(places))[0][0])} is not", field="place_m")
-    return np.asarray(np.floor(places / size_m), dtype=np.int64)
-
-
 def ring_query(
     data: CensoredLifetimes, index: ChunkIndex, chunk: Chunk, variance_bound: float, kind: str = "weibull"
 ) -> RingEstimate:
-    """The model of a chunk's samples, joined by ring after ring until its variance is below a bound.
+    """Fit a model to the samples of a chunk, joined by ring after ring until its variance is below a bound.
 
-    Where all samples together do not reach the bound, theirs is the answer; its variance says so.
+    Where all samples together do not reach the bound, their model is returned; its variance says so.
 
     Args:
         data: N samples.
         index: of their places.
-        chunk: asked about; it need not hold any.
+        chunk: the one in question; it may be empty.
         variance_bound: of `P(T > median)`: 0.0025 is a standard deviation of 5 %.
         kind: of model, as `parametric_fit.KINDS` has them.
 
