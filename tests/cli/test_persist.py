@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 from evermap.cli.main import app
 from evermap.runs.folder import MANIFEST
 from evermap.runs.persist.table import read_looks
+from evermap.types import landmark_id_of
 
 PNG = b"\x89PNG"
 
@@ -55,7 +56,7 @@ def test_the_summary_is_printed_as_it_is_written_and_lists_every_file(done: tupl
     assert {"beliefs.csv", "changes.jsonl", "forecasts.csv", "report.html", "figures/overview.png"} <= set(there)
     assert "figures/feature-cart-3.png" in there
     assert all((out / name).read_bytes().startswith(PNG) for name in there if name.endswith(".png"))
-    assert summary["schema_version"] == "1"
+    assert summary["schema_version"] == "2"
     assert summary["never_leave_share"] == pytest.approx({"all": 0.0, "cart": 0.1})
     assert summary["detector"]["p_miss"] == {"least": 0.1, "most": 0.1}
     assert summary["model"] == {"all": "one-stay", "cart": "one-stay"}
@@ -85,13 +86,14 @@ def test_changes_tell_what_happened(done: tuple[Path, dict[str, Any]]) -> None:
     out, summary = done
     changes = [json.loads(line) for line in (out / "changes.jsonl").read_text().splitlines()]
     assert summary["counts"]["vanished"] + summary["counts"]["returned"] == len(changes)
-    gone = [change for change in changes if change["feature_id"] == "pallet-7"]
-    assert [change["change"] for change in gone] == ["vanished"]
+    gone = [change for change in changes if change["names"] == ["pallet-7"]]
+    assert [change["kind"] for change in gone] == ["vanished"]
+    assert gone[0]["landmarks"] == [landmark_id_of("pallet-7")]
     left_s = 2.6 * 86400.0  # as the example has it
-    assert gone[0]["earliest_s"] <= left_s <= gone[0]["latest_s"] <= gone[0]["decided_s"]
-    assert gone[0]["earliest_s"] <= gone[0]["stamp_s"] <= gone[0]["latest_s"]
-    assert 0.9 <= gone[0]["confidence"] <= 1.0
-    assert not [change for change in changes if change["feature_id"].startswith("pillar")]
+    assert gone[0]["stamp_from_s"] <= left_s <= gone[0]["stamp_to_s"] <= gone[0]["decided_s"]
+    assert gone[0]["stamp_from_s"] <= gone[0]["stamp_s"] <= gone[0]["stamp_to_s"]
+    assert 0.9 <= gone[0]["probability"] <= 1.0
+    assert not [change for change in changes if change["names"][0].startswith("pillar")]
 
 
 def test_forecasts_never_rise_without_a_look_and_say_how_long(done: tuple[Path, dict[str, Any]]) -> None:
@@ -158,8 +160,8 @@ def test_ids_that_are_numbers_stay_numbers(tmp_path: Path) -> None:
     path.write_text("stamp_s,feature_id,detected\n" + "".join(f"{k},12,{hit}\n" for k, hit in enumerate(hits)))
     assert run(path, "--out", tmp_path / "out").exit_code == 0
     change = json.loads((tmp_path / "out" / "changes.jsonl").read_text())
-    assert change["feature_id"] == 12
-    assert change["change"] == "vanished"
+    assert (change["landmarks"], change["names"]) == ([12], None)
+    assert change["kind"] == "vanished"
 
 
 def test_a_learned_model_is_kept_and_gives_the_same_beliefs_again(example: Path, tmp_path: Path) -> None:
@@ -238,5 +240,5 @@ def test_a_real_recording_scores_as_its_truth_says(shared_data: Path, tmp_path: 
     ]
     assert summary["metrics"]["brier"] == pytest.approx(sum(errors) / len(errors))
     # what never leaves is never reported as gone
-    changed = {json.loads(line)["feature_id"] for line in (tmp_path / "out" / "changes.jsonl").open()}
+    changed = {json.loads(line)["landmarks"][0] for line in (tmp_path / "out" / "changes.jsonl").open()}
     assert changed <= {0, 2, 4, 6}

@@ -72,6 +72,7 @@ def test_log_has_a_line_for_every_revision(site: Path) -> None:
     third = listed["revisions"][2]
     assert (third["recording"], third["source"], third["seed"], third["config"]) == ("day 2", "/data", 4, "[slam]")
     assert third["changes"] == {"appeared": 1, "moved": 1}
+    assert third["grown"] == len(said("diff", site, 2, 3)["grown"])
     assert third["existing"] == existing
 
 
@@ -109,15 +110,18 @@ def test_show_foretells_less_the_longer_ahead(site: Path) -> None:
 def test_diff_lists_changes_and_edits(site: Path) -> None:
     run("pin", site, int(MAPS[2].members.landmark_id[0]))
     content = said("diff", site, 1)
-    wanted = diff(MAPS[0], MAPS[2])
+    with open_store(site) as store:
+        wanted, first = diff(store, 1), diff(store, 0, 1)
     assert (content["a"], content["b"]) == (1, 4)
     assert [(c["landmarks"], c["kind"]) for c in content["changes"]] == [
-        (list(c.landmark_ids), c.kind.value) for c in wanted
+        (list(c.landmark_ids), c.kind.value) for c in wanted.changes
     ]
+    assert content["grown"] == wanted.grown.tolist()
     assert {"landmark": int(MAPS[2].members.landmark_id[0]), "what": "pinned"} in said("diff", site, 3)["edits"]
     lines = run("diff", site, 0, 1).stdout.splitlines()
-    assert len(lines) == len(diff(open_store(site).load(0), MAPS[0]))
-    assert all("appeared" in line and "hits" in line for line in lines)
+    assert len(lines) == len(first.changes) + 1
+    assert all("hits" in line for line in lines[:-1])
+    assert lines[-1].startswith(f"the map grew by {len(first.grown)} landmarks: ")
     assert "no difference between revisions 2 and 2" in run("diff", site, 2, 2).stderr
 
 

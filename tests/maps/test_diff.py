@@ -1,295 +1,326 @@
-"""Differences of maps that were changed on purpose, against what was done to them."""
+"""What is told of several sessions together: net effects of made-up changes, and of real sessions."""
 
 from __future__ import annotations
 
-import math
+import json
+from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from random_maps import random_map
+from typer.testing import CliRunner
 
-from evermap.maps.diff import diff, edits
+import evermap as em
+from evermap.cli.main import app
+from evermap.maps.diff import Difference, diff, edits, grown, net
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
-from evermap.types import ChangeKind
+from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.types import ChangeKind, MapChange
 
-NOW_S = 100.0
-LATER_S = 200.0
-NEVER = -np.inf
+APPEARED, VANISHED, RETURNED = ChangeKind.APPEARED, ChangeKind.VANISHED, ChangeKind.RETURNED
+MOVED, SWAPPED = ChangeKind.MOVED, ChangeKind.SWAPPED
+EMPTY = LivingMap()
 
 
-def a_map(
-    sites: list[tuple[int, int, float]],
-    places: list[tuple[int, int, float, float]],
-    *,
-    cliques: dict[int, int],
-    stays: list[tuple[int, int, float, float, float, float]] = (),
-    hits: dict[tuple[int, int], tuple[int, int]] | None = None,
-    stamp_s: float = NOW_S,
-    deleted: tuple[int, ...] = (),
-    pinned: tuple[int, ...] = (),
-    sigma_m: float = 0.02,
-) -> LivingMap:
-    """A map by hand: sites (id, clique, p), places (site, landmark, x, y), stays (clique, site, four stamps)."""
-    ids = np.array(sorted(cliques), dtype=np.int64)
-    site, clique, p = (np.array(column) for column in zip(*sites, strict=True))
-    at, name, x, y = (np.array(column) for column in zip(*places, strict=True))
-    counts = np.array([(hits or {}).get((s, n), (0, 0)) for s, n in zip(at, name, strict=True)])
-    rows = np.array(stays, dtype=np.float64).reshape(-1, 6)
-    rows = rows[np.argsort(rows[:, 3], kind="stable")]
+def a_map(places: dict[int, tuple[float, float]], away: tuple[int, ...] = (), stamp_s: float = 100.0) -> LivingMap:
+    """Landmarks that each are a clique of their own at one site; those that are away are known, too."""
+    names = np.array(sorted([*places, *away]), dtype=np.int64)
+    stands = ~np.isin(names, away)
+    count = len(names)
+    zeros = np.zeros(count)
+    p_here = np.where(stands, 0.9, 0.05)
+    position = np.array([places.get(int(name), (50.0, 50.0)) for name in names]).reshape(-1, 2)
     return LivingMap(
         stamp_s=stamp_s,
-        members=Members(
-            ids,
-            np.full(len(ids), -1),
-            np.array([cliques[int(i)] for i in ids]),
-            np.isin(ids, pinned),
-            np.isin(ids, deleted),
-        ),
-        sites=Sites(site, clique, *np.tile(p.astype(float), (2, 1)), np.zeros(len(site)), np.full(len(site), stamp_s)),
-        places=Places(at, name, np.column_stack([x, y]).astype(float), counts[:, 0], counts[:, 1]),
+        members=Members(names, np.full(count, -1), names, *np.zeros((2, count), dtype=np.bool_)),
+        sites=Sites(names, names, p_here, p_here, zeros, zeros + stamp_s),
+        places=Places(names, names, position, *np.zeros((2, count), dtype=np.int64)),
         stays=Stays(
-            rows[:, 0].astype(np.int64),
-            rows[:, 1].astype(np.int64),
-            np.full(len(rows), -1),
-            np.zeros((len(rows), 2)),
-            *rows[:, 2:].T.copy(),
-            np.isfinite(rows[:, 5]).astype(np.float64),
+            names, names, np.full(count, -1), position, zeros - np.inf, zeros, zeros + 1.0,
+            np.where(stands, np.inf, 2.0), np.where(stands, 0.0, 1.0),
         ),
-        covariance_m2=sigma_m**2 * np.eye(2 * len(places)),
-        n_cliques_ever=100,
-        n_sites_ever=100,
-    )
+        covariance_m2=1e-4 * np.eye(2 * count),
+        n_cliques_ever=1000,
+        n_sites_ever=1000,
+    )  # fmt: skip
 
 
-def only(a: LivingMap, b: LivingMap):
-    (change,) = diff(a, b)
-    return change
+def told(kind: ChangeKind, *names: int, at: float = 10.0, by: tuple[float, float] | None = None, p: float = 0.9):
+    nowhere = (np.nan, np.nan)
+    return MapChange(names, kind, at, at + 5.0, nowhere if by is None else by, 0.0, p, 3, 2)
 
 
-def one(p: float, **more: object) -> LivingMap:
-    """Landmark 5 at (1, 2) with belief p."""
-    return a_map([(0, 3, p)], [(0, 5, 1.0, 2.0)], cliques={5: 3}, **more)
+HERE, THERE, FAR = (1.0, 2.0), (4.0, 2.0), (9.0, 9.0)
 
 
-EMPTY = LivingMap()
+@pytest.mark.parametrize(
+    ("sessions", "before", "after", "expected"),
+    [
+        pytest.param([[told(VANISHED, 5)], []], a_map({5: HERE}), a_map({}, (5,)), VANISHED, id="one change as it was"),
+        pytest.param([[told(VANISHED, 5)], [told(RETURNED, 5, by=(0.0, 0.0))]], a_map({5: HERE}), a_map({5: HERE}),
+                     None, id="left and came back"),
+        pytest.param([[told(VANISHED, 5)], [told(RETURNED, 5, by=(3.0, 0.0))]], a_map({5: HERE}), a_map({5: THERE}),
+                     MOVED, id="left and came back elsewhere"),
+        pytest.param([[told(MOVED, 5, by=(1.0, 0.0))], [told(MOVED, 5, by=(2.0, 0.0))]], a_map({5: HERE}),
+                     a_map({5: THERE}), MOVED, id="moved twice"),
+        pytest.param([[told(MOVED, 5, by=(3.0, 0.0))], [told(MOVED, 5, by=(-3.0, 0.0))]], a_map({5: HERE}),
+                     a_map({5: HERE}), None, id="moved and moved back"),
+        pytest.param([[told(MOVED, 5, by=(3.0, 0.0))], [told(VANISHED, 5)]], a_map({5: HERE}), a_map({}, (5,)),
+                     VANISHED, id="moved, then gone"),
+        pytest.param([[told(APPEARED, 5)], [told(VANISHED, 5)]], EMPTY, a_map({}, (5,)), None, id="came and went"),
+        pytest.param([[told(APPEARED, 5)], [told(MOVED, 5, by=(3.0, 0.0))]], EMPTY, a_map({5: THERE}), APPEARED,
+                     id="appeared and was moved"),
+        pytest.param([[told(RETURNED, 5, by=(0.0, 0.0))], [told(VANISHED, 5)]], a_map({}, (5,)), a_map({}, (5,)), None,
+                     id="was here for a session"),
+        pytest.param([[], [told(VANISHED, 5)]], EMPTY, a_map({}, (5,)), None, id="the map grew, then it was gone"),
+        pytest.param([[], [told(MOVED, 5, by=(3.0, 0.0))]], EMPTY, a_map({5: THERE}), None, id="grew, then it moved"),
+    ],
+)  # fmt: skip
+def test_net_effect(sessions, before: LivingMap, after: LivingMap, expected: ChangeKind | None) -> None:
+    found = net([(changes, False) for changes in sessions], before, after)
+    assert [change.kind for change in found] == ([] if expected is None else [expected])
+    if expected is MOVED:
+        np.testing.assert_allclose(found[0].displacement_m, np.subtract(THERE, HERE))
+
+
+def test_a_composed_change_rests_on_all_that_led_to_it() -> None:
+    sessions = [
+        ([told(APPEARED, 5, at=10.0, p=0.8)], False),
+        ([told(VANISHED, 5, at=20.0, p=0.7)], False),
+        ([told(RETURNED, 5, at=30.0, by=(0.0, 0.0), p=0.6)], False),
+        ([told(MOVED, 5, at=40.0, by=(3.0, 0.0), p=0.5)], False),
+    ]
+    (change,) = net(sessions, EMPTY, a_map({5: THERE}))
+    assert change.kind is APPEARED
+    assert change.probability == pytest.approx(0.6 * 0.5)  # since it came for the last time
+    assert (change.stamp_from_s, change.stamp_to_s) == (30.0, 45.0)
+    assert (change.n_hits, change.n_misses) == (6, 4)
+    assert np.isnan(change.displacement_m).all()
+
+
+def test_landmarks_of_a_body_part_where_their_histories_do() -> None:
+    sessions = [([told(MOVED, 5, 6, by=(3.0, 0.0))], False), ([told(VANISHED, 6, at=30.0)], False)]
+    found = net(sessions, a_map({5: HERE, 6: (1.0, 3.0)}), a_map({5: THERE}, (6,)))
+    assert {change.landmark_ids: change.kind for change in found} == {(5,): MOVED, (6,): VANISHED}
+    np.testing.assert_allclose(next(c for c in found if c.kind is MOVED).displacement_m, (3.0, 0.0))
+
+
+def test_two_that_stand_in_each_others_place_in_the_end_were_swapped() -> None:
+    sessions = [
+        ([told(MOVED, 1, by=(0.0, 9.0))], False),
+        ([told(MOVED, 2, by=(-3.0, 0.0))], False),
+        ([told(MOVED, 1, by=(3.0, -9.0))], False),
+    ]
+    (change,) = net(sessions, a_map({1: HERE, 2: THERE}), a_map({1: THERE, 2: HERE}))
+    assert (change.kind, change.landmark_ids) == (SWAPPED, (1, 2))
+    back = [*sessions, ([told(SWAPPED, 1, 2, by=(-3.0, 0.0))], False)]
+    assert net(back, a_map({1: HERE, 2: THERE}), a_map({1: HERE, 2: THERE})) == ()
+
+
+def test_one_session_is_told_word_for_word() -> None:
+    changes = (told(MOVED, 99, by=(0.01, 0.0)), told(VANISHED, 7))
+    assert net([(changes, False)], EMPTY, EMPTY) == changes
+
+
+@pytest.mark.parametrize(
+    ("change", "before", "after", "expected"),
+    [
+        (told(VANISHED, 5), a_map({}, (5,)), a_map({5: HERE}), RETURNED),
+        (told(APPEARED, 5), a_map({5: HERE}), EMPTY, VANISHED),
+        (told(RETURNED, 5, by=(0.0, 0.0)), a_map({5: HERE}), a_map({}, (5,)), VANISHED),
+        (told(MOVED, 5, by=(3.0, 0.0)), a_map({5: THERE}), a_map({5: HERE}), MOVED),
+        (told(APPEARED, 5), a_map({5: HERE}), a_map({5: HERE}), None),  # told of another way to the same map
+    ],
+)
+def test_the_way_back_undoes_what_was_told(
+    change: MapChange, before: LivingMap, after: LivingMap, expected: ChangeKind | None
+) -> None:
+    found = net([((change,), True)], before, after)
+    assert [one.kind for one in found] == ([] if expected is None else [expected])
+    if expected is MOVED:
+        np.testing.assert_allclose(found[0].displacement_m, (-3.0, 0.0))
+
+
+def test_what_stands_and_was_not_known_is_grown_unless_told_of() -> None:
+    after = a_map({5: HERE, 6: THERE, 7: FAR}, (8,))
+    assert grown(np.array([5]), after, []).tolist() == [6, 7]
+    assert grown(np.array([5]), after, [told(APPEARED, 6)]).tolist() == [7]
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_map_differs_by_nothing_from_itself(seed: int) -> None:
     living = random_map(seed)
-    assert diff(living, living) == ()
+    assert net([], living, living) == ()
     assert edits(living, living) == ()
+    assert not len(grown(living.members.landmark_id, living, ()))
 
 
-def told(living: LivingMap) -> dict[int, bool]:
-    """Landmarks that are said to stand somewhere, and whether their place was seen empty before."""
-    stays = living.stays
-    result = {}
-    for name, clique in zip(living.members.landmark_id.tolist(), living.members.clique_id.tolist(), strict=True):
-        mine = [k for k in range(len(stays)) if stays.clique_id[k] == clique and stays.gone_s[k] == np.inf]
-        deleted = living.members.deleted[living.members.landmark_id == name][0]
-        if mine and not deleted:
-            result[name] = bool(np.isfinite(stays.elsewhere_s[mine]).all())
+def test_edits_are_what_operators_said() -> None:
+    living = a_map({5: HERE})
+    assert edits(living, living.edited(5, pinned=True, deleted=True)) == ((5, "deleted"), (5, "pinned"))
+    assert edits(living.edited(5, deleted=True), living) == ((5, "undeleted"),)
+
+
+# --- sessions of a building, of which each sees a part ---
+
+KEYS = [
+    "landmarks", "kind", "stamp_from_s", "stamp_to_s", "displacement_m", "rotation_rad", "probability", "hits",
+    "misses", "names", "stamp_s", "decided_s",
+]  # fmt: skip
+QUICK = [
+    "--set",
+    "output.figures=false",
+    "--set",
+    "output.rerun=false",
+    "--set",
+    "slam.calibration.fix.range_slope=0.0",
+]
+
+
+REPORTS = (0, 2)
+
+
+def run(*arguments: str | Path | int):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == 0, result.output
     return result
 
 
-def test_of_a_new_map_has_appeared_whose_place_was_seen_empty() -> None:
-    living = random_map(7, cliques=12)
-    found = diff(EMPTY, living)
-    expected = [name for name, seen_empty in told(living).items() if seen_empty]
-    assert 0 < len(expected) < len(told(living))
-    assert {c.kind for c in found} == {ChangeKind.APPEARED}
-    assert sorted(n for c in found for n in c.landmark_ids) == sorted(expected)
-    for change in found:
-        assert np.isnan(change.displacement_m).all()
+def said(*arguments: str | Path | int):
+    return json.loads(run(*arguments, "--json").stdout)
 
 
-def test_appeared_between_the_looks_of_its_stay() -> None:
-    new = one(0.9, stays=[(3, 0, 120.0, 150.0, 190.0, np.inf)], hits={(0, 5): (7, 1)}, stamp_s=LATER_S)
-    change = only(EMPTY, new)
-    assert (change.stamp_from_s, change.stamp_to_s) == (120.0, 150.0)
-    assert (change.n_hits, change.n_misses) == (7, 0)
-    nobody_looked = one(0.9, stays=[(3, 0, NEVER, 150.0, 190.0, np.inf)], stamp_s=LATER_S)
-    assert diff(EMPTY, nobody_looked) == ()  # the map grew
-
-
-def test_vanished_between_its_last_sighting_and_the_first_miss() -> None:
-    old = one(0.8, stays=[(3, 0, NEVER, 1.0, 90.0, np.inf)], hits={(0, 5): (9, 2)})
-    new = one(0.1, stays=[(3, 0, NEVER, 1.0, 110.0, 130.0)], hits={(0, 5): (10, 8)}, stamp_s=LATER_S)
-    change = only(old, new)
-    assert change.kind is ChangeKind.VANISHED
-    assert change.landmark_ids == (5,)
-    assert change.probability == pytest.approx(0.8 * 0.9)
-    assert (change.stamp_from_s, change.stamp_to_s) == (110.0, 130.0)
-    assert (change.n_hits, change.n_misses) == (0, 6)
-    assert np.isnan(change.displacement_m).all()
-
-
-def test_existence_is_decided_at_one_half() -> None:
-    assert diff(one(0.5), one(0.6)) == ()
-    assert diff(one(0.49), one(0.1)) == ()
-    assert only(one(0.5), one(0.499)).kind is ChangeKind.VANISHED
-    assert only(one(0.4), one(0.5)).kind is ChangeKind.RETURNED
-
-
-def test_moved_with_displacement_time_and_evidence() -> None:
-    places = [(0, 5, 1.0, 2.0), (1, 5, 1.5, 1.0)]
-    old = a_map([(0, 3, 0.9)], places[:1], cliques={5: 3}, hits={(0, 5): (20, 1)})
-    new = a_map(
-        [(0, 3, 0.05), (1, 3, 0.9)],
-        places,
-        cliques={5: 3},
-        stays=[(3, 0, NEVER, 1.0, 110.0, 125.0), (3, 1, 115.0, 140.0, 180.0, np.inf)],
-        hits={(0, 5): (20, 5), (1, 5): (12, 0)},
-        stamp_s=LATER_S,
+def part_of(recording: em.Recording, begin: float, end: float) -> em.Recording:
+    """The frames between two shares of a patrol: the rest of the building is not looked at."""
+    frames = recording.frames
+    stamps = frames.stamp_s
+    first_s, last_s = (stamps[0] + share * np.ptp(stamps) for share in (begin, end))
+    kept = np.flatnonzero((stamps >= first_s) & (stamps <= last_s))
+    mine = np.isin(recording.detections.frame, kept)
+    columns = {name: getattr(recording.detections, name)[mine] for name in recording.detections.__slots__}
+    columns["frame"] = np.searchsorted(kept, columns["frame"])
+    return replace(
+        recording, frames=replace(frames, stamp_s=stamps[kept]), detections=replace(recording.detections, **columns)
     )
-    change = only(old, new)
-    assert change.kind is ChangeKind.MOVED
-    np.testing.assert_allclose(change.displacement_m, (0.5, -1.0))
-    assert change.rotation_rad == 0.0
-    assert change.probability == pytest.approx(0.9 * 0.9)
-    assert (change.stamp_from_s, change.stamp_to_s) == (115.0, 125.0)
-    assert (change.n_hits, change.n_misses) == (12, 4)
-    back = only(new, old)
-    np.testing.assert_allclose(back.displacement_m, (-0.5, 1.0))
 
 
-def test_moved_twice_between_leaving_the_first_place_and_coming_to_the_last() -> None:
-    places = [(0, 5, 1.0, 2.0), (1, 5, 4.0, 4.0), (2, 5, 1.5, 1.0)]
-    old = a_map([(0, 3, 0.9)], places[:1], cliques={5: 3})
-    stays = [(3, 0, NEVER, 1.0, 110.0, 120.0), (3, 1, 110.0, 125.0, 140.0, 160.0), (3, 2, 140.0, 165.0, 190.0, np.inf)]
-    new = a_map([(0, 3, 0.0), (1, 3, 0.0), (2, 3, 0.9)], places, cliques={5: 3}, stays=stays, stamp_s=LATER_S)
-    change = only(old, new)
-    assert (change.kind, change.stamp_from_s, change.stamp_to_s) == (ChangeKind.MOVED, 110.0, 165.0)
-    gone = replace(new, sites=replace(new.sites, p_here=np.zeros(3)))
-    gone.stays.gone_s[2] = 195.0
-    change = only(old, gone)
-    assert (change.kind, change.stamp_from_s, change.stamp_to_s) == (ChangeKind.VANISHED, 190.0, 195.0)
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of five days of which three see only a part, each with its run folder beside it."""
+    from evermap.io import write_native
+    from evermap.sim import BuildingConfig, SensorConfig, simulate_building
+
+    folder = tmp_path_factory.mktemp("site")
+    config = BuildingConfig(days=5, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1, change_rate=2.0,
+                            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0))  # fmt: skip
+    views = [(0.0, 0.6), (0.0, 1.0), (0.3, 1.0), (0.0, 1.0), (0.0, 0.7)]
+    for day, (recording, view) in enumerate(zip(simulate_building(config, seed=11).sessions, views, strict=True)):
+        write_native(part_of(recording, *view), folder / f"day{day}")
+        run("slam", folder / f"day{day}", "--map", folder / "site.evermap", "--out", folder / f"out{day}", *QUICK,
+            "--set", f"output.report={str(day in REPORTS).lower()}")  # fmt: skip
+    return folder / "site.evermap"
 
 
-def test_moved_by_leaving_and_coming_back_elsewhere() -> None:
-    places = [(0, 5, 1.0, 2.0), (1, 5, 4.0, 4.0)]
-    old = a_map([(0, 3, 0.9)], places[:1], cliques={5: 3})
-    stays = [(3, 0, NEVER, 1.0, 110.0, 130.0), (3, 1, 130.0, 160.0, 190.0, np.inf)]
-    new = a_map([(0, 3, 0.0), (1, 3, 0.9)], places, cliques={5: 3}, stays=stays, stamp_s=LATER_S)
-    change = only(old, new)
-    assert (change.kind, change.stamp_from_s, change.stamp_to_s) == (ChangeKind.MOVED, 110.0, 160.0)
+def test_log_diff_folder_and_report_say_the_same(site: Path) -> None:
+    revisions = said("map", "log", site)["revisions"]
+    kinds = Counter()
+    for number, revision in enumerate(revisions, start=1):
+        out = site.parent / f"out{number - 1}"
+        between = said("map", "diff", site, number - 1, number)
+        summary = json.loads((out / "summary.json").read_text())
+        lines = [json.loads(line) for line in (out / "changes.jsonl").read_text().splitlines()]
+        assert between["changes"] == summary["changes"] == lines
+        assert all(list(change) == KEYS for change in (*between["changes"], *lines))
+        assert revision["changes"] == dict(Counter(change["kind"] for change in lines))
+        assert revision["grown"] == len(between["grown"]) == summary["counts"]["landmarks_grown"]
+        kinds += Counter(change["kind"] for change in lines)
+        with open_store(site) as store:
+            assert list(store.changes(number)) == list(diff(store, number - 1, number).changes)
+        if number - 1 not in REPORTS:
+            continue
+        report = (out / "report.html").read_text()
+        spoken = run("map", "diff", site, number - 1, number).stdout.splitlines()
+        for change, line in zip(lines, spoken, strict=False):
+            words, probability = line.split(" between ")[0].split(" before ")[0], line.split(", probability ")[1]
+            probability = probability.split(" (")[0].replace(">", "&gt;").replace("<", "&lt;")
+            assert f"{words} " in report
+            assert f"probability {probability}" in report
+            assert change["kind"] in ("moved", "rotated", "swapped") or change["kind"] in words
+        assert (f"the map grew by {revision['grown']} " in report) == bool(revision["grown"])
+    assert revisions[0]["changes"] == {}
+    assert revisions[0]["grown"] > 10
+    assert revisions[1]["grown"] > 0  # the part that the first day did not see
+    assert {"moved", "vanished"} <= set(kinds)
+    assert kinds["appeared"] + kinds["returned"] > 0
 
 
-def test_another_site_within_the_noise_is_no_move() -> None:
-    """Sites are named anew where bodies are put together otherwise; the things did not move for that."""
-    old = a_map([(0, 3, 0.9)], [(0, 5, 1.0, 2.0)], cliques={5: 3}, sigma_m=0.1)
-    new = a_map([(8, 4, 0.9)], [(8, 5, 1.1, 2.1)], cliques={5: 4}, sigma_m=0.1)
-    assert diff(old, new) == ()
-    sharp = replace(new, covariance_m2=1e-8 * np.eye(2))
-    assert only(replace(old, covariance_m2=1e-8 * np.eye(2)), sharp).kind is ChangeKind.MOVED
+def test_over_several_revisions_only_what_was_told_is_composed(site: Path) -> None:
+    with open_store(site) as store:
+        for a in range(store.head() + 1):
+            for b in range(a + 1, store.head() + 1):
+                found = diff(store, a, b)
+                before, after = store.load(a), store.load(b)
+                named = [name for change in found.changes for name in change.landmark_ids]
+                assert len(named) == len(set(named))
+                spoken = {n for k in range(a + 1, b + 1) for c in store.changes(k) for n in c.landmark_ids}
+                assert set(named) <= spoken
+                assert not set(named) & set(found.grown.tolist())
+                assert not set(found.grown.tolist()) & set(before.members.landmark_id.tolist())
+                if b > a + 1:  # what stood and what stands, by the maps themselves
+                    assert_ends_fit(found, before, after)
 
 
-def body(angle_rad: float, step_m: tuple[float, float], site: int) -> list[tuple[int, int, float, float]]:
-    """Places of landmarks 1 to 4 on a body that was turned about its middle, (2, 1), and moved."""
-    corners = np.array([[1.0, 0.0], [3.0, 0.5], [3.0, 2.0], [1.0, 1.5]])
-    turn = np.array([[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]])
-    moved = (corners - corners.mean(axis=0)) @ turn.T + corners.mean(axis=0) + step_m
-    return [(site, k + 1, float(x), float(y)) for k, (x, y) in enumerate(moved)]
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.4, -2.5])
-def test_a_body_moves_as_one(angle: float) -> None:
-    cliques = dict.fromkeys(range(1, 5), 7)
-    old = a_map([(0, 7, 1.0)], body(0.0, (0, 0), 0), cliques=cliques)
-    new = a_map([(0, 7, 0.0), (1, 7, 1.0)], body(0.0, (0, 0), 0) + body(angle, (2, -1), 1), cliques=cliques)
-    change = only(old, new)
-    assert change.landmark_ids == (1, 2, 3, 4)
-    assert change.kind is (ChangeKind.ROTATED if angle else ChangeKind.MOVED)
-    np.testing.assert_allclose(change.displacement_m, (2.0, -1.0), atol=1e-12)
-    assert change.rotation_rad == pytest.approx(angle)
-
-
-def test_a_turn_that_may_be_noise_is_none() -> None:
-    cliques = dict.fromkeys(range(1, 5), 7)
-    old = a_map([(0, 7, 1.0)], body(0.0, (0, 0), 0), cliques=cliques, sigma_m=0.05)
-    new = a_map([(1, 7, 1.0)], body(0.03, (2, 0), 1), cliques=cliques, sigma_m=0.05)
-    assert (only(old, new).kind, only(old, new).rotation_rad) == (ChangeKind.MOVED, 0.0)
-
-
-def test_two_that_stand_in_each_others_place_were_swapped() -> None:
-    spots = {1: (0.0, 0.0), 2: (3.0, 1.0), 3: (5.0, 5.0)}
-    old = a_map([(k, k, 0.9) for k in spots], [(k, k, *spots[k]) for k in spots], cliques={k: k for k in spots})
-    new = a_map(
-        [(11, 1, 0.9), (12, 2, 0.8), (13, 3, 0.9)],
-        [(11, 1, 3.01, 0.99), (12, 2, 0.01, 0.0), (13, 3, 5.0, 6.0)],
-        cliques={k: k for k in spots},
-    )
-    swap, move = sorted(diff(old, new), key=lambda c: len(c.landmark_ids), reverse=True)
-    assert (swap.kind, swap.landmark_ids) == (ChangeKind.SWAPPED, (1, 2))
-    np.testing.assert_allclose(swap.displacement_m, (3.01, 0.99))
-    assert swap.probability == pytest.approx(0.9**3 * 0.8)
-    assert (move.kind, move.landmark_ids) == (ChangeKind.MOVED, (3,))
-
-
-def test_three_that_changed_places_in_a_ring_were_not_swapped() -> None:
-    spots = {1: (0.0, 0.0), 2: (3.0, 1.0), 3: (5.0, 5.0)}
-    old = a_map([(k, k, 0.9) for k in spots], [(k, k, *spots[k]) for k in spots], cliques={k: k for k in spots})
-    new = a_map(
-        [(10 + k, k, 0.9) for k in spots],
-        [(10 + k, k, *spots[k % 3 + 1]) for k in spots],
-        cliques={k: k for k in spots},
-    )
-    assert [c.kind for c in diff(old, new)] == [ChangeKind.MOVED] * 3
-
-
-def test_returned_to_where_it_was_or_elsewhere() -> None:
-    gone = one(0.1, stays=[(3, 0, NEVER, 1.0, 50.0, 60.0)])
-    same = one(0.9, stays=[(3, 0, NEVER, 1.0, 50.0, 60.0), (3, 0, 150.0, 160.0, 190.0, np.inf)], stamp_s=LATER_S)
-    change = only(gone, same)
-    assert change.kind is ChangeKind.RETURNED
-    assert change.displacement_m == (0.0, 0.0)
-    assert change.probability == pytest.approx(0.9 * 0.9)
-    assert (change.stamp_from_s, change.stamp_to_s) == (150.0, 160.0)
-    other = a_map(
-        [(0, 3, 0.0), (1, 3, 0.9)],
-        [(0, 5, 1.0, 2.0), (1, 5, 4.0, 2.0)],
-        cliques={5: 3},
-        stays=[(3, 0, NEVER, 1.0, 50.0, 60.0), (3, 1, NEVER, 160.0, 190.0, np.inf)],
-        stamp_s=LATER_S,
-    )
-    elsewhere = only(gone, other)
-    np.testing.assert_allclose(elsewhere.displacement_m, (3.0, 0.0))
-    assert (elsewhere.stamp_from_s, elsewhere.stamp_to_s) == (60.0, 160.0)
-
-
-def test_what_an_operator_deleted_did_not_vanish() -> None:
-    assert diff(one(0.9), one(0.1, deleted=(5,))) == ()
-    assert diff(one(0.9, deleted=(5,)), one(0.1)) == ()
-    assert edits(one(0.9), one(0.9, deleted=(5,), pinned=(5,))) == ((5, "deleted"), (5, "pinned"))
-    assert edits(one(0.9, deleted=(5,)), one(0.9)) == ((5, "undeleted"),)
-
-
-def test_a_landmark_that_the_map_forgot_has_vanished() -> None:
-    other = a_map([(4, 9, 0.9)], [(4, 6, 0.0, 0.0)], cliques={6: 9}, stamp_s=LATER_S)
-    kinds = {c.kind: c for c in diff(one(0.9), other)}
-    assert set(kinds) == {ChangeKind.APPEARED, ChangeKind.VANISHED}
-    assert kinds[ChangeKind.VANISHED].landmark_ids == (5,)
-    assert (kinds[ChangeKind.VANISHED].stamp_from_s, kinds[ChangeKind.VANISHED].stamp_to_s) == (NOW_S, LATER_S)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_backwards_vanished_is_appeared_or_returned(seed: int) -> None:
-    """Of two arbitrary maps, the same things change forwards and backwards, each landmark at most once."""
-    a, b = random_map(seed, cliques=8), random_map(seed + 100, cliques=8)
-    there, back = diff(a, b), diff(b, a)
-
-    def names(changes, *kinds):
-        return sorted(n for c in changes if c.kind in kinds for n in c.landmark_ids)
-
-    every = [n for c in there for n in c.landmark_ids]
-    assert len(every) == len(set(every))
-    for one, other, living in ((there, back, a), (back, there, b)):  # but for what came to be known
-        came = names(other, ChangeKind.APPEARED, ChangeKind.RETURNED)
-        left = set(names(one, ChangeKind.VANISHED))
-        assert set(came) <= left
-        assert not any(told(living)[name] for name in left - set(came))
-    for change in (*there, *back):
+def assert_ends_fit(found: Difference, before: LivingMap, after: LivingMap) -> None:
+    stood, stands = (set(living.members.landmark_id[living.told_site() >= 0].tolist()) for living in (before, after))
+    for change in found.changes:
+        came = change.kind in (APPEARED, RETURNED)
+        assert all((name in stood) != came for name in change.landmark_ids), change
+        assert all((name in stands) == (change.kind is not VANISHED) for name in change.landmark_ids), change
         assert 0.0 <= change.probability <= 1.0
-        assert math.isnan(change.stamp_from_s) or change.stamp_from_s <= change.stamp_to_s
+        assert not change.stamp_from_s > change.stamp_to_s
+
+
+def test_backwards_and_over_a_revert_everything_is_undone(site: Path, tmp_path: Path) -> None:
+    path = tmp_path / "site.evermap"
+    path.write_bytes(site.read_bytes())
+    with open_store(path) as store:
+        there, back = diff(store, 2, 5), diff(store, 5, 2)
+        came = {n for c in there.changes if c.kind in (APPEARED, RETURNED) for n in c.landmark_ids}
+        left = {n for c in there.changes if c.kind is VANISHED for n in c.landmark_ids}
+        assert {n for c in back.changes if c.kind is VANISHED for n in c.landmark_ids} == came
+        assert {n for c in back.changes if c.kind is RETURNED for n in c.landmark_ids} == left
+        head = store.revert(2)
+        assert diff(store, 2, head).changes == ()
+        undone = diff(store, 5, head)
+        assert [(c.kind, c.landmark_ids) for c in undone.changes] == [(c.kind, c.landmark_ids) for c in back.changes]
+
+
+def test_an_edit_is_told_beside_the_changes(site: Path, tmp_path: Path) -> None:
+    path = tmp_path / "site.evermap"
+    path.write_bytes(site.read_bytes())
+    with open_store(path) as store:
+        head, living = store.head(), store.load()
+        name = int(living.members.landmark_id[0])
+        store.commit(living.edited(name, pinned=True), Provenance(kind=RevisionKind.EDIT), parent=head)
+        assert diff(store, head).edits == ((name, "pinned"),)
+        assert diff(store, head).changes == ()
+        assert diff(store, head - 1).changes == tuple(c for c in diff(store, head - 1, head).changes)
+
+
+def test_a_session_that_arrives_late_tells_how_the_newest_map_changed(site: Path, tmp_path: Path) -> None:
+    """Between the newest map and the one with the late session in it: each thing at most once, and as both maps say."""
+    with open_store(tmp_path / "late.evermap", create=True) as store:
+        fed = [fed_into(store, site.parent / f"day{day}") for day in (0, 1, 3, 2)]
+        found = diff(store, 3, 4)
+        assert fed[-1].replayed
+        assert list(found.changes) == list(fed[-1].changes) == list(store.changes(4))
+        assert_ends_fit(found, store.load(3), store.load(4))
+
+
+def fed_into(store: MapStore, recording: Path) -> em.Entered:
+    config = em.load_config(None, ["slam.calibration.fix.range_slope=0.0"])
+    entered = em.enter_session(store, em.read_recording(recording), config)
+    entered.commit(store, config)
+    return entered

@@ -117,31 +117,33 @@ def diff(
 ) -> None:
     """Tell what changed between two revisions.
 
-    What appeared, vanished, moved, swapped places and returned, and what operators did.
+    What appeared, vanished, moved, swapped places and returned, by how much the map grew, and what operators did.
 
     \b
     Example:
       evermap map diff site.evermap 3 7
     """
-    from evermap.cli.map_content import change_content, change_line
+    from evermap.cli.map_content import change_line
     from evermap.maps.diff import diff as between
-    from evermap.maps.diff import edits
     from evermap.maps.store import open_store
+    from evermap.runs.summary import change_dict
+    from evermap.viz.change_words import grew
 
     with open_store(file) as store:
-        later = store.head() if b is None else b
-        old, new = store.load(a), store.load(later)
-    changes, edited = [change.named(new.landmark_names) for change in between(old, new)], edits(old, new)
+        found = between(store, a, b)
+        new = store.load(found.b)
     if as_json:
-        listed = [{"landmark": name, "what": word} for name, word in edited]
-        print_json({"map": file, "a": a, "b": later, "changes": [*map(change_content, changes)], "edits": listed})
+        told = {"changes": [*map(change_dict, found.changes)], "grown": found.grown.tolist()}
+        edited = [{"landmark": name, "what": word} for name, word in found.edits]
+        print_json({"map": file, "a": found.a, "b": found.b, **told, "edits": edited})
         return
-    for change in changes:
-        echo(change_line(change, new.clock))
-    for name, word in edited:
-        echo(f"landmark {new.label(name)} {word} by an operator")
-    if not changes and not edited:
-        say(f"no difference between revisions {a} and {later}")
+    lines = [change_line(change, new.clock) for change in found.changes]
+    lines += grew(len(found.grown), [*map(new.label, found.grown.tolist())])
+    lines += [f"landmark {new.label(name)} {word} by an operator" for name, word in found.edits]
+    for line in lines:
+        echo(line)
+    if not lines:
+        say(f"no difference between revisions {found.a} and {found.b}")
 
 
 @app.command("export")

@@ -41,13 +41,15 @@ def revision_dict(item: Revision) -> dict[str, Any]:
         "landmarks": item.n_landmarks,
         "existing": item.n_existing,
         "changes": {kind.value: count for kind, count in item.n_changes.items()},
+        "grown": item.n_grown,
     }
 
 
 def revision_row(item: Revision, clock: Clock) -> list[str]:
     """The same in words."""
     origin = item.provenance
-    changes = ", ".join(f"{count} {kind.value}" for kind, count in item.n_changes.items())
+    changes = [f"{count} {kind.value}" for kind, count in item.n_changes.items()]
+    changes += [f"grew by {item.n_grown}"] if item.n_grown else []
     return [
         str(item.number),
         item.created_at.replace("T", " ").removesuffix("+00:00"),
@@ -55,24 +57,9 @@ def revision_row(item: Revision, clock: Clock) -> list[str]:
         origin.note or origin.recording or "-",
         stamp_text(origin.stamp_from_s, clock),
         f"{item.n_existing} of {item.n_landmarks}",
-        changes or "-",
+        ", ".join(changes) or "-",
         f"{origin.wall_s:.1f} s" if math.isfinite(origin.wall_s) else "-",
     ]
-
-
-def change_content(change: MapChange) -> dict[str, Any]:
-    """A change with what speaks for it."""
-    return {
-        "landmarks": [int(name) for name in change.landmark_ids],
-        "kind": change.kind.value,
-        "stamp_from_s": number(change.stamp_from_s),
-        "stamp_to_s": number(change.stamp_to_s),
-        "displacement_m": [number(part) for part in change.displacement_m],
-        "rotation_rad": number(change.rotation_rad),
-        "probability": number(change.probability),
-        "hits": change.n_hits,
-        "misses": change.n_misses,
-    }
 
 
 def change_line(change: MapChange, clock: Clock) -> str:
@@ -146,6 +133,8 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
 
 def answer_dict(answer: Answer) -> dict[str, Any]:
     """Everything behind a 'why', with every look."""
+    from evermap.runs.summary import change_dict
+
     seen, stays = answer.evidence, answer.stays
     return {
         "landmark": answer.landmark_id,
@@ -184,7 +173,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
             }
             for k in range(len(stays))
         ],
-        "changes": [{"revision": revision, **change_content(change)} for revision, change in answer.changes],
+        "changes": [{"revision": revision, **change_dict(change)} for revision, change in answer.changes],
         "edits": [{"revision": revision, "at": when, "what": word} for revision, when, word in answer.edits],
         "looks": {
             "stamp_s": seen.stamp_s.tolist(),

@@ -15,7 +15,7 @@ from evermap.interrupts import held, kept
 
 if TYPE_CHECKING:
     from evermap.config import Config
-    from evermap.types import Recording, SlamResult
+    from evermap.types import Recording
 
 
 def run_in_map(
@@ -31,10 +31,11 @@ def run_in_map(
     inputs: Sequence[str | Path | None],
 ) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
-    from evermap.config import to_toml
-    from evermap.maps.store import Provenance, RevisionKind, open_store
+    from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
+    from evermap.runs.folder import RunInfo, write_run
     from evermap.runs.sessions import at_time, enter_session
+    from evermap.viz.change_words import explanations, grew
 
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
@@ -54,68 +55,30 @@ def run_in_map(
             else:
                 entered = enter_session(store, recording, config, progress=progress)
                 session = entered.session
-                result, recording = session.slam, session.recording
-                if entered.replayed:
-                    result = replace(result, changes=entered.changes)
+                result, recording = replace(session.slam, changes=entered.changes), session.recording
         elapsed_s = time.perf_counter() - start
-        _write(
-            recording, result, config, out, elapsed_s, realtime=realtime, as_json=as_json, force=force, inputs=inputs
+        info = RunInfo(
+            command=command_line(),
+            seeds={"slam": config.slam.seed},
+            processing_s=None if realtime else elapsed_s,
+            total_s=elapsed_s,
+            grown=None if localize else len(entered.grown),
         )
-        if localize or result.interrupted:
+        summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
+        for remark in summary["warnings"]:
+            warn(remark)
+        show_run(summary, out, as_json=as_json, findings=[*explanations(result), *grew(info.grown)])
+        if result.interrupted:
+            raise KeyboardInterrupt(
+                f"the part of the recording that was processed is in {out}; the map stays as it was"
+            )
+        if localize:
             return
         if not session.found:
             raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
-        stamps = recording.frames.stamp_s
-        provenance = Provenance(
-            kind=RevisionKind.SESSION,
-            recording=recording.name,
-            source=recording.source,
-            command=command_line(),
-            config=to_toml(config),
-            seed=config.slam.seed,
-            stamp_from_s=float(stamps[0]),
-            stamp_to_s=float(stamps[-1]),
-            wall_s=elapsed_s,
-        )
         with held():
-            revision = store.commit(
-                entered.living,
-                provenance,
-                entered.changes,
-                session.evidence,
-                parent=entered.parent,
-                attachments=entered.attachments,
-            )
+            revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
             kept(map_file, f"the session is revision {revision} of {map_file}")
         if entered.replayed:
             again = ", ".join(entered.replayed)
             say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
-
-
-def _write(
-    recording: Recording,
-    result: SlamResult,
-    config: Config,
-    out: Path,
-    elapsed_s: float,
-    *,
-    realtime: bool,
-    as_json: bool,
-    force: bool,
-    inputs: Sequence[str | Path | None],
-) -> None:
-    from evermap.runs.folder import RunInfo, write_run
-    from evermap.viz.change_words import explanations
-
-    info = RunInfo(
-        command=command_line(),
-        seeds={"slam": config.slam.seed},
-        processing_s=None if realtime else elapsed_s,
-        total_s=elapsed_s,
-    )
-    summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
-    for remark in summary["warnings"]:
-        warn(remark)
-    show_run(summary, out, as_json=as_json, findings=explanations(result))
-    if result.interrupted:
-        raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}; the map stays as it was")

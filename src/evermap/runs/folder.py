@@ -25,7 +25,7 @@ from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.interrupts import held, kept, temporary
 from evermap.io.atomic import write_atomic
-from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, summary_dict, timing_dict
+from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, changes_text, summary_dict, timing_dict
 from evermap.types import Innovations, Recording, SlamResult
 
 if TYPE_CHECKING:
@@ -444,8 +444,7 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     for rank, alternative in enumerate(result.alternatives, start=1):
         write_map_geojson(alternative.landmarks, folder.path(f"alternative_{rank}.geojson"))
     _write_innovations(result.innovations, folder.path("innovations.parquet"))
-    lines = "".join(json.dumps(change_dict(change), allow_nan=False) + "\n" for change in result.changes)
-    folder.path("changes.jsonl").write_text(lines, encoding="utf-8")
+    folder.path("changes.jsonl").write_text(changes_text(map(change_dict, result.changes)), encoding="utf-8")
 
 
 def _write_innovations(innovations: Innovations, path: Path) -> None:

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import DataError, InputError
-from evermap.maps.store import Attachment, MapStore, Revision, RevisionKind
+from evermap.maps.store import Attachment, MapStore, Provenance, Revision, RevisionKind
 
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
-    from evermap.types import MapChange, Recording
+    from evermap.types import IntArray, MapChange, Recording
 
 Progress = Callable[[float, float], None]
 
@@ -31,19 +31,66 @@ class Entered:
 
     Attributes:
         session: the session itself, in the map as it was at its time.
-        living: the map after it, and after all later sessions.
-        changes: between the newest revision and that map.
+        newest: the newest revision of the map.
+        living: the map after the session, and after all later sessions.
+        changes: from `newest` to `living`, as `maps.diff` tells them.
         replayed: names of the later sessions that were brought in again.
         parent: revision that it was made from.
         attachments: to commit with it.
     """
 
     session: Session
+    newest: LivingMap
     living: LivingMap
     changes: tuple[MapChange, ...]
     replayed: tuple[str, ...]
     parent: int
     attachments: dict[str, bytes]
+
+    @property
+    def grown(self) -> IntArray:
+        """Landmarks that the map did not know before, and that nobody saw appear."""
+        from evermap.maps.diff import grown
+
+        return grown(self.newest.members.landmark_id, self.living, self.changes)
+
+    def commit(
+        self, store: MapStore, config: Config | None = None, *, command: str = "", wall_s: float = np.nan
+    ) -> int:
+        """Commit the map as the next revision; returns its number.
+
+        Args:
+            store: that the session was entered into.
+            config: settings of the session, as `enter_session` was given them.
+            command: the command line.
+            wall_s: what estimating took.
+
+        Raises:
+            StaleRevisionError: somebody else committed in between.
+        """
+        from evermap.config import Config, to_toml
+
+        config, recording = config or Config(), self.session.recording
+        stamps = recording.frames.stamp_s
+        provenance = Provenance(
+            kind=RevisionKind.SESSION,
+            recording=recording.name,
+            source=recording.source,
+            command=command,
+            config=to_toml(config),
+            seed=config.slam.seed,
+            stamp_from_s=float(stamps[0]),
+            stamp_to_s=float(stamps[-1]),
+            wall_s=wall_s,
+        )
+        return store.commit(
+            self.living,
+            provenance,
+            self.changes,
+            self.session.evidence,
+            parent=self.parent,
+            attachments=self.attachments,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +117,7 @@ def enter_session(
         InputError: it is in the map already, or it is late and a later session kept no recording.
         DataError, NumericalError: as `pipeline.run_session`.
     """
-    from evermap.maps.diff import diff
+    from evermap.maps.diff import net
     from evermap.maps.store.recorded import RECORDING, pack_recording
     from evermap.pipeline import run_session
     from evermap.valid import check_type
@@ -85,7 +132,7 @@ def enter_session(
     start_s = float(stamps[0]) if len(stamps) else np.inf
     if not start_s < newest.session_start_s:
         session = run_session(recording, newest, config, progress=progress)
-        return Entered(session, session.living, session.changes, (), head, {RECORDING: data})
+        return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
     steps = _history(store, kept)
     first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
     base = store.load(steps[first].revision.parent)
@@ -94,17 +141,22 @@ def enter_session(
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
     if not len(living.places):
         living = replace(living, clock=recording.clock)
+    told = [(store.changes(step.revision.number)[::-1], True) for step in reversed(steps[first:])]
     for step in (step for step in later if step.start_s <= start_s):
-        living = _again(store, step, living)
+        living, changes = _again(store, step, living)
+        told.append((changes, False))
     session = run_session(recording, living, config, progress=progress)
     if not session.found:
-        return Entered(session, newest, (), (), head, {})
+        return Entered(session, newest, newest, (), (), head, {})
     living = session.living
+    told.append((session.changes, False))
     replayed = [step for step in later if step.start_s > start_s]
     for step in replayed:
-        living = _again(store, step, living)
+        living, changes = _again(store, step, living)
+        told.append((changes, False))
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
-    return Entered(session, living, diff(newest, living), names, head, {RECORDING: data})
+    found = tuple(change.named(living.landmark_names) for change in net(told, newest, living))
+    return Entered(session, newest, living, found, names, head, {RECORDING: data})
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:
@@ -158,8 +210,8 @@ def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
     return steps
 
 
-def _again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
-    """The map after a session or an edit that it has had before."""
+def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, tuple[MapChange, ...]]:
+    """The map after a session or an edit that it has had before, and what changed."""
     from evermap.maps.diff import edits
 
     if step.recording is None:
@@ -171,13 +223,14 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> LivingMap:
         for landmark, word in edits(store.load(step.revision.parent), store.load(number)):
             if landmark in living.members.landmark_id:
                 living = living.edited(landmark, **words[word])
-        return living
+        return living, ()
     from evermap.config import parse_config
     from evermap.maps.store.recorded import unpack_recording
     from evermap.pipeline import run_session
 
     recording = unpack_recording(store.attached(step.recording))
     try:
-        return run_session(recording, living, parse_config(step.revision.provenance.config)).living
+        session = run_session(recording, living, parse_config(step.revision.provenance.config))
     except DataError as error:
         raise DataError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
+    return session.living, session.changes

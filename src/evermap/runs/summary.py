@@ -5,9 +5,10 @@ Everything outside of `timing` and `versions` is a function of the inputs and th
 
 from __future__ import annotations
 
+import json
 import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
@@ -19,7 +20,7 @@ import numpy as np
 from evermap import __version__
 from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult
 
-SUMMARY_SCHEMA_VERSION = "1"
+SUMMARY_SCHEMA_VERSION = "2"
 
 _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin where it stood, x ahead of it, y to its left; metres",
@@ -39,6 +40,7 @@ class RunInfo:
             outputs; None takes the sum of the steps.
         total_s: wall time of everything so far; None if not measured.
         peak_memory_mb: of the process; None asks the operating system.
+        grown: number of landmarks that a living map grew by; None without a map.
     """
 
     command: str = ""
@@ -46,6 +48,7 @@ class RunInfo:
     processing_s: float | None = None
     total_s: float | None = None
     peak_memory_mb: float | None = None
+    grown: int | None = None
 
 
 def summary_dict(
@@ -89,7 +92,7 @@ def summary_dict(
         },
         "metrics": dict(metrics),
         "timing": dict(timing),
-        "counts": _counts(recording, result),
+        "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
         "changes": [change_dict(change) for change in result.changes],
         "alternatives": [_alternative(alternative) for alternative in result.alternatives],
         "parameters": [_parameter(parameter) for parameter in result.parameters],
@@ -99,8 +102,14 @@ def summary_dict(
     }
 
 
-def change_dict(change: MapChange) -> dict[str, Any]:
-    """A change as in `summary.json` and in a line of `changes.jsonl`: stable keys, null where a stamp is not known."""
+def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: float | None = None) -> dict[str, Any]:
+    """Return a change as every verb writes and prints it: the same keys in the same order, null where nothing is known.
+
+    Args:
+        change: what changed.
+        stamp_s: when it most probably happened, where that is estimated.
+        decided_s: the look at which it became clear, where that is told.
+    """
     return {
         "landmarks": [int(identity) for identity in change.landmark_ids],
         "kind": change.kind.value,
@@ -112,7 +121,14 @@ def change_dict(change: MapChange) -> dict[str, Any]:
         "hits": change.n_hits,
         "misses": change.n_misses,
         "names": list(change.names) or None,
+        "stamp_s": _number(stamp_s),
+        "decided_s": _number(decided_s),
     }
+
+
+def changes_text(changes: Iterable[Mapping[str, Any]]) -> str:
+    """Return the content of `changes.jsonl`: a change of `change_dict` a line."""
+    return "".join(json.dumps(change, allow_nan=False, ensure_ascii=False) + "\n" for change in changes)
 
 
 def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict[str, Any]:

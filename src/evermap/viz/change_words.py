@@ -65,10 +65,19 @@ def probability(value: float) -> str:
     return "probability " + ("> 99 %" if value > 0.99 else "< 1 %" if value < 0.01 else percent)
 
 
+def grew(count: int | None, labels: Sequence[str] = ()) -> list[str]:
+    """'the map grew by 2 landmarks: 17, 18': what was found, but not seen to appear; [] where that is nothing."""
+    if not count:
+        return []
+    return [f"the map grew by {count} landmark{'s' if count != 1 else ''}" + (f": {_listed(labels)}" if labels else "")]
+
+
 def _group(change: MapChange) -> str:
-    ids = list(change.labels)
-    shown = ", ".join(ids[:_MAX_IDS]) + (f" and {len(ids) - _MAX_IDS} more" if len(ids) > _MAX_IDS else "")
-    return f"landmark{'s' if len(ids) != 1 else ''} {shown}"
+    return f"landmark{'s' if len(change.labels) != 1 else ''} {_listed(change.labels)}"
+
+
+def _listed(labels: Sequence[str]) -> str:
+    return ", ".join(labels[:_MAX_IDS]) + (f" and {len(labels) - _MAX_IDS} more" if len(labels) > _MAX_IDS else "")
 
 
 def _when(change: MapChange, start_s: float) -> str:

@@ -7,18 +7,14 @@ from typing import Self
 
 import numpy as np
 
-from evermap.geometry.rigid import rigid
+from evermap.maps.diff import SAME_SPOT_M, motion_of, with_swaps
 from evermap.maps.learning import LongestLives
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.sessions.arrive import Arrivals
 from evermap.maps.sessions.believe import Looks, class_of, clique_rows, site_middles
 from evermap.maps.sessions.geometry import of_places
-from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
+from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
-SAME_PLACE_M = 0.3
-"""Cliques that stand this close to where another stood have taken its place."""
-SAME_SPOT_M = 0.1
-"""Cliques that stand this close to where they stood have not moved."""
 LEAST_EVIDENCE = 1.5
 """What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
 SURELY_AWAY = 0.02
@@ -91,7 +87,7 @@ def decided(
         sites=replace(after.sites, p_kept=session.p_kept),
         sightlines=after.sightlines.after_session(hidden, shown),
     )
-    return after, _swaps(session.found, before, after)
+    return after, with_swaps(session.found, before, after)
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,48 +413,6 @@ def _gone_for_good(living: LivingMap) -> IntArray:
     return np.asarray(cliques[np.concatenate([hopeless, too_many])])
 
 
-def _swaps(found: list[MapChange], before: LivingMap, after: LivingMap) -> tuple[MapChange, ...]:
-    """Two that moved to each other's place have been exchanged, or carry each other's identity."""
-    then, now = before.landmarks(), after.landmarks()
-
-    def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
-        rows = np.isin(records.landmark_id, names)
-        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(2, np.nan)
-
-    moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
-    was = {k: at(then, found[k].landmark_ids) for k in moved}
-    is_at = {k: at(now, found[k].landmark_ids) for k in moved}
-    swapped: dict[int, int] = {}
-    for a in moved:
-        for b in moved:
-            if a < b and a not in swapped and b not in swapped:
-                across = max(np.linalg.norm(is_at[a] - was[b]), np.linalg.norm(is_at[b] - was[a]))
-                if across < SAME_PLACE_M:
-                    swapped[a] = b
-    partners = set(swapped.values())
-    told = []
-    for k, change in enumerate(found):
-        if k in partners:
-            continue
-        if k in swapped:
-            told.append(_exchanged(change, found[swapped[k]]))
-        else:
-            told.append(change)
-    return tuple(told)
-
-
-def _exchanged(change: MapChange, other: MapChange) -> MapChange:
-    """Two moves told as one exchange; the displacement is that of the first."""
-    return replace(
-        change,
-        kind=ChangeKind.SWAPPED,
-        landmark_ids=tuple(sorted((*change.landmark_ids, *other.landmark_ids))),
-        probability=min(change.probability, other.probability),
-        n_hits=change.n_hits + other.n_hits,
-        n_misses=change.n_misses + other.n_misses,
-    )
-
-
 def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     """Shift and rotation of a body from one site to another, by the landmarks that have places at both.
 
@@ -470,10 +424,7 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     if len(i):
         a, b = a[i], b[j]
     was, now = living.places.position_m[a], living.places.position_m[b]
-    shift = now.mean(axis=0) - was.mean(axis=0)
-    if len(i) < 2:
-        return shift, 0.0
-    return shift, float(rigid(was, now)[2])
+    return motion_of(was, now) if len(i) else (now.mean(axis=0) - was.mean(axis=0), 0.0)
 
 
 def _first_miss(looks: Looks, site: int, last_s: float, start_s: float) -> float:

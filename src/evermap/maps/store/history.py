@@ -36,6 +36,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "note": str,
     "n_landmarks": int,
     "n_existing": int,
+    "n_grown": (int, type(None)),
     "n_cliques_ever": int,
     "n_sites_ever": int,
     "changes": list,
@@ -118,6 +119,7 @@ class Record:
             n_landmarks=row["n_landmarks"],
             n_existing=row["n_existing"],
             n_changes=counts,
+            n_grown=row["n_grown"],
         )
 
     def chunk(self) -> Chunk:
@@ -149,6 +151,7 @@ class Record:
             raise DamagedError("a part is not the record of a revision")
         if row.get("format") != FORMAT:
             raise DamagedError(f"a record of format {row.get('format')!r}, this evermap reads {FORMAT}")
+        row.setdefault("n_grown", None)  # an older evermap did not count them
         for name, kind in _TYPES.items():
             if name not in row or not isinstance(row[name], kind) or isinstance(row[name], bool):
                 raise DamagedError(f"'{name}' of a revision is missing or of another type")

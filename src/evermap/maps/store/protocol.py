@@ -96,6 +96,7 @@ class Revision:
         provenance: where it comes from.
         n_landmarks, n_existing: landmarks that it knows, and those of them that more probably exist than not.
         n_changes: number of changes by kind, kinds without any left out.
+        n_grown: landmarks that its session found, but nobody saw appear; None in files of an older evermap.
     """
 
     number: int
@@ -107,6 +108,7 @@ class Revision:
     n_landmarks: int
     n_existing: int
     n_changes: Mapping[ChangeKind, int] = field(default_factory=dict)
+    n_grown: int | None = None
 
 
 class MapStore(Protocol):

@@ -14,6 +14,7 @@ from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from evermap import __version__
 from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.maps.diff import grown
 from evermap.maps.living import Evidence, LivingMap
 from evermap.maps.store import content, schema
 from evermap.maps.store.content import Chunk, DamagedError
@@ -292,7 +293,7 @@ class SqlStore:
                 hint = "the same again, which continues from the newest"
                 raise StaleRevisionError(problem, path=self._where, hint=hint)
             record = Record(
-                told,
+                {**told, "n_grown": 0 if restores is not None else self._n_grown(connection, parent, living, changes)},
                 before,
                 name,
                 config.name,
@@ -309,6 +310,21 @@ class SqlStore:
             self._move_anchor(connection, number, record.name)
         self._checked |= chunks.keys()
         return number
+
+    def _n_grown(
+        self, connection: Connection, parent: int, living: LivingMap, changes: Sequence[MapChange]
+    ) -> int | None:
+        """How many landmarks a map has grown by; None where it is not known what its parent knew."""
+        known = np.zeros(0, dtype=np.int64)
+        try:
+            if parent:
+                content_of, column = self._record(connection, parent).content, "members.landmark_id"
+                known = content.unpack_columns(content_of, [column], lambda keys: self._fetched(connection, keys))[
+                    column
+                ]
+        except (DamagedError, InputError):
+            return None
+        return len(grown(known, living, changes))
 
     def _attach(
         self, attachments: Mapping[str, bytes | Attachment], chunks: dict[bytes, Chunk]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
@@ -18,11 +17,11 @@ from evermap.runs.folder import SUMMARY, RunFolder, summary_text
 from evermap.runs.persist.draw import draw_run
 from evermap.runs.persist.report import render_report
 from evermap.runs.persist.run import PersistResult
-from evermap.runs.summary import peak_memory_mb, versions
-from evermap.types import Clock
+from evermap.runs.summary import change_dict, changes_text, peak_memory_mb, versions
+from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png
 
-SCHEMA_VERSION = "1"
+SCHEMA_VERSION = "2"
 FIGURES = 12
 
 
@@ -157,20 +156,24 @@ def _forecasts(result: PersistResult) -> bytes:
 
 
 def _changes(result: PersistResult) -> str:
-    """One JSON object a line; ids that are numbers in the table are numbers here."""
-    names: tuple[Any, ...] = result.table.names
-    if all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names):
-        names = tuple(int(name) for name in names)
-    return "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in _rows(result, names))
-
-
-def _rows(result: PersistResult, names: tuple[Any, ...]) -> Iterator[dict[str, Any]]:
-    changes = result.changes
-    columns = ("stamp_s", "earliest_s", "latest_s", "decided_s", "confidence")
-    values = zip(*(getattr(changes, name).tolist() for name in columns), strict=True)
-    for feature, returned, row in zip(changes.feature.tolist(), changes.returned.tolist(), values, strict=True):
-        what = {"feature_id": names[feature], "change": "returned" if returned else "vanished"}
-        yield what | dict(zip(columns, row, strict=True))
+    """What vanished and returned, as every verb writes changes."""
+    changes, names = result.changes, result.table.names
+    numbers = all(name.lstrip("-").isdigit() and str(int(name)) == name for name in names)
+    rows = []
+    for k, feature in enumerate(changes.feature.tolist()):
+        name = names[feature]
+        change = MapChange(
+            landmark_ids=(int(name) if numbers else landmark_id_of(name),),
+            kind=ChangeKind.RETURNED if changes.returned[k] else ChangeKind.VANISHED,
+            stamp_from_s=float(changes.earliest_s[k]),
+            stamp_to_s=float(changes.latest_s[k]),
+            displacement_m=(math.nan, math.nan),
+            rotation_rad=0.0,
+            probability=float(changes.confidence[k]),
+            names=() if numbers else (name,),
+        )
+        rows.append(change_dict(change, stamp_s=float(changes.stamp_s[k]), decided_s=float(changes.decided_s[k])))
+    return changes_text(rows)
 
 
 def _learning(result: PersistResult) -> dict[str, Any] | None:
