@@ -16,7 +16,7 @@ from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
 from evermap.slam.problem import Estimate
 from evermap.slam.solver import IncrementalSolver, Motion
-from evermap.slam.triangulate import sighted_at
+from evermap.slam.streaming import sighted_at
 from evermap_studies.peers.isam import IncrementalSmoother
 
 SOLVERS: dict[str, Callable[..., IncrementalSolver]] = {"arrow": BorderFilter, "gtsam": IncrementalSmoother}

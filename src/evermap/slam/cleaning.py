@@ -1,8 +1,7 @@
-"""What a live robot logs, made a valid `Recording`: what can be saved is saved, the rest is left out and counted.
+"""Repair what a live robot logs: a valid `Recording`, with every repair counted in its warnings.
 
-Readers of files refuse what looks like a mistake of whoever wrote the file. A robot on duty cannot ask anybody: it gets
-messages late, twice or never, its clocks are set, its drivers send numbers that are none. A recording that is valid
-comes back as it is.
+Readers of files refuse what looks like a mistake of the file's author. A robot on duty gets messages late, twice or
+never, its clocks are set, its drivers send invalid values. A valid recording is returned unchanged.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.errors import DataError
-from evermap.slam.clocks import STRAY_S, restored, running_median, set_forward
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
+from evermap.valid import LATEST_S
 
 FASTEST = 100.0
 """No robot drives [m/s] or turns [rad/s] faster."""
@@ -229,3 +228,76 @@ def _mended(what: str, stamp_s: FloatArray, remarks: list[str]) -> FloatArray:
 def _remark(remarks: list[str], what: str, count: int) -> None:
     if count:
         remarks.append(f"{what}: {count}")
+
+
+STRAY_S = 10.0
+"""A stamp farther than this from those that arrive around it is none."""
+STEP_S = 1.0
+"""Smallest step of a clock that is noticed; less is taken for messages that come late."""
+AROUND = 9
+"""Messages that a stamp is compared with: fewer than half of them may be late or wrong."""
+
+
+def restored(stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The stamps as a clock that is never set back would have shown them.
+
+    Args:
+        stamp_s: (N,) in the order of arrival, anything.
+
+    Returns:
+        (N,) stamps, nan where one is none; late ones still stand where they arrived. And (K,) by how much the clock was
+        set back, each time.
+    """
+    stamps = np.where(np.abs(stamp_s) <= LATEST_S, stamp_s, np.nan)  # nan fails the comparison
+    if np.all(np.diff(stamps) > 0.0):
+        return stamps, np.zeros(0)
+    found = np.flatnonzero(np.isfinite(stamps))
+    told = stamps[found]
+    kept = np.abs(told - running_median(told)) <= STRAY_S
+    stamps[found[~kept]] = np.nan
+    found, told = found[kept], told[kept]
+    forward = np.diff(told)
+    forward = forward[forward > 0.0]
+    # against a clock that ticks once a message, a loss is a step up, and only a clock that is set back a step down
+    ahead = running_median(told - np.arange(len(told)) * (np.median(forward) if len(forward) else 0.0))
+    fall = np.diff(ahead, prepend=ahead[:1])
+    set_back = fall < -STEP_S
+    stamps[found] = told - np.cumsum(np.where(set_back, fall, 0.0))
+    return stamps, -fall[set_back]
+
+
+def running_median(values: FloatArray) -> FloatArray:
+    """(N,) median of the `AROUND` values centred on each; the first and last are repeated beyond the ends."""
+    if len(values) == 0:
+        return values
+    padded = np.pad(values, AROUND // 2, mode="edge")
+    middle: FloatArray = np.median(np.lib.stride_tricks.sliding_window_view(padded, AROUND), axis=1)
+    return middle
+
+
+def set_forward(stamp_s: FloatArray, other_s: FloatArray) -> tuple[int, float] | None:
+    """Whether a clock was set forward, judged by another stream of the same robot.
+
+    It was, if this stream seems to end later than the other, and has a pause of just that length in which the other
+    goes on.
+
+    Args:
+        stamp_s: (N,) increasing.
+        other_s: (M,) increasing.
+
+    Returns:
+        First row after the step and the step's size [s]; None if it was not.
+    """
+    if len(stamp_s) < AROUND or len(other_s) < AROUND:
+        return None
+    later_s = stamp_s[-1] - other_s[-1]
+    if later_s < 2.0 * STEP_S:
+        return None
+    pause = np.diff(stamp_s)
+    step_s = pause - np.median(pause)
+    row = int(np.argmin(np.abs(step_s - later_s)))
+    if abs(step_s[row] - later_s) > STEP_S:
+        return None
+    between = other_s[(other_s > stamp_s[row]) & (other_s < stamp_s[row + 1])]
+    longest_s = np.max(np.diff(between, prepend=stamp_s[row], append=min(stamp_s[row + 1], other_s[-1])))
+    return None if longest_s > 0.5 * step_s[row] else (row + 1, float(step_s[row]))

@@ -12,8 +12,8 @@ from evermap import plugins
 from evermap.config import SlamConfig
 from evermap.interrupts import watched
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint
-from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.intake import Prepared
 from evermap.slam.method import Method, Static
 from evermap.slam.problem import Noise

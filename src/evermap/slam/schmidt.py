@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.slam.frame_kernels import linearise_frame, spread_of_frame, turn_pose
+from evermap.slam.frame_factor import linearise_frame, spread_of_frame, turn_pose
 from evermap.slam.kernels import AT_PLACES, detection_residual, inlier_weight, kernel, wrapped
 from evermap.types import FloatArray, IntArray
 

@@ -10,7 +10,7 @@ from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Evidence, compare
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem

@@ -12,10 +12,9 @@ from recordings import building
 from evermap.metrics.landmarks import identity_scores
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.associator import Associator
+from evermap.slam.association.associator import Associator, fit_sighting_noise
 from evermap.slam.association.filter import Belief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.identify import identified
-from evermap.slam.association.sighting_noise import fit_sighting_noise
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate

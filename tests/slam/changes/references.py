@@ -9,7 +9,7 @@ import numpy as np
 from scipy.stats import multivariate_normal
 
 from evermap.slam.changes.evidence import Comparison, Evidence
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 
 
 def log_normal(e: np.ndarray, covariance: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from test_gain import gain_of
 
 from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE
 from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.problem import Estimate, Problem, independent
 
 KNOWN_SIZE = default_prior(range_slope=0.0)

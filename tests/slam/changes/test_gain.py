@@ -20,8 +20,7 @@ from scipy.integrate import quad
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, Evidence, compare
 from evermap.slam.changes.explain import GivenMap, Group, explained
-from evermap.slam.changes.gain import hypothesis_gain
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior, hypothesis_gain
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
 

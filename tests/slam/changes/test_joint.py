@@ -13,7 +13,7 @@ from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
 from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap, Group, explained
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.method import Revision
 from evermap.types import ChangeKind, MapChange
 

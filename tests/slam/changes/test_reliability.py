@@ -12,7 +12,7 @@ from worlds import Move, make_session
 from evermap.slam.arrow import Smoother
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.weigh import MAP_FACTOR_SPREAD, MAP_FACTORS, Verdict, weigh
 
 PRIOR = ChangePrior(p_moved=0.3, move_sigma_m=0.08)

@@ -10,10 +10,9 @@ from references import static_evidence
 
 from evermap.slam.changes.evidence import Evidence, compare
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.prior import ChangePrior
-from evermap.slam.changes.robust import without_transients
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
-from evermap.slam.changes.weigh import weigh
+from evermap.slam.changes.weigh import weigh, without_transients
 
 PRIOR = ChangePrior()
 COUNT, WINDOWS = 6, 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from references import all_labellings, comparison_of, gains_of_all, slam_like_covariance, static_evidence
 
-from evermap.slam.changes.prior import ChangePrior
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import MOST_GROUPS, find_changes
 
 PRIOR = ChangePrior(p_rotated=0.0)

@@ -11,7 +11,7 @@ from worlds import Move, Session, make_session
 
 from evermap.slam.changes.evidence import Evidence, compare
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.changes.swaps import P_SWAPPED, likeliest_swap, with_swap
+from evermap.slam.changes.joint import P_SWAPPED, likeliest_swap, with_swap
 from evermap.types import ChangeKind
 
 

@@ -10,7 +10,7 @@ from problems import QUIET, World, make_world, slow_detection
 from scipy.stats import binom
 
 from evermap.geometry import se2
-from evermap.slam.changes.timing import parting_time
+from evermap.slam.changes.explain import parting_time
 from evermap.slam.problem import Problem
 
 MEMBERS = np.array([1, 3])

@@ -10,8 +10,8 @@ from problems import World, default_prior, make_world, slow_detection
 from evermap.geometry import se2
 from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap
+from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint
-from evermap.slam.changes.prior import ChangePrior
 from evermap.slam.method import Revision
 from evermap.slam.problem import Estimate, Problem, independent
 

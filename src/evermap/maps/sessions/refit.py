@@ -11,8 +11,7 @@ from evermap.geometry.rigid import rigid
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
-from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome
-from evermap.slam.triangulate import sighted_at
+from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, sighted_at
 from evermap.types import FloatArray, IntArray
 
 HEAVY_STEPS = 6

@@ -17,7 +17,7 @@ from evermap.slam.border import drive_on
 from evermap.slam.kernels import AT_PLACES, detection_residual
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import Motion
-from evermap.slam.triangulate import sighted_at
+from evermap.slam.streaming import sighted_at
 from evermap.types import FloatArray, IntArray
 
 

@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from evermap.slam.arrow import Normal, Smoother, eliminate_chain
 from evermap.slam.calibration import FORWARD, N_STATES, SKEW, SLIP, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
-from evermap.slam.triangulate import sighted_at
+from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FEWEST_SIGHTINGS = 3

@@ -17,16 +17,15 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence
-from evermap.slam.changes.explain import GivenMap, Group, explained
-from evermap.slam.changes.prior import ChangePrior
-from evermap.slam.changes.swaps import likeliest_swap, with_swap
-from evermap.slam.changes.timing import parting_time, unswayed
+from evermap.slam.changes.evidence import Comparison, Evidence, compare, in_sensor_metres, landmark_evidence
+from evermap.slam.changes.explain import GivenMap, Group, explained, parting_time, unswayed
+from evermap.slam.changes.gain import ChangePrior
+from evermap.slam.changes.search import item_columns
 from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Method, Revision, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
-from evermap.slam.triangulate import outvoted
+from evermap.slam.streaming import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
 RIVAL_NATS = 5.0
@@ -358,3 +357,52 @@ def _with_copies(estimate: Estimate, evidence: Evidence, groups: tuple[Group, ..
         if group.window > 0:
             landmark[group.members] = first[group.members]
     return Estimate(estimate.pose, landmark, estimate.states)
+
+
+P_SWAPPED = 1e-5
+"""Prior probability that any two landmarks of a map were mixed up."""
+
+
+class Swap(NamedTuple):
+    """Two landmarks, and the log prior of their being mixed up."""
+
+    first: int
+    second: int
+    log_prior: float
+
+
+def likeliest_swap(evidence: Evidence, comparison: Comparison, given: GivenMap) -> Swap | None:
+    """The two landmarks that gain most by taking each other's place; None if that gains less than it costs.
+
+    Args:
+        evidence: of the copies.
+        comparison: the same, seen from the map.
+        given: the map.
+    """
+    candidates = np.intersect1d(np.unique(evidence.landmark), np.flatnonzero(given.given))
+    count = len(candidates)
+    if count < 2:
+        return None
+    quadratic, linear = item_columns(evidence, comparison, given.mean, 1, candidates)
+    precision = quadratic.reshape(count, 4, count, 4)[:, :2, :, :2]
+    pull = linear.reshape(count, 4)[:, :2]
+    place = given.mean[candidates]
+    first, second = np.triu_indices(count, 1)
+    step = place[second] - place[first]
+    rows = np.arange(count)
+    own = precision[rows, :, rows, :]
+    stiff = own[first] + own[second] - precision[first, :, second, :] - precision[second, :, first, :]
+    gain: FloatArray = (step * (pull[first] - pull[second])).sum(axis=1)
+    gain -= 0.5 * np.einsum("ka,kab,kb->k", step, stiff, step)
+    best = int(np.argmax(gain))
+    log_prior = float(np.log(P_SWAPPED) - np.log(len(gain)))
+    if gain[best] + log_prior <= 0.0:
+        return None
+    return Swap(int(candidates[first[best]]), int(candidates[second[best]]), log_prior)
+
+
+def with_swap(given: GivenMap, first: int, second: int) -> GivenMap:
+    """The map with two landmarks at each other's place."""
+    order = np.arange(len(given.mean))
+    order[[first, second]] = second, first
+    return replace(given, mean=given.mean[order], covariance=given.covariance[order])

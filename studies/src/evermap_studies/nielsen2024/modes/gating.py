@@ -14,7 +14,7 @@ import numpy as np
 from evermap.slam.kernels import detection_residual, kernel
 from evermap.slam.noise import joint_covariance
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.triangulate import sighted_at
+from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 from evermap_studies.nielsen2024.modes.places import FREE, Modes, at_places, grown, moved_to
 
