@@ -18,7 +18,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import Localizer, Sightings
+from evermap.slam.localize import FrameSightings, Localizer
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray, Sensor
@@ -67,7 +67,7 @@ class Drives:
     pose: FloatArray
     drive: Drive
     stamp_s: FloatArray
-    sightings: list[Sightings]
+    sightings: list[FrameSightings]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def draw(n_landmarks: int, n_frames: int = N_FRAMES, seed: int = 0) -> Drives:
         reading = np.column_stack([np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])])
         rows = np.flatnonzero((reading[:, 0] < RANGE_M) & (rng.random(n_landmarks) < P_DETECT))
         reading = reading[rows] + NOISE.detection * rng.normal(size=(len(rows), 2))
-        sightings.append(Sightings(rows, reading, np.full((len(rows), 2), np.nan)))
+        sightings.append(FrameSightings(rows, reading, np.full((len(rows), 2), np.nan)))
     places = KnownPlaces.of(
         np.arange(n_landmarks),
         landmark + where.normal(0.0, SIGMA_MAP_M, landmark.shape),

@@ -10,7 +10,7 @@ from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import FLOOR_FORWARD_M, FLOOR_TURN_RAD
 from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import Localizer, Located, Sightings
+from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.problem import Drive, Noise
 from evermap.types import Sensor
 
@@ -36,7 +36,7 @@ class World:
     states: np.ndarray
     drive: Drive
     stamp_s: np.ndarray
-    sightings: list[Sightings]
+    sightings: list[FrameSightings]
 
 
 def place_randomly(rng: np.random.Generator, count: int, side_m: float) -> np.ndarray:
@@ -91,7 +91,7 @@ def _at(truth: np.ndarray, stamps: np.ndarray, when: float) -> np.ndarray:
     return se2.compose(truth[k], se2.exp(part * se2.log(se2.between(truth[k], truth[k + 1]))))
 
 
-def _seen(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, states: np.ndarray) -> Sightings:
+def _seen(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, states: np.ndarray) -> FrameSightings:
     away = se2.transform(se2.inverse(pose), landmark)
     r, b = np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])
     seen = np.flatnonzero((r > 0.3) & (r < SENSOR.range_max_m) & (np.abs(b) < 2.0) & (rng.random(len(r)) < 0.9))
@@ -99,7 +99,7 @@ def _seen(rng: np.random.Generator, pose: np.ndarray, landmark: np.ndarray, stat
     reading = np.column_stack(
         [states[0] + r * (1.0 + states[1] + states[2] * b + states[3] * b**2), b + states[4]]
     ) + NOISE.detection * rng.normal(size=(len(seen), 2))
-    return Sightings(seen.astype(np.int64), reading, np.full((len(seen), 2), np.nan))
+    return FrameSightings(seen.astype(np.int64), reading, np.full((len(seen), 2), np.nan))
 
 
 def surveyed(rng: np.random.Generator, landmark: np.ndarray, sigma_m: float) -> KnownPlaces:

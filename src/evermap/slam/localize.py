@@ -45,7 +45,7 @@ BETTER_BY = 1.5
 """Times by which another pose must fit better than the present one: one that is chosen to fit always fits somewhat."""
 
 
-class Sightings(NamedTuple):
+class FrameSightings(NamedTuple):
     """Detections of one frame: (M,) landmark_id, (M, 2) range [m] and bearing [rad], (M, 2) sigmas, nan where none."""
 
     landmark_id: IntArray
@@ -139,7 +139,7 @@ class Localizer:
         considered: IntArray = self._considered[self._considered != UNKNOWN]
         return considered
 
-    def step(self, stamp_s: float, drive: Drive, seen: Sightings) -> Located:
+    def step(self, stamp_s: float, drive: Drive, seen: FrameSightings) -> Located:
         """Process a frame: predict, place if need be, compare, update, expect.
 
         Args:
@@ -215,7 +215,7 @@ class Localizer:
         self._agreed.clear()
 
     def _update(
-        self, stamp_s: float, first: IntArray, last: IntArray, seen: Sightings, used: IntArray
+        self, stamp_s: float, first: IntArray, last: IntArray, seen: FrameSightings, used: IntArray
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Place, innovation and weight of the detections `used`."""
         places, reading = self.places, np.ascontiguousarray(seen.reading[used])

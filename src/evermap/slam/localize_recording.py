@@ -15,7 +15,7 @@ from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
 from evermap.slam.known_places import KnownPlaces
-from evermap.slam.localize import Localizer, Located, Sightings
+from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.noise import START, NoiseFit
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.result import described
@@ -70,13 +70,7 @@ def localize(
     start_s = float(odometry.stamp_s[0])
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
-    there = np.flatnonzero(landmarks.p_exists > 0.0)
-    if joint_m2 is not None:
-        corner = se2.xy_rows(there)
-        joint_m2 = joint_m2[np.ix_(corner, corner)]
-    landmarks = _rows(landmarks, there)
-    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
-    places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists)
+    landmarks, places = _existing(landmarks, joint_m2)
     _compile()
     localizer = Localizer(places, recording.sensor, prior, noise)
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
@@ -108,6 +102,15 @@ def localize(
         warnings=tuple(_warnings(recording, run, places)),
         interrupted=run.interrupted,
     )
+
+
+def _existing(landmarks: Landmarks, joint_m2: FloatArray | None) -> tuple[Landmarks, KnownPlaces]:
+    """Return the landmarks that may exist, and the same as the localiser wants them."""
+    there = np.flatnonzero(landmarks.p_exists > 0.0)
+    landmarks = _rows(landmarks, there)
+    corner = se2.xy_rows(there)
+    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2[np.ix_(corner, corner)]
+    return landmarks, KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists)
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +185,7 @@ def _feed(
 
     def step(row: int) -> None:
         low, high = first[row], last[row]
-        sightings = Sightings(
+        sightings = FrameSightings(
             seen.landmark_id[low:high],
             np.column_stack([seen.range_m[low:high], seen.bearing_rad[low:high]]),
             np.column_stack([seen.sigma_range_m[low:high], seen.sigma_bearing_rad[low:high]]),
@@ -202,7 +205,7 @@ def _compile() -> None:
     sensor, prior = Sensor(range_max_m=5.0), CalibrationPrior.from_settings(calibrated=True, fix={})
     localizer = Localizer(places, sensor, prior, START)
     reading = np.column_stack([np.hypot(*at[:3].T), np.arctan2(at[:3, 1], at[:3, 0])])
-    seen = Sightings(np.arange(3), reading, np.full((3, 2), np.nan))
+    seen = FrameSightings(np.arange(3), reading, np.full((3, 2), np.nan))
     for stamp_s in (0.0, 0.1):
         localizer.step(stamp_s, Drive.from_rows(np.array([0.0, 0.1]), np.zeros((2, 3))), seen)
 

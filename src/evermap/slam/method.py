@@ -26,7 +26,7 @@ class Rival:
     """Another explanation that the measurements cannot rule out.
 
     Attributes:
-        changes: what moved then, as in `Revision`.
+        changes: what moved then, as in `Explanation`.
         probability: its weight among all explanations.
         position: (L, 2) where the landmarks would be; nan where never seen.
         covariance: (L, 2, 2) of each.
@@ -39,7 +39,7 @@ class Rival:
 
 
 @dataclass(frozen=True, slots=True)
-class Revision:
+class Explanation:
     """What a method makes of all that was measured so far.
 
     Attributes:
@@ -85,7 +85,7 @@ class Method(Protocol):
         """
         return problem, estimate
 
-    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """The best explanation of everything so far.
 
         Args:
@@ -109,7 +109,7 @@ class Static(Method):
         del row, compare
         return problem.landmark_row[detections]
 
-    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Nothing to think about."""
         del noise, heavy, final
-        return Revision(problem, estimate, self._current)
+        return Explanation(problem, estimate, self._current)

@@ -19,7 +19,7 @@ from evermap.geometry.rigid import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.border import BorderFilter
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.method import Method, Revision, Static
+from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import IncrementalSolver, Motion, compare
@@ -84,7 +84,7 @@ class Outcome:
     scale: float
     log_scale_sigma: float
     aligned: bool
-    revision: Revision
+    revision: Explanation
 
 
 class StreamingSlam:
@@ -354,7 +354,7 @@ class StreamingSlam:
         self._take_stock()
 
     def _divided(
-        self, revision: Revision, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
+        self, revision: Explanation, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
     ) -> Outcome:
         if self._aligned:
             states, covariance, scale, log_sigma = estimate.states, marginals.states.copy(), 1.0, 0.0

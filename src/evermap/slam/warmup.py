@@ -9,7 +9,7 @@ import numpy as np
 from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.evidence import Evidence, compare
+from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
@@ -61,6 +61,6 @@ def warm_up() -> None:
 def _search() -> None:
     """Three landmarks at their places, searched for changes."""
     place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3
-    evidence = Evidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
+    evidence = WindowEvidence(np.arange(count), np.zeros(count, dtype=np.int64), place, sure, np.zeros(6), 0.0)
     comparison = compare(evidence, place, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, dtype=np.bool_))
     find_changes(evidence, comparison, place, 1, ChangePrior())

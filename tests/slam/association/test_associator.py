@@ -13,7 +13,7 @@ from evermap.metrics.landmarks import identity_scores
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise
-from evermap.slam.association.filter import Belief, pairings_of_frame, predicted, updated, with_landmark
+from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.identify import identified
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
@@ -57,7 +57,7 @@ def test_a_detection_of_nothing_is_nobodys() -> None:
 def test_the_filter_is_the_smoother_where_all_is_nearly_linear() -> None:
     made = make_world(0, n_poses=6, n_landmarks=3, noisy=0.02, prior=KNOWN_SENSORS, p_seen=1.0)
     problem, sigma = made.problem, made.noise.of_detections(made.problem.sigma_given)
-    belief = Belief.first(problem)
+    belief = PoseBelief.first(problem)
     for row in range(len(problem.stamp_s)):
         belief = predicted(belief, problem, made.noise, row)
         detections = np.flatnonzero(problem.pose_row == row)
@@ -69,7 +69,7 @@ def test_the_filter_is_the_smoother_where_all_is_nearly_linear() -> None:
             belief = with_landmark(belief, problem, sigma, int(m))
     smoother = Smoother(problem, made.noise, robust=False)
     estimate = smoother.optimum(Estimate(made.truth.pose, made.truth.landmark, problem.prior.mean))
-    batch = Belief.at(estimate, smoother.marginals(estimate), len(problem.stamp_s) - 1)
+    batch = PoseBelief.at(estimate, smoother.marginals(estimate), len(problem.stamp_s) - 1)
     np.testing.assert_allclose(belief.landmark, batch.landmark, atol=2e-4)
     np.testing.assert_allclose(belief.pose, batch.pose, atol=2e-4)
     free = np.r_[0:3, 12 : len(batch.covariance)]

@@ -8,7 +8,7 @@ from math import comb, log
 import numpy as np
 from scipy.stats import multivariate_normal
 
-from evermap.slam.changes.evidence import Comparison, Evidence
+from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import ChangePrior
 
 
@@ -33,11 +33,11 @@ def slam_like_covariance(rng: np.random.Generator, position: np.ndarray) -> np.n
     return gauge + random_covariance(rng, 2 * count, 0.04) + 0.02**2 * np.eye(2 * count)
 
 
-def static_evidence(position: np.ndarray, n_windows: int = 1) -> Evidence:
+def static_evidence(position: np.ndarray, n_windows: int = 1) -> WindowEvidence:
     """Copies of all landmarks in all windows, for where only the shape of the arrays matters."""
     count = len(position)
     size = 2 * count * n_windows
-    return Evidence(
+    return WindowEvidence(
         landmark=np.tile(np.arange(count), n_windows),
         window=np.repeat(np.arange(n_windows), count),
         position=np.tile(position, (n_windows, 1)),
@@ -54,7 +54,7 @@ def comparison_of(e: np.ndarray, covariance: np.ndarray) -> Comparison:
     return Comparison(precision, precision @ e, 0.0, float(e @ precision @ e), float(len(e)))
 
 
-def membership(evidence: Evidence, members: np.ndarray, onset: int = 0) -> np.ndarray:
+def membership(evidence: WindowEvidence, members: np.ndarray, onset: int = 0) -> np.ndarray:
     """(2 R, 2) the columns `B` of a group: one identity for every copy of a member from its window on."""
     moved = np.isin(evidence.landmark, members) & (evidence.window >= onset)
     return np.kron(moved[:, None].astype(float), np.eye(2))

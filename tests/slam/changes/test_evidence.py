@@ -1,4 +1,4 @@
-"""Evidence about the landmarks against dense linear algebra, and its comparison with a map against scipy."""
+"""WindowEvidence about the landmarks against dense linear algebra, and its comparison with a map against scipy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from references import log_group_prior, log_normal, random_covariance, static_ev
 from test_gain import gain_of
 
 from evermap.slam.calibration import FORWARD, SKEW, SLIP, SLOPE
-from evermap.slam.changes.evidence import Evidence, compare, in_sensor_metres, landmark_evidence
+from evermap.slam.changes.evidence import WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.problem import Estimate, Problem, independent
 
@@ -20,12 +20,12 @@ KNOWN_SIZE = default_prior(range_slope=0.0)
 """With the range slope given, lengths are what the sensor says: nothing to divide."""
 
 
-def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> Evidence:
+def evidence_of(world: World, bounds: list[int], estimate: Estimate | None = None) -> WindowEvidence:
     estimate = world.truth if estimate is None else estimate
     return landmark_evidence(world.problem, estimate, world.noise, world.problem.prior, np.array(bounds))
 
 
-def problem_of_copies(problem: Problem, evidence: Evidence, bounds: list[int]) -> Problem:
+def problem_of_copies(problem: Problem, evidence: WindowEvidence, bounds: list[int]) -> Problem:
     """Every copy as a landmark of its own; what became no copy is not measured; no priors of start and landmarks."""
     window = np.searchsorted(bounds, problem.pose_row, side="right") - 1
     copy = {(int(j), int(w)): k for k, (j, w) in enumerate(zip(evidence.landmark, evidence.window, strict=True))}
@@ -134,7 +134,7 @@ def test_range_slope_is_a_choice_of_metres(grow: float) -> None:
     assert in_sensor_metres(truth, KNOWN_SIZE) is truth
 
 
-def well_conditioned(seed: int, *, n_windows: int = 2, log_scale_sigma: float = 0.0) -> Evidence:
+def well_conditioned(seed: int, *, n_windows: int = 2, log_scale_sigma: float = 0.0) -> WindowEvidence:
     rng = np.random.default_rng(seed)
     plain = static_evidence(rng.uniform(-4.0, 4.0, (5, 2)), n_windows)
     size = len(plain.pull)

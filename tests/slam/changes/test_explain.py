@@ -7,7 +7,7 @@ import pytest
 from problems import make_world
 
 from evermap.geometry import se2
-from evermap.slam.changes.explain import SLACK_M, GivenMap, Group, explained
+from evermap.slam.changes.explain import SLACK_M, GivenMap, MovedGroup, explained
 from evermap.slam.problem import Estimate
 
 SPREAD = np.array([0.7, 0.7, 0.5])
@@ -21,7 +21,7 @@ def given() -> GivenMap:
     return GivenMap(rng.uniform(-4.0, 4.0, (COUNT, 2)), root @ root.transpose(0, 2, 1), np.arange(COUNT) != 5)
 
 
-def told(given: GivenMap, *groups: Group):
+def told(given: GivenMap, *groups: MovedGroup):
     world = make_world(1, n_poses=20, n_landmarks=COUNT)
     estimate = Estimate(world.truth.pose, given.mean + 0.01, world.truth.states)
     return (world.problem, *explained(world.problem, estimate, given, groups, SPREAD))
@@ -52,7 +52,7 @@ def columns_of(position: np.ndarray, angle: float | None) -> np.ndarray:
 @pytest.mark.parametrize("turns", [False, True])
 def test_before_the_session(given: GivenMap, turns: bool) -> None:
     members, angle = np.array([0, 2, 3]), 0.6
-    group = Group(members, turns, np.array([0.4, -0.2, angle if turns else 0.0]), 0)
+    group = MovedGroup(members, turns, np.array([0.4, -0.2, angle if turns else 0.0]), 0)
     before, problem, start, landmark = told(given, group)
     np.testing.assert_array_equal(landmark, np.arange(COUNT))
     np.testing.assert_array_equal(problem.landmark_row, before.landmark_row)
@@ -81,7 +81,7 @@ def test_before_the_session(given: GivenMap, turns: bool) -> None:
 def test_within_the_session(given: GivenMap) -> None:
     """Old and new places share the map's error; the new one has the motion's besides."""
     members = np.array([1, 4])
-    group = Group(members, False, np.array([0.4, -0.2, 0.0]), 1, since_s=8.0, between_s=(7.0, 8.0))
+    group = MovedGroup(members, False, np.array([0.4, -0.2, 0.0]), 1, since_s=8.0, between_s=(7.0, 8.0))
     before, problem, start, landmark = told(given, group)
     np.testing.assert_array_equal(landmark, [0, 1, 2, 3, 4, 5, 1, 4])
     all_rows = rows(np.array([1, 4, 6, 7]))
@@ -101,7 +101,7 @@ def test_within_the_session(given: GivenMap) -> None:
 
 
 def test_new_places_that_no_map_holds_are_tied_to_the_old_alone(given: GivenMap) -> None:
-    group = Group(np.array([5]), False, np.array([0.4, -0.2, 0.0]), 1, since_s=8.0, between_s=(7.0, 8.0))
+    group = MovedGroup(np.array([5]), False, np.array([0.4, -0.2, 0.0]), 1, since_s=8.0, between_s=(7.0, 8.0))
     _, problem, _, landmark = told(given, group)
     np.testing.assert_array_equal(landmark, [0, 1, 2, 3, 4, 5, 5])
     both = np.ix_(rows([5, 6]), rows([5, 6]))
@@ -112,8 +112,8 @@ def test_new_places_that_no_map_holds_are_tied_to_the_old_alone(given: GivenMap)
 
 
 def test_two_groups_at_two_times(given: GivenMap) -> None:
-    first = Group(np.array([0, 2]), False, np.array([0.4, 0.0, 0.0]), 2, since_s=9.0, between_s=(8.0, 9.0))
-    second = Group(np.array([1, 3]), False, np.array([0.0, 0.3, 0.0]), 1, since_s=5.0, between_s=(4.0, 5.0))
+    first = MovedGroup(np.array([0, 2]), False, np.array([0.4, 0.0, 0.0]), 2, since_s=9.0, between_s=(8.0, 9.0))
+    second = MovedGroup(np.array([1, 3]), False, np.array([0.0, 0.3, 0.0]), 1, since_s=5.0, between_s=(4.0, 5.0))
     before, problem, _, landmark = told(given, first, second)
     np.testing.assert_array_equal(landmark, [0, 1, 2, 3, 4, 5, 0, 2, 1, 3])
     stamp_s = before.stamp_s[before.pose_row]

@@ -18,8 +18,8 @@ from references import (
 from scipy.integrate import quad
 
 from evermap.geometry import se2
-from evermap.slam.changes.evidence import Comparison, Evidence, compare
-from evermap.slam.changes.explain import GivenMap, Group, explained
+from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
+from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
 from evermap.slam.changes.gain import ChangePrior, hypothesis_gain
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
@@ -28,7 +28,7 @@ PRIOR = ChangePrior()
 
 
 def gain_of(
-    evidence: Evidence,
+    evidence: WindowEvidence,
     comparison: Comparison,
     position: np.ndarray,
     n_windows: int,
@@ -85,21 +85,23 @@ def test_gain_is_the_difference_of_log_marginal_likelihoods(n_windows: int, labe
             np.testing.assert_allclose(motion[g - 1, :2], mean, atol=1e-9)
 
 
-def linear_world(seed: int, n_windows: int) -> tuple[Evidence, GivenMap]:
+def linear_world(seed: int, n_windows: int) -> tuple[WindowEvidence, GivenMap]:
     """Well-conditioned measurements of six landmarks, and a map of them."""
     rng = np.random.default_rng(seed)
     position = rng.uniform(-5.0, 5.0, (6, 2))
     plain = static_evidence(position + 0.2 * rng.normal(size=position.shape), n_windows)
     size = len(plain.pull)
     information = np.linalg.inv(random_covariance(rng, size))
-    evidence = Evidence(
+    evidence = WindowEvidence(
         plain.landmark, plain.window, plain.position, information, information @ (0.1 * rng.normal(size=size)), 0.0
     )
     root = 0.02 * (np.eye(2) + 0.3 * rng.normal(size=(6, 2, 2)))
     return evidence, GivenMap(position, root @ root.transpose(0, 2, 1), np.ones(6, bool))
 
 
-def log_marginal_likelihood(evidence: Evidence, place: np.ndarray, mean: np.ndarray, information: np.ndarray) -> float:
+def log_marginal_likelihood(
+    evidence: WindowEvidence, place: np.ndarray, mean: np.ndarray, information: np.ndarray
+) -> float:
     """Of the linear problem whose copies are at `place` (R,), with a Gaussian prior of the places."""
     tied = np.kron(np.eye(len(mean))[place], np.eye(2))
     covariance = np.linalg.inv(evidence.information) + tied @ np.linalg.inv(information) @ tied.T
@@ -122,7 +124,7 @@ def test_gain_is_what_the_solved_problem_gains(onset: int, monkeypatch: pytest.M
         since = None if onset == 0 else float(problem.stamp_s[2])
         estimate = Estimate(np.zeros((4, 3)), given.mean.copy(), problem.prior.mean)
         likelihoods = []
-        for groups in ((), (Group(members, False, motion[0], onset, since),)):
+        for groups in ((), (MovedGroup(members, False, motion[0], onset, since),)):
             told, _, landmark = explained(problem, estimate, given, groups, PRIOR.spread)
             last = np.arange(6)
             last[landmark[6:]] = np.arange(6, len(landmark))

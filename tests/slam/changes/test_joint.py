@@ -12,9 +12,9 @@ import pytest
 from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
 from evermap.slam.arrow import Smoother
-from evermap.slam.changes.explain import GivenMap, Group, explained
+from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
 from evermap.slam.changes.gain import ChangePrior
-from evermap.slam.method import Revision
+from evermap.slam.method import Explanation
 from evermap.types import ChangeKind, MapChange
 
 BEFORE = Move((1, 2, 5), (0.3, -0.2))
@@ -103,11 +103,13 @@ def test_group_that_moved_within_the_session(moves: tuple[Move, ...], options: d
     assert exact >= least
 
 
-def told(session: Session, *moves: Move) -> Revision:
+def told(session: Session, *moves: Move) -> Explanation:
     """What somebody estimates who was told what moved, and when."""
     assert session.given is not None
     groups = tuple(
-        Group(np.array(m.members), bool(m.turn_rad), np.array([*m.by, m.turn_rad]), 0 if m.at_s is None else 1, m.at_s)
+        MovedGroup(
+            np.array(m.members), bool(m.turn_rad), np.array([*m.by, m.turn_rad]), 0 if m.at_s is None else 1, m.at_s
+        )
         for m in moves
     )
     start = replace(session.world.truth, landmark=session.before)
@@ -115,7 +117,7 @@ def told(session: Session, *moves: Move) -> Revision:
     estimate = Smoother(problem, session.world.noise).optimum(start)
     current = np.arange(len(session.before))
     current[landmark] = np.arange(len(landmark))
-    return Revision(problem, estimate, current)
+    return Explanation(problem, estimate, current)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from references import static_evidence
 
-from evermap.slam.changes.evidence import Evidence, compare
+from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
@@ -19,7 +19,7 @@ COUNT, WINDOWS = 6, 4
 SIGMA_M = 0.02
 
 
-def evidence_with(shift: np.ndarray, seed: int) -> tuple[Evidence, GivenMap]:
+def evidence_with(shift: np.ndarray, seed: int) -> tuple[WindowEvidence, GivenMap]:
     """Copies of six landmarks in four windows, displaced by `shift` (WINDOWS, COUNT, 2) and by noise."""
     rng = np.random.default_rng(seed)
     position = rng.uniform(-5.0, 5.0, (COUNT, 2))
@@ -33,7 +33,7 @@ def evidence_with(shift: np.ndarray, seed: int) -> tuple[Evidence, GivenMap]:
     return evidence, GivenMap(position, np.tile(0.02**2 * np.eye(2), (COUNT, 1, 1)), np.ones(COUNT, bool))
 
 
-def dropped(evidence: Evidence, given: GivenMap) -> set[tuple[int, int]]:
+def dropped(evidence: WindowEvidence, given: GivenMap) -> set[tuple[int, int]]:
     """(landmark, window) of the copies left out."""
 
     def search(evidence, start):

@@ -9,13 +9,13 @@ import pytest
 from test_robust import COUNT, evidence_with, none
 from worlds import Move, Session, make_session
 
-from evermap.slam.changes.evidence import Evidence, compare
+from evermap.slam.changes.evidence import WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.joint import P_SWAPPED, likeliest_swap, with_swap
 from evermap.types import ChangeKind
 
 
-def swap_of(evidence: Evidence, given: GivenMap):
+def swap_of(evidence: WindowEvidence, given: GivenMap):
     return likeliest_swap(evidence, compare(evidence, given.mean, given.covariance, given.given), given)
 
 

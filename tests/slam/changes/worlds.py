@@ -12,7 +12,7 @@ from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint
-from evermap.slam.method import Revision
+from evermap.slam.method import Explanation
 from evermap.slam.problem import Estimate, Problem, independent
 
 ALIGNED_INFORMATION = 1e-2
@@ -60,7 +60,7 @@ class Session:
         """The joint search, before it has seen anything."""
         return Joint(len(self.before), self.world.problem.prior, self.given, prior or ChangePrior())
 
-    def revised(self, prior: ChangePrior | None = None) -> tuple[Joint, Revision]:
+    def revised(self, prior: ChangePrior | None = None) -> tuple[Joint, Explanation]:
         """What the method makes of the whole session, as the estimator asks it at the end."""
         method = self.method(prior)
         problem, estimate = method.unprejudiced(self.problem, self.static)
@@ -124,7 +124,7 @@ def make_session(
     return Session(world, problem, given, before, after)
 
 
-def landmark_rmse(session: Session, revision: Revision, *, at_start: bool = False) -> float:
+def landmark_rmse(session: Session, revision: Explanation, *, at_start: bool = False) -> float:
     """Of the places now, or of those at the start."""
     place = np.arange(len(session.before)) if at_start else revision.current
     error = revision.estimate.landmark[place] - (session.before if at_start else session.after)

@@ -15,7 +15,7 @@ import numpy as np
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.constellation import RISE_NATS, propose_constellation, propose_merges
-from evermap.slam.association.filter import Belief, pairings_of_frame, predicted, updated, with_landmark
+from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.jcbb import Pairings, pairing_probability
 from evermap.slam.kernels import detection_residual
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
@@ -60,7 +60,7 @@ LAST_ROUNDS = 5
 class _Frame:
     """A frame compared with the map: rows of `pairings` that are certain, and p (n,) of each to be new."""
 
-    belief: Belief
+    belief: PoseBelief
     pairings: Pairings
     derivative: FloatArray
     taken: IntArray
@@ -86,7 +86,7 @@ class Associator:
         self._pose = np.zeros((len(problem.stamp_s), 3))
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
         self._sighting_noise = SightingNoise.constant(noise.detection)
-        self._belief = Belief.first(problem)
+        self._belief = PoseBelief.first(problem)
         self._done = 0
         self._next_stock = FIRST_STOCK
 
@@ -121,7 +121,7 @@ class Associator:
         """Landmarks a square metre that one may still meet."""
         return density_of_unmet(self._belief.landmark)
 
-    def _match(self, belief: Belief, detections: IntArray) -> _Frame:
+    def _match(self, belief: PoseBelief, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
         pairings, derivative = pairings_of_frame(
@@ -133,7 +133,9 @@ class Associator:
         taken = np.flatnonzero((probability >= P_MATCH) | self._harmless(belief, pairings, probability, known))
         return _Frame(belief, pairings, derivative, taken, 1.0 - known, sigma)
 
-    def _harmless(self, belief: Belief, pairings: Pairings, probability: FloatArray, known: FloatArray) -> BoolArray:
+    def _harmless(
+        self, belief: PoseBelief, pairings: Pairings, probability: FloatArray, known: FloatArray
+    ) -> BoolArray:
         """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
 
         That is where the gate is small, or where its rivals may well be the same landmark.
@@ -167,7 +169,7 @@ class Associator:
         assignment, marginals = self._settled(self._without_chance(self._assignment()))
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
-        self._belief = Belief.at(assignment.estimate, marginals, self._done - 1)
+        self._belief = PoseBelief.at(assignment.estimate, marginals, self._done - 1)
 
     def _assignment(self) -> Assignment:
         measured = self._problem.until(self._done)
@@ -243,7 +245,7 @@ class Associator:
         row = np.full_like(assignment.landmark_row, NOBODY)
         for i in range(self._done):
             detections = np.arange(self._first[i], self._first[i + 1])
-            belief = Belief.at(assignment.estimate, marginals, i)
+            belief = PoseBelief.at(assignment.estimate, marginals, i)
             pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=self._density)
             probability, _ = pairing_probability(pairings, confidence=GATE)
             taken = np.flatnonzero(probability > 0.5)

@@ -46,7 +46,7 @@ class LocalMap:
 
 
 @dataclass(frozen=True, slots=True)
-class Overlay:
+class Alignment:
     """A motion and what it explains.
 
     Attributes:
@@ -60,7 +60,7 @@ class Overlay:
     log_evidence: float
 
 
-def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float) -> list[Overlay]:
+def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float) -> list[Alignment]:
     """Ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
 
     Args:
@@ -69,7 +69,7 @@ def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density:
         allowed: (n, m) which pairs may be the same at all.
         density: landmarks a square metre that one expects where they are not the same.
     """
-    found: dict[tuple[tuple[int, int], ...], Overlay] = {}
+    found: dict[tuple[tuple[int, int], ...], Alignment] = {}
     for motion in _motions(source, target, allowed):
         overlay = _weighed(motion, source, target, allowed, density)
         known = found.get(overlay.pairs)
@@ -104,7 +104,7 @@ def agreed_pairs(
 
 
 def _without_doubt(
-    best: Overlay, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float, margin: float
+    best: Alignment, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float, margin: float
 ) -> list[tuple[int, int]]:
     """Pairs that are better by `margin` nats than any change of the overlay by one: none, another, or exchanged."""
     pairings = _pairings(best.motion, source, target, allowed, density)
@@ -174,15 +174,15 @@ def _sigma_of_span(source: LocalMap, i: int, j: int) -> float:
     return math.sqrt(max(float(row @ source.covariance @ row), 0.0))
 
 
-def _weighed(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Overlay:
+def _weighed(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Alignment:
     """The largest jointly compatible set of pairs around a motion, and its evidence."""
     pairings = _pairings(motion, source, target, allowed, density)
     found = most_pairings(pairings, confidence=CONFIDENCE)
     rows = found.pairing[found.pairing >= 0]
     if len(rows) == 0:
-        return Overlay(motion, (), 0.0)
+        return Alignment(motion, (), 0.0)
     pairs = tuple((int(pairings.source[k]), int(pairings.target[k])) for k in rows)
-    return Overlay(motion, pairs, _evidence(pairings, rows.tolist(), density))
+    return Alignment(motion, pairs, _evidence(pairings, rows.tolist(), density))
 
 
 def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: BoolArray, density: float) -> Pairings:

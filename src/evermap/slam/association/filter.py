@@ -22,7 +22,7 @@ from evermap.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class PoseBelief:
     """Mean and covariance.
 
     Attributes:
@@ -38,13 +38,13 @@ class Belief:
     covariance: FloatArray
 
     @classmethod
-    def first(cls, problem: Problem) -> Belief:
+    def first(cls, problem: Problem) -> PoseBelief:
         """Before the first frame: the start pose, the priors of the states, no landmark."""
         spread = np.append(np.full(3, 1.0 / problem.start_information), (problem.prior.sigma * problem.prior.free) ** 2)
         return cls(problem.start_pose.copy(), problem.prior.mean.copy(), np.zeros((0, 2)), np.diag(spread))
 
     @classmethod
-    def at(cls, estimate: Estimate, marginals: Marginals, row: int) -> Belief:
+    def at(cls, estimate: Estimate, marginals: Marginals, row: int) -> PoseBelief:
         """The smoothed belief about pose `row`; every landmark has to be known."""
         n = 2 * len(estimate.landmark)
         order = np.append(n + np.arange(9), np.arange(n))
@@ -65,18 +65,18 @@ class Belief:
         return bool(gap @ np.linalg.solve(spread, gap) < gates(1, confidence)[1])
 
 
-def predicted(belief: Belief, problem: Problem, noise: Noise, row: int) -> Belief:
+def predicted(belief: PoseBelief, problem: Problem, noise: Noise, row: int) -> PoseBelief:
     """The belief about pose `row` by odometry from the pose before; the first one as it is."""
     if row == 0:
         return belief
     motion = Motion.between(problem, noise, row, belief.states)
     pose, covariance = belief.pose.copy(), belief.covariance.copy()
     drive_on(pose, covariance, motion.increment, motion.by_states, motion.covariance)
-    return Belief(pose, belief.states, belief.landmark, covariance)
+    return PoseBelief(pose, belief.states, belief.landmark, covariance)
 
 
 def pairings_of_frame(
-    belief: Belief, problem: Problem, sigma: FloatArray, detections: IntArray, *, confidence: float, density: float
+    belief: PoseBelief, problem: Problem, sigma: FloatArray, detections: IntArray, *, confidence: float, density: float
 ) -> tuple[Pairings, FloatArray]:
     """Detections of a frame with the landmarks whose gates they pass.
 
@@ -151,7 +151,7 @@ def _in_gate(
     return source[:found], target[:found], innovation[:found], block[:found]
 
 
-def updated(belief: Belief, pairings: Pairings, derivative: FloatArray, taken: IntArray) -> Belief:
+def updated(belief: PoseBelief, pairings: Pairings, derivative: FloatArray, taken: IntArray) -> PoseBelief:
     """The belief after the pairings `taken` (rows of `pairings`)."""
     rows = np.column_stack([2 * taken, 2 * taken + 1]).ravel()
     h = derivative[rows]
@@ -159,7 +159,7 @@ def updated(belief: Belief, pairings: Pairings, derivative: FloatArray, taken: I
     gain = np.linalg.solve(pairings.covariance[np.ix_(rows, rows)], cross.T).T
     step = -gain @ pairings.innovation[taken].ravel()
     covariance = belief.covariance - gain @ cross.T
-    return Belief(
+    return PoseBelief(
         se2.compose(belief.pose, np.array([step[0], step[1], step[2]])),
         belief.states + step[3:12],
         belief.landmark + step[12:].reshape(-1, 2),
@@ -167,7 +167,7 @@ def updated(belief: Belief, pairings: Pairings, derivative: FloatArray, taken: I
     )
 
 
-def with_landmark(belief: Belief, problem: Problem, sigma: FloatArray, detection: int) -> Belief:
+def with_landmark(belief: PoseBelief, problem: Problem, sigma: FloatArray, detection: int) -> PoseBelief:
     """The belief with one more landmark, where the detection points."""
     reading = problem.reading[detection]
     place = sighted_at(belief.pose, reading, belief.states, problem.mount)
@@ -183,4 +183,4 @@ def with_landmark(belief: Belief, problem: Problem, sigma: FloatArray, detection
     joint[n:, :n] = by @ belief.covariance
     joint[:n, n:] = joint[n:, :n].T
     joint[n:, n:] = by @ belief.covariance @ by.T + inverse @ np.diag(sigma[detection] ** 2) @ inverse.T
-    return Belief(belief.pose, belief.states, np.vstack([belief.landmark, place]), joint)
+    return PoseBelief(belief.pose, belief.states, np.vstack([belief.landmark, place]), joint)

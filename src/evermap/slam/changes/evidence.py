@@ -8,6 +8,7 @@ has a copy in every window it was seen in; a static landmark is one whose copies
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -27,7 +28,7 @@ TINY_INFORMATION = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class WindowEvidence:
     """Quadratic log likelihood of the copies: `pull' x - x' information x / 2`, `x` the step from `position`.
 
     Attributes:
@@ -55,7 +56,7 @@ class Evidence:
         position[landmark] = self.position[first]
         return position
 
-    def without(self, copies: BoolArray) -> Evidence:
+    def without(self, copies: BoolArray) -> WindowEvidence:
         """With some copies (R,) left out, as if their sightings had not been made."""
         kept = ~copies
         rows = np.repeat(kept, 2)
@@ -72,7 +73,7 @@ class Evidence:
             pull=self.pull[rows] - cross @ solved[:, -1],
         )
 
-    def softened(self, sigma_m: float) -> Evidence:
+    def softened(self, sigma_m: float) -> WindowEvidence:
         """With an error of its own in every copy: what is wrong with sightings is not new at every sighting."""
         if sigma_m == 0.0:
             return self
@@ -115,7 +116,7 @@ def landmark_evidence(
     bounds: IntArray,
     *,
     sized: bool = True,
-) -> Evidence:
+) -> WindowEvidence:
     """Eliminate poses and calibration of a linearised problem, window by window.
 
     Args:
@@ -131,20 +132,8 @@ def landmark_evidence(
     held = prior.without_scale()
     n_windows = len(bounds) - 1
     pieces = [_piece(problem, estimate, noise, held, *bounds[w : w + 2]) for w in range(n_windows)]
-    count = sum(len(piece.landmark) for piece in pieces)
-    # unknowns: copies, poses between windows, calibration states
-    at_pose, at_states = 2 * count, 2 * count + 3 * (n_windows + 1)
-    information = np.zeros((at_states + N_STATES, at_states + N_STATES))
-    right = np.zeros(at_states + N_STATES)
-    first = 0
-    for w, piece in enumerate(pieces):
-        copies = np.arange(2 * first, 2 * (first + len(piece.landmark)))
-        poses = at_pose + 3 * w + np.arange(3)
-        rows = np.concatenate([poses + 3, poses, copies, at_states + np.arange(N_STATES)])
-        information[np.ix_(rows, rows)] += piece.information
-        right[rows] += piece.right
-        first += len(piece.landmark)
-    states = at_states + np.arange(N_STATES)
+    information, right, at_pose = _joined(pieces)
+    states = np.arange(len(right) - N_STATES, len(right))
     information[states, states] += 1.0 / held.sigma**2
     right[states] += (held.mean - estimate.states) / held.sigma**2
     others = np.arange(at_pose, len(right))
@@ -162,7 +151,7 @@ def landmark_evidence(
         scale, log_sigma = 1.0, 0.0
     centre = estimate.landmark[estimate.known].mean(axis=0)
     position = np.concatenate([piece.position for piece in pieces])
-    return Evidence(
+    return WindowEvidence(
         landmark=np.concatenate([piece.landmark for piece in pieces]),
         window=np.repeat(np.arange(n_windows), [len(piece.landmark) for piece in pieces]),
         position=centre + scale * (position - centre),
@@ -172,7 +161,27 @@ def landmark_evidence(
     )
 
 
-def compare(evidence: Evidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
+def _joined(pieces: Sequence[_Piece]) -> tuple[FloatArray, FloatArray, int]:
+    """Return the normal equations of all windows, and the first row of a pose.
+
+    Unknowns are copies of landmarks, poses between windows and calibration states, in this order.
+    """
+    count = sum(len(piece.landmark) for piece in pieces)
+    at_pose, at_states = 2 * count, 2 * count + 3 * (len(pieces) + 1)
+    information = np.zeros((at_states + N_STATES, at_states + N_STATES))
+    right = np.zeros(at_states + N_STATES)
+    first = 0
+    for w, piece in enumerate(pieces):
+        copies = np.arange(2 * first, 2 * (first + len(piece.landmark)))
+        poses = at_pose + 3 * w + np.arange(3)
+        rows = np.concatenate([poses + 3, poses, copies, at_states + np.arange(N_STATES)])
+        information[np.ix_(rows, rows)] += piece.information
+        right[rows] += piece.right
+        first += len(piece.landmark)
+    return information, right, at_pose
+
+
+def compare(evidence: WindowEvidence, mean: FloatArray, covariance: FloatArray, mapped: BoolArray) -> Comparison:
     """Set the evidence against a map.
 
     Args:

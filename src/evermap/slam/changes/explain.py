@@ -43,7 +43,7 @@ class GivenMap:
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class MovedGroup:
     """Landmarks that moved together.
 
     Attributes:
@@ -62,7 +62,7 @@ class Group:
     since_s: float | None = None
     between_s: tuple[float, float] | None = None
 
-    def same_as(self, other: Group) -> bool:
+    def same_as(self, other: MovedGroup) -> bool:
         """Same landmarks, same kind of motion, same time."""
         return (
             np.array_equal(self.members, other.members)
@@ -94,7 +94,7 @@ class Group:
 
 
 def explained(
-    problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[Group, ...], spread: FloatArray
+    problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[MovedGroup, ...], spread: FloatArray
 ) -> tuple[Problem, Estimate, IntArray]:
     """The problem in a world where `groups` moved.
 

@@ -17,12 +17,12 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.changes.evidence import Comparison, Evidence, compare, in_sensor_metres, landmark_evidence
-from evermap.slam.changes.explain import GivenMap, Group, explained, parting_time, unswayed
+from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
+from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import item_columns
 from evermap.slam.changes.weigh import Verdict, weigh
-from evermap.slam.method import Compare, Method, Revision, Rival
+from evermap.slam.method import Compare, Explanation, Method, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
 from evermap.slam.streaming import outvoted
@@ -76,9 +76,9 @@ class Joint(Method):
         self._prior = prior
         self._robust = robust
         self._loosened: _Loosened | None = None
-        self._concluded: Revision | None = None
+        self._concluded: Explanation | None = None
         self._landmark = np.arange(n_landmarks)
-        self._groups: tuple[Group, ...] = ()
+        self._groups: tuple[MovedGroup, ...] = ()
         self._swaps: tuple[tuple[int, int, float], ...] = ()
         self.verdict: Verdict | None = None
 
@@ -114,7 +114,7 @@ class Joint(Method):
             return estimate
         return Estimate(se2.compose(motion, estimate.pose), se2.transform(motion, estimate.landmark), estimate.states)
 
-    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Search at the present estimate, and again at what it leads to where the session ends."""
         if final and self._concluded is not None:
             return replace(self._concluded, problem=problem, estimate=estimate)
@@ -129,21 +129,21 @@ class Joint(Method):
         given = self._given if in_map and self._given is not None else GivenMap.empty(self._count)
         base = self._base(problem)
         if not in_map and len(self._bounds(base)) == 2:  # one window and no map: nothing to compare with
-            return Revision(problem, estimate, self._current())
+            return Explanation(problem, estimate, self._current())
         for _ in range(ROUNDS if final else 1):
             bounds = self._bounds(base)
             evidence = landmark_evidence(
                 base, self._first_places(estimate), noise, self._calibration, bounds, sized=in_map
             )
             if len(evidence.landmark) == 0:
-                return Revision(problem, estimate, self._current())
+                return Explanation(problem, estimate, self._current())
             before = self.verdict
             verdict, given = self._weighed(evidence, given, len(bounds) - 1, thorough=final)
             groups = tuple(self._timed(group, base, estimate, noise, evidence, bounds) for group in verdict.groups)
             settled = before is not None and before.map_factor == verdict.map_factor and _same(groups, self._groups)
             self.verdict, self._groups = verdict, groups
             if not in_map and not groups and len(self._landmark) == self._count:
-                return Revision(problem, estimate, self._current())
+                return Explanation(problem, estimate, self._current())
             # the search may find the map better than it says; the solution does not build on that
             believed = replace(given, covariance=given.covariance * max(verdict.map_factor, 1.0) ** 2)
             problem, start, self._landmark = self._explained(base, estimate, evidence, believed, groups)
@@ -156,7 +156,9 @@ class Joint(Method):
             self._given = given
         if not heavy:
             estimate = Smoother(problem, noise, robust=self._robust).optimum(estimate, iterations=5, tolerance=1e-4)
-        revision = Revision(problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base))
+        revision = Explanation(
+            problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base)
+        )
         if final:
             revision = replace(
                 revision,
@@ -178,7 +180,12 @@ class Joint(Method):
         return Estimate(estimate.pose, estimate.landmark[: self._count], estimate.states)
 
     def _explained(
-        self, base: Problem, estimate: Estimate, evidence: Evidence, believed: GivenMap, groups: tuple[Group, ...]
+        self,
+        base: Problem,
+        estimate: Estimate,
+        evidence: WindowEvidence,
+        believed: GivenMap,
+        groups: tuple[MovedGroup, ...],
     ) -> tuple[Problem, Estimate, IntArray]:
         """The problem in a world where these groups moved, a start, and the landmark of every place."""
         start = _with_copies(self._first_places(estimate), evidence, groups)
@@ -187,7 +194,7 @@ class Joint(Method):
     def _rivals(
         self,
         base: Problem,
-        evidence: Evidence,
+        evidence: WindowEvidence,
         believed: GivenMap,
         estimate: Estimate,
         noise: Noise,
@@ -221,7 +228,7 @@ class Joint(Method):
         return ()
 
     def _weighed(
-        self, evidence: Evidence, given: GivenMap, n_windows: int, *, thorough: bool
+        self, evidence: WindowEvidence, given: GivenMap, n_windows: int, *, thorough: bool
     ) -> tuple[Verdict, GivenMap]:
         """The verdict, and the map with the landmarks that carry each other's identity at each other's place."""
         verdict = weigh(evidence, given, self._prior, n_windows, before=self.verdict, thorough=thorough)
@@ -256,8 +263,14 @@ class Joint(Method):
         return _current(self._landmark, self._count)
 
     def _timed(
-        self, group: Group, base: Problem, estimate: Estimate, noise: Noise, evidence: Evidence, bounds: IntArray
-    ) -> Group:
+        self,
+        group: MovedGroup,
+        base: Problem,
+        estimate: Estimate,
+        noise: Noise,
+        evidence: WindowEvidence,
+        bounds: IntArray,
+    ) -> MovedGroup:
         """The group with the time of its change, where that was within the session.
 
         The search, for which no pose is certain, says between which windows. Within those every detection tells, once
@@ -285,7 +298,7 @@ class Joint(Method):
         )
         return replace(group, since_s=since_s, between_s=between_s)
 
-    def _changes(self, groups: tuple[Group, ...], probability: float, base: Problem) -> tuple[MapChange, ...]:
+    def _changes(self, groups: tuple[MovedGroup, ...], probability: float, base: Problem) -> tuple[MapChange, ...]:
         first_s = float(base.stamp_s[0])
         moved = tuple(_change(group, probability, first_s) for group in groups)
         return (*(self._swap_change(swap, first_s) for swap in self._swaps), *moved)
@@ -314,7 +327,7 @@ class _Loosened(NamedTuple):
     start: Estimate
 
 
-def _visits(problem: Problem, group: Group) -> FloatArray:
+def _visits(problem: Problem, group: MovedGroup) -> FloatArray:
     """When a group was met again [s], around the time when it is thought to have moved."""
     if group.between_s is None or group.since_s is None:
         return np.zeros(0)
@@ -325,7 +338,7 @@ def _visits(problem: Problem, group: Group) -> FloatArray:
     return np.append(starts[near][:MOST_VISITS], group.since_s)
 
 
-def _change(group: Group, probability: float, first_s: float) -> MapChange:
+def _change(group: MovedGroup, probability: float, first_s: float) -> MapChange:
     between = (float("nan"), first_s) if group.between_s is None else group.between_s
     return MapChange(
         landmark_ids=tuple(int(j) for j in group.members),
@@ -338,7 +351,7 @@ def _change(group: Group, probability: float, first_s: float) -> MapChange:
     )
 
 
-def _same(groups: tuple[Group, ...], others: tuple[Group, ...]) -> bool:
+def _same(groups: tuple[MovedGroup, ...], others: tuple[MovedGroup, ...]) -> bool:
     return len(groups) == len(others) and all(a.same_as(b) for a, b in zip(groups, others, strict=True))
 
 
@@ -349,7 +362,7 @@ def _current(landmark: IntArray, count: int) -> IntArray:
     return current
 
 
-def _with_copies(estimate: Estimate, evidence: Evidence, groups: tuple[Group, ...]) -> Estimate:
+def _with_copies(estimate: Estimate, evidence: WindowEvidence, groups: tuple[MovedGroup, ...]) -> Estimate:
     """Where members of groups that moved within the session were seen first."""
     landmark = estimate.landmark.copy()
     first = evidence.first_seen(landmark)
@@ -371,7 +384,7 @@ class Swap(NamedTuple):
     log_prior: float
 
 
-def likeliest_swap(evidence: Evidence, comparison: Comparison, given: GivenMap) -> Swap | None:
+def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: GivenMap) -> Swap | None:
     """The two landmarks that gain most by taking each other's place; None if that gains less than it costs.
 
     Args:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.changes.evidence import Comparison, Evidence
+from evermap.slam.changes.evidence import Comparison, WindowEvidence
 from evermap.slam.changes.gain import ChangePrior, hypothesis_gain
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -42,7 +42,7 @@ class Hypotheses(NamedTuple):
 
 
 def find_changes(
-    evidence: Evidence,
+    evidence: WindowEvidence,
     comparison: Comparison,
     position: FloatArray,
     n_windows: int,
@@ -93,7 +93,7 @@ def find_changes(
 
 
 def _candidates(
-    evidence: Evidence, comparison: Comparison, n_landmarks: int, prior: ChangePrior, start: Hypotheses | None
+    evidence: WindowEvidence, comparison: Comparison, n_landmarks: int, prior: ChangePrior, start: Hypotheses | None
 ) -> IntArray:
     """Landmarks that may have moved: in a large map those that would gain most alone, and those already suspected."""
     gain = np.full(n_landmarks, -np.inf)
@@ -111,7 +111,7 @@ def _candidates(
 
 
 def item_columns(
-    evidence: Evidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
+    evidence: WindowEvidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
 

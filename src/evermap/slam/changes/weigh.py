@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.slam.changes.evidence import Comparison, Evidence, compare
-from evermap.slam.changes.explain import GivenMap, Group
+from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
+from evermap.slam.changes.explain import GivenMap, MovedGroup
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import Hypotheses, find_changes
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -43,18 +43,18 @@ class Verdict:
         evidence: what was weighed: without the copies that are displaced alone.
     """
 
-    groups: tuple[Group, ...]
+    groups: tuple[MovedGroup, ...]
     probability: float
-    alternatives: tuple[tuple[tuple[Group, ...], float], ...]
+    alternatives: tuple[tuple[tuple[MovedGroup, ...], float], ...]
     map_factor: float
     softness_m: float
     score: float
     misfit: float
-    evidence: Evidence
+    evidence: WindowEvidence
 
 
 def weigh(
-    evidence: Evidence,
+    evidence: WindowEvidence,
     given: GivenMap,
     prior: ChangePrior,
     n_windows: int,
@@ -79,7 +79,7 @@ def weigh(
     position = np.where(given.given[:, None], given.mean, evidence.first_seen(given.mean))
     if n_windows > 1 and not spared:
 
-        def search(evidence: Evidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
+        def search(evidence: WindowEvidence, start: Hypotheses | None) -> tuple[Comparison, Hypotheses]:
             soft = evidence.softened(TRANSIENT_SOFTNESS_M)
             comparison = compare(soft, given.mean, given.covariance * factor**2, given.given)
             return comparison, find_changes(soft, comparison, position, n_windows, prior, start=start)
@@ -133,7 +133,7 @@ def _beside(values: tuple[float, ...], value: float) -> tuple[float, ...]:
 
 
 def _try(
-    evidence: Evidence,
+    evidence: WindowEvidence,
     given: GivenMap,
     position: FloatArray,
     prior: ChangePrior,
@@ -157,7 +157,7 @@ class _Seen(NamedTuple):
     given: BoolArray
 
     @classmethod
-    def of(cls, evidence: Evidence, given: GivenMap) -> _Seen:
+    def of(cls, evidence: WindowEvidence, given: GivenMap) -> _Seen:
         first = np.full(len(given.mean), np.iinfo(np.int64).max)
         last = np.full(len(given.mean), -1)
         np.minimum.at(first, evidence.landmark, evidence.window)
@@ -169,11 +169,11 @@ class _Seen(NamedTuple):
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
-def _verdict(evidence: Evidence, trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
+def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
-    leader: dict[_Key, tuple[float, tuple[Group, ...]]] = {}
+    leader: dict[_Key, tuple[float, tuple[MovedGroup, ...]]] = {}
     for trial in trials:
         for row, gain in enumerate(trial.hypotheses.gain):
             key, groups = _groups(trial.hypotheses, row, seen)
@@ -200,7 +200,7 @@ def _verdict(evidence: Evidence, trials: list[_Trial], best: _Trial, seen: _Seen
 _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
-def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[Group, ...]]:
+def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[MovedGroup, ...]]:
     """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
     label = hypotheses.label[row]
     groups = []
@@ -211,7 +211,7 @@ def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[
             continue
         if np.all(seen.first[members] >= window):  # nobody saw them before: as well before the session
             window = 0
-        groups.append(Group(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window))
+        groups.append(MovedGroup(members, bool(hypotheses.turns[row, g]), hypotheses.motion[row, g - 1], window))
     key = tuple((tuple(int(j) for j in group.members), group.window > 0) for group in groups)
     return key, tuple(groups)
 
@@ -219,11 +219,13 @@ def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[
 LOG_ODDS = 7.0
 """Prior log odds against a copy being displaced alone."""
 
-Search = Callable[[Evidence, Hypotheses | None], tuple[Comparison, Hypotheses]]
+Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypotheses]]
 """Compares an evidence with the map and finds changes, from a start."""
 
 
-def without_transients(evidence: Evidence, position: FloatArray, prior: ChangePrior, search: Search) -> Evidence:
+def without_transients(
+    evidence: WindowEvidence, position: FloatArray, prior: ChangePrior, search: Search
+) -> WindowEvidence:
     """The evidence without copies that are displaced alone.
 
     Args:
@@ -254,13 +256,13 @@ def without_transients(evidence: Evidence, position: FloatArray, prior: ChangePr
     return evidence
 
 
-def _dropped(evidence: Evidence, copy: int) -> Evidence:
+def _dropped(evidence: WindowEvidence, copy: int) -> WindowEvidence:
     out = np.zeros(len(evidence.landmark), dtype=bool)
     out[copy] = True
     return evidence.without(out)
 
 
-def _only_copies(evidence: Evidence) -> BoolArray:
+def _only_copies(evidence: WindowEvidence) -> BoolArray:
     """(R,) copies of landmarks that have no other."""
     only: BoolArray = np.bincount(evidence.landmark)[evidence.landmark] < 2
     return only
@@ -279,7 +281,7 @@ def _gains(comparison: Comparison, sigma_m: float) -> FloatArray:
 
 
 def _explained_away(
-    evidence: Evidence, comparison: Comparison, found: Hypotheses, position: FloatArray, prior: ChangePrior
+    evidence: WindowEvidence, comparison: Comparison, found: Hypotheses, position: FloatArray, prior: ChangePrior
 ) -> Comparison:
     """The comparison with the motions of the best hypothesis integrated out."""
     columns: list[FloatArray] = []

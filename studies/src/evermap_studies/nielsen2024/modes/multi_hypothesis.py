@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from evermap.config import SlamConfig
-from evermap.slam.method import Compare, Method, Revision
+from evermap.slam.method import Compare, Explanation, Method
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.types import FloatArray, IntArray, Sensor
 from evermap_studies.nielsen2024.modes.alternation import ModeModel, explain_with_modes
@@ -48,7 +48,7 @@ class MultiHypothesis(Method):
             place[k] = self._best_of(mine, distance[which == k], log_volume[which == k])
         return place
 
-    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Revision:
+    def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Births and the alternation over everything so far."""
         found = explain_with_modes(
             problem, estimate, noise, self._modes, self._model, self._rng, heavy=heavy, anew=final
@@ -59,8 +59,8 @@ class MultiHypothesis(Method):
         self._log_belief[current] = 0.0
         changes = switches(found, self._model.chain)
         if np.array_equal(found.problem.landmark_row, problem.landmark_row):
-            return Revision(problem, estimate, current, changes)
-        return Revision(found.problem, found.estimate, current, changes)
+            return Explanation(problem, estimate, current, changes)
+        return Explanation(found.problem, found.estimate, current, changes)
 
     def _best_of(self, places: IntArray, distance: FloatArray, log_volume: FloatArray) -> int:
         """One step of the forward filter over the modes of one landmark, and where its detection belongs."""
