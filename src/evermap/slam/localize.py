@@ -101,7 +101,7 @@ class Localizer:
         start: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         self.places = places
-        self._field, self._prior, self._noise = NominalField(sensor), prior, noise
+        self._field, self._prior, self.noise = NominalField(sensor), prior, noise
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._log_p = np.log(np.maximum(places.p_here, LEAST_BELIEF))
         self._believed = self._log_p.copy()
@@ -150,7 +150,7 @@ class Localizer:
         """
         self._frame += 1
         if self._stamp_s is not None:
-            self._drive(Motion.over(drive, self._stamp_s, stamp_s, self._states, self._prior.free, self._noise))
+            self._drive(Motion.over(drive, self._stamp_s, stamp_s, self._states, self._prior.free, self.noise))
         self._stamp_s = stamp_s
         first, last = self.places.rows_of(seen.landmark_id)
         usable = (last > first) & np.all(np.isfinite(seen.reading), axis=1) & (seen.landmark_id != UNKNOWN)
@@ -219,7 +219,7 @@ class Localizer:
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Place, innovation and weight of the detections `used`."""
         places, reading = self.places, np.ascontiguousarray(seen.reading[used])
-        sigma = self._noise.of_detections(seen.sigma_given[used])
+        sigma = self.noise.of_detections(seen.sigma_given[used])
         row = np.empty(len(used), dtype=np.int64)
         choose_places(
             self._pose, self._states, self._covariance, places.position_m, places.covariance_m2,
@@ -227,7 +227,7 @@ class Localizer:
         )  # fmt: skip
         self._consider(np.unique(row))
         nis, weight = np.empty((2, len(used)))
-        log_odds = self._noise.outlier_log_odds + self._believed[row]
+        log_odds = self.noise.outlier_log_odds + self._believed[row]
         update_considering(
             self._pose, self._states, self._covariance, places.position_m[self._considered], self._slot[row], reading,
             sigma, log_odds, self._mount, self._prior.free, nis, weight,

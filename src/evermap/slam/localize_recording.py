@@ -75,33 +75,13 @@ def localize(
     localizer = Localizer(places, recording.sensor, prior, noise)
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
-    placed = run.placed
-    if not placed.any():
+    if not run.placed.any():
         raise DataError(
             f"{recording.name}: cannot localise in the map: too few of its landmarks were seen standing to each other "
             "as it says",
             hint="check that it is the map of this place",
         )
-    pose = np.array([one.pose for one in run.located])[placed]
-    pose[:, 2] = se2.wrap(pose[:, 2])
-    spread = np.array([one.covariance for one in run.located])[placed]
-    trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
-    reported = CalibrationPrior.from_settings(calibrated=False, fix={}).mean
-    reckoned, spread = dead_reckoned(trajectory.stamp_s - start_s, drive, reported, START)
-    misses = run.misses(places)
-    fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
-    return SlamResult(
-        trajectory=trajectory,
-        online=trajectory,
-        landmarks=_with_counts(landmarks, recording, run, places, misses),
-        parameters=described(localizer.states, localizer.states_covariance, fit, prior),
-        innovations=run.innovations(recording),
-        misses=misses,
-        step_s=run.step_s[placed],
-        dead_reckoning=replace(trajectory, pose_world_robot=se2.compose(pose[0], reckoned), covariance=spread),
-        warnings=tuple(_warnings(recording, run, places)),
-        interrupted=run.interrupted,
-    )
+    return _result(recording, run, localizer, prior, drive, landmarks, places)
 
 
 def _existing(landmarks: Landmarks, joint_m2: FloatArray | None) -> tuple[Landmarks, KnownPlaces]:
@@ -195,6 +175,40 @@ def _feed(
     step_s, interrupted = fed(stamps[frame], step, realtime=realtime, progress=progress)
     done = len(step_s)
     return _Run(frame[:done], first[:done], located[:done], step_s, interrupted)
+
+
+def _result(
+    recording: Recording,
+    run: _Run,
+    localizer: Localizer,
+    prior: CalibrationPrior,
+    drive: Drive,
+    landmarks: Landmarks,
+    places: KnownPlaces,
+) -> SlamResult:
+    """Return what the frames said, as plain arrays."""
+    stamps, placed = recording.frames.stamp_s, run.placed
+    pose = np.array([one.pose for one in run.located])[placed]
+    pose[:, 2] = se2.wrap(pose[:, 2])
+    spread = np.array([one.covariance for one in run.located])[placed]
+    trajectory = Trajectory(stamps[run.frame[placed]], pose, spread, frame="prior_map", clock=recording.clock)
+    reported = CalibrationPrior.from_settings(calibrated=False, fix={}).mean
+    reckoned, spread = dead_reckoned(trajectory.stamp_s - recording.odometry.stamp_s[0], drive, reported, START)
+    misses = run.misses(places)
+    noise = localizer.noise
+    fit = NoiseFit(noise, np.zeros_like(noise.detection), np.zeros_like(noise.odometry))
+    return SlamResult(
+        trajectory=trajectory,
+        online=trajectory,
+        landmarks=_with_counts(landmarks, recording, run, places, misses),
+        parameters=described(localizer.states, localizer.states_covariance, fit, prior),
+        innovations=run.innovations(recording),
+        misses=misses,
+        step_s=run.step_s[placed],
+        dead_reckoning=replace(trajectory, pose_world_robot=se2.compose(pose[0], reckoned), covariance=spread),
+        warnings=tuple(_warnings(recording, run, places)),
+        interrupted=run.interrupted,
+    )
 
 
 @functools.cache
