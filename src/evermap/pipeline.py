@@ -136,9 +136,8 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
             if config.living.search == "joint" and not steps.fits(visit, alone):
                 return steps.lost(alone, before, "most sightings contradict it; it is bent, or of another place")
         # judged twice: the second time by the lifetimes that the first has learned
-        known, _, _ = steps.judged(living, where, visit, config.living)
-        after, changes, evidence = steps.judged(living, where, visit, config.living, known)
-        return steps.told(after, where, visit, changes, evidence)
+        known = steps.judged(living, where, visit, config.living).living
+        return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
 
 
 def run_localization(

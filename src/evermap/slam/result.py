@@ -56,19 +56,23 @@ def concluded(solved: Solved) -> SlamResult:
     )
 
 
-def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
-    """Bridge the blind stretches and count the misses.
+def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None = None) -> SlamResult:
+    """Bridge the blind stretches, and count the misses where nobody has.
 
     Args:
         solved: the recording and its estimate.
         frame: in which the estimate is: 'first_pose' or 'prior_map'.
-        in_map: landmarks that are told, with what is to be seen of them.
+        in_map: landmarks that are told.
+        misses: what a living map, which counts misses itself, has missed in this recording; None for landmarks whose
+            misses are not counted yet: each line of sight in the field of view is then taken to be clear.
     """
     recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
     path = trajectory(prepared, outcome, recording, frame)
-    rows = np.flatnonzero(recording.frames.stamp_s <= path.stamp_s[-1] + 1e-9).astype(np.int64)
-    poses = path.pose_world_robot[rows_at(path, recording, rows)]
-    misses = find_misses(rows, poses, recording.detections, in_map, recording.frames.stamp_s, recording.sensor)
+    if misses is None:
+        rows = np.flatnonzero(recording.frames.stamp_s <= path.stamp_s[-1] + 1e-9).astype(np.int64)
+        poses = path.pose_world_robot[rows_at(path, recording, rows)]
+        misses = find_misses(rows, poses, recording.detections, in_map, recording.frames.stamp_s, recording.sensor)
+        in_map = with_misses(in_map, misses)
     states = described(outcome.estimate.states, outcome.states_covariance, outcome.noise, solved.prior)
     warnings = [*prepared.warnings, *far_off(states)]
     if solved.interrupted:
@@ -77,7 +81,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
     return SlamResult(
         trajectory=path,
         online=online(prepared, solved.slam, recording, frame),
-        landmarks=with_misses(in_map, misses),
+        landmarks=in_map,
         parameters=states,
         innovations=innovations(prepared, solved.slam, outcome, recording),
         misses=misses,

@@ -398,3 +398,69 @@ def test_what_is_not_to_be_learned_is_not(changing: dict[int, tuple[BuildingSimu
     learned = sessions[-1].living
     assert len(learned.lives.life) > 0
     assert np.unique(learned.sites.clique_id, return_counts=True)[1].max() > 1
+
+
+def test_hits_and_misses_are_the_same_in_the_result_the_map_and_its_evidence(
+    changing: dict[int, tuple[BuildingSimulation, list[Session]]],
+) -> None:
+    """By landmark, at the place where it stands: of all sessions in the records, of the last one in misses."""
+    compared = bodies = 0
+    for _, sessions in changing.values():
+        for before, session in zip([None, *sessions], sessions, strict=False):
+            living, misses = session.living, session.slam.misses
+            counted = {
+                (int(name), int(site)): (int(hits), int(missed))
+                for name, site, hits, missed in zip(
+                    living.places.landmark_id, living.places.site_id, living.places.n_hits, living.places.n_misses,
+                    strict=True,
+                )
+            }  # fmt: skip
+            at = dict(zip(living.members.landmark_id.tolist(), living.site_of().tolist(), strict=True))
+            records = session.slam.landmarks
+            for k, name in enumerate(records.landmark_id.tolist()):
+                assert (records.n_hits[k], records.n_misses[k]) == counted[name, at[name]]
+            known: dict[tuple[int, int], int] = {}
+            if before is not None:
+                places = before.living.places
+                keys = zip(places.landmark_id.tolist(), places.site_id.tolist(), strict=True)
+                known = dict(zip(keys, places.n_misses.tolist(), strict=True))
+            of_session = {key: missed - known.get(key, 0) for key, (_, missed) in counted.items()}
+            for name in records.landmark_id.tolist():
+                if (name, at[name]) in known:
+                    assert int((misses.landmark_id == name).sum()) == of_session[name, at[name]]
+                    compared += 1
+            # what `why` shows: of bodies that have one site, landmark by landmark
+            evidence = session.evidence
+            for clique in np.unique(evidence.clique_id).tolist():
+                mine = np.flatnonzero(living.members.clique_id == clique)
+                site = living.sites.site_id[living.sites.clique_id == clique]
+                names = living.members.landmark_id[mine].tolist()
+                if len(site) == 1 and all((name, int(site[0])) in known for name in names):
+                    told = int(evidence.n_misses[evidence.clique_id == clique].sum())
+                    assert told == sum(of_session[name, int(site[0])] for name in names)
+                    bodies += 1
+    assert compared > 100
+    assert bodies > 50
+
+
+def test_misses_are_in_view_and_not_detected_there(
+    changing: dict[int, tuple[BuildingSimulation, list[Session]]],
+) -> None:
+    for _, sessions in changing.values():
+        session = sessions[-1]
+        recording, misses = session.recording, session.slam.misses
+        stamps = recording.frames.stamp_s[misses.frame]
+        pose = session.slam.trajectory.pose_world_robot[np.searchsorted(session.slam.trajectory.stamp_s, stamps)]
+        assert len(misses)
+        assert ((misses.p_detect > 0.0) & (misses.p_detect < 1.0)).all()
+        assert (np.diff(misses.frame) >= 0).all()
+        pairs = np.column_stack([misses.frame, misses.landmark_id])
+        assert len(np.unique(pairs, axis=0)) == len(pairs)
+        sensor = recording.sensor
+        for name in np.unique(misses.landmark_id).tolist():
+            _, place, _ = place_of(session.living, name)
+            mine = misses.landmark_id == name
+            away = se2.transform(se2.inverse(se2.compose(pose[mine], sensor.mount_robot_sensor)), place)
+            assert np.hypot(*away.T).max() < sensor.range_max_m + 0.2
+            hits = recording.detections.frame[recording.detections.landmark_id == name]
+            assert not np.isin(misses.frame[mine], hits).any()

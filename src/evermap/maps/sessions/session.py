@@ -23,7 +23,7 @@ from evermap.maps.sessions.size import log_ratio, settled
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
-from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Recording, SlamResult, rows_of
+from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Misses, Recording, SlamResult, rows_of
 
 INLIER = 0.5
 LEAST_FIT = 0.75
@@ -181,10 +181,27 @@ def fits(visit: Solved, alone: Solved) -> bool:
     return bool(visit.outcome.inlier.mean() >= LEAST_FIT * alone.outcome.inlier.mean())
 
 
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """What a session says of a map.
+
+    Attributes:
+        living: the map after it.
+        changes: what changed since the session before.
+        evidence: what was seen of every clique, frame by frame.
+        misses: of landmarks at the places where they most probably stand, as the map counts them.
+    """
+
+    living: LivingMap
+    changes: tuple[MapChange, ...]
+    evidence: Evidence
+    misses: Misses
+
+
 def judged(
     living: LivingMap, where: Laid | None, visit: Solved, config: LivingConfig, known: LivingMap | None = None
-) -> tuple[LivingMap, tuple[MapChange, ...], Evidence]:
-    """Return the map after the session, what changed, and what was seen of every clique.
+) -> Judged:
+    """Return the map after the session, what changed, and what was seen and missed.
 
     What was found goes into the map, then hits and misses into beliefs, and those into decisions.
 
@@ -203,7 +220,8 @@ def judged(
     seen, eye = looks(entry, visit, config)
     now = believed(entry, seen, visit, config)
     after, changes = decided(entry.before, now, seen, visit, config, known)
-    return learned(after, seen, replace(entry, living=now.living), eye, config), changes, now.evidence
+    after = learned(after, seen, replace(entry, living=now.living), eye, config)
+    return Judged(after, changes, now.evidence, missed(now.living, seen, visit))
 
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Solved, config: LivingConfig) -> Extended:
@@ -307,6 +325,21 @@ def believed(entry: Extended, seen: Looks, visit: Solved, config: LivingConfig) 
     return Believed(living, log_evidence, evidence)
 
 
+def missed(living: LivingMap, seen: Looks, visit: Solved) -> Misses:
+    """Return the looks that the map counts as misses of landmarks where they most probably stand after the session.
+
+    These are looks in the field of view, without a detection, along lines of sight that are known to be clear.
+    """
+    place = seen.place
+    member = np.searchsorted(living.members.landmark_id, living.places.landmark_id)
+    here = living.site_of()[member] == living.places.site_id
+    rows = np.flatnonzero(seen.counts & ~seen.rows.hit & here[place])
+    rows = rows[np.lexsort((place[rows], seen.rows.stamp_s[rows]))]
+    frame = np.searchsorted(visit.recording.frames.stamp_s, seen.rows.stamp_s[rows])
+    p_detect = seen.lines.p_detect[seen.rows.key[rows]]
+    return Misses(frame.astype(np.int64), living.places.landmark_id[place[rows]], p_detect)
+
+
 def decided(
     before: LivingMap, now: Believed, seen: Looks, visit: Solved, config: LivingConfig, known: LivingMap | None = None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
@@ -346,15 +379,13 @@ def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, con
     return after
 
 
-def told(
-    after: LivingMap, where: Laid | None, visit: Solved, changes: tuple[MapChange, ...], evidence: Evidence
-) -> Session:
-    """Return the session that made a map of another."""
+def told(found: Judged, where: Laid | None, visit: Solved) -> Session:
+    """Return the session that made a map of another; its landmarks have hits and misses of all sessions of the map."""
     frame, names = "first_pose" if where is None else "prior_map", visit.recording.landmark_names
-    landmarks = replace(after.landmarks(p_least=0.5), frame=frame, names=names)
-    changes = tuple(change.named(names) for change in changes)
-    slam = replace(of_slam.result(visit, frame, landmarks), changes=changes)
-    return Session(after, True, visit.recording, slam, changes, evidence)
+    landmarks = replace(found.living.landmarks(p_least=0.5), frame=frame, names=names)
+    changes = tuple(change.named(names) for change in found.changes)
+    slam = replace(of_slam.result(visit, frame, landmarks, found.misses), changes=changes)
+    return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 
 def lost(alone: Solved, living: LivingMap, reason: str) -> Session:
