@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.sort import Sort
+from evermap.config import TrackerConfig
 from evermap.survival import GeneralPurpose
 from evermap.tracking.record import Recorder
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import Followed, TrackState
 from evermap.tracking.views import View
@@ -154,7 +154,7 @@ def tracks_of(scene: Scene, recording: Recording) -> list[Reported]:
 
 def tracker_of(scene: Scene) -> Tracker:
     """All as it is by default, but for the density of false detections."""
-    return Tracker(TrackerSettings(sigma_position_m=SIGMA_M, clutter_per_m3=CLUTTER / scene.spacing_m**3))
+    return Tracker(TrackerConfig(sigma_position_m=SIGMA_M, clutter_per_m3=CLUTTER / scene.spacing_m**3))
 
 
 def view_of(recording: Recording) -> View:

@@ -19,7 +19,7 @@ TYPE_CHECKING = False  # as in typing, which takes longer to load than all of th
 if TYPE_CHECKING:
     from typing import Any
 
-    from evermap.config import Config, load_config
+    from evermap.config import Config, PersistConfig, load_config
     from evermap.errors import EvermapError
     from evermap.io import read_recording, write_native
     from evermap.maps.living import LivingMap
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization, run_session, run_slam
     from evermap.runs.folder import write_run
-    from evermap.runs.persist.config import PersistConfig
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.table import read_looks
     from evermap.runs.sessions import Entered, enter_session
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
 _HOME = {
-    "evermap.config": ("Config", "load_config"),
+    "evermap.config": ("Config", "PersistConfig", "load_config"),
     "evermap.errors": ("EvermapError",),
     "evermap.io": ("read_recording", "write_native"),
     "evermap.maps.living": ("LivingMap",),
@@ -43,7 +42,6 @@ _HOME = {
     "evermap.maps.sessions.session": ("Session",),
     "evermap.slam.check": ("check_recording",),
     "evermap.pipeline": ("run_localization", "run_session", "run_slam"),
-    "evermap.runs.persist.config": ("PersistConfig",),
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),
     "evermap.runs.folder": ("write_run",),

@@ -52,8 +52,9 @@ class EvermapError(Exception):
         problem: what is wrong, in one line without a final full stop.
         path: the file it is in, if any.
         line: line number in that file, counted from 1, header and comments included.
-        field: column or key in question.
-        hint: what to try.
+        field: argument, column or key in question.
+        hint: what to try. Arguments stand in `backquotes` here and in `problem`.
+        row: of the array in question, counted from 0, for callers who know where the array came from.
     """
 
     def __init__(
@@ -64,12 +65,14 @@ class EvermapError(Exception):
         line: int | None = None,
         field: str | None = None,
         hint: str | None = None,
+        row: int | None = None,
     ) -> None:
         self.problem = problem
         self.path = None if path is None else Path(path)
         self.line = line
         self.field = field
         self.hint = hint
+        self.row = row
         super().__init__(self.one_line())
 
     def one_line(self) -> str:

@@ -13,9 +13,9 @@ from scipy.stats import binomtest
 from typer.testing import CliRunner
 
 from evermap.cli.main import app
+from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
 from evermap.survival import Weibull
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN
@@ -85,7 +85,7 @@ def test_tracks_of_patrols_are_the_stays_that_are_drawn_directly() -> None:
     centre = spot.mean(axis=0)
     view = View(centre, 50.0, lambda position: np.full(len(position), 0.9))
     away = View(centre + 500.0, 50.0, lambda position: np.zeros(len(position)))
-    tracker = Tracker(TrackerSettings(sigma_position_m=0.1))
+    tracker = Tracker(TrackerConfig(sigma_position_m=0.1))
     visits = run.visit_s[0][np.diff(run.visit_s[0], append=np.inf) > 15.0]
     for visit in visits:
         there = (run.arrival_s <= visit) & (visit <= run.arrival_s + run.lifetime_s)

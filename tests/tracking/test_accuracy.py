@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from evermap.cli.bench import load_benchmarks
-from evermap.tracking.settings import TrackerSettings
+from evermap.config import TrackerConfig
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
@@ -116,7 +116,7 @@ def test_who_leaves_view_and_comes_back_static_keeps_its_identity(seed: int) -> 
     rng = np.random.default_rng(seed)
     place = grid((10, 10, 5), 10.0)
     n, low, high = len(place), place.min(axis=0) - 5.0, place.max(axis=0) + 5.0
-    tracker = Tracker(TrackerSettings(clutter_per_m3=0.05 / 10.0**3))
+    tracker = Tracker(TrackerConfig(clutter_per_m3=0.05 / 10.0**3))
     here = View(place.mean(axis=0), 100.0, lambda p: np.full(len(p), P_DETECT))
     away = View(place.mean(axis=0) + 1e4, 100.0, lambda p: np.zeros(len(p)))
     swing = rng.normal(size=(n, 3))
@@ -150,7 +150,7 @@ def test_exchanged_objects_are_told_apart_by_what_they_look_like(seed: int, with
     place = grid((10, 10, 1), 8.0)
     low, high = place.min(axis=0) - [4.0, 4.0, 1.0], place.max(axis=0) + [4.0, 4.0, 1.0]
     looks = rng.normal(size=(n, length)) / np.sqrt(length)
-    tracker = Tracker(TrackerSettings(clutter_per_m3=1e-4), n_appearance=length if with_appearance else 0)
+    tracker = Tracker(TrackerConfig(clutter_per_m3=1e-4), n_appearance=length if with_appearance else 0)
 
     def watch(start_s: float, who: IntArray) -> list[list[int]]:
         kept: list[list[int]] = [[] for _ in range(n)]
@@ -201,7 +201,7 @@ def parked(seed: int, duration_s: float = 200.0) -> tuple[StaticSpells, FloatArr
     speed_in, speed_off = rng.uniform(1.0, 3.0, (2, n))
     radius, heading, course = rng.uniform(5.0, 15.0, n), *rng.uniform(-np.pi, np.pi, (2, n))
     off = np.stack([np.cos(course), np.sin(course), rng.uniform(-0.3, 0.3, n)], axis=1)
-    tracker = Tracker(TrackerSettings(sigma_position_m=0.2, clutter_per_m3=1e-6, p_detect=0.8))
+    tracker = Tracker(TrackerConfig(sigma_position_m=0.2, clutter_per_m3=1e-6, p_detect=0.8))
     view = View(place.mean(axis=0), 1e4, lambda p: np.full(len(p), 0.8))
     stamp = 0.0
     while stamp < duration_s:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.config import TrackerConfig
 from evermap.survival import Exponential
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import EventKind
 
@@ -55,7 +55,7 @@ def test_swapped_objects_are_not_confused_when_they_look_different() -> None:
 
 
 def test_objects_that_may_be_moved_are_found_where_they_are_now() -> None:
-    tracker = Tracker(TrackerSettings(moved_reach_m=20.0), n_appearance=3)
+    tracker = Tracker(TrackerConfig(moved_reach_m=20.0), n_appearance=3)
     ids = watched(tracker, appearance=LOOKS)
     after, events = tracker.step(100.0, TWO, appearance=LOOKS[::-1])
     assert after.tolist() == ids[::-1].tolist()
@@ -66,7 +66,7 @@ def test_objects_that_may_be_moved_are_found_where_they_are_now() -> None:
 
 
 def test_the_class_tells_two_objects_in_one_place_apart() -> None:
-    tracker = Tracker(TrackerSettings(p_off_class=1e-6), n_classes=2)
+    tracker = Tracker(TrackerConfig(p_off_class=1e-6), n_classes=2)
     ids = watched(tracker, class_id=[0, 1])
     after, _ = tracker.step(100.0, TWO, [1, 1])
     assert after[1] == ids[1]
@@ -113,7 +113,7 @@ def test_the_nearest_of_several_is_found_jointly() -> None:
 
 @pytest.mark.parametrize("motion", ["acceleration", "velocity"])
 def test_an_object_found_again_is_followed_when_it_drives_off(motion: str) -> None:
-    tracker = Tracker(TrackerSettings(motion=motion))  # type: ignore[arg-type]
+    tracker = Tracker(TrackerConfig(motion=motion))  # type: ignore[arg-type]
     ids = watched(tracker, TWO[:1])
     for k in range(50):
         after, _ = tracker.step(100.0 + 0.1 * k, TWO[:1] + [0.005 * k**2, 0.0, 0.0])  # 1 m/s^2

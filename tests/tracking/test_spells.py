@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.config import TrackerConfig
 from evermap.survival.censored import lifetimes_of_sightings
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
@@ -100,7 +100,7 @@ def test_one_that_came_while_nobody_looked(here: View, elsewhere: View) -> None:
 def test_a_parked_one_that_drives_off_ends_its_spell_and_starts_another() -> None:
     """Parked until 20 s, 4 m in 4 s with no more than 1 m/s^2, parked again from 24 s on."""
     rng = np.random.default_rng(0)
-    tracker = Tracker(TrackerSettings(sigma_position_m=0.1))
+    tracker = Tracker(TrackerConfig(sigma_position_m=0.1))
     for k in range(600):
         stamp = 0.1 * k
         driven = np.clip(stamp - 20.0, 0.0, 4.0)
@@ -130,7 +130,7 @@ def test_noise_does_not_end_a_spell() -> None:
 def test_a_slow_drift_is_no_rest() -> None:
     """At 0.3 m/s no instant's velocity is above the threshold, but it does not stay where it is."""
     rng = np.random.default_rng(2)
-    tracker = Tracker(TrackerSettings(sigma_position_m=0.1))
+    tracker = Tracker(TrackerConfig(sigma_position_m=0.1))
     for k in range(600):
         tracker.step(0.1 * k, ONE + [0.03 * k, 0.0, 0.0] + rng.normal(0.0, 0.1, 3))
     spells = tracker.static_spells()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.tracking.settings import TrackerSettings
+from evermap.config import TrackerConfig
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.tracking.views import View
@@ -21,7 +21,7 @@ def states(tracker: Tracker) -> list[TrackState]:
 
 
 def test_birth_lasts_as_long_as_the_warm_up() -> None:
-    tracker = Tracker(TrackerSettings(warm_up=4))
+    tracker = Tracker(TrackerConfig(warm_up=4))
     for k in range(3):
         assert look(tracker, 0.1 * k, 1, ONE) == []
         assert states(tracker) == [TrackState.BIRTH]
@@ -39,7 +39,7 @@ def test_a_false_alarm_dies_unheard() -> None:
 
 def test_belief_is_the_persistence_filters() -> None:
     """After a detection it is the product of prior odds and likelihood ratios, worked out by hand."""
-    tracker = Tracker(TrackerSettings(vanish_rate_hz=1.0, clutter_per_m3=1e-2, p_real=0.4))
+    tracker = Tracker(TrackerConfig(vanish_rate_hz=1.0, clutter_per_m3=1e-2, p_real=0.4))
     tracker.step(0.0, ONE)
     odds = 0.6 / 0.4
     assert tracker.followed().p_exists[0] == pytest.approx(0.4)
@@ -59,7 +59,7 @@ def _jerk_noise() -> float:
 
 
 def test_lost_and_found() -> None:
-    tracker = Tracker(TrackerSettings(lost_after=3, max_missed=10))
+    tracker = Tracker(TrackerConfig(lost_after=3, max_missed=10))
     look(tracker, 0.0, 30, ONE)
     assert look(tracker, 3.0, 2, NOTHING) == []
     assert kinds(look(tracker, 3.2, 1, NOTHING)) == [EventKind.LOST]
@@ -93,7 +93,7 @@ def test_a_fast_one_dies() -> None:
 
 
 def test_the_class_decides_what_is_fast() -> None:
-    tracker = Tracker(TrackerSettings(class_speed_mps=(0.5, 5.0)), n_classes=2)
+    tracker = Tracker(TrackerConfig(class_speed_mps=(0.5, 5.0)), n_classes=2)
     for k in range(40):
         both = np.array([[0.15 * k, 0.0, 0.0], [0.15 * k, 50.0, 0.0]])
         tracker.step(0.1 * k, both, [0, 1])
@@ -102,7 +102,7 @@ def test_the_class_decides_what_is_fast() -> None:
 
 
 def test_what_should_be_seen_and_is_not_dies(here: View, elsewhere: View) -> None:
-    tracker = Tracker(TrackerSettings(judge_every_s=1.0))
+    tracker = Tracker(TrackerConfig(judge_every_s=1.0))
     look(tracker, 0.0, 30, ONE, view=here)
     look(tracker, 3.0, 11, NOTHING, view=elsewhere)
     assert len(tracker.working_set) == 1  # not seen because not to be seen
@@ -115,7 +115,7 @@ def test_what_should_be_seen_and_is_not_dies(here: View, elsewhere: View) -> Non
 
 def test_looks_closer_together_than_a_judgement_count_once(here: View, elsewhere: View) -> None:
     def survives(step_s: float) -> int:
-        tracker = Tracker(TrackerSettings(judge_every_s=1.0))
+        tracker = Tracker(TrackerConfig(judge_every_s=1.0))
         look(tracker, 0.0, 30, ONE, view=here)
         look(tracker, 3.0, 11, NOTHING, view=elsewhere)
         for k in range(12):
@@ -126,7 +126,7 @@ def test_looks_closer_together_than_a_judgement_count_once(here: View, elsewhere
 
 
 def test_an_active_one_in_view_dies_sooner_than_it_is_given_up(here: View) -> None:
-    tracker = Tracker(TrackerSettings(max_missed=100))
+    tracker = Tracker(TrackerConfig(max_missed=100))
     look(tracker, 0.0, 50, ONE, view=here)
     events = look(tracker, 5.0, 20, NOTHING, view=here)
     assert kinds(events) == [EventKind.LOST, EventKind.DIED]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
 from evermap.survival import Exponential
 from evermap.tracking.record import Recorder, Tracks
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
@@ -29,7 +29,7 @@ def crossing(seed: int, n: int = 60, n_frames: int = 60) -> list[np.ndarray]:
 
 
 def run(frames: list[np.ndarray], order: np.random.Generator | None = None) -> tuple[Tracks, list[np.ndarray]]:
-    tracker, recorder, ids = Tracker(TrackerSettings(clutter_per_m3=1e-3)), Recorder(), []
+    tracker, recorder, ids = Tracker(TrackerConfig(clutter_per_m3=1e-3)), Recorder(), []
     for k, points in enumerate(frames):
         shuffle = np.arange(len(points)) if order is None else order.permutation(len(points))
         tracks, events = tracker.step(0.1 * k, points[shuffle])
@@ -62,7 +62,7 @@ def test_errors_are_as_large_as_their_covariances_say() -> None:
     n = 100
     start = np.arange(n)[:, None] * [20.0, 0.0, 0.0]
     velocity = rng.normal(0.0, 1.0, (n, 3))
-    tracker = Tracker(TrackerSettings(motion_density=1e-9))
+    tracker = Tracker(TrackerConfig(motion_density=1e-9))
     root = rng.normal(0.0, 0.3, (n, 3, 3))
     noise = root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3)  # long in one direction, another for each
     half = np.linalg.cholesky(noise)
@@ -147,13 +147,13 @@ def test_bad_input_is_told_in_one_line(given: dict[str, object], says: str) -> N
     ("make", "says"),
     [
         (
-            lambda: TrackerSettings(p_detect=1.0),
+            lambda: TrackerConfig(p_detect=1.0),
             "field 'p_detect': 1.0 is out of range (try: a number between 0 and 1)",
         ),
-        (lambda: TrackerSettings(warm_up=0), "field 'warm_up': 0 is out of range (try: a whole number from 1)"),
-        (lambda: TrackerSettings(chunk_m=0.0), "field 'chunk_m': 0.0 is out of range (try: a number above 0)"),
+        (lambda: TrackerConfig(warm_up=0), "field 'warm_up': 0 is out of range (try: a whole number from 1)"),
+        (lambda: TrackerConfig(chunk_m=0.0), "field 'chunk_m': 0.0 is out of range (try: a number above 0)"),
         (
-            lambda: TrackerSettings(motion="jerk"),  # type: ignore[arg-type]
+            lambda: TrackerConfig(motion="jerk"),  # type: ignore[arg-type]
             "field 'motion': 'jerk' is out of range (try: acceleration, velocity)",
         ),
         (lambda: Tracker(n_classes=0), "field 'n_classes': 0 classes (try: at least 1)"),
@@ -173,7 +173,7 @@ def test_bad_input_is_told_in_one_line(given: dict[str, object], says: str) -> N
             "field 'priors': 2 lifetime priors for 3 classes",
         ),
         (
-            lambda: Tracker(TrackerSettings(class_speed_mps=(1.0, 2.0)), n_classes=3),
+            lambda: Tracker(TrackerConfig(class_speed_mps=(1.0, 2.0)), n_classes=3),
             "field 'class_speed_mps': 2 speeds for 3 classes",
         ),
     ],

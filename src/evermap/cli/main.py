@@ -16,6 +16,7 @@ from typer.core import TyperGroup
 from evermap import __version__, interrupts, plugins
 from evermap.cli import bench, check, convert, persist, reproduce, simulate, slam, survival, track
 from evermap.cli import map as living_map
+from evermap.cli.options import Verb
 from evermap.cli.terminal import fail, say, warn
 from evermap.errors import EvermapError, EvermapWarning
 
@@ -92,14 +93,26 @@ app = typer.Typer(
 
 app.command("check")(check.check)
 app.command("slam")(slam.slam)
-app.command("persist")(persist.persist)
-app.command("track")(track.track)
+app.command("persist", help=persist.HELP)(persist.persist)
+app.command("track", help=track.HELP)(track.track)
 app.command("convert")(convert.convert)
 app.add_typer(living_map.app)
 app.add_typer(survival.app)
 app.command("simulate")(simulate.simulate)
 app.add_typer(reproduce.app)
 app.command("bench")(bench.bench)
+
+
+def _translate_errors(group: typer.Typer) -> None:
+    """Let all commands, also those of sub-groups, speak of options where the core speaks of arguments."""
+    for command in group.registered_commands:
+        command.cls = Verb
+    for below in group.registered_groups:
+        assert below.typer_instance is not None
+        _translate_errors(below.typer_instance)
+
+
+_translate_errors(app)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:

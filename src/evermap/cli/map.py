@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evermap.cli.map_edits import delete, pin, revert, undelete, unpin, verify
-from evermap.cli.picture import check_picture, write_picture
-from evermap.cli.terminal import echo, print_json, print_rows, say
+from evermap.cli.terminal import check_picture, echo, print_json, print_rows, say, write_picture
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from evermap.cli.picture import write_picture
-from evermap.cli.terminal import echo, print_rows
+from evermap.cli.terminal import echo, print_rows, write_picture
 
 if TYPE_CHECKING:
     from evermap.maps.why import Answer

@@ -8,6 +8,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import plugins
+from evermap.cli.options import Verb
 from evermap.errors import ConfigError, suggestion
 
 
@@ -42,7 +43,7 @@ def command(group: str, name: str) -> Any:
     if name not in plugins.found(group):
         return None
     app = typer.Typer(rich_markup_mode=None, add_completion=False)
-    app.command(name)(plugins.load(group, name))
+    app.command(name, cls=Verb)(plugins.load(group, name))
     return typer.main.get_command(app)
 
 

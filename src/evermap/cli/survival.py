@@ -1,25 +1,95 @@
-"""`evermap survival`: how long features stay, as words, numbers and pictures."""
+"""`evermap survival`: how long features stay, as words, numbers and pictures; estimated, and learned."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.fit import fit
-from evermap.cli.learn import learn
-from evermap.cli.lifetime_numbers import lifetime_lines, lifetime_numbers
-from evermap.cli.picture import check_picture, write_picture
-from evermap.cli.terminal import print_json, print_table, say
+from evermap.cli.options import AsJson, ConfigFile, Settings, ShowConfig, configured, duration_s
+from evermap.cli.persist import Per, PFalse, PMiss, Recurrent
+from evermap.cli.terminal import check_picture, print_json, print_table, progress_bar, say, warn, write_picture
 from evermap.errors import ConfigError
 
+if TYPE_CHECKING:
+    from evermap.existence.choose import Choice
+    from evermap.runs.persist.learning import LearnedModels
+    from evermap.runs.track.estimate import Estimate
+    from evermap.runs.track.lifetimes import Group, LifetimeTable
+    from evermap.survival import LifetimePrior
+
+PLOT = """\
+Draw lifetime priors in four views.
+The views are hazard, cumulative hazard, survival and density over the time since a feature was first seen.
+Durations have a unit (us, ms, s, min, h, d, w, y), rates are per such a unit, shares are below 1.
+
+\b
+A prior is one of:
+  exponential:half-life=2d                            half are gone after 2 days; or mean=3d, or rate=0.5/d
+  unknown:1h..30d                                     the mean stay is unknown, between 1 hour and 30 days
+  general-purpose:low=0.001/s,high=1/s                the same by its rates, as in Rosen 2016
+  uniform:limit=3d                                    any stay up to 3 days, none longer
+  weibull:scale=2d,shape=0.7                          shape < 1: what has stayed stays longer; > 1: it wears out
+  lognormal:median=2d,spread=1.5                      half are gone after 2 days, the logarithms spread by 1.5
+  gamma:scale=2d,shape=2                              two exponential stages of 2 days one after the other
+  never-leaves                                        walls
+  gone-overnight:p=0.3,seen=10:00,night=20:00..6:00   a night takes 30 %, a day nothing; first seen at 10:00
+  gone-by-day:p=0.3,seen=10:00,day=8:00..18:00        a day takes 30 %, a night nothing
+  hazard:0s=1/d,3d=0.01/d                             a rate of 1 a day for 3 days, then 0.01 a day
+  mass:0s..1h=0.3,2d=0.5,never=0.2                    30 % leave within the first hour, 50 % after just 2 days
+  periodic:period=1w,0s=0.2/d,5d=0/d,start=2d         a rate that repeats, here 5 days a week; first seen on day 2
+or a mixture of them:
+  0.3*exponential:half-life=1h+0.7*never-leaves
+
+\b
+Example:
+  evermap survival plot unknown:1h..30d exponential:half-life=2d --out priors.png
+"""
+FIT = """\
+Estimate lifetimes of which only bounds are known.
+\b
+The table has a row a lifetime, in seconds: left, for how long it was seen to stay, and right, when it was found
+gone (equal: the end was watched; empty: never seen gone). It may have entry (known only because it was still
+there by then), weight, class_id, x_m, y_m. `evermap track` writes such tables.
+
+\b
+Estimators:
+  npmle                                   the most probable distribution of all (Turnbull), for any bounds
+  kaplan-meier                            the same with bands, where each end was watched or never seen
+  exponential, weibull, lognormal, gamma  the most probable of a family; extrapolates
+  general-purpose                         the rate is unknown between two limits
+  two-exponentials, some-never-leave      some stay briefly, others long; or for ever
+  best                                    the family with the least AIC
+  gp                                      a Gaussian process hazard with credible bands; groups learn from all
+
+\b
+Every result is a prior: --json gives its text for `evermap persist --prior`, --out a file for --model.
+In JSON, null stands for infinity: in support_right, for mass that was never seen to end.
+
+\b
+Examples:
+  evermap survival fit lifetimes.csv --by class --figure survival.png --out priors.json
+  evermap survival fit lifetimes.csv --by class,chunk --estimator best --json
+  evermap persist looks.csv --model priors.json
+"""
+LEARN = """\
+Learn how long things stay and stay away.
+From looks alone: no truth, no list of changes. Every kind of model is learned without the last part of the looks
+and asked to predict it; the best is learned again from all of them.
+
+\b
+Example:
+  evermap survival learn looks.csv --out model.json --figure model.png
+  evermap persist tomorrow.csv --model model.json
+"""
+
 app = typer.Typer(name="survival", help="How long features stay.", no_args_is_help=True, rich_markup_mode=None)
-app.command("fit")(fit)
-app.command("learn")(learn)
 
 
-@app.command("plot")
+@app.command("plot", help=PLOT)
 def plot(
     priors: Annotated[list[str], typer.Argument(metavar="PRIOR...", help="Lifetimes, written as below.")],
     out: Annotated[Path, typer.Option(help="Figure to write, .png or .svg.")] = Path("lifetimes.png"),
@@ -30,45 +100,15 @@ def plot(
         bool | None,
         typer.Option("--log/--linear", help="Axis of time.", show_default="by the span of the lifetimes"),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the numbers as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Draw lifetime priors in four views.
-
-    The views are hazard, cumulative hazard, survival and density over the time since a feature was first seen.
-    Durations have a unit (us, ms, s, min, h, d, w, y), rates are per such a unit, shares are below 1.
-
-    \b
-    A prior is one of:
-      exponential:half-life=2d                            half are gone after 2 days; or mean=3d, or rate=0.5/d
-      unknown:1h..30d                                     the mean stay is unknown, between 1 hour and 30 days
-      general-purpose:low=0.001/s,high=1/s                the same by its rates, as in Rosen 2016
-      uniform:limit=3d                                    any stay up to 3 days, none longer
-      weibull:scale=2d,shape=0.7                          shape < 1: what has stayed stays longer; > 1: it wears out
-      lognormal:median=2d,spread=1.5                      half are gone after 2 days, the logarithms spread by 1.5
-      gamma:scale=2d,shape=2                              two exponential stages of 2 days one after the other
-      never-leaves                                        walls
-      gone-overnight:p=0.3,seen=10:00,night=20:00..6:00   a night takes 30 %, a day nothing; first seen at 10:00
-      gone-by-day:p=0.3,seen=10:00,day=8:00..18:00        a day takes 30 %, a night nothing
-      hazard:0s=1/d,3d=0.01/d                             a rate of 1 a day for 3 days, then 0.01 a day
-      mass:0s..1h=0.3,2d=0.5,never=0.2                    30 % leave within the first hour, 50 % after just 2 days
-      periodic:period=1w,0s=0.2/d,5d=0/d,start=2d         a rate that repeats, here 5 days a week; first seen on day 2
-    or a mixture of them:
-      0.3*exponential:half-life=1h+0.7*never-leaves
-
-    \b
-    Example:
-      evermap survival plot unknown:1h..30d exponential:half-life=2d --out priors.png
-    """
-    from evermap.survival.durations import parse_duration_s
+    """Draw lifetime priors in four views."""
     from evermap.survival.text import parse_prior
     from evermap.viz.lifetime_figure import plot as draw
 
-    check_picture(out, "--out")
+    check_picture(out, "out")
     named = {text: parse_prior(text) for text in priors}
-    try:
-        until_s = None if until is None else parse_duration_s(until)
-    except ConfigError as error:
-        raise ConfigError(error.problem, field="--until", hint=error.hint) from None
+    until_s = duration_s(until, "until")
     write_picture(out, draw(named, until_s=until_s, log_time=log_time))
     rows = {name: lifetime_numbers(prior) for name, prior in named.items()}
     if as_json:
@@ -77,3 +117,255 @@ def plot(
     for name, numbers in rows.items():
         print_table(name, lifetime_lines(numbers))
     say(f"drawn in {out}")
+
+
+Lifetimes = Annotated[
+    Path, typer.Argument(metavar="FILE", help="Table of lifetimes: .csv, .csv.gz or .parquet.", show_default=False)
+]
+By = Annotated[
+    str | None,
+    typer.Option(metavar="class,chunk", help="Estimate classes, places or both separately.", show_default="all as one"),
+]
+Estimator = Annotated[
+    str | None, typer.Option(metavar="NAME", help="How to estimate: one of the list below.", show_default="npmle")
+]
+ChunkSide = Annotated[float | None, typer.Option(help="Side of the squares of --by chunk [m].", show_default="10")]
+PriorsFile = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.json", help="Keep the priors for `evermap persist --model`.", show_default="none"),
+]
+Curves = Annotated[
+    Path | None, typer.Option(metavar="FILE.png", help="Draw the survival functions.", show_default="none")
+]
+
+
+@app.command("fit", help=FIT)
+def fit(
+    input: Lifetimes,
+    by: By = None,
+    estimator: Estimator = None,
+    chunk_m: ChunkSide = None,
+    out: PriorsFile = None,
+    figure: Curves = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    show_config: ShowConfig = False,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate lifetimes of which only bounds are known."""
+    values = {"survival.by": by, "survival.estimator": estimator, "survival.chunk_m": chunk_m}
+    chosen = configured(config, settings, values, within="survival", show=show_config).survival
+    from evermap.runs.folder import check_output_file
+    from evermap.runs.track.estimate import check_estimator, estimates
+    from evermap.runs.track.lifetimes import BY_CHUNK, groups_of, parse_by, read_lifetimes
+
+    check_estimator(chosen.estimator)
+    words = parse_by(chosen.by)
+    if figure is not None:
+        check_picture(figure, "figure", inputs=[input])
+    if out is not None:
+        check_output_file(out, inputs=[input], ending=".json")
+    if out is not None and BY_CHUNK in words:
+        raise ConfigError("a model file knows no places", field="out", hint="--by class, or the texts of --json")
+    table = read_lifetimes(input)
+    groups = groups_of(table, words, chosen.chunk_m)
+    found: list[Estimate] = []
+    with progress_bar(f"{input.name}: estimating", speed=False) as progress:
+        for one in estimates(chosen.estimator, table, groups):
+            found.append(one)
+            if progress:
+                progress(len(found), len(groups))
+    if out is not None:
+        _keep(out, groups, found)
+    if figure is not None:
+        _draw(figure, groups, found)
+    for remark in [*table.warnings, *_remarks(table, groups)]:
+        warn(remark)
+    if as_json:
+        parts = [_content(table, group, one) for group, one in zip(groups, found, strict=True)]
+        head = {"source": str(input), "by": list(words), "config": {"survival": chosen.to_dict()}}
+        print_json({**head, "groups": parts} if words else {**head, **parts[0]})
+        return
+    for group, one in zip(groups, found, strict=True):
+        print_table(group.label if words else input.name, _lines(table, group, one))
+    if out is not None:
+        say(f"written to {out}; use it with: evermap persist INPUT --model {out}")
+    if figure is not None:
+        say(f"drawn in {figure}")
+
+
+@app.command("learn", help=LEARN)
+def learn(
+    input: Annotated[
+        Path, typer.Argument(metavar="INPUT", help="Table of looks, as `evermap persist` reads it.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="File for the model.")] = Path("model.json"),
+    figure: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Draw what the model predicts.", show_default="none")
+    ] = None,
+    recurrent: Recurrent = None,
+    per: Per = None,
+    p_miss: PMiss = None,
+    p_false: PFalse = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    show_config: ShowConfig = False,
+    as_json: AsJson = False,
+) -> None:
+    """Learn how long things stay and stay away."""
+    given = {"recurrent": recurrent, "per": per, "p_miss": p_miss, "p_false": p_false}
+    values = {f"persist.{name}": value for name, value in given.items()}
+    chosen = configured(config, settings, values, within="persist", show=show_config).persist
+    if recurrent is None and chosen.stays_once:  # there is nothing to learn of one stay
+        chosen = chosen.model_copy(update={"recurrent": "auto"})
+    if figure is not None:
+        check_picture(figure, "figure", inputs=[input])
+    from evermap.runs.folder import check_output_file
+    from evermap.runs.persist.learning import learn_models
+    from evermap.runs.persist.modelfile import save_models
+    from evermap.runs.persist.table import read_looks
+
+    check_output_file(out, inputs=[input], ending=".json")
+    table = read_looks(input, p_miss=chosen.p_miss, p_false=chosen.p_false)
+    with progress_bar(f"{input.name}: learning", speed=False) as progress:
+        tell = None if progress is None else lambda done: progress(done, 1.0)
+        learned = learn_models(table, table.looks(table.order()), chosen, progress=tell)
+    save_models(learned.models, learned.per, out)
+    if figure is not None:
+        from evermap.viz.presence_model_figure import plot_presence_models
+
+        write_picture(figure, plot_presence_models(dict(zip(learned.models.names, learned.models.models, strict=True))))
+    if as_json:
+        content = {"out": str(out), "per": learned.per, "models": _models(learned)}
+        print_json(content | {"config": {"persist": chosen.to_dict()}})
+        return
+    for name, choice in zip(learned.models.names, learned.choices, strict=True):
+        print_table(name or input.name, _learned_lines(choice))
+    say(f"written to {out}; use it with: evermap persist INPUT --model {out}")
+
+
+def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
+    """The priors as models of one stay."""
+    import numpy as np
+
+    from evermap.existence.one_stay import OneStay
+    from evermap.runs.persist.modelfile import save_models
+    from evermap.runs.persist.models import ModelOfEach
+
+    models = tuple(OneStay(found.prior, found.text) for found in estimates)
+    names = tuple(group.class_id or "" for group in groups)
+    per = "all" if groups[0].class_id is None else "class"
+    save_models(ModelOfEach(models, names, np.zeros(0, dtype=np.int64)), per, out)
+
+
+def _draw(path: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
+    from evermap.viz.survival_fit_figure import plot_survival
+
+    write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
+
+
+def _remarks(table: LifetimeTable, groups: Sequence[Group]) -> list[str]:
+    """What a reader of the result must know."""
+    import numpy as np
+
+    endless = [g.label for g in groups if not np.isfinite(table.data.right_s[g.rows]).any()]
+    return [f"{label}: nothing was seen to leave, so the estimate says that nothing ever does" for label in endless]
+
+
+def _counts(table: LifetimeTable, group: Group) -> dict[str, Any]:
+    """How many lifetimes there are of each sort."""
+    import numpy as np
+
+    left, right, entry = (getattr(table.data, name)[group.rows] for name in ("left_s", "right_s", "entry_s"))
+    exact = left == right
+    return {
+        "samples": len(group.rows),
+        "weight": float(table.data.weight[group.rows].sum()),
+        "exact": int(exact.sum()),
+        "intervals": int((np.isfinite(right) & ~exact).sum()),
+        "never_seen_gone": int(np.isinf(right).sum()),
+        "truncated": int((entry > 0.0).sum()),
+    }
+
+
+def _content(table: LifetimeTable, group: Group, found: Estimate) -> dict[str, Any]:
+    """For `--json`."""
+    who: dict[str, Any] = {}
+    if group.class_id is not None:
+        who["class_id"] = group.class_id
+    if group.chunk is not None:
+        who["chunk"] = list(group.chunk)
+    return {
+        **who,
+        "estimator": found.estimator,
+        **_counts(table, group),
+        **found.numbers,
+        **lifetime_numbers(found.prior),
+        "prior": found.text,
+    }
+
+
+def _lines(table: LifetimeTable, group: Group, found: Estimate) -> list[tuple[str, str]]:
+    """What a person wants to know."""
+    counts = _counts(table, group)
+    ends = f"{counts['exact']:,} watched, {counts['intervals']:,} between two looks"
+    lines = [
+        ("lifetimes", f"{counts['samples']:,}"),
+        ("their ends", f"{ends}, {counts['never_seen_gone']:,} never seen"),
+        ("estimator", found.estimator),
+    ]
+    if "loglik" in found.numbers:
+        lines.append(("log likelihood", f"{found.numbers['loglik']:.6g}"))
+    if len(found.text) < 80:
+        lines.append(("prior", found.text))
+    return [*lines, *lifetime_lines(lifetime_numbers(found.prior))]
+
+
+def _models(learned: LearnedModels) -> dict[str, Any]:
+    """For `--json`."""
+    return {
+        name or "all": {"kind": choice.kind, "held_out_s": choice.held_out_s, "scores": dict(choice.scores)}
+        for name, choice in zip(learned.models.names, learned.choices, strict=True)
+    }
+
+
+def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
+    """What a person wants to know of a model."""
+    import numpy as np
+
+    from evermap.survival.durations import duration_text
+    from evermap.viz.presence_model_figure import week_of_presence
+
+    lines = [("kind", choice.kind)]
+    if choice.scores:
+        best = max(choice.scores.values())
+        others = [f"{name} {score - best:.1f}" for name, score in choice.scores.items() if name != choice.kind]
+        lines.append((f"log score of the others, last {duration_text(choice.held_out_s)}", ", ".join(others)))
+    _, week = week_of_presence(choice.model)
+    lines.append(("there on the whole", f"{100.0 * float(np.mean(week)):.1f} % of the time"))
+    return lines
+
+
+def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
+    """Quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
+    quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
+    values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
+    values["mean_stay_s"] = prior.mean()
+    return {k: v if math.isfinite(v) else None for k, v in values.items()} | {"p_never_leaves": prior.p_never_leaves}
+
+
+def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The same in words."""
+    from evermap.survival.durations import duration_text
+
+    names = {
+        "quarter_gone_s": "a quarter is gone after",
+        "half_gone_s": "half are gone after",
+        "three_quarters_gone_s": "three quarters after",
+    }
+    lines = [(title, duration_text(math.inf if numbers[key] is None else numbers[key])) for key, title in names.items()]
+    if numbers["mean_stay_s"] is not None:
+        lines.append(("mean stay", duration_text(numbers["mean_stay_s"])))
+    if numbers["p_never_leaves"]:
+        lines.append(("never leave", f"{100.0 * numbers['p_never_leaves']:.3g} %"))
+    return lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shlex
@@ -10,15 +11,19 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from evermap.errors import printable
+from evermap.errors import ConfigError, printable
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.console import Console
 
+SUFFIXES = (".png", ".svg")
+"""Of pictures."""
 PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
 
@@ -161,3 +166,31 @@ def _console(*, stderr: bool = False) -> Console:
 
 def _colour(stream: TextIO) -> bool:
     return stream.isatty() and "NO_COLOR" not in os.environ
+
+
+def check_picture(path: Path, field: str, *, inputs: Sequence[str | Path] = ()) -> None:
+    """Refuse a file that cannot be drawn, before the work that it shows is done.
+
+    Args:
+        path: the file.
+        field: the argument that named it.
+        inputs: files that are read.
+
+    Raises:
+        ConfigError: a suffix that is neither .png nor .svg, or the file is an input.
+    """
+    from evermap.runs.folder import check_output_file
+
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"cannot draw a '{path.suffix}' file", path=path, field=field, hint="a name ending in .png")
+    check_output_file(path, inputs=inputs)
+
+
+def write_picture(path: Path, figure: Figure) -> None:
+    """Write a figure, whole or not at all."""
+    from evermap.io.atomic import write_atomic
+    from evermap.viz.style import save_png, save_svg
+
+    content = io.BytesIO()
+    (save_svg if path.suffix.lower() == ".svg" else save_png)(figure, content)
+    write_atomic(path, content.getvalue())

@@ -7,8 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from evermap.errors import NumericalError
-from evermap.existence.checks import impossible, likelihoods
+from evermap.existence.checks import likelihoods
 from evermap.existence.death import log_death_odds
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Instants, Looks, Track
@@ -82,9 +81,7 @@ class OneStay:
         evidence, belief = np.zeros(looks.n_features), np.empty(len(time))
         bad = int(stream(feature, odds, there, gone, np.zeros(looks.n_features), evidence, belief))
         if bad >= 0:
-            raise NumericalError(
-                impossible(f"feature {feature[bad]} at {time[bad]} s"), hint="P_M and P_F strictly between 0 and 1"
-            )
+            raise looks.impossible(int(look[bad]))
         p_present = np.full(len(asked.stamp_s), np.nan)
         answer = instant >= 0
         p_present[instant[answer]] = belief[answer]

@@ -50,7 +50,7 @@ class Looks:
         """The error of a look that is impossible, whether the feature is there or not."""
         feature = int(np.searchsorted(self.first, row, side="right")) - 1
         who = f"feature {feature} at {self.stamp_s[row]} s"
-        return NumericalError(checks.impossible(who), hint="P_M and P_F strictly between 0 and 1")
+        return NumericalError(checks.impossible(who), hint="P_M and P_F strictly between 0 and 1", row=row)
 
     @classmethod
     def from_rows(

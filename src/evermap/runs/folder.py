@@ -97,6 +97,17 @@ class RunFolder:
         """Names of all files written so far and of their list, sorted, with forward slashes."""
         return sorted({*_entries(self._partial), MANIFEST})
 
+    def finish(self, summary: dict[str, Any], *more: str) -> dict[str, Any]:
+        """Write `summary.json` and return its content, with the names of all files as `outputs`.
+
+        Args:
+            summary: content, with the keys of `summary_head`.
+            more: names of files that are still to be written.
+        """
+        summary["outputs"] = sorted({*self.files(), SUMMARY, *more})
+        self.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+        return summary
+
     def _take_place(self) -> None:
         """Whole by a rename where the old folder is evermap's alone, else file by file among those of the user."""
         try:
@@ -178,7 +189,7 @@ def check_replaceable(
     """
     shown, out = Path(out), Path(out).expanduser().resolve()
     if out.exists() and not out.is_dir():
-        raise ConfigError("is a file; results need a folder", path=out, field="out", hint="another --out")
+        raise ConfigError("is a file; results need a folder", path=out, field="out", hint="another folder")
     if any(place.is_relative_to(out) for place in _places()):
         raise ConfigError("would replace the working or home folder", path=out, field="out", hint="a folder below it")
     for path in (one for one in inputs if one):
@@ -190,13 +201,13 @@ def check_replaceable(
         return
     ours, foreign = _whose(out)
     if not force and not renew and (ours or foreign):
-        raise ConfigError("is not empty", path=out, field="out", hint="another folder, or --force to write into it")
+        raise ConfigError("is not empty", path=out, field="out", hint="another folder, or `force` to write into it")
     listed = _manifest(out)
     in_the_way = [name for name in foreign if not force or name in listed or name == SUMMARY]
     if in_the_way:
         name = in_the_way[0]
         what = "which was changed since evermap wrote it" if name in listed else "which no evermap run wrote"
-        hint = "another --out" if force else "another --out, or --force to write beside it"
+        hint = "another folder" if force else "another folder, or `force` to write beside it"
         raise ConfigError(f"holds '{name}', {what}", path=out, field="out", hint=hint)
 
 
@@ -303,7 +314,7 @@ def _check_free(folder: Path, ours: Mapping[str, str], new: Iterable[str]) -> No
             blocked.append(path)
         if blocked:
             problem = f"holds '{blocked[0].relative_to(folder).as_posix()}', which evermap did not write"
-            raise ConfigError(problem, path=folder, field="out", hint="another --out, or rename it")
+            raise ConfigError(problem, path=folder, field="out", hint="another folder, or rename it")
 
 
 def _remove(folder: Path, names: Iterable[str]) -> None:
@@ -339,7 +350,7 @@ def _checksum(path: Path) -> str:
 
 
 def _cannot_write(out: Path, error: OSError) -> ConfigError:
-    return ConfigError(f"cannot be written: {error.strerror or error}", path=out, field="out", hint="another --out")
+    return ConfigError(f"cannot be written: {error.strerror or error}", path=out, field="out", hint="another folder")
 
 
 def write_run(
@@ -396,7 +407,6 @@ def write_run(
         if _choose(scene, wanted, "rerun"):
             remarks += _write_scene(folder, recording, result, evaluation, must=scene is True)
 
-        outputs = sorted({*folder.files(), SUMMARY, *(["report.html"] if tell else [])})
         summary = summary_dict(
             recording,
             result,
@@ -404,10 +414,10 @@ def write_run(
             config=_plain(config),
             info=info,
             timing=timing,
-            outputs=outputs,
+            outputs=(),
             warnings=remarks,
         )
-        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
+        folder.finish(summary, *(["report.html"] if tell else []))
         if tell:
             from evermap.viz.report import render_report
 

@@ -21,6 +21,7 @@ from evermap import __version__
 from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult
 
 SUMMARY_SCHEMA_VERSION = "2"
+"""Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
 
 _FRAME_MEANING = {
     "first_pose": "the robot's first pose: origin where it stood, x ahead of it, y to its left; metres",
@@ -36,6 +37,7 @@ class RunInfo:
     Attributes:
         command: the command line, '' if there was none.
         seeds: every seed by name.
+        read_s: wall time of reading the input; None if not measured.
         processing_s: wall time spent on estimating, without waiting for a live recording and without writing the
             outputs; None takes the sum of the steps.
         total_s: wall time of everything so far; None if not measured.
@@ -45,10 +47,49 @@ class RunInfo:
 
     command: str = ""
     seeds: Mapping[str, int] = field(default_factory=dict)
+    read_s: float | None = None
     processing_s: float | None = None
     total_s: float | None = None
     peak_memory_mb: float | None = None
     grown: int | None = None
+
+
+def summary_head(
+    info: RunInfo,
+    *,
+    config: Mapping[str, Any],
+    source: str,
+    timing: Mapping[str, Any],
+    warnings: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return the keys that every `summary.json` has; `RunFolder.finish` adds `outputs`. Pure, timing aside.
+
+    Args:
+        info: command and seeds.
+        config: the sections of the configuration in effect, as JSON values.
+        source: what was read, '' for what was made in memory.
+        timing: seconds by step; the total, peak memory and date are added where they are missing.
+        warnings: remarks.
+    """
+    times = {**({} if info.read_s is None else {"read_s": info.read_s}), **timing}
+    if "total_s" not in times:
+        times["total_s"] = sum(seconds for name, seconds in times.items() if name.endswith("_s") and seconds)
+    if "peak_memory_mb" not in times:
+        times["peak_memory_mb"] = _number(peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb)
+    times.setdefault("written_at", datetime.now(UTC).isoformat(timespec="seconds"))
+    return {
+        "schema_version": SUMMARY_SCHEMA_VERSION,
+        "evermap": __version__,
+        "version": __version__,
+        "versions": versions(),
+        "command": info.command,
+        "config": dict(config),
+        "seeds": dict(info.seeds),
+        "input": source,
+        "source": source,
+        "warnings": list(warnings),
+        "timing": times,
+    }
 
 
 def summary_dict(
@@ -75,14 +116,9 @@ def summary_dict(
         warnings: remarks beyond those of the recording and the result.
     """
     frame = result.trajectory.frame
+    remarks = [*recording.warnings, *result.warnings, *warnings]
     return {
-        "schema_version": SUMMARY_SCHEMA_VERSION,
-        "evermap": __version__,
-        "versions": versions(),
-        "command": info.command,
-        "config": config,
-        "seeds": dict(info.seeds),
-        "source": recording.source,
+        **summary_head(info, config=config, source=recording.source, timing=timing, warnings=remarks),
         "recording": {"name": recording.name, "source": recording.source, "clock": recording.clock.value},
         "frames": {
             "world": f"{frame}: {_FRAME_MEANING.get(frame, 'as named; metres')}",
@@ -91,12 +127,10 @@ def summary_dict(
             "clock": f"{recording.clock.value}; seconds",
         },
         "metrics": dict(metrics),
-        "timing": dict(timing),
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
         "changes": [change_dict(change) for change in result.changes],
         "alternatives": [_alternative(alternative) for alternative in result.alternatives],
         "parameters": [_parameter(parameter) for parameter in result.parameters],
-        "warnings": [*recording.warnings, *result.warnings, *warnings],
         "outputs": list(outputs),
         "interrupted": bool(result.interrupted),
     }

@@ -8,7 +8,7 @@ from evermap.types import FloatArray, IntArray
 
 
 class Rules(NamedTuple):
-    """When tracklets change their state; see `TrackerSettings`."""
+    """When tracklets change their state; see `TrackerConfig`."""
 
     odds_confirm: float
     odds_dead: float

@@ -27,7 +27,7 @@ class Evidence(NamedTuple):
         class_prior: (C,) of objects that are not known.
         log_clutter: log of the density of detections that are of nobody known, 1/m^3.
         gate: largest squared Mahalanobis distance.
-        appearance_nats, appearance_neutral: see `TrackerSettings`.
+        appearance_nats, appearance_neutral: see `TrackerConfig`.
         moved_reach_m: objects may be found this far from where they are expected, 0 if not ...
         log_moved: ... with this log density, 1/m^3.
     """

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
 from evermap.survival import GeneralPurpose, LifetimePrior
 from evermap.tracking import detections
 from evermap.tracking.frame import EventTable, Frame, Rules, SpellTable
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import SpellLog, StaticSpells
 from evermap.tracking.tracklets import Event, EventKind, Followed, TrackState, grown, room_for
 from evermap.tracking.views import View, ViewMemory
@@ -43,7 +43,7 @@ class Tracker:
 
     def __init__(
         self,
-        settings: TrackerSettings | None = None,
+        settings: TrackerConfig | None = None,
         *,
         n_classes: int = 1,
         confusion: FloatArray | None = None,
@@ -55,7 +55,7 @@ class Tracker:
         if n_classes < 1:
             raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
         self._gating, self._kalman, self._life, self._rows = gating, kalman, life, rows
-        self.settings = s = settings or TrackerSettings()
+        self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         lifetimes = _as_priors(priors, n_classes)
         self._evidence = gating.Evidence(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.config import PersistConfig
 from evermap.existence.one_stay import OneStay
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Looks
-from evermap.runs.persist.changes import TAIL, Changes, find_changes
+from evermap.runs.persist.changes import Changes, find_changes
 from evermap.survival import Exponential
 
 
@@ -56,7 +57,10 @@ def test_decisions_and_intervals_equal_brute_force(seed: int) -> None:
         beliefs = p[looks.first[feature] : looks.first[feature + 1]].tolist()
         for entered, decided, returned in walk(beliefs, 0.9):
             cumulative = np.cumsum(posterior(mine, entered, decided, returned))
-            first, last = np.argmax(cumulative >= TAIL), np.argmax(cumulative >= 1.0 - TAIL)
+            first, last = (
+                np.argmax(cumulative >= PersistConfig().tail),
+                np.argmax(cumulative >= 1.0 - PersistConfig().tail),
+            )
             edges = mine.stamp_s[entered : decided + 1]
             median = np.interp(0.5, np.concatenate([[0.0], cumulative]), edges)
             confidence = beliefs[decided] if returned else 1.0 - beliefs[decided]

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evermap.cli.options import priors_by_class
+from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, EvermapError, InputError
 from evermap.existence.one import PersistenceFilter
 from evermap.existence.one_stay import OneStay
@@ -17,7 +19,6 @@ from evermap.existence.protocol import Instants
 from evermap.existence.run_length import RunLength
 from evermap.existence.storage import save_model
 from evermap.metrics.belief import belief_scores
-from evermap.runs.persist.config import PersistConfig, split_priors
 from evermap.runs.persist.models import ModelOfEach, looks_at, some_looks
 from evermap.runs.persist.run import nice_step, run_persist
 from evermap.runs.persist.table import LookTable, read_looks
@@ -207,7 +208,7 @@ def test_features_that_come_back_under_one_stay_are_remarked_on(tmp_path: Path) 
     path.write_text("stamp_s,feature_id,detected\n" + rows)
     result = run_persist(read_looks(path))
     np.testing.assert_array_equal(result.changes.returned, [False, True])
-    assert "1 feature came back, which lifetimes of one stay rule out: try --recurrent" in result.warnings
+    assert "1 feature came back, which lifetimes of one stay rule out: try persist.recurrent" in result.warnings
 
 
 def test_models_by_class_answer_for_a_part_of_the_features() -> None:
@@ -222,8 +223,10 @@ def test_models_by_class_answer_for_a_part_of_the_features() -> None:
 @pytest.mark.parametrize("most", [100, 57, 20, 3])
 def test_learning_takes_whole_features_or_the_latest_looks_of_one(tmp_path: Path, most: int) -> None:
     looks = run_persist(table(tmp_path)).looks
-    assert some_looks(looks, len(looks.stamp_s)) is looks
-    part = some_looks(looks, most)
+    every = np.arange(looks.n_features)
+    np.testing.assert_array_equal(some_looks(looks, every, len(looks.stamp_s))[1], np.arange(len(looks.stamp_s)))
+    part, rows = some_looks(looks, every, most)
+    np.testing.assert_array_equal(part.stamp_s, looks.stamp_s[rows])
     assert 0 < len(part.stamp_s) <= most
     whole = [looks.of(feature).stamp_s.tolist() for feature in range(looks.n_features)]
     for feature in range(part.n_features):
@@ -237,20 +240,20 @@ def test_learning_takes_whole_features_or_the_latest_looks_of_one(tmp_path: Path
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({"query": "rows"}, "'rows' is no query"),
-        ({"step_s": 0.0}, "field '--step-s': must be positive"),
-        ({"horizon_s": -1.0}, "field '--horizon': must be positive"),
-        ({"confidence": 0.5}, "field '--confidence': must lie above 0.5"),
-        ({"prior": "exponential:half-lif=2d"}, r"field '--prior': .*half-lif.*\(try: half-life\)"),
-        ({"prior": "hazard:0s=-1/d"}, "field '--prior': .*not negative"),
-        ({"class_priors": {"door": PRIOR}}, "field '--prior': no feature is of class 'door'"),
-        ({"recurrent": "sometimes"}, "field '--recurrent': 'sometimes' is no kind of model"),
-        ({"recurrent": "two-state", "model": "m.json"}, "field '--recurrent': a model from a file is not learned"),
-        ({"recurrent": "two-state", "per": "row"}, "field '--per': 'row' is no grouping"),
-        ({"learn_from": 1}, "field '--learn-from': 1 looks teach nothing"),
+        ({"query": "rows"}, "field 'query': input should be 'times' or 'grid', not 'rows'"),
+        ({"step_s": 0.0}, "field 'step_s': input should be greater than 0"),
+        ({"horizon_s": -1.0}, "field 'horizon_s': input should be greater than 0"),
+        ({"confidence": 0.5}, "field 'confidence': input should be greater than 0.5"),
+        ({"prior": "exponential:half-lif=2d"}, r"field 'prior': .*half-lif.*\(try: half-life\)"),
+        ({"prior": "hazard:0s=-1/d"}, "field 'prior': .*not negative"),
+        ({"class_priors": {"door": PRIOR}}, "field 'class_priors': no feature is of class 'door'"),
+        ({"recurrent": "sometimes"}, "field 'recurrent': unknown kind of model 'sometimes'"),
+        ({"recurrent": "two-state", "model": "m.json"}, "field 'recurrent': a model from a file is not learned"),
+        ({"recurrent": "two-state", "per": "row"}, "field 'per': input should be .* not 'row'"),
+        ({"learn_from": 1}, "field 'learn_from': input should be greater than or equal to 2, not 1"),
         ({"model": "/no/such.json"}, "cannot be read"),
-        ({"query": "grid", "step_s": 1e-7}, "field '--step-s': .* instants of 8 features"),
-        ({"horizon_s": 1e9, "step_s": 1.0}, "field '--horizon'"),
+        ({"query": "grid", "step_s": 1e-7}, "field 'step_s': .* instants of 8 features"),
+        ({"horizon_s": 1e9, "step_s": 1.0}, "field 'horizon_s'"),
     ],
 )
 def test_choices_that_cannot_be_are_named(tmp_path: Path, config: dict[str, object], message: str) -> None:
@@ -260,14 +263,14 @@ def test_choices_that_cannot_be_are_named(tmp_path: Path, config: dict[str, obje
 
 def test_priors_by_class_are_told_from_priors() -> None:
     texts = ["exponential:half-life=2d", "door = 0.5*uniform:limit=1d + 0.5*never-leaves", "big box=never-leaves"]
-    common, by_class = split_priors(texts)
+    common, by_class = priors_by_class(texts)
     assert common == texts[0]
     assert by_class == {"door": "0.5*uniform:limit=1d + 0.5*never-leaves", "big box": "never-leaves"}
-    assert split_priors(["0.3*exponential:half-life=1h+0.7*never-leaves"])[1] == {}
-    assert split_priors([]) == (None, {})
+    assert priors_by_class(["0.3*exponential:half-life=1h+0.7*never-leaves"])[1] is None
+    assert priors_by_class([]) == (None, None)
     for twice in (["never-leaves", PRIOR], ["a=never-leaves", "a=never-leaves"]):
         with pytest.raises(ConfigError, match="given twice"):
-            split_priors(twice)
+            priors_by_class(twice)
 
 
 def test_nice_steps() -> None:
@@ -292,7 +295,7 @@ def test_looks_that_make_beliefs_wrong_are_told(tmp_path: Path) -> None:
 def test_an_inverted_detector_is_refused_by_file_option_and_array(tmp_path: Path, rates: tuple[float, float]) -> None:
     path = tmp_path / "looks.csv"
     path.write_text("stamp_s,feature_id,detected\n0,a,1\n5,a,1\n")
-    with pytest.raises(ConfigError, match=r"'--p-miss': .* make 1 or more"):
+    with pytest.raises(ConfigError, match=r"'p_miss': .* make 1 or more"):
         read_looks(path, p_miss=rates[0], p_false=rates[1])
     table = read_looks(path)
     with pytest.raises(InputError, match="make 1 or more"):

@@ -14,8 +14,6 @@ import numpy as np
 from evermap.existence.protocol import Looks
 from evermap.types import BoolArray, FloatArray, IntArray
 
-TAIL = 0.025
-"""Posterior probability that a change lies before the interval given for it, and as much after it."""
 _SHORTEST_GAP_S = 1e-9
 """Looks at one time are no time apart, but a change between them can be all that is left."""
 _CERTAIN = 700.0
@@ -50,13 +48,14 @@ class Changes:
         return np.bincount(self.feature, minlength=n_features)
 
 
-def find_changes(looks: Looks, p_present: FloatArray, confidence: float) -> Changes:
+def find_changes(looks: Looks, p_present: FloatArray, confidence: float, tail: float = 0.025) -> Changes:
     """Changes of all features.
 
     Args:
         looks: by feature and time.
         p_present: (M,) belief right after each look, nan where there is none.
         confidence: belief in a state from which on it is taken to be so, above 0.5.
+        tail: probability that a change lies before the interval given for it, and as much after it.
     """
     feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
     state = np.where(p_present >= confidence, 1, np.where(p_present <= 1.0 - confidence, -1, 0))
@@ -66,7 +65,7 @@ def find_changes(looks: Looks, p_present: FloatArray, confidence: float) -> Chan
     decided = sure[flip]
     entered = _since(sure, feature, flip)
     returned = state[decided] == 1
-    stamp_s, before, after = _when(looks, entered, decided, returned)
+    stamp_s, before, after = _when(looks, entered, decided, returned, tail)
     belief = p_present[decided]
     found = Changes(
         feature=feature[decided],
@@ -91,9 +90,9 @@ def _since(sure: IntArray, feature: IntArray, flip: IntArray) -> IntArray:
 
 
 def _when(
-    looks: Looks, entered: IntArray, decided: IntArray, returned: BoolArray
+    looks: Looks, entered: IntArray, decided: IntArray, returned: BoolArray, tail: float
 ) -> tuple[FloatArray, IntArray, IntArray]:
-    """Posterior of one change within each window of looks `entered` to `decided`: median, and the looks around 95 %.
+    """Return the median of one change within each window of looks `entered` to `decided`, and the looks around it.
 
     If the change lies in the gap after look `k`, the looks up to `k` speak about the old state and later ones about
     the new. All windows are laid one behind the other, so that no loop over them is needed.
@@ -122,7 +121,7 @@ def _when(
     left = total[middle] - np.arange(len(length)) - weight[middle]
     inside = np.clip((0.5 - left) / weight[middle], 0.0, 1.0)
     start_s, stop_s = looks.stamp_s[gap[middle]], looks.stamp_s[gap[middle] + 1]
-    return start_s + inside * (stop_s - start_s), gap[entry(TAIL)], gap[entry(1.0 - TAIL)] + 1
+    return start_s + inside * (stop_s - start_s), gap[entry(tail)], gap[entry(1.0 - tail)] + 1
 
 
 def _log_ratio(looks: Looks) -> FloatArray:

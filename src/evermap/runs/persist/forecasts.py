@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from evermap.config import PersistConfig
 from evermap.errors import ConfigError
 from evermap.existence.one_stay import OneStay, births
 from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.run_length import RunLength
-from evermap.runs.persist.config import PersistConfig
 from evermap.runs.persist.models import ModelOfEach, looks_at
 from evermap.types import FloatArray
 
-SHARE = 0.25
-"""Horizon where none is given: this share of the time that the looks span."""
 STEPS = 10
 MOST_STEPS = 10_000
 
@@ -41,16 +39,16 @@ class Forecasts:
 
 
 def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatArray:
-    """(N,) instants from the latest look on, `--horizon` far.
+    """(N,) instants from the latest look on, `horizon_s` far.
 
     Raises:
         ConfigError: so many steps that one of them must be wrong.
     """
-    horizon_s = config.horizon_s or SHARE * (now_s - float(looks.stamp_s.min())) or 1.0
+    horizon_s = config.horizon_s or config.horizon_share * (now_s - float(looks.stamp_s.min())) or 1.0
     step_s = config.step_s or horizon_s / STEPS
     count = int(np.floor(horizon_s / step_s * (1.0 + 1e-12)))
     if count > MOST_STEPS:
-        raise ConfigError(f"{horizon_s:g} s in steps of {step_s:g} s", field="--horizon", hint="a longer --step-s")
+        raise ConfigError(f"{horizon_s:g} s in steps of {step_s:g} s", field="horizon_s", hint="a longer `step_s`")
     return now_s + step_s * np.arange(count + 1, dtype=np.float64)
 
 

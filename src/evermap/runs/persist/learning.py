@@ -7,22 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.errors import ConfigError, DataError
+from evermap.config import PersistConfig
+from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.existence.choose import KINDS, Choice, choose
 from evermap.existence.protocol import Looks
 from evermap.existence.rhythm import BIN_S
 from evermap.io.text import quote
-from evermap.runs.persist.models import ModelOfEach, looks_at, some_looks
+from evermap.runs.persist.models import ModelOfEach, some_looks
 from evermap.runs.persist.table import LookTable
 from evermap.types import UNKNOWN, IntArray
 
 AUTO = "auto"
-PER = (AUTO, "all", "class", "feature")
-MOST_FEATURES_ALONE = 32
-FEWEST_LOOKS_ALONE = 200
-MOST_LOOKS = 100_000
-"""Looks that are learned from: more make learning slow and the model hardly better."""
-
 MOST_STEPS = 20_000_000
 """Steps of time that learning of run lengths goes through, hundreds of times: more would need gigabytes and days."""
 MOST_BINS = 2_000_000
@@ -49,10 +44,8 @@ class LearnedModels:
 def learn_models(
     table: LookTable,
     looks: Looks,
-    kind: str = AUTO,
-    per: str = AUTO,
+    config: PersistConfig,
     *,
-    most_looks: int = MOST_LOOKS,
     progress: Progress | None = None,
 ) -> LearnedModels:
     """Learn how features come and go from looks alone.
@@ -60,10 +53,11 @@ def learn_models(
     Args:
         table: what was read; its truth is not looked at.
         looks: its looks by feature and time.
-        kind: one of `choose.KINDS`, or 'auto', which chooses for each model by foretelling looks that were held out.
-        per: 'all' features share a model, or those of a 'class', or every 'feature' has its own. 'auto': by class where
-            the table has classes, by feature where there are few features with many looks each, else one for all.
-        most_looks: of more, whole features drawn at random are learned from, or the latest looks at one.
+        config: `recurrent` is one of `choose.KINDS`, or 'auto', which chooses for each model by predicting looks that
+            were held out. With `per`, 'all' features share a model, or those of a 'class', or every 'feature' has its
+            own; 'auto': by class where the table has classes, by feature where there are few features with many looks
+            each, else one for all. Of more looks than `learn_from`, whole features drawn at random are learned from, or
+            the latest looks at one.
         progress: called with the part that is done.
 
     Raises:
@@ -71,17 +65,16 @@ def learn_models(
         DataError: a group with too few looks to learn from, or with looks over so long a time, in steps of their
             usual gap, that no memory holds it.
     """
+    kind = config.recurrent
     if kind != AUTO and kind not in KINDS:
-        raise ConfigError(f"'{kind}' is no kind of model", field="--recurrent", hint=", ".join((AUTO, *KINDS)))
-    if per not in PER:
-        raise ConfigError(f"'{per}' is no grouping", field="--per", hint=" or ".join(PER))
-    grouping = _grouping(table, looks) if per == AUTO else per
+        raise ConfigError(f"unknown kind of model '{kind}'", field="recurrent", hint=", ".join((AUTO, *KINDS)))
+    grouping = _grouping(table, looks, config) if config.per == AUTO else config.per
     groups = list(_groups(table, grouping))
     of_feature = np.zeros(table.n_features, dtype=np.int64)
     choices: list[Choice] = []
     tell = progress or (lambda _: None)
     for number, (name, features) in enumerate(groups):
-        part = some_looks(looks_at(looks, features)[0], max(most_looks // len(groups), 2))
+        part, rows = some_looks(looks, features, max(config.learn_from // len(groups), 2))
 
         def within(done: float, number: int = number) -> None:
             tell((number + done) / len(groups))
@@ -91,6 +84,9 @@ def learn_models(
             choices.append(choose(part, None if kind == AUTO else [kind], progress=within))
         except DataError as error:
             raise DataError(f"{quote(name)}: {error.problem}" if name else error.problem, hint=error.hint) from error
+        except NumericalError as error:
+            row = None if error.row is None else int(rows[error.row])
+            raise NumericalError(error.problem, hint=error.hint, row=row) from error
         of_feature[features] = number
         within(1.0)
     names = tuple(name for name, _ in groups)
@@ -110,16 +106,16 @@ def _check_span(looks: Looks, kind: str) -> None:
     steps = float(pause_s.sum()) / step_s
     if steps > (MOST_BINS * looks.n_features if phases else MOST_STEPS):
         problem = f"{steps:.2g} steps of {step_s:g} s lie between the looks, the longest pause is {pause_s.max():g} s"
-        hint = "is a stamp astray? else fewer looks (--learn-from), or --recurrent two-state"
+        hint = "is a stamp astray? else fewer looks (`learn_from`), or `recurrent` two-state"
         raise DataError(problem, field="stamp_s", hint=hint)
 
 
-def _grouping(table: LookTable, looks: Looks) -> str:
+def _grouping(table: LookTable, looks: Looks, config: PersistConfig) -> str:
     """By class where there are classes, by feature where each has a lot to say, else all together."""
     if table.class_names:
         return "class"
-    plenty = np.diff(looks.first).min() >= FEWEST_LOOKS_ALONE
-    return "feature" if table.n_features <= MOST_FEATURES_ALONE and plenty else "all"
+    plenty = np.diff(looks.first).min() >= config.fewest_looks_alone
+    return "feature" if table.n_features <= config.most_features_alone and plenty else "all"
 
 
 def _groups(table: LookTable, per: str) -> Iterator[tuple[str, IntArray]]:
@@ -129,7 +125,7 @@ def _groups(table: LookTable, per: str) -> Iterator[tuple[str, IntArray]]:
             yield name, np.array([feature])
     elif per == "class":
         if not table.class_names:
-            raise ConfigError("the table has no classes", field="--per", hint="a column class_id, or --per all")
+            raise ConfigError("the table has no classes", field="per", hint="a column class_id, or `per` all")
         for index, name in enumerate(table.class_names):
             yield name, np.flatnonzero(table.class_of_feature == index)
         others = np.flatnonzero(table.class_of_feature == UNKNOWN)

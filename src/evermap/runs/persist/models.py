@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.config import PersistConfig
+from evermap.config.tables import NO_RECURRENCE
 from evermap.errors import ConfigError, EvermapError
 from evermap.existence.one_stay import OneStay
 from evermap.existence.protocol import Instants, Looks, PresenceFilter, PresenceModel, Track
 from evermap.io.text import quote
-from evermap.runs.persist.config import NO_RECURRENCE, PersistConfig
 from evermap.runs.persist.table import LookTable
 from evermap.types import FloatArray, IntArray
 
@@ -73,16 +74,16 @@ def models_for(
     if config.stays_once:
         return _one_stay(config, table), None
     if config.class_priors:
-        raise ConfigError("lifetimes are for features that stay once", field="--prior", hint="without --recurrent")
+        raise ConfigError("lifetimes are for features that stay once", field="class_priors", hint="without `recurrent`")
     if config.model:
         if config.recurrent != NO_RECURRENCE:
-            raise ConfigError("a model from a file is not learned", field="--recurrent", hint="without --model")
+            raise ConfigError("a model from a file is not learned", field="recurrent", hint="without `model`")
         from evermap.runs.persist.modelfile import load_models
 
         return load_models(config.model, table), None
     from evermap.runs.persist.learning import learn_models
 
-    learned = learn_models(table, looks, config.recurrent, config.per, most_looks=config.learn_from, progress=progress)
+    learned = learn_models(table, looks, config, progress=progress)
     return learned.models, learned
 
 
@@ -91,14 +92,14 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
     for name, text in config.class_priors.items():
         if name not in table.class_names:
             hint = f"one of {', '.join(table.class_names)}" if table.class_names else "a column class_id in the table"
-            raise ConfigError(f"no feature is of class {quote(name)}", field="--prior", hint=hint)
+            raise ConfigError(f"no feature is of class {quote(name)}", field="class_priors", hint=hint)
         texts[name] = text
     models = []
     for text in texts.values():
         try:
             models.append(OneStay.of_text(text))
         except EvermapError as error:
-            raise ConfigError(error.problem, field="--prior", hint=error.hint) from error
+            raise ConfigError(error.problem, field="prior", hint=error.hint) from error
     index = {name: k for k, name in enumerate(texts)}
     of_class = np.array([index.get(name, 0) for name in table.class_names] + [0])  # the last one is for UNKNOWN = -1
     return ModelOfEach(tuple(models), tuple(texts), of_class[table.class_of_feature])
@@ -126,18 +127,22 @@ def ask(model: PresenceFilter, looks: Looks, *questions: tuple[IntArray, FloatAr
     return np.split(answers, ends[:-1]), track
 
 
-def some_looks(looks: Looks, most: int) -> Looks:
-    """All looks at as many features, drawn at random, as make up at most `most`; of a single one its latest."""
-    if len(looks.stamp_s) <= most:
-        return looks
-    drawn = np.random.default_rng(0).permutation(looks.n_features)
-    enough = int(np.searchsorted(np.cumsum(np.diff(looks.first)[drawn]), most, side="right"))
-    part, _ = looks_at(looks, np.sort(drawn[: max(enough, 1)]))
-    if len(part.stamp_s) <= most:
-        return part
-    latest = slice(len(part.stamp_s) - most, None)
-    columns = (part.stamp_s, part.detected, part.p_miss, part.p_false)
-    return Looks(np.array([0, most]), *(column[latest] for column in columns))
+def some_looks(looks: Looks, features: IntArray, most: int) -> tuple[Looks, IntArray]:
+    """Return looks at some features and the rows they are: of so many of these, at random, as make up at most `most`.
+
+    Of a single feature with more looks its latest are returned.
+    """
+    part, rows = looks_at(looks, features)
+    if len(rows) <= most:
+        return part, rows
+    drawn = np.random.default_rng(0).permutation(part.n_features)
+    enough = int(np.searchsorted(np.cumsum(np.diff(part.first)[drawn]), most, side="right"))
+    part, rows = looks_at(looks, features[np.sort(drawn[: max(enough, 1)])])
+    if len(rows) <= most:
+        return part, rows
+    latest = rows[-most:]
+    columns = (looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
+    return Looks(np.array([0, most]), *(column[latest] for column in columns)), latest
 
 
 def looks_at(looks: Looks, features: IntArray) -> tuple[Looks, IntArray]:

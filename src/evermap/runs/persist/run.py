@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.existence.one_stay import OneStay
 from evermap.existence.protocol import Looks
 from evermap.io.text import counted, quote
 from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
 from evermap.runs.persist.changes import Changes, find_changes
-from evermap.runs.persist.config import DEFAULT_PRIOR, PersistConfig
 from evermap.runs.persist.forecasts import Forecasts, forecast_stamps, forecasts_of
 from evermap.runs.persist.models import ModelOfEach, ask, models_for
 from evermap.runs.persist.table import LookTable, Truth
@@ -120,11 +119,11 @@ def run_persist(
         clock.done("learn")
         beliefs, p_at_looks, forecasts, merged_mass = _filter(table, order, config, models, looks)
     except NumericalError as error:
-        raise _named(error, table) from error
+        raise _named(error, table, order) from error
     except DataError as error:
         raise DataError(error.problem, path=table.source or None, hint=error.hint) from error
     clock.done("filter")
-    changes = find_changes(looks, p_at_looks, config.confidence)
+    changes = find_changes(looks, p_at_looks, config.confidence, config.tail)
     clock.done("changes")
     at_rows = table.present if truth is None and config.query == "times" else None
     truth = truth or table.truth(order)
@@ -140,7 +139,7 @@ def run_persist(
 def warm_up() -> None:
     """Compile the kernels of the persistence filter, or load them."""
     looks = Looks.from_rows([0, 0], [0.0, 1.0], [1, 1], 0.1, 0.1)
-    OneStay.of_text(DEFAULT_PRIOR).track(looks)
+    OneStay.of_text(PersistConfig().prior).track(looks)
 
 
 def _filter(
@@ -172,7 +171,7 @@ def _grid(table: LookTable, config: PersistConfig) -> tuple[IntArray, FloatArray
     count = int(np.floor((stop_s - start_s) / step_s * (1.0 + 1e-12))) + 1
     if count * table.n_features > MOST_ROWS:
         problem = f"{step_s:g} s make {count} instants of {table.n_features} features"
-        raise ConfigError(problem, field="--step-s", hint="a longer step, or --query times")
+        raise ConfigError(problem, field="step_s", hint="a longer step, or `query` times")
     instants = start_s + step_s * np.arange(count)
     return np.repeat(np.arange(table.n_features), count), np.tile(instants, table.n_features)
 
@@ -204,7 +203,7 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
     remarks = _odd_looks(looks)
     if config.learns and len(looks.stamp_s) > config.learn_from:
         remarks.append(
-            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (--learn-from)"
+            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (persist.learn_from)"
         )
     for name, model in zip(models.names, models.models, strict=True):
         stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
@@ -218,7 +217,9 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
         )
     back = len(np.unique(changes.feature[changes.returned]))
     if back and config.stays_once:
-        remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try --recurrent")
+        remarks.append(
+            f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try persist.recurrent"
+        )
     return remarks
 
 
@@ -247,17 +248,16 @@ def _odd_looks(looks: Looks) -> list[str]:
     return remarks
 
 
-def _named(error: NumericalError, table: LookTable) -> Exception:
-    """The error of a model, which counts features, with the feature's own name and the line in the file."""
-    found = re.match(r"feature (\d+) at (\S+) s: (.*)", error.problem)
-    if found is None:
+def _named(error: NumericalError, table: LookTable, order: IntArray) -> Exception:
+    """Return the error of a model, which counts looks, with the feature's name and the line in the file."""
+    if error.row is None:
         return error
-    feature, stamp_s = int(found[1]), float(found[2])
-    row = np.flatnonzero((table.feature == feature) & (table.stamp_s == stamp_s) & table.looked)
+    row = order[table.looked[order]][error.row]
     return InputError(
-        f"feature {quote(table.names[feature])} at {stamp_s:.15g} s: {found[3]}",
+        f"feature {quote(table.names[table.feature[row]])} at {table.stamp_s[row]:.15g} s: this observation is "
+        "impossible, whether the feature is there or gone",
         path=table.source or None,
-        line=int(table.line[row[0]]) if row.size else None,
+        line=int(table.line[row]),
         field="detected",
         hint=error.hint,
     )

@@ -176,13 +176,13 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         InputError: anything wrong in the file, by line and column.
         ConfigError: a default that is no probability.
     """
-    for option, value in (("--p-miss", p_miss), ("--p-false", p_false)):
+    for name, value in (("p_miss", p_miss), ("p_false", p_false)):
         if not 0.0 <= value <= 1.0:
-            raise ConfigError(f"{value} is no probability", field=option, hint="a number between 0 and 1")
+            raise ConfigError(f"{value} is no probability", field=name, hint="a number between 0 and 1")
     if p_miss + p_false >= 1.0:
-        problem = f"{p_miss:g} and --p-false {p_false:g} make 1 or more: a detection would speak against the feature"
+        problem = f"{p_miss:g} and `p_false` {p_false:g} make 1 or more: a detection would speak against the feature"
         hint = "both below 0.5; P(detection | there) is 1 - p_miss"
-        raise ConfigError(problem, field="--p-miss", hint=hint)
+        raise ConfigError(problem, field="p_miss", hint=hint)
     warnings: list[str] = []
     table = read_columns(path, warnings)
     _explain_missing(table)

@@ -5,47 +5,39 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from evermap import __version__
 from evermap.io.columns import csv_bytes, named
-from evermap.runs.folder import SUMMARY, RunFolder, summary_text
+from evermap.runs.folder import RunFolder
 from evermap.runs.persist.draw import draw_run
 from evermap.runs.persist.report import render_report
 from evermap.runs.persist.run import PersistResult
-from evermap.runs.summary import change_dict, changes_text, peak_memory_mb, versions
+from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
 from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png
-
-SCHEMA_VERSION = "2"
-FIGURES = 12
 
 
 def write_persist(
     out: str | Path,
     result: PersistResult,
     *,
-    figures: int = FIGURES,
     clock: Clock | None = None,
-    command: str = "",
-    read_s: float | None = None,
+    info: RunInfo | None = None,
     force: bool = False,
     inputs: Iterable[str | Path | None] = (),
     progress: Callable[[float, float], None] | None = None,
 ) -> dict[str, Any]:
-    """Writes the folder of a run. Returns the content of `summary.json`.
+    """Write the folder of a run and return the content of `summary.json`.
 
     Args:
         out: the folder; an older run there is replaced at the end.
-        result: of `run_persist`.
-        figures: how many features get a figure of their own.
+        result: of `run_persist`; `result.config.figures` features get a figure of their own.
         clock: of the stamps, for the figures; None guesses.
-        command: the command line, '' if there was none.
-        read_s: wall time of reading the table.
+        info: command and measured times.
         force: write into a folder that holds other files, too; they stay.
         inputs: files that were read, beside the table.
         progress: told after each figure.
@@ -54,7 +46,7 @@ def write_persist(
         ConfigError: `out` must not or cannot be written.
     """
     with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
-        start = _now()
+        start = perf_counter()
         folder.path("beliefs.csv").write_bytes(_beliefs(result))
         folder.path("forecasts.csv").write_bytes(_forecasts(result))
         folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
@@ -62,39 +54,32 @@ def write_persist(
             from evermap.runs.persist.modelfile import save_models
 
             save_models(result.models, result.learned.per, folder.path("model.json"))
-        written = _now()
+        written = perf_counter()
         drawn: list[NamedFigure] = []
-        total = min(figures, result.table.n_features) + 1 + (result.scores is not None)
-        for figure in draw_run(result, figures=figures, clock=clock):
+        total = min(result.config.figures, result.table.n_features) + 1 + (result.scores is not None)
+        for figure in draw_run(result, figures=result.config.figures, clock=clock):
             save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
             drawn.append(figure)
             if progress:
                 progress(len(drawn), total)
         timing = {
-            **({} if read_s is None else {"read_s": read_s}),
             **{f"{name}_s": seconds for name, seconds in result.step_s.items()},
             "write_s": written - start,
-            "draw_s": _now() - written,
+            "draw_s": perf_counter() - written,
         }
-        summary = persist_summary(result, command=command, timing=timing)
-        summary["outputs"] = sorted([*folder.files(), SUMMARY, "report.html"])
+        summary = folder.finish(persist_summary(result, info=info or RunInfo(), timing=timing), "report.html")
         pages = [folder.path(f"figures/{figure.name}.png").read_bytes() for figure in drawn]
         folder.path("report.html").write_text(render_report(result, summary, drawn, pages), encoding="utf-8")
-        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
     return summary
 
 
-def persist_summary(result: PersistResult, *, command: str, timing: dict[str, float]) -> dict[str, Any]:
-    """The content of `summary.json`; outside of `timing` and `versions` a function of the input and the choices."""
+def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, float]) -> dict[str, Any]:
+    """Return the content of `summary.json`; outside of `timing` and `versions` a function of input and choices."""
     table, changes = result.table, result.changes
     looked = table.looked
+    config = {"persist": result.config.to_dict()}
     return {
-        "schema_version": SCHEMA_VERSION,
-        "evermap": __version__,
-        "versions": versions(),
-        "command": command,
-        "source": table.source,
-        "config": result.config.to_dict(),
+        **summary_head(info, config=config, source=table.source, timing=timing, warnings=result.warnings),
         "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
         "learning": _learning(result),
         "counts": {
@@ -118,13 +103,6 @@ def persist_summary(result: PersistResult, *, command: str, timing: dict[str, fl
         "merged_mass": _number(result.merged_mass),
         "metrics": None if result.scores is None else {k: _number(v) for k, v in asdict(result.scores).items()},
         "reliability": None if result.reliability is None else _reliability(result),
-        "timing": {
-            **timing,
-            "total_s": sum(timing.values()),
-            "peak_memory_mb": _number(peak_memory_mb()),
-            "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        },
-        "warnings": list(result.warnings),
     }
 
 
@@ -211,9 +189,3 @@ def _reliability(result: PersistResult) -> dict[str, list[Any]]:
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value
-
-
-def _now() -> float:
-    from time import perf_counter
-
-    return perf_counter()

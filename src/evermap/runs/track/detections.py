@@ -102,7 +102,7 @@ def read_detections(path: str | Path, *, min_score: float = 0.0) -> DetectionTab
     kept = given.all(axis=1)
     strong = kept & _strong(table, min_score)
     if not strong.any():
-        hint = "a row with a position" if not kept.any() else "a lower --min-score"
+        hint = "a row with a position" if not kept.any() else "a lower `min_score`"
         raise InputError("holds no detection", path=path, field="x_m", hint=hint)
     frames, frame = np.unique(stamp_s, return_inverse=True)
     rows = np.flatnonzero(strong)
@@ -128,7 +128,7 @@ def _strong(table: Columns, min_score: float) -> BoolArray:
     """(R,) whether the score, where there is one, is high enough."""
     if SCORE.name not in table:
         if min_score > 0.0:
-            raise ConfigError("the table has no scores", field="--min-score", hint="a column score in the table")
+            raise ConfigError("the table has no scores", field="min_score", hint="a column score in the table")
         return np.ones(len(table), dtype=np.bool_)
     return np.asarray(~(table.numbers(SCORE) < min_score))
 

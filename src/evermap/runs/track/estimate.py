@@ -54,7 +54,7 @@ def estimators() -> tuple[str, ...]:
 def check_estimator(name: str) -> None:
     """Raises ConfigError for a name that `estimate` does not take."""
     if name not in estimators():
-        raise ConfigError(f"'{name}' is no estimator", field="--estimator", hint=", ".join(estimators()))
+        raise ConfigError(f"'{name}' is no estimator", field="estimator", hint=", ".join(estimators()))
 
 
 def estimates(name: str, table: LifetimeTable, groups: Sequence[Group]) -> Iterator[Estimate]:

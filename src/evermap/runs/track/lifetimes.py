@@ -152,7 +152,7 @@ def parse_by(text: str) -> tuple[str, ...]:
     words = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
     for word in words:
         if word not in {BY_CLASS, BY_CHUNK}:
-            raise ConfigError(f"'{word}' is no grouping", field="--by", hint="class, chunk, or class,chunk")
+            raise ConfigError(f"'{word}' is no grouping", field="by", hint="class, chunk, or class,chunk")
     return words
 
 
@@ -169,17 +169,17 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[G
         InputError: a row without a position where places are told apart.
     """
     if not (np.isfinite(chunk_m) and chunk_m > 0.0):
-        raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="--chunk-m", hint="10")
+        raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="chunk_m", hint="10")
     from evermap.survival.pooling import chunks_of
 
     keys = np.zeros((len(table), 3), dtype=np.int64)  # class, chunk's column and row
     if BY_CLASS in by:
         if not table.has_classes:
-            raise ConfigError("the table names no classes", field="--by", hint="a column class_id in the table")
+            raise ConfigError("the table names no classes", field="by", hint="a column class_id in the table")
         keys[:, 0] = np.where(table.class_of_row == UNKNOWN, len(table.class_names), table.class_of_row)
     if BY_CHUNK in by:
         if not table.has_places:
-            raise ConfigError("the table has no places", field="--by", hint="columns x_m and y_m in the table")
+            raise ConfigError("the table has no places", field="by", hint="columns x_m and y_m in the table")
         nowhere = np.flatnonzero(np.isnan(table.position_m).any(axis=1))
         if nowhere.size:
             line = int(table.line[nowhere[0]])

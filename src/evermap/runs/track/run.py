@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from time import perf_counter
 
 import numpy as np
 
+from evermap.config import TrackConfig
 from evermap.errors import ConfigError, DataError
-from evermap.io.text import counted
-from evermap.runs.track.config import TrackConfig
+from evermap.io.text import counted, quote
 from evermap.runs.track.detections import DetectionTable, said_of
+from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
+from evermap.survival.text import parse_prior
 from evermap.tracking.record import Recorder, Tracks
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
@@ -20,8 +22,6 @@ from evermap.tracking.tracklets import Event
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-_GAP_STEPS = 10.0
-"""A time between frames that is so many times as long as usual is one at which nobody looked."""
 _SLOW_STEP_S = 2.0
 """Frames that are farther apart than this say little about motion."""
 
@@ -89,25 +89,25 @@ def run_track(
     config = config or TrackConfig()
     if config.range_m is not None and table.sensor_m is None:
         hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
-        raise ConfigError("nobody knows where the sensor was", field="--range-m", hint=hint)
+        raise ConfigError("nobody knows where the sensor was", field="range_m", hint=hint)
     names = table.class_names
     tracker = Tracker(
-        replace(config.settings, class_speed_mps=config.speeds(names)),
+        config.model_copy(update={"class_speed_mps": _speeds(config, names)}),
         n_classes=len(names),
         confusion=confusion,
         n_appearance=0 if table.appearance is None else table.appearance.shape[1],
-        priors=config.priors(names),
+        priors=_priors(config, names),
     )
     start = perf_counter()
     recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
     tracks = recorder.tracks()
     if len(tracks) == 0:
-        hint = f"fewer detections to be believed: --set warm_up={max(1, config.settings.warm_up - 1)}"
+        hint = f"fewer detections to be believed: track.warm_up={max(1, config.warm_up - 1)}"
         if _usual_step_s(table) > _SLOW_STEP_S:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
-    spells = _long_enough(tracker.static_spells(), config.settings.rest_for_s)
-    lifetimes, spell_of_lifetime = _lifetimes(spells, config.settings.rest_for_s)
+    spells = _long_enough(tracker.static_spells(), config.rest_for_s)
+    lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
     confirmed = np.isin(track_of_detection, tracks.track_id)
     return TrackResult(
         table=table,
@@ -124,13 +124,36 @@ def run_track(
     )
 
 
+def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePrior, ...]:
+    """Return the prior of every class; ConfigError for text that is no prior, or a class that no detection has."""
+    _check_classes(config.class_priors, class_names, "class_priors")
+    try:
+        return tuple(parse_prior(config.class_priors.get(name, config.prior)) for name in class_names)
+    except ConfigError as error:
+        raise ConfigError(error.problem, field="prior", hint=error.hint) from error
+
+
+def _speeds(config: TrackConfig, class_names: Sequence[str]) -> tuple[float, ...]:
+    """Return the speed of every class above which it is dynamic [m/s]; ConfigError for one that no detection has."""
+    _check_classes(config.speeds_mps, class_names, "speeds_mps")
+    common = config.class_speeds(len(class_names)).tolist()
+    return tuple(config.speeds_mps.get(name, speed) for name, speed in zip(class_names, common, strict=True))
+
+
+def _check_classes(by_class: Mapping[str, object], class_names: Sequence[str], field: str) -> None:
+    for name in by_class:
+        if name not in class_names:
+            hint = f"one of {', '.join(class_names)}" if any(class_names) else "a column class_id in the table"
+            raise ConfigError(f"no detection is of class {quote(name)}", field=field, hint=hint)
+
+
 def _follow(
     tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
 ) -> tuple[Recorder, IntArray, int]:
     """Frame after frame; between them, where nobody looked for long, blind ones."""
-    noise = _noise(table, config.settings.sigma_position_m)
+    noise = _noise(table, config.sigma_position_m)
     step_s = _usual_step_s(table)
-    gap_s = config.gap_s or _GAP_STEPS * step_s
+    gap_s = config.gap_s or config.gap_steps * step_s
     recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
         rows = slice(int(table.first[k]), int(table.first[k + 1]))
@@ -157,7 +180,7 @@ def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
     """What could be seen in frame `k`, if that is known: a ball around the sensor."""
     if config.range_m is None or table.sensor_m is None:
         return None
-    return View.ball(table.sensor_m[k], config.range_m, config.settings.p_detect)
+    return View.ball(table.sensor_m[k], config.range_m, config.p_detect)
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
@@ -210,7 +233,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     if step_s > _SLOW_STEP_S:
         remarks.append(f"frames are {step_s:.3g} s apart: what moves is hardly followed at that pace")
     if config.range_m is None and table.sensor_m is not None:
-        remarks.append("without --range-m, what should be seen and is not counts for nothing")
+        remarks.append("without range_m, what should be seen and is not counts for nothing")
     unknown = int((~_bounded(spells)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} with a beginning that nobody can bound"

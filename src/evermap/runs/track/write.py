@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
-from datetime import UTC, datetime
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from evermap import __version__
 from evermap.errors import MissingExtraError
 from evermap.io.columns import csv_bytes, named
 from evermap.io.table import parquet_bytes
-from evermap.runs.folder import SUMMARY, RunFolder, summary_text
-from evermap.runs.summary import peak_memory_mb, versions
+from evermap.runs.folder import RunFolder
+from evermap.runs.summary import RunInfo, summary_head
 from evermap.runs.track.draw import draw_run, write_recording
 from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.runs.track.run import TrackResult
@@ -24,15 +22,12 @@ from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.types import UNKNOWN, FloatArray, IntArray
 from evermap.viz.style import save_png
 
-SCHEMA_VERSION = "1"
-
 
 def write_track(
     out: str | Path,
     result: TrackResult,
     *,
-    command: str = "",
-    read_s: float | None = None,
+    info: RunInfo | None = None,
     scene: bool = True,
     force: bool = False,
     inputs: Iterable[str | Path | None] = (),
@@ -43,8 +38,7 @@ def write_track(
     Args:
         out: the folder; an older run there is replaced at the end.
         result: of `run_track`.
-        command: the command line, '' if there was none.
-        read_s: wall time of reading the table.
+        info: command and measured times.
         scene: whether to write a recording for rerun; left out with a warning where rerun-sdk is missing.
         force: write into a folder that holds other files, too; they stay.
         inputs: files that were read, beside the table.
@@ -70,31 +64,25 @@ def write_track(
         written = perf_counter()
         save_png(draw_run(result), folder.path("figures/objects.png"))
         remarks = _scene(result, folder) if scene else []
-        timing = {
-            **({} if read_s is None else {"read_s": read_s}),
+        timing: dict[str, float] = {
             "track_s": result.seconds,
             "write_s": written - start,
             "draw_s": perf_counter() - written,
         }
-        summary = track_summary(result, command=command, timing=timing)
+        summary = track_summary(result, info=info or RunInfo(), timing=timing)
         summary["warnings"] += remarks
-        summary["outputs"] = sorted([*folder.files(), SUMMARY])
-        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
-    return summary
+        return folder.finish(summary)
 
 
-def track_summary(result: TrackResult, *, command: str, timing: dict[str, float]) -> dict[str, Any]:
+def track_summary(result: TrackResult, *, info: RunInfo, timing: Mapping[str, Any]) -> dict[str, Any]:
     """The content of `summary.json`; outside of `timing` and `versions` a function of the input and the choices."""
     table, spells = result.table, result.spells
     happened = np.array([event.kind for event in result.events], dtype=np.int64)
     class_of_track = result.class_of_track()
+    config = {"track": result.config.to_dict()}
+    pace = {"frames_per_second": table.n_frames / result.seconds if result.seconds > 0.0 else None}
     return {
-        "schema_version": SCHEMA_VERSION,
-        "evermap": __version__,
-        "versions": versions(),
-        "command": command,
-        "source": table.source,
-        "config": result.config.to_dict(),
+        **summary_head(info, config=config, source=table.source, timing=timing | pace, warnings=result.warnings),
         "counts": {
             "frames": table.n_frames,
             "empty_frames": int((np.diff(table.first) == 0).sum()),
@@ -108,14 +96,6 @@ def track_summary(result: TrackResult, *, command: str, timing: dict[str, float]
             "duration_s": float(table.stamp_s[-1] - table.stamp_s[0]),
         },
         "classes": {name or "all": _of_class(result, k, class_of_track) for k, name in enumerate(table.class_names)},
-        "timing": {
-            **timing,
-            "frames_per_second": table.n_frames / result.seconds if result.seconds > 0.0 else None,
-            "total_s": sum(timing.values()),
-            "peak_memory_mb": peak_memory_mb(),
-            "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
-        },
-        "warnings": list(result.warnings),
     }
 
 

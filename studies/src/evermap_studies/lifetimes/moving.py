@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import TrackerConfig
 from evermap.survival.censored import lifetimes_of_sightings
 from evermap.survival.parametric_fit import ParametricFit, fit_sightings
-from evermap.tracking.settings import TrackerSettings
 from evermap.tracking.spells import StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import Followed, TrackState
@@ -52,10 +52,10 @@ class TrackedRun:
         return score_tracks(truth, tracks, GATE_M)
 
 
-def settings_for(world: MovingWorld) -> TrackerSettings:
+def settings_for(world: MovingWorld) -> TrackerConfig:
     """What a user would tell the tracker about this sensor."""
     volume_m3 = np.pi * world.reach_m**2  # 1 m high
-    return TrackerSettings(
+    return TrackerConfig(
         sigma_position_m=world.sigma_m,
         p_detect=min(world.p_detect, 0.999),
         clutter_per_m3=max(world.false_per_frame, 1e-3) / volume_m3,

@@ -1,0 +1,146 @@
+"""What the verbs share on the command line: common options, the configuration, and arguments of errors as options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from evermap.errors import ConfigError, EvermapError
+
+if TYPE_CHECKING:
+    from evermap.config import Config
+
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="TOML file; see --show-config.", show_default=False)
+]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, as section.key=value; repeatable."),
+]
+ShowConfig = Annotated[
+    bool, typer.Option("--show-config", help="Print the configuration in force as commented TOML and exit.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")]
+Robot = Annotated[int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)]
+Recorded = Annotated[
+    Path,
+    typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False),
+]
+TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
+Priors = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="[CLASS=]PRIOR",
+        help="How long they stay, as in `evermap survival plot --help`; repeatable for classes.",
+        show_default="unknown:1min..10y",
+    ),
+]
+
+_OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed"}
+"""Arguments of the core that are given by an option of another name."""
+
+
+def configured(
+    path: Path | None,
+    settings: Sequence[str] | None,
+    values: Mapping[str, Any] | None = None,
+    *,
+    within: str = "",
+    show: bool = False,
+) -> Config:
+    """Return the configuration of `--config`, `--set` and single options; where asked to, print it and exit.
+
+    Args:
+        path: TOML file.
+        settings: `section.key=value` each.
+        values: what other options say, by key; None where an option was not given.
+        within: section that keys without a dot are of.
+        show: print the configuration and exit.
+
+    Raises:
+        ConfigError: an unknown key or a value out of its bounds.
+    """
+    from evermap.config import load_config, to_toml
+
+    config = load_config(path, settings or [], values, within=within)
+    if show:
+        typer.echo(to_toml(config), nl=False)
+        raise typer.Exit
+    return config
+
+
+def priors_by_class(texts: Sequence[str] | None) -> tuple[str | None, dict[str, str] | None]:
+    """Return the prior without a class and those of classes, of `PRIOR` and `door=exponential:half-life=2d`.
+
+    Raises:
+        ConfigError: the same class twice.
+    """
+    common: str | None = None
+    by_class: dict[str, str] = {}
+    for text in texts or []:
+        found = re.fullmatch(r"\s*([^:=*]+?)\s*=(.+)", text)  # in a prior, a colon or a star comes before any '='
+        name = found[1] if found else ""
+        if (name in by_class) if found else (common is not None):
+            whose = f"class '{name}'" if found else "all features"
+            raise ConfigError(f"given twice for {whose}", field="prior", hint="CLASS=PRIOR for a single class")
+        if found:
+            by_class[name] = found[2].strip()
+        else:
+            common = text.strip()
+    return common, by_class or None
+
+
+def duration_s(text: str | None, field: str) -> float | None:
+    """Return the seconds of a duration like 3d, None for None; a ConfigError names `field`."""
+    from evermap.survival.durations import parse_duration_s
+
+    try:
+        return None if text is None else parse_duration_s(text)
+    except ConfigError as error:
+        raise ConfigError(error.problem, field=field, hint=error.hint) from None
+
+
+class Verb(TyperCommand):
+    """A command whose errors speak of its options where the core speaks of arguments."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except EvermapError as error:
+            speak_of_options(error, ctx)
+            raise
+
+
+def speak_of_options(error: EvermapError, ctx: Any) -> None:
+    """Name the options of a command instead of the core's arguments, in an error's field and in its `backquotes`.
+
+    An argument `step_s` is the option whose parameter is called so; a configuration key `persist.step_s` is, too, if
+    that option was given.
+    """
+    shown = {param.name: _shown(param) for param in ctx.command.params}
+    shown |= {name: shown[other] for name, other in _OTHER_NAMES.items() if other in shown}
+
+    def option(name: str) -> str | None:
+        leaf = name.rpartition(".")[2]
+        if leaf != name and "COMMANDLINE" not in str(ctx.get_parameter_source(_OTHER_NAMES.get(leaf, leaf))):
+            return None
+        return shown.get(leaf)
+
+    def replaced(text: str) -> str:
+        return re.sub(r"`([a-z0-9_.]+)`", lambda found: option(found[1]) or found[0], text)
+
+    error.problem = replaced(error.problem)
+    error.hint = error.hint and replaced(error.hint)
+    error.field = error.field and (option(error.field) or error.field)
+
+
+def _shown(param: Any) -> str:
+    """Return how a parameter is called on the command line: its longest option, or the name of an argument."""
+    return max(param.opts, key=len) if param.param_type_name == "option" else param.metavar or param.name.upper()

@@ -1,0 +1,188 @@
+"""Everything that can be set: nested, frozen, every field with a default, a bound and a meaning.
+
+A run needs no configuration. What is set comes from a TOML file, then from `--set slam.robust=false` overrides:
+
+    config = load_config("my.toml", ["slam.seed=3"])
+
+One file may hold the sections of all verbs; each verb reads its own. The sections in effect are written beside the
+results (`summary.json`), and `to_toml` prints them with their meanings. This package needs pydantic and is therefore
+imported only by what really runs, never by `import evermap`.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import Field, ValidationError
+
+from evermap.config.living import LivingConfig
+from evermap.config.section import Section, config_error
+from evermap.config.slam import CalibrationConfig, ChangesConfig, ModesConfig, OutputConfig, SensorConfig, SlamConfig
+from evermap.config.tables import PersistConfig, SurvivalConfig, TrackConfig, TrackerConfig
+from evermap.errors import ConfigError
+
+
+class Config(Section):
+    """The whole configuration, one section a table of the TOML file."""
+
+    slam: SlamConfig = Field(default_factory=SlamConfig, description="the estimator")
+    living: LivingConfig = Field(default_factory=LivingConfig, description="a map that lives on between sessions")
+    sensor: SensorConfig = Field(default_factory=SensorConfig, description="corrections of the recording's sensor")
+    output: OutputConfig = Field(default_factory=OutputConfig, description="what is written beside the numbers")
+    persist: PersistConfig = Field(default_factory=PersistConfig, description="a table of looks")
+    track: TrackConfig = Field(default_factory=TrackConfig, description="a table of detections")
+    survival: SurvivalConfig = Field(default_factory=SurvivalConfig, description="a table of lifetimes")
+
+
+def load_config(
+    path: str | Path | None = None,
+    overrides: Iterable[str] = (),
+    values: Mapping[str, Any] | None = None,
+    *,
+    within: str = "",
+) -> Config:
+    """Return the configuration of a TOML file (or the defaults), then overridden key by key.
+
+    Args:
+        path: TOML file with the tables of `Config`; None for the defaults.
+        overrides: `section.key=value` each; the value in TOML notation, or a bare word for a string.
+        values: further overrides by dotted key, as values; None leaves a key as it is.
+        within: section that keys without a dot are taken to be of.
+
+    Raises:
+        ConfigError: unreadable file, unknown key (the nearest known one is named), or a value out of its bounds.
+    """
+    source = None if path is None else Path(path)
+    return _overridden(_validate(_read_toml(source), source), overrides, values or {}, within)
+
+
+def parse_config(text: str) -> Config:
+    """Return the configuration that `to_toml` wrote; '' for the defaults.
+
+    Raises:
+        ConfigError: a key or a value that this version does not know.
+    """
+    return _validate(tomllib.loads(text), None)
+
+
+def with_overrides(config: Config, overrides: Iterable[str]) -> Config:
+    """Return `config` with `section.key=value` overrides; errors as `load_config`."""
+    return _overridden(config, overrides, {}, "")
+
+
+def to_toml(config: Config) -> str:
+    """Return a commented TOML file that `load_config` reads back. Unset fields are commented out."""
+    return "\n".join(_table_lines(config, ())).lstrip("\n") + "\n"
+
+
+def _read_toml(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ConfigError(
+            "no such file", path=path, hint="print one to start from with: evermap slam --show-config"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"cannot be read: {error}", path=path) from None
+    except RecursionError:
+        raise ConfigError("not valid TOML: nested too deeply", path=path) from None
+    except ValueError as error:  # of TOML, and of numbers with thousands of digits
+        raise ConfigError(f"not valid TOML: {error}", path=path, hint="text values need quotes") from None
+
+
+def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, Any], within: str) -> Config:
+    content = config.model_dump()
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not all(name.strip() for name in key.split(".")):
+            raise ConfigError(f"'{override}' is no setting", hint="section.key=value, for example slam.seed=1")
+        short = within and "." not in key and key.strip() not in Config.model_fields
+        _set(content, f"{within}.{key}" if short else key, _toml_value(text.strip()))
+    for key, value in values.items():
+        if value is not None:
+            _set(content, key, value)
+    return _validate(content, None)
+
+
+def _set(content: dict[str, Any], key: str, value: Any) -> None:
+    """Write a value into nested dicts by its dotted key."""
+    names = [name.strip() for name in key.split(".")]
+    table: Any = content
+    for name in names[:-1]:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise ConfigError("is a value, not a section", field=".".join(names[:-1]))
+    table[names[-1]] = value
+
+
+def _toml_value(text: str) -> Any:
+    """A value in TOML notation; anything that is none is a string."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        return text
+
+
+def _validate(values: Mapping[str, Any], path: Path | None) -> Config:
+    """Return the checked configuration; the first thing that is wrong becomes one line."""
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise config_error(Config, error, path) from None
+
+
+def _table_lines(section: Section, prefix: tuple[str, ...]) -> Iterable[str]:
+    """Plain values first, then sub-tables, as TOML wants them."""
+    tables: list[tuple[str, Section]] = []
+    if prefix:
+        yield ""
+        yield f"[{'.'.join(prefix)}]"
+    for name, info in type(section).model_fields.items():
+        value = getattr(section, name)
+        if isinstance(value, Section):
+            tables.append((name, value))
+            continue
+        yield f"# {info.description}{_choices(info.annotation)}"
+        yield f"# {name} =" if value is None else f"{name} = {_toml_text(value)}"
+    for name, table in tables:
+        yield from _table_lines(table, (*prefix, name))
+
+
+def _choices(annotation: Any) -> str:
+    options = [option for option in get_args(annotation) if isinstance(option, str)]
+    return f" ({' | '.join(options)})" if options else ""
+
+
+def _toml_text(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(key)} = {_toml_text(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_toml_text, value)) + "]"
+    return json.dumps(value)
+
+
+__all__ = [
+    "CalibrationConfig",
+    "ChangesConfig",
+    "Config",
+    "LivingConfig",
+    "ModesConfig",
+    "OutputConfig",
+    "PersistConfig",
+    "Section",
+    "SensorConfig",
+    "SlamConfig",
+    "SurvivalConfig",
+    "TrackConfig",
+    "TrackerConfig",
+    "load_config",
+    "parse_config",
+    "to_toml",
+    "with_overrides",
+]

@@ -1,0 +1,84 @@
+"""The base of all sections of the configuration, and errors of their values in one line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from evermap.errors import ConfigError, similar
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Probability = Annotated[float, Field(ge=0, le=1)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+"""A probability that is neither zero nor one."""
+Count = Annotated[int, Field(ge=1)]
+
+
+class _RaisesOurErrors(ModelMetaclass):
+    """Sections made from Python raise `ConfigError` as those from a file do; nested ones report the whole key."""
+
+    def __call__(self, *args: Any, **values: Any) -> Any:
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            raise config_error(self, error) from None
+
+
+class Section(BaseModel, metaclass=_RaisesOurErrors):
+    """Base of all sections: frozen, no unknown keys, no infinities or nan, every field with a default."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the section as plain JSON values, for `summary.json`."""
+        return self.model_dump(mode="json")
+
+
+def config_error(root: Any, error: ValidationError, path: Path | None = None) -> ConfigError:
+    """Return the first thing that is wrong with values for `root` as an error of one line.
+
+    Args:
+        root: the section that the values were for.
+        error: of its validation.
+        path: file that the values came from.
+    """
+    first = error.errors(include_url=False)[0]
+    names = [str(name) for name in first["loc"]]
+    field = ".".join(names)
+    if first["type"] == "extra_forbidden":
+        return ConfigError("unknown key", path=path, field=field, hint=_nearest_key(root, names))
+    told = first["ctx"]["error"] if first["type"] == "value_error" else None
+    if isinstance(told, ValueError):
+        return ConfigError(str(told), path=path, field=field or None)
+    problem = f"{first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"
+    return ConfigError(problem, path=path, field=field)
+
+
+def known_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator[str]:
+    """Yield the dotted names of all fields and of the sections that hold them."""
+    for name, info in section.model_fields.items():
+        yield ".".join((*prefix, name))
+        if isinstance(info.annotation, type) and issubclass(info.annotation, Section):
+            yield from known_keys(info.annotation, (*prefix, name))
+
+
+def _nearest_key(root: type[Section], names: list[str]) -> str:
+    """The known key that resembles an unknown one most, or the keys of its section."""
+    known = list(known_keys(root))
+    meant = similar(".".join(names), known, cutoff=0.6)
+    in_other_section = [key for key in known if key.rsplit(".", maxsplit=1)[-1] == names[-1]]
+    if meant or in_other_section:
+        return meant or in_other_section[0]
+    section = max(
+        (key.rpartition(".")[0] for key in known if ".".join(names).startswith(key.rpartition(".")[0])), key=len
+    )
+    return "one of " + ", ".join(key for key in known if key.rpartition(".")[0] == section)

@@ -1,0 +1,196 @@
+"""Settings of the verbs that read tables: `persist` (looks), `track` (detections) and `survival fit` (lifetimes)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share
+from evermap.errors import ConfigError
+from evermap.types import FloatArray
+
+DEFAULT_PRIOR = "unknown:1min..10y"
+"""From a cup that is put down to a wall: every order of magnitude of the mean stay is equally likely."""
+NO_RECURRENCE = "none"
+
+
+class PersistConfig(Section):
+    """Beliefs, changes and forecasts of a table of looks."""
+
+    prior: str = Field(default=DEFAULT_PRIOR, description="lifetime of features that stay once")
+    class_priors: dict[str, str] = Field(default_factory=dict, description="the same for single classes, by name")
+    recurrent: str = Field(
+        default=NO_RECURRENCE,
+        description="how features come back: 'none' for one stay, a kind of model to learn, or 'auto'",
+    )
+    per: Literal["auto", "all", "class", "feature"] = Field(
+        default="auto", description="whose looks are put together to learn"
+    )
+    model: str = Field(default="", description="file of a model that was learned before; '' learns it from the table")
+    learn_from: int = Field(
+        default=100_000, ge=2, description="looks to learn from, at most: all those at some of the features, at random"
+    )
+    most_features_alone: Count = Field(default=32, description="with more features, 'auto' learns one model for all")
+    fewest_looks_alone: Count = Field(
+        default=200, description="looks at each feature from which on 'auto' learns a model for each"
+    )
+    query: Literal["times", "grid"] = Field(
+        default="times", description="'times' asks for the belief at the time of every row, 'grid' at regular times"
+    )
+    step_s: Positive | None = Field(default=None, description="step of grid and forecasts [s]; unset: chosen")
+    horizon_s: Positive | None = Field(
+        default=None, description="how far to forecast beyond the latest look [s]; unset: a share of the looks' span"
+    )
+    horizon_share: Positive = Field(default=0.25, description="horizon as a share of the span, where none is given")
+    confidence: float = Field(default=0.9, gt=0.5, lt=1.0, description="belief from which on a change is reported")
+    tail: float = Field(
+        default=0.025,
+        gt=0.0,
+        lt=0.5,
+        description="probability that a change lies before the interval given for it, and as much after it",
+    )
+    p_miss: Probability = Field(default=0.1, description="P(no detection | there) where the table does not say")
+    p_false: Probability = Field(default=0.1, description="P(detection | not there) where the table does not say")
+    figures: int = Field(default=12, ge=0, description="how many features get a figure of their own")
+
+    @property
+    def stays_once(self) -> bool:
+        """Whether features have one lifetime and never return."""
+        return self.recurrent == NO_RECURRENCE and not self.model
+
+    @property
+    def learns(self) -> bool:
+        """Whether a model is learned from the looks."""
+        return self.recurrent != NO_RECURRENCE and not self.model
+
+
+class TrackerConfig(Section):
+    """What the tracker assumes about objects and their detector."""
+
+    motion: Literal["acceleration", "velocity"] = Field(
+        default="acceleration", description="what is constant while nothing is seen: nine states, or six"
+    )
+    motion_density: Positive = Field(
+        default=0.1, description="spectral density, each axis, of white jerk [m^2/s^5] or white acceleration [m^2/s^3]"
+    )
+    sigma_velocity_mps: Positive = Field(
+        default=1.0, description="standard deviation of a new object's velocity, each axis [m/s]"
+    )
+    sigma_acceleration_mps2: Positive = Field(default=0.5, description="the same of its acceleration [m/s^2]")
+    sigma_position_m: Positive = Field(
+        default=0.3, description="noise of a detection, each axis, where none is given with it [m]"
+    )
+    gate_probability: Share = Field(
+        default=0.9999, description="share of an object's own detections that its gate lets through"
+    )
+    p_detect: Share = Field(
+        default=0.9, description="probability to detect an object in view, where no view says better"
+    )
+    clutter_per_m3: Positive = Field(
+        default=1e-4, description="false detections and first sightings, a frame and cubic metre"
+    )
+    p_real: Share = Field(
+        default=0.5, description="probability that a detection of no known object is an object, not a false alarm"
+    )
+    p_confirm: Share = Field(default=0.999, description="belief from which on a tracklet is ALIVE")
+    p_dead: Share = Field(default=0.01, description="belief below which a tracklet is DEAD")
+    warm_up: Count = Field(default=3, description="detections that a tracklet needs to be ALIVE")
+    lost_after: Count = Field(default=3, description="frames without a detection in a row until a tracklet is LOST")
+    max_missed: Count = Field(
+        default=10, description="frames without a detection in a row until it is given up: kept in mind if it rests"
+    )
+    vanish_rate_hz: NotNegative = Field(default=1e-3, description="rate at which objects in view cease to exist [1/s]")
+    class_speed_mps: Positive | tuple[Positive, ...] = Field(
+        default=0.5, description="speed above which an object is dynamic [m/s]: one for all, or one a class"
+    )
+    rest_for_s: NotNegative = Field(default=2.0, description="time without motion before an object is static [s]")
+    p_off_class: Share = Field(default=0.05, description="probability of a wrong class, without a confusion matrix")
+    appearance_nats: NotNegative = Field(
+        default=20.0, description="log likelihood ratio between equal appearances and unrelated ones"
+    )
+    appearance_neutral: float = Field(
+        default=0.7, ge=-1.0, lt=1.0, description="cosine of two appearances that says nothing"
+    )
+    appearance_memory: float = Field(
+        default=0.9, ge=0.0, lt=1.0, description="share of the old appearance that a new detection leaves"
+    )
+    place_sigma_m: Positive = Field(
+        default=0.2, description="how exactly a static object is found again in its place, beside the noise [m]"
+    )
+    moved_reach_m: NotNegative = Field(
+        default=0.0, description="how far objects may be moved while out of view, 0 if never; wants appearances [m]"
+    )
+    p_moved: Share = Field(default=0.01, description="probability of that")
+    chunk_m: Positive = Field(default=10.0, description="side of the working set's square chunks [m]")
+    judge_every_s: NotNegative = Field(
+        default=1.0, description="time between two looks that are independent evidence about the working set [s]"
+    )
+
+    @property
+    def order(self) -> int:
+        """Derivatives of the position that are estimated, itself included: 3 or 2."""
+        return 3 if self.motion == "acceleration" else 2
+
+    def confusion_matrix(self, n_classes: int, given: FloatArray | None) -> FloatArray:
+        """Return (C, C) `P(detected class | true class)`, a row a true class: the given one, or one of equal mistakes.
+
+        Raises:
+            ConfigError: a matrix of another shape, or rows that are not distributions.
+        """
+        if given is None:
+            if n_classes == 1:
+                return np.ones((1, 1))
+            matrix = np.full((n_classes, n_classes), self.p_off_class / (n_classes - 1))
+            np.fill_diagonal(matrix, 1.0 - self.p_off_class)
+            return matrix
+        matrix = np.ascontiguousarray(given, dtype=np.float64)
+        if matrix.shape != (n_classes, n_classes):
+            raise ConfigError(f"shape {matrix.shape} instead of ({n_classes}, {n_classes})", field="confusion")
+        sums = matrix.sum(axis=1)
+        for row in range(n_classes):
+            if not (np.all(matrix[row] >= 0.0) and abs(sums[row] - 1.0) < 1e-6):
+                raise ConfigError(
+                    f"row {row} is no distribution over detected classes (sum {sums[row]:g})",
+                    field="confusion",
+                    hint="rows are true classes and sum to 1",
+                )
+        return matrix
+
+    def class_speeds(self, n_classes: int) -> FloatArray:
+        """Return (C,) the speed above which an object of each class is dynamic.
+
+        Raises:
+            ConfigError: another number of speeds than of classes.
+        """
+        speeds = np.atleast_1d(np.asarray(self.class_speed_mps, dtype=np.float64))
+        if len(speeds) not in {1, n_classes}:
+            raise ConfigError(f"{len(speeds)} speeds for {n_classes} classes", field="class_speed_mps")
+        return np.ascontiguousarray(np.broadcast_to(speeds, (n_classes,)))
+
+
+class TrackConfig(TrackerConfig):
+    """Objects over time from a table of detections, and how long they stay."""
+
+    speeds_mps: dict[str, Positive] = Field(
+        default_factory=dict, description="speed above which objects of single classes are dynamic, by name [m/s]"
+    )
+    prior: str = Field(default=DEFAULT_PRIOR, description="lifetime of objects at rest")
+    class_priors: dict[str, str] = Field(default_factory=dict, description="the same for single classes, by name")
+    range_m: Positive | None = Field(
+        default=None, description="the sensor's reach [m]; unset: nothing is known of what should be seen"
+    )
+    min_score: Probability = Field(default=0.0, description="detections of a lower score are left out")
+    gap_s: Positive | None = Field(
+        default=None, description="a longer time between two frames is one at which nobody looked [s]; unset: chosen"
+    )
+    gap_steps: float = Field(default=10.0, gt=1.0, description="that time in usual steps, where gap_s is unset")
+
+
+class SurvivalConfig(Section):
+    """Lifetimes estimated from a table of which only bounds are known."""
+
+    estimator: str = Field(default="npmle", description="how to estimate, as `evermap survival fit --help` lists them")
+    by: str = Field(default="", description="what is estimated separately: '', 'class', 'chunk', or 'class,chunk'")
+    chunk_m: Positive = Field(default=10.0, description="side of the square chunks [m]")
