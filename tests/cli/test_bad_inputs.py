@@ -329,16 +329,16 @@ def of_looks() -> Iterator[Case]:
         "persist", "not even a date", column(file, "stamp_s", lambda _: "2026-02-30T00:00"), 2, "is not a number"
     )
     for option, words in (
-        ("--p-miss 2", "is no probability"),
-        ("--p-false nan", "is no probability"),
-        ("--confidence 0.3", "above 0.5"),
-        ("--step-s -1", "positive and finite"),
+        ("--p-miss 2", "--p-miss.*less than or equal to 1"),
+        ("--p-false nan", "--p-false.*finite"),
+        ("--confidence 0.3", "--confidence.*greater than 0.5"),
+        ("--step-s -1", "--step-s.*greater than 0"),
         ("--horizon soon", "--horizon"),
         ("--prior exponentiel:mean=1d", "expon"),
         ("--prior exponential:mean=-1d", "prior|mean"),
         ("--query sometimes", "query"),
-        ("--learn-from 1", "teach"),
-        ("--recurrent perhaps", "perhaps"),
+        ("--learn-from 1", "--learn-from.*greater than or equal to 2"),
+        ("--recurrent perhaps", "--recurrent.*perhaps"),
         ("--figures -1", "figures"),
         ("--step-s 1e-9 --query grid", "instants"),
         ("--model nowhere.json", "nowhere.json"),

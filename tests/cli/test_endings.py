@@ -15,7 +15,7 @@ from evermap.errors import InputError
 VERBS = ["demo", "check", "slam", "persist", "track", "convert", "simulate", "bench"]
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "verify", "revert", "pin", "unpin", "delete", "undelete"],
-    "survival": ["fit", "learn", "plot"],
+    "survival": ["plot", "fit", "learn"],
 }
 
 

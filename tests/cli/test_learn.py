@@ -88,8 +88,8 @@ def test_what_is_printed_for_machines(table: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--recurrent", "markov"), "'markov' is no kind of model"),
-        (("--per", "robot"), "'robot' is no grouping"),
+        (("--recurrent", "markov"), "field '--recurrent': unknown kind of model 'markov'"),
+        (("--per", "robot"), "field '--per': input should be"),
         (("--recurrent", "two-state", "--figure", "a.gif"), "cannot draw a '.gif' file"),
     ],
 )

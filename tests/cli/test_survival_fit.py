@@ -175,7 +175,7 @@ def test_help_lists_every_estimator() -> None:
         ("left,right\n5,\n", ("--estimator", "weibull"), "no lifetime has an end"),
         ("left,right\n5,7\n", ("--figure", "a.gif"), "cannot draw a '.gif' file"),
         ("left,right,x_m,y_m\n5,7,1,1\n", ("--by", "chunk", "--out", "a.json"), "a model file knows no places"),
-        ("left,right\n5,7\n", ("--by", "class", "--chunk-m", "0"), "must be positive and finite"),
+        ("left,right\n5,7\n", ("--by", "class", "--chunk-m", "0"), "field '--chunk-m': input should be greater than 0"),
     ],
 )
 def test_mistake_is_one_line_and_2(

@@ -19,7 +19,7 @@ from evermap.runs import folder as runfolder
 from evermap.runs.folder import MANIFEST, RunFolder, RunInfo, check_output_file, check_replaceable, write_run
 from evermap.runs.summary import summary_dict, timing_dict
 
-sys.path.insert(0, str(Path(__file__).parent / "metrics"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "metrics"))
 
 INFO = RunInfo(command="evermap slam x", seeds={"slam": 0}, processing_s=2.0, total_s=3.0, peak_memory_mb=100.0)
 
@@ -169,7 +169,7 @@ def test_a_new_run_replaces_the_old_one_completely(run, tmp_path):
     quick(out, run)
     assert not (out / "figures").exists()
     (out / "notes.txt").write_text("mine")
-    with pytest.raises(ConfigError, match=r"notes\.txt.*--force"):
+    with pytest.raises(ConfigError, match=r"notes\.txt.*`force`"):
         quick(out, run)
     assert (out / "notes.txt").read_text() == "mine"
     quick(out, run, force=True)
@@ -372,7 +372,7 @@ def test_files_of_the_user_stay_beside_a_forced_run(tmp_path):
     (out / "dangling").symlink_to("nowhere")
     (out / "empty").mkdir()
     inode = out.stat().st_ino
-    with pytest.raises(ConfigError, match="--force to write beside it"):
+    with pytest.raises(ConfigError, match="`force` to write beside it"):
         write(out, {"map.csv": "2"})
     new = {"summary.json": "2", "map.csv": "2", "figures/b.png": "2"}
     write(out, new, force=True)

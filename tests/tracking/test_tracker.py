@@ -148,13 +148,13 @@ def test_bad_input_is_told_in_one_line(given: dict[str, object], says: str) -> N
     [
         (
             lambda: TrackerConfig(p_detect=1.0),
-            "field 'p_detect': 1.0 is out of range (try: a number between 0 and 1)",
+            "field 'p_detect': input should be less than 1, not 1.0",
         ),
-        (lambda: TrackerConfig(warm_up=0), "field 'warm_up': 0 is out of range (try: a whole number from 1)"),
-        (lambda: TrackerConfig(chunk_m=0.0), "field 'chunk_m': 0.0 is out of range (try: a number above 0)"),
+        (lambda: TrackerConfig(warm_up=0), "field 'warm_up': input should be greater than or equal to 1, not 0"),
+        (lambda: TrackerConfig(chunk_m=0.0), "field 'chunk_m': input should be greater than 0, not 0.0"),
         (
             lambda: TrackerConfig(motion="jerk"),  # type: ignore[arg-type]
-            "field 'motion': 'jerk' is out of range (try: acceleration, velocity)",
+            "field 'motion': input should be 'acceleration' or 'velocity', not 'jerk'",
         ),
         (lambda: Tracker(n_classes=0), "field 'n_classes': 0 classes (try: at least 1)"),
         (

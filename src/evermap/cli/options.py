@@ -143,4 +143,4 @@ def speak_of_options(error: EvermapError, ctx: Any) -> None:
 
 def _shown(param: Any) -> str:
     """Return how a parameter is called on the command line: its longest option, or the name of an argument."""
-    return max(param.opts, key=len) if param.param_type_name == "option" else param.metavar or param.name.upper()
+    return str(max(param.opts, key=len) if param.param_type_name == "option" else param.metavar or param.name.upper())

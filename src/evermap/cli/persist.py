@@ -161,7 +161,7 @@ def persist(
     from evermap.types import Clock
 
     out = out or default_out(input)
-    inputs = [input, chosen.model, truth, config]
+    inputs: list[str | Path | None] = [input, chosen.model, truth, config]
     counts = None if clock is None else Clock(clock.value)
     summary = _run(input, truth, chosen, out, clock=counts, force=force, inputs=inputs)
     if as_json:

@@ -90,7 +90,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, content: str, message
 
 
 def test_defaults_must_be_probabilities(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"field '--p-miss': 2 is no probability"):
+    with pytest.raises(ConfigError, match=r"field 'p_miss': 2 is no probability"):
         read(tmp_path, f"{HEADER}\n1,a,1\n", p_miss=2)
 
 

@@ -82,7 +82,7 @@ def track_summary(result: TrackResult, *, info: RunInfo, timing: Mapping[str, An
     config = {"track": result.config.to_dict()}
     pace = {"frames_per_second": table.n_frames / result.seconds if result.seconds > 0.0 else None}
     return {
-        **summary_head(info, config=config, source=table.source, timing=timing | pace, warnings=result.warnings),
+        **summary_head(info, config=config, source=table.source, timing={**timing, **pace}, warnings=result.warnings),
         "counts": {
             "frames": table.n_frames,
             "empty_frames": int((np.diff(table.first) == 0).sum()),
