@@ -31,7 +31,7 @@ RULES = {
     "existence": "errors compiled types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors types config geometry survival sensing existence slam",
-    "tracking": "errors compiled types survival sensing existence",
+    "tracking": "errors compiled types config survival sensing existence",
     "viz": "errors types geometry survival metrics existence",
     "pipeline": "errors types config valid slam maps",
     "runs": "errors interrupts types config survival valid io metrics existence maps tracking viz pipeline",
