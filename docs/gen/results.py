@@ -27,6 +27,7 @@ STUDIES = (
     "bateman2020",
     "presence",
     "lifetimes",
+    "tracking",
     "persistence-speed",
     "soak",
 )
