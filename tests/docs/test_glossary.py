@@ -14,21 +14,16 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 ROW = re.compile(r"^\| (?P<noun>[a-z ]+) \| (?P<meaning>[^|]+) \| `(?P<path>[\w.]+)` \|", re.MULTILINE)
 TERMS = list(ROW.finditer((REPOSITORY / "docs" / "glossary.md").read_text(encoding="utf-8")))
 USED_FOR_SEVERAL = {
-    "Belief",
     "Candidate",
     "ChangeKind",
     "Drive",
     "Estimate",
     "Evidence",
     "Frames",
-    "Group",
     "Learned",
     "Looks",
     "Method",
-    "Overlay",
-    "Revision",
     "SensorConfig",
-    "Sightings",
     "Stamps",
 }
 """Names of classes that two modules define, for different things. The list may only become shorter."""
