@@ -166,7 +166,7 @@ def test_features_of_a_table_of_looks(tmp_path: Path) -> None:
 def test_the_legend_of_a_map_has_every_name(tmp_path: Path) -> None:
     import numpy as np
 
-    from evermap.viz.living_map_figure import plot_living_map
+    from evermap.viz.living_map_figures import plot_living_map
 
     count = len(NAMES)
     figure = plot_living_map(

@@ -22,6 +22,6 @@ def evaluation(run):
 
 @pytest.fixture(scope="session")
 def figures(run, evaluation):
-    from evermap.viz.figures import draw_figures
+    from evermap.viz.run_figures import draw_figures
 
     return draw_figures(*run, evaluation, real_time_factor=123.4)

@@ -13,10 +13,10 @@ from synthetic_run import with_changes
 from evermap.geometry import se2
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import Alternative, ChangeKind, MapChange
-from evermap.viz.change_layer import GROUP_COLOURS, moves
 from evermap.viz.change_words import describe, describe_all, explanations, near_alternatives, probability
-from evermap.viz.figures import draw_figures
+from evermap.viz.map_figure import GROUP_COLOURS, moves
 from evermap.viz.rerun_scene import write_scene
+from evermap.viz.run_figures import draw_figures
 from evermap.viz.style import MUTED
 
 NAN = math.nan

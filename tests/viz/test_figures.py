@@ -12,10 +12,8 @@ from matplotlib.text import Text
 
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import Innovations, Landmarks, Trajectory
-from evermap.viz.calibration_figure import quantity
-from evermap.viz.figures import draw_figures
-from evermap.viz.style import CSS_ROLES, inline_svg, save_png, save_svg
-from evermap.viz.time_figures import blind_stretches
+from evermap.viz.run_figures import blind_stretches, draw_figures, quantity
+from evermap.viz.style import ROLES, inline_svg, save_png, save_svg
 
 
 def by_name(figures, name):
@@ -149,7 +147,7 @@ def test_files_are_reproducible_and_svg_is_themed(figures, tmp_path):
     inline = inline_svg(figures[1].figure, "errors")
     assert "var(--estimate)" in inline
     assert "http" not in inline
-    assert not any(colour in inline for colour in CSS_ROLES)
+    assert not any(colour in inline for colour in ROLES)
 
 
 def test_drawing_never_loads_pyplot_or_changes_the_settings():
@@ -158,7 +156,7 @@ def test_drawing_never_loads_pyplot_or_changes_the_settings():
         f"sys.path.insert(0, {str(Path(__file__).parents[1] / 'metrics')!r})\n"
         "from synthetic_run import make_run\n"
         "from evermap.metrics.summary import compare_with_truth\n"
-        "from evermap.viz.figures import draw_figures\n"
+        "from evermap.viz.run_figures import draw_figures\n"
         "run = make_run(duration_s=60.0)\n"
         "draw_figures(*run, compare_with_truth(*run))\n"
         "assert 'matplotlib.pyplot' not in sys.modules\n"

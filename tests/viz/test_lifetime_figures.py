@@ -15,7 +15,7 @@ from evermap.errors import ConfigError, InputError
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Mixture, Uniform, Weibull, never_leaves
 from evermap.types import Clock
 from evermap.viz.belief_figure import plot_belief, stretches
-from evermap.viz.lifetime_figure import plot
+from evermap.viz.lifetime_figures import plot_lifetimes
 from evermap.viz.time_axis import unit_for
 
 DAY_S = 86400.0
@@ -34,7 +34,7 @@ def texts(figure: Any) -> list[str]:
 
 
 def test_four_views_agree_with_scipy_in_the_unit_of_the_axis() -> None:
-    figure = plot(Weibull(2 * DAY_S, 1.5), until_s=6 * DAY_S, log_time=False)
+    figure = plot_lifetimes(Weibull(2 * DAY_S, 1.5), until_s=6 * DAY_S, log_time=False)
     reference = scipy.stats.weibull_min(1.5, scale=2.0)  # in days
     views = {
         "hazard": lambda t: reference.pdf(t) / reference.sf(t),
@@ -52,7 +52,7 @@ def test_four_views_agree_with_scipy_in_the_unit_of_the_axis() -> None:
 
 def test_features_that_never_leave_are_named_and_marked() -> None:
     mixture = Mixture((Exponential(1.0), never_leaves()), (0.6, 0.4))
-    figure = plot({"chairs": mixture, "bins": Exponential(0.1)})
+    figure = plot_lifetimes({"chairs": mixture, "bins": Exponential(0.1)})
     assert "chairs (40 % never leave)" in texts(figure)
     assert "bins" in texts(figure)
     levels = [item.get_ydata()[0] for item in panel(figure, "survival").lines if item.get_ls() == ":"]
@@ -66,26 +66,28 @@ def test_features_that_never_leave_are_named_and_marked() -> None:
     ("prior", "logarithmic"), [(GeneralPurpose(1e-6, 1.0), True), (Exponential(1.0), False), (never_leaves(), False)]
 )
 def test_axis_of_time_suits_the_span_of_the_lifetimes(prior: LifetimePrior, logarithmic: bool) -> None:
-    axes = panel(plot(prior), "survival")
+    axes = panel(plot_lifetimes(prior), "survival")
     assert (axes.get_xscale() == "log") == logarithmic
-    assert panel(plot(prior, log_time=not logarithmic), "survival").get_xscale() == ("linear" if logarithmic else "log")
+    assert panel(plot_lifetimes(prior, log_time=not logarithmic), "survival").get_xscale() == (
+        "linear" if logarithmic else "log"
+    )
 
 
 def test_poles_are_cut_and_leave_the_rest_in_sight() -> None:
-    axes = panel(plot({"a": Uniform(10.0), "b": Exponential(0.5)}, log_time=False), "hazard")
+    axes = panel(plot_lifetimes({"a": Uniform(10.0), "b": Exponential(0.5)}, log_time=False), "hazard")
     assert 0.5 < axes.get_ylim()[1] < 20.0
 
 
 def test_ticks_of_wide_spans_are_durations() -> None:
-    labels = texts(plot(GeneralPurpose(1 / (30 * DAY_S), 1 / 60.0)))
+    labels = texts(plot_lifetimes(GeneralPurpose(1 / (30 * DAY_S), 1 / 60.0)))
     assert {"1 h", "1 day"} <= set(labels)
 
 
 def test_lifetimes_refuse_nothing_and_no_time() -> None:
     with pytest.raises(ConfigError, match="no lifetime prior"):
-        plot({})
+        plot_lifetimes({})
     with pytest.raises(ConfigError, match="until_s"):
-        plot(Exponential(1.0), until_s=0.0)
+        plot_lifetimes(Exponential(1.0), until_s=0.0)
 
 
 @pytest.mark.parametrize(("span_s", "name"), [(30, "s"), (900, "min"), (12 * 3600, "h"), (30 * DAY_S, "days")])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.viz.objects_figure import MOST_SPELLS, Rests, plot_objects
+from evermap.viz.track_figures import MOST_SPELLS, Rests, plot_objects
 
 HOUR_S = 3600.0
 

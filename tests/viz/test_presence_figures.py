@@ -10,8 +10,7 @@ from matplotlib.text import Text
 
 from evermap.errors import InputError
 from evermap.metrics.belief import belief_scores, reliability
-from evermap.viz.presence_raster import plot_raster
-from evermap.viz.reliability_figure import plot_reliability
+from evermap.viz.presence_figures import plot_raster, plot_reliability
 
 
 def texts(figure: Any) -> list[str]:

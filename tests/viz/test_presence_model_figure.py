@@ -9,7 +9,7 @@ from evermap.existence.phase_type import PhaseType
 from evermap.existence.rhythm import BINS, Rhythm
 from evermap.existence.run_length import RunLength
 from evermap.survival import Exponential
-from evermap.viz.presence_model_figure import has_rhythm, plot_presence_models, week_of_presence
+from evermap.viz.presence_figures import has_rhythm, plot_presence_models, week_of_presence
 
 LEAVE_HZ, RETURN_HZ = 1 / 600.0, 1 / 1800.0
 

@@ -15,8 +15,7 @@ from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.kaplan_meier import kaplan_meier
 from evermap.survival.parametric_fit import fit
 from evermap.survival.turnbull import npmle
-from evermap.viz.lifetime_samples_figure import plot_samples
-from evermap.viz.survival_fit_figure import plot_chunks, plot_survival
+from evermap.viz.lifetime_figures import plot_chunks, plot_samples, plot_survival
 
 DAY_S = 86400.0
 INF = float("inf")

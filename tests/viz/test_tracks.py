@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from evermap.errors import MissingExtraError
+from evermap.viz.rerun_scene import log_tracks
 from evermap.viz.style import house_style, new_figure
-from evermap.viz.tracks_figure import ARROW_S, DYNAMIC, STATIC, draw_tracks
-from evermap.viz.tracks_recording import log_tracks
+from evermap.viz.track_figures import ARROW_S, DYNAMIC, STATIC, draw_tracks
 
 POSITION = np.array([[0.0, 1.0, 0.0], [5.0, 2.0, 0.0], [9.0, -3.0, 1.0]])
 VELOCITY = np.array([[0.01, 0.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.0]])

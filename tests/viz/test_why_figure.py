@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError
-from evermap.viz.living_map_figure import plot_living_map
+from evermap.viz.living_map_figures import plot_living_map, plot_why
 from evermap.viz.style import ALERT, LANDMARK
-from evermap.viz.why_figure import plot_why
 
 HOUR_S = 3600.0
 

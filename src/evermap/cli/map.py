@@ -90,7 +90,7 @@ def show(
         living = store.load(number)
     content = landmark_dicts(living, _p_ahead(living, ahead_s))
     if figure is not None:
-        from evermap.viz.living_map_figure import plot_living_map
+        from evermap.viz.living_map_figures import plot_living_map
 
         write_picture(figure, plot_living_map(**_picture(living), title=f"{Path(file).name}, revision {number}"))
     if as_json:

@@ -46,7 +46,7 @@ def draw_why(path: Path, answer: Answer) -> None:
     """The same as a figure."""
     import numpy as np
 
-    from evermap.viz.why_figure import plot_why
+    from evermap.viz.living_map_figures import plot_why
 
     seen, stays = answer.evidence, answer.stays
     session = np.repeat([v.revision for v in answer.visits], [v.n_looks for v in answer.visits])

@@ -104,12 +104,12 @@ def plot(
 ) -> None:
     """Draw lifetime priors in four views."""
     from evermap.survival.text import parse_prior
-    from evermap.viz.lifetime_figure import plot as draw
+    from evermap.viz.lifetime_figures import plot_lifetimes
 
     check_picture(out, "out")
     named = {text: parse_prior(text) for text in priors}
     until_s = duration_s(until, "until")
-    write_picture(out, draw(named, until_s=until_s, log_time=log_time))
+    write_picture(out, plot_lifetimes(named, until_s=until_s, log_time=log_time))
     rows = {name: lifetime_numbers(prior) for name, prior in named.items()}
     if as_json:
         print_json({"out": str(out), "priors": rows})
@@ -232,7 +232,7 @@ def learn(
         learned = learn_models(table, table.looks(table.order()), chosen, progress=tell)
     save_models(learned.models, learned.per, out)
     if figure is not None:
-        from evermap.viz.presence_model_figure import plot_presence_models
+        from evermap.viz.presence_figures import plot_presence_models
 
         write_picture(figure, plot_presence_models(dict(zip(learned.models.names, learned.models.models, strict=True))))
     if as_json:
@@ -259,7 +259,7 @@ def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> 
 
 
 def _draw(path: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
-    from evermap.viz.survival_fit_figure import plot_survival
+    from evermap.viz.lifetime_figures import plot_survival
 
     write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
 
@@ -334,7 +334,7 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
     import numpy as np
 
     from evermap.survival.durations import duration_text
-    from evermap.viz.presence_model_figure import week_of_presence
+    from evermap.viz.presence_figures import week_of_presence
 
     lines = [("kind", choice.kind)]
     if choice.scores:

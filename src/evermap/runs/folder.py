@@ -469,7 +469,7 @@ def _write_innovations(innovations: Innovations, path: Path) -> None:
 def _draw(
     recording: Recording, result: SlamResult, evaluation: Evaluation, timing: Mapping[str, Any]
 ) -> tuple[NamedFigure, ...]:
-    from evermap.viz.figures import draw_figures
+    from evermap.viz.run_figures import draw_figures
 
     return draw_figures(recording, result, evaluation, real_time_factor=timing["real_time_factor"])
 

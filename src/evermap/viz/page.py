@@ -4,20 +4,14 @@ from __future__ import annotations
 
 from string import Template
 
-# Only the style sheet decides colours; figures refer to the same variables. Okabe-Ito hues, lighter on dark pages.
-STYLE = """
-:root {
-  --paper:#fffffe; --card:#f6f8fa; --ink:#1b1f24; --muted:#636c76; --grid:#d8dde3; --shade:#e9ecf0;
-  --estimate:#0072b2; --estimate-band:#cfe3f1; --odometry:#e69f00; --landmark:#009e73; --alert:#d55e00;
-  --online:#cc79a7; --group:#7a4fb5; color-scheme:light dark;
-}
-@media screen and (prefers-color-scheme:dark) {
-  :root {
-    --paper:#14181d; --card:#1c2229; --ink:#e7ebef; --muted:#9aa5b1; --grid:#323a44; --shade:#262d36;
-    --estimate:#56b4e9; --estimate-band:#1d3b50; --odometry:#e6a823; --landmark:#2fc39a; --alert:#ff8a4c;
-    --online:#dd97bd; --group:#b794f0;
-  }
-}
+from evermap.viz.style import page_theme
+
+# colours of figures are variables of the page, so that its theme decides what they look like
+STYLE = (
+    page_theme()
+    + """
+:root { --card:#f6f8fa }
+@media screen and (prefers-color-scheme:dark) { :root { --card:#1c2229 } }
 * { box-sizing:border-box }
 html { -webkit-text-size-adjust:100% }
 body { margin:0; background:var(--paper); color:var(--ink); font:16px/1.55 system-ui,-apple-system,"Segoe UI",
@@ -67,6 +61,7 @@ footer { color:var(--muted); font-size:.85rem; margin-top:3rem; padding-top:1rem
   .cards { grid-template-columns:repeat(3,1fr) }
 }
 """
+)
 
 # the policy makes a browser refuse whatever is not in this very file
 PAGE = Template(

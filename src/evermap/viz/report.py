@@ -5,18 +5,20 @@ from __future__ import annotations
 import base64
 import io
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from evermap.metrics.summary import Evaluation
-from evermap.types import Recording, SlamResult
-from evermap.viz.change_words import explanations, grew, near_alternatives
-from evermap.viz.headline import headline_cards
+from evermap.types import UNKNOWN, ParameterEstimate, Recording, SlamResult
+from evermap.viz.change_words import explanations, near_alternatives
 from evermap.viz.page import PAGE, STYLE
+from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure, house_style, inline_svg
-from evermap.viz.tables import calibration_table, change_table, landmark_table, noise_table, table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -61,7 +63,7 @@ def render_report(
     parts += [
         headline_cards(summary),
         _interrupted(summary),
-        _changes(result, summary),
+        _changes(result),
         _warnings(summary),
         _figures("Where it was", figures, ("map", "errors"), _frames(summary)),
         _figures("What the sensors are like", figures, ("calibration",), _calibration(result)),
@@ -105,9 +107,9 @@ def _warnings(summary: Mapping[str, Any]) -> str:
     return f'<div class="note"><strong>Worth knowing</strong><ul>{items}</ul></div>'
 
 
-def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
+def _changes(result: SlamResult) -> str:
     """What differs from the map, in words and numbers, and what else it may be; '' where nothing is in question."""
-    lines = explanations(result) + grew(summary["counts"].get("landmarks_grown"))
+    lines = explanations(result)
     if not lines:
         return ""
     items = "".join(f"<li>{escape(line)}</li>" for line in lines)
@@ -238,3 +240,183 @@ def _footer(summary: Mapping[str, Any]) -> str:
     if timing["written_at"]:
         text += f", {escape(timing['written_at'])}"
     return text + ". All numbers of this page are in <code>summary.json</code>."
+
+
+def headline_cards(summary: Mapping[str, Any]) -> str:
+    """Cards for the numbers this run has, as a definition list."""
+    cards = [card for card in _cards(summary) if card is not None]
+    return f'<dl class="cards">{"".join(cards)}</dl>' if cards else ""
+
+
+def _cards(summary: Mapping[str, Any]) -> list[str | None]:
+    metrics, timing = summary["metrics"], summary["timing"]
+    odometry, pose = metrics["dead_reckoning_rmse_m"], metrics["pose_rmse_m"]
+    heading, odometry_heading = metrics["heading_rmse_deg"], metrics["dead_reckoning_heading_rmse_deg"]
+    return [
+        _card("Position error", pose, "{:.3f}", "m RMSE", _gain(pose, odometry, "{:.2f} m")),
+        _card("Heading error", heading, "{:.2f}", "° RMSE", _gain(heading, odometry_heading, "{:.1f}°")),
+        _landmark_card(metrics),
+        _card("Speed", timing["real_time_factor"], "{:.0f}", "× real time", _latency(timing)),
+        _card("Innovations", metrics["nis_mean"], "{:.2f}", "mean NIS", _nis(metrics)),
+        _card(
+            "Online position error",
+            metrics["online_pose_rmse_m"],
+            "{:.3f}",
+            "m RMSE",
+            "What the robot knew at the time, without hindsight, while it saw something.",
+        ),
+    ]
+
+
+def _card(label: str, value: float | None, form: str, unit: str, meaning: str) -> str | None:
+    if value is None:
+        return None
+    number = f'<dd class="number">{escape(form.format(value))} <small>{escape(unit)}</small></dd>'
+    return f'<div class="card"><dt>{escape(label)}</dt>{number}<dd><p>{escape(meaning)}</p></dd></div>'
+
+
+def _gain(value: float | None, odometry: float | None, form: str) -> str:
+    if value is None or odometry is None:
+        return "Against truth, after aligning the whole path to it."
+    ratio = odometry / max(value, 1e-9)
+    times = (
+        "no worse" if ratio < 1.05 else f"{ratio:.1f} times as much" if ratio < 9.95 else f"{ratio:.0f} times as much"
+    )
+    return f"Odometry alone is {form.format(odometry)} off: {times}."
+
+
+def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
+    after_path, own = metrics["landmark_rmse_m"], metrics["landmark_rmse_own_alignment_m"]
+    scored, least = metrics["landmarks_scored"], metrics["landmark_min_sightings"]
+    if after_path is not None:
+        meaning = f"{scored} landmarks with at least {least} sightings, after the alignment of the path."
+        return _card("Landmark error", after_path, "{:.3f}", "m RMSE", meaning)
+    meaning = f"{scored} landmarks with at least {least} sightings, aligned among themselves: there is no true path."
+    return _card("Landmark error", own, "{:.3f}", "m RMSE", meaning)
+
+
+def _latency(timing: Mapping[str, Any]) -> str:
+    if timing["step_p99_ms"] is None:
+        return "Duration of the recording over the time it took."
+    p50, p99 = timing["step_p50_ms"], timing["step_p99_ms"]
+    return f"99% of the steps were done within {p99:.1f} ms, half within {p50:.1f} ms."
+
+
+def _nis(metrics: Mapping[str, Any]) -> str:
+    mean = metrics["nis_mean"]
+    if mean > 2.6:
+        verdict = "errors are larger than it believes"
+    elif mean < 1.4:
+        verdict = "errors are smaller than it believes"
+    else:
+        verdict = "its uncertainties are about right"
+    return f"2 is expected: {verdict}. {metrics['nis_in_band_share']:.0%} lie below the 95% bound."
+
+
+_MAX_LANDMARK_ROWS = 500
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int] = ()) -> str:
+    """A table of ready markup; `numbers` are the columns to align right."""
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        kind = [' class="n"' if column in numbers else "" for column in range(len(cells))]
+        return "<tr>" + "".join(f"<{tag}{k}>{cell}</{tag}>" for k, cell in zip(kind, cells, strict=True)) + "</tr>"
+
+    body = "".join(row("td", cells) for cells in rows)
+    return f'<div class="scroll"><table><thead>{row("th", head)}</thead><tbody>{body}</tbody></table></div>'
+
+
+def is_noise(parameter: ParameterEstimate) -> bool:
+    """Noise levels are named `sigma_...`; everything else is a calibration state."""
+    return parameter.name.startswith("sigma_")
+
+
+def calibration_table(result: SlamResult) -> str:
+    """Calibration states with uncertainty and prior; '' if there is none."""
+    return _parameters([parameter for parameter in result.parameters if not is_noise(parameter)])
+
+
+def noise_table(result: SlamResult) -> str:
+    """Noise levels as the recording determined them; '' if there is none."""
+    return _parameters([parameter for parameter in result.parameters if is_noise(parameter)])
+
+
+def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
+    if not parameters:
+        return ""
+    rows = [
+        (
+            f"<code>{escape(p.name)}</code>",
+            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit))
+            + (" <small>fixed</small>" if p.fixed else ""),
+            escape(quantity(p.prior_mean, p.prior_sigma, p.unit)) if has_prior(p) else "–",
+            _learned(p),
+            escape(p.meaning),
+        )
+        for p in parameters
+    ]
+    return table(("name", "estimate, 1σ", "prior, 1σ", "narrower", "meaning"), rows, numbers=(1, 2, 3))
+
+
+def _learned(parameter: ParameterEstimate) -> str:
+    """How many times narrower than its prior the estimate is."""
+    if not has_prior(parameter) or not 0 < parameter.sigma < math.inf:
+        return "–"
+    return f"{parameter.prior_sigma / parameter.sigma:.3g} ×"
+
+
+def change_table(result: SlamResult) -> str:
+    """Every change with its numbers; stamps as in the recording. '' if there is none."""
+    if not result.changes:
+        return ""
+    rows = [
+        (
+            ", ".join(change.labels),
+            change.kind.value,
+            _stamp(change.stamp_from_s),
+            _stamp(change.stamp_to_s),
+            f"{change.displacement_m[0]:.3f}",
+            f"{change.displacement_m[1]:.3f}",
+            f"{math.degrees(change.rotation_rad):.2f}",
+            f"{change.probability:.4f}",
+        )
+        for change in result.changes
+    ]
+    head = ("landmarks", "kind", "not before [s]", "not after [s]", "Δx [m]", "Δy [m]", "turn [°]", "probability")
+    return table(head, rows, numbers=(2, 3, 4, 5, 6, 7))
+
+
+def _stamp(stamp_s: float) -> str:
+    return f"{stamp_s:.1f}" if math.isfinite(stamp_s) else "–"
+
+
+def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
+    """The map, landmark by landmark, with its error where surveyed; '' if it is empty."""
+    landmarks, errors = result.landmarks, evaluation.landmarks or evaluation.landmarks_own
+    if len(landmarks) == 0:
+        return ""
+    error_of = {} if errors is None else dict(zip(errors.landmark_id.tolist(), errors.error_m.tolist(), strict=True))
+    nees_of = {} if errors is None else dict(zip(errors.landmark_id.tolist(), errors.nees.tolist(), strict=True))
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance_m2)[:, 1], 0.0))
+    rows = []
+    for i, name in enumerate(landmarks.landmark_id[:_MAX_LANDMARK_ROWS].tolist()):
+        kind = int(landmarks.class_id[i])
+        nees = nees_of.get(name, math.nan)
+        rows.append(
+            (
+                escape(landmarks.names.get(name, str(name))),
+                escape(landmarks.class_names[kind]) if UNKNOWN < kind < len(landmarks.class_names) else "–",
+                f"{landmarks.n_hits[i]:,}",
+                f"{landmarks.n_misses[i]:,}",
+                f"{landmarks.position_m[i, 0]:.3f}",
+                f"{landmarks.position_m[i, 1]:.3f}",
+                f"{2e3 * sigma[i]:.0f}",
+                f"{1e3 * error_of[name]:.0f}" if name in error_of else "–",
+                f"{nees:.1f}" if math.isfinite(nees) else "–",
+            )
+        )
+    head = ("id", "class", "seen", "missed", "x [m]", "y [m]", "2σ [mm]", "error [mm]", "NEES")
+    html = table(head, rows, numbers=(2, 3, 4, 5, 6, 7, 8))
+    more = len(landmarks) - len(rows)
+    return html + (f"<p>{more} more are in <code>map.parquet</code>.</p>" if more > 0 else "")

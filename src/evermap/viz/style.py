@@ -1,7 +1,7 @@
 """One look for all figures: colour-blind safe, 8 pt and larger, and at home on light and dark pages.
 
 Figures use matplotlib's object interface only, so no backend, display or global state is touched. Every colour has
-a role; in SVG for the report a role becomes a CSS variable, so that the page's theme decides what it looks like.
+a role; a page's theme, or an SVG file's own style sheet, decides what a role looks like in the dark.
 """
 
 from __future__ import annotations
@@ -9,19 +9,23 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+import numpy as np
+
 from evermap.errors import printable
+from evermap.types import FloatArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito (2008), told apart with every common kind of colour blindness; the violet of a third group is darker
+# Okabe and Ito (2008), distinguished with every common kind of colour blindness; wine and violet are darker additions
 INK = "#1b1f24"
 MUTED = "#636c76"
 GRID = "#d8dde3"
@@ -34,21 +38,57 @@ LANDMARK = "#009e73"
 ALERT = "#d55e00"
 ONLINE = "#cc79a7"
 GROUP = "#7a4fb5"
+SKY = "#56b4e9"
+WINE = "#882255"
 
-CSS_ROLES = {
-    INK: "--ink",
-    MUTED: "--muted",
-    GRID: "--grid",
-    SHADE: "--shade",
-    PAPER: "--paper",
-    ESTIMATE: "--estimate",
-    ESTIMATE_BAND: "--estimate-band",
-    ODOMETRY: "--odometry",
-    LANDMARK: "--landmark",
-    ALERT: "--alert",
-    ONLINE: "--online",
-    GROUP: "--group",
+ROLES = {
+    INK: ("ink", "#e7ebef"),
+    MUTED: ("muted", "#9aa5b1"),
+    GRID: ("grid", "#323a44"),
+    SHADE: ("shade", "#262d36"),
+    PAPER: ("paper", "#14181d"),
+    ESTIMATE: ("estimate", "#56b4e9"),
+    ESTIMATE_BAND: ("estimate-band", "#1d3b50"),
+    ODOMETRY: ("odometry", "#e6a823"),
+    LANDMARK: ("landmark", "#2fc39a"),
+    ALERT: ("alert", "#ff8a4c"),
+    ONLINE: ("online", "#dd97bd"),
+    GROUP: ("group", "#b794f0"),
+    SKY: ("sky", "#2f74c0"),
+    WINE: ("wine", "#b5427f"),
 }
+"""Colours by role: its name, which is a CSS variable of the report, and its colour on dark pages."""
+
+CLASS_COLOURS = (ESTIMATE, ODOMETRY, ONLINE, WINE, SKY, INK)
+CLASS_MARKERS = ("o", "s", "^", "D", "v", "P", "h")
+
+
+@dataclass(frozen=True, slots=True)
+class ClassLook:
+    """Colour and marker of a class in all figures."""
+
+    colour: str
+    marker: str
+
+
+NO_CLASS = ClassLook(LANDMARK, "o")
+"""Of what has no class, or one without a name."""
+
+
+def class_looks(names: Iterable[str]) -> dict[str, ClassLook]:
+    """Return the look of each class by its name, and `NO_CLASS` for the empty name.
+
+    The order of the names decides, so that all figures of a run agree when they are given the same classes. Colours
+    are distinguished by readers with every common kind of colour blindness; as their number and that of the markers
+    have no common divisor, 42 classes look different.
+    """
+    known = enumerate(sorted({name for name in names if name}))
+    looks = {
+        name: ClassLook(CLASS_COLOURS[k % len(CLASS_COLOURS)], CLASS_MARKERS[k % len(CLASS_MARKERS)])
+        for k, name in known
+    }
+    return {"": NO_CLASS, **looks}
+
 
 _RC: Any = {
     "font.family": "DejaVu Sans",
@@ -131,10 +171,72 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def settle(figure: Figure) -> None:
-    """Computes the layout once, so that saving in several formats does not repeat it."""
+    """Compute the layout once, so that saving in several formats does not repeat it, and move labels apart."""
     _write_powers(figure)
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
+    for axes in figure.axes:
+        _declutter(axes, [text for text in axes.texts if text.get_label() == _POINT_LABEL])
+
+
+def label_points(axes: Axes, points: FloatArray, texts: Iterable[str]) -> None:
+    """Write a text beside each point (K, 2); `settle` moves those that overlap, with a thin line to what is far off."""
+    from matplotlib.patheffects import withStroke
+
+    line = {"arrowstyle": "-", "color": MUTED, "lw": 0.6, "shrinkA": 0.5, "shrinkB": 2.0}
+    halo = [withStroke(linewidth=2.2, foreground=PAPER)]
+    for point, text in zip(points, texts, strict=True):
+        label = axes.annotate(
+            printable(text, 24), point, (0.0, 8.0), textcoords="offset points", ha="center", va="center", size=8,
+            color=INK, path_effects=halo, arrowprops=line, zorder=10,
+        )  # fmt: skip
+        label.set_label(_POINT_LABEL)
+
+
+_POINT_LABEL = "label of a point"
+_MARK_PT = 3.5
+"""Half the side of the square about a point that no label should cover."""
+_NEAR_PT = 9.0
+"""Up to so far from its point a label needs no line."""
+_RINGS_PT = (4.0, 9.0, 16.0, 25.0, 36.0)
+
+
+def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
+    """Give each label in turn the nearest position around its point where it covers no label and no point.
+
+    Where none is free, the one that covers least.
+    """
+    from matplotlib.text import Text
+
+    if not labels:
+        return
+    figure: Any = axes.figure
+    renderer, pt = figure.canvas.get_renderer(), figure.dpi / 72.0
+    points = axes.transData.transform([label.xy for label in labels])
+    marks = np.concatenate([points - _MARK_PT * pt, points + _MARK_PT * pt], axis=1)
+    frame = np.array(axes.bbox.extents)
+    boxes = np.zeros((0, 4))
+    for label, point in zip(labels, points, strict=True):
+        extent = Text.get_window_extent(label, renderer)
+        half = 0.5 * np.array([extent.width, extent.height])
+        angle = np.radians(np.arange(0.0, 360.0, 22.5) + 45.0)
+        way = np.tile(np.stack([np.cos(angle), np.sin(angle)], axis=1), (len(_RINGS_PT), 1))
+        ring = np.repeat(_RINGS_PT, len(angle))
+        middle = point + way * (ring[:, None] * pt + half)
+        here = np.concatenate([middle - half, middle + half], axis=1)
+        outside = np.maximum(frame[:2] - here[:, :2], 0.0) + np.maximum(here[:, 2:] - frame[2:], 0.0)
+        cost = _shared(here, boxes) + _shared(here, marks) + 1e3 * outside.sum(axis=1) + 1e-3 * ring
+        best = int(np.argmin(cost))
+        boxes = np.concatenate([boxes, here[best : best + 1]])
+        label.set_position((middle[best] - point) / pt)
+        label.arrow_patch.set_visible(bool(ring[best] > _NEAR_PT))
+
+
+def _shared(boxes: FloatArray, others: FloatArray) -> FloatArray:
+    """(K,) area that each box shares with all others; corners as (x0, y0, x1, y1)."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.asarray(np.prod(np.maximum(high - low, 0.0), axis=2).sum(axis=1))
 
 
 def _write_powers(figure: Figure) -> None:
@@ -174,33 +276,37 @@ _RAISED = str.maketrans("0123456789-.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻·")
 
 
 def save_png(figure: Figure, path: Path | BinaryIO, *, dpi: int = 160) -> None:
-    """Writes a PNG on white paper; the same figure gives the same bytes."""
+    """Write a PNG on white paper; the same figure gives the same bytes."""
     _write_powers(figure)
     with house_style():
         figure.savefig(path, format="png", dpi=dpi, facecolor="white", metadata={"Software": None})
 
 
 def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
-    """Writes a stand-alone SVG on white paper; the same figure gives the same bytes."""
-    _write_powers(figure)
-    with house_style():
-        figure.savefig(path, format="svg", facecolor="white", metadata={"Date": None, "Creator": None})
+    """Write a stand-alone SVG that follows the reader's light or dark theme; the same figure gives the same bytes.
+
+    Its colours are those on white paper; a style sheet inside replaces them in the dark, so that programs that know
+    no style sheets draw it as in print. Text is in the current colour, for pages that contain the drawing.
+    """
+    text = _svg(figure)
+    at = text.index(">", text.index("<svg")) + 1
+    content = (text[:at] + f"\n<style>{_file_theme()}</style>" + text[at:]).encode()
+    if isinstance(path, Path):
+        path.write_bytes(content)
+    else:
+        path.write(content)
 
 
 def save_all(figures: Mapping[str, Figure], path: Callable[[str], Path]) -> None:
-    """Writes every figure as PNG and SVG, to where `path` puts a file of its name."""
+    """Write every figure as PNG and SVG, to where `path` puts a file of its name."""
     for name, figure in figures.items():
         save_png(figure, path(f"{name}.png"), dpi=130)
         save_svg(figure, path(f"{name}.svg"))
 
 
 def inline_svg(figure: Figure, name: str) -> str:
-    """The figure as an `<svg>` element for an HTML page: no prolog, no address, ids prefixed by `name`, themed."""
-    _write_powers(figure)
-    buffer = io.StringIO()
-    with house_style():
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    text = buffer.getvalue()
+    """Return the figure as a themed `<svg>` element for an HTML page: no prolog, no address, ids prefixed by `name`."""
+    text = _svg(figure)
     text = text[text.index("<svg") :]
     text = re.sub(r"<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text)
@@ -208,7 +314,37 @@ def inline_svg(figure: Figure, name: str) -> str:
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = re.sub(r"url\(#", f"url(#{name}-", text)
     text = re.sub(r'href="#', f'href="#{name}-', text)
-    for colour, role in CSS_ROLES.items():
-        text = text.replace(colour, f"var({role})")
+    for colour, (role, _) in ROLES.items():
+        text = text.replace(colour, "currentColor" if colour == INK else f"var(--{role})")
     # the page scales the drawing; the view box keeps its proportions
     return re.sub(r'<svg height="[^"]*"', "<svg", re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1), count=1)
+
+
+def page_theme() -> str:
+    """Return the style sheet of a page's variables, one a role, with those of dark pages."""
+    light = ";".join(f"--{role}:{colour}" for colour, (role, _) in ROLES.items())
+    dark = ";".join(f"--{role}:{colour}" for role, colour in ROLES.values())
+    return f":root{{{light};color-scheme:light dark}}\n@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
+
+
+def _svg(figure: Figure) -> str:
+    """The drawing as matplotlib writes it."""
+    _write_powers(figure)
+    buffer = io.StringIO()
+    metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    with house_style():
+        figure.savefig(buffer, format="svg", facecolor=PAPER, metadata=metadata)
+    return buffer.getvalue()
+
+
+def _file_theme() -> str:
+    """Rules for the colours that matplotlib writes into the style of each element."""
+    rules = "".join(
+        f'[style*="{what}: {light}"]{{{what}:{dark}}}'
+        for light, (_, dark) in ROLES.items()
+        for what in ("fill", "stroke")
+        if light != INK
+    ).replace("}", " !important}")
+    ink = "".join(f'[style*="{what}: {INK}"]{{{what}:currentColor !important}}' for what in ("fill", "stroke"))
+    dark_ink = ROLES[INK][1]
+    return f"svg{{color:{INK}}}{ink}@media (prefers-color-scheme:dark){{svg{{color:{dark_ink}}}{rules}}}"

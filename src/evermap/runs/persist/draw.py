@@ -52,7 +52,7 @@ def most_interesting(result: PersistResult, n: int) -> IntArray:
 
 
 def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
-    from evermap.viz.presence_raster import plot_raster
+    from evermap.viz.presence_figures import plot_raster
 
     features = most_interesting(result, RASTER_ROWS)
     start_s, end_s = _span(result)
@@ -85,7 +85,7 @@ def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
 
 
 def _calibration(result: PersistResult) -> NamedFigure:
-    from evermap.viz.reliability_figure import plot_reliability
+    from evermap.viz.presence_figures import plot_reliability
 
     assert result.scores is not None and result.reliability is not None  # noqa: PT018
     figure = plot_reliability(result.reliability, result.scores)

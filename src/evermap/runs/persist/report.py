@@ -14,8 +14,8 @@ import numpy as np
 from evermap.runs.persist.run import PersistResult
 from evermap.survival.durations import duration_text
 from evermap.viz.page import PAGE, STYLE
+from evermap.viz.report import table
 from evermap.viz.style import NamedFigure
-from evermap.viz.tables import table
 
 _MOST_ROWS = 100
 

@@ -10,7 +10,7 @@ import numpy as np
 from evermap.runs.track.run import TrackResult
 from evermap.tracking.tracklets import EventKind
 from evermap.types import FloatArray
-from evermap.viz.objects_figure import Rests, plot_objects
+from evermap.viz.track_figures import Rests, plot_objects
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,7 +43,7 @@ def write_recording(result: TrackResult, path: Path) -> None:
     Raises:
         MissingExtraError: rerun-sdk is not installed.
     """
-    from evermap.viz.tracks_recording import log_tracks
+    from evermap.viz.rerun_scene import log_tracks
 
     table, tracks = result.table, result.tracks
     rows = np.argsort(tracks.stamp_s, kind="stable")

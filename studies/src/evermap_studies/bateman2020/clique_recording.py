@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.types import BoolArray, FloatArray, IntArray
-from evermap.viz.rerun_stream import require_rerun, rgb
+from evermap.viz.rerun_scene import require_rerun, rgb
 from evermap.viz.style import ALERT, ESTIMATE, MUTED, PAPER
 
 TIMELINE = "step"

@@ -24,7 +24,7 @@ from evermap.viz.style import (
     new_figure,
     settle,
 )
-from evermap.viz.tracks_figure import draw_tracks
+from evermap.viz.track_figures import draw_tracks
 from evermap_studies.lifetimes.moving import TrackedRun
 from evermap_studies.lifetimes.rooms import RoomStays
 from evermap_studies.lifetimes.truth import ESTIMATORS, NAIVE, Stays, Value, groups

@@ -148,7 +148,7 @@ def reproduce(
 def _record(tracked: TrackedRun, path: Path) -> None:
     """The first run, if rerun-sdk is installed."""
     from evermap.errors import MissingExtraError
-    from evermap.viz.tracks_recording import log_tracks
+    from evermap.viz.rerun_scene import log_tracks
 
     kept = slice(None, None, RECORDED_EVERY)
     followed = tracked.followed[kept]

@@ -179,7 +179,7 @@ def _draw_paths(paths: Mapping[str, Row]) -> Figure:
 
 
 def _draw_reliability(said: list[float], right: list[bool]) -> Figure:
-    from evermap.viz.reliability_figure import plot_reliability
+    from evermap.viz.presence_figures import plot_reliability
 
     truth = [float(value) for value in right]
     figure = plot_reliability(reliability(said, truth), belief_scores(said, truth), title="changes reported by 'joint'")

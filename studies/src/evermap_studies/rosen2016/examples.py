@@ -14,7 +14,7 @@ from evermap.existence.one import PersistenceFilter
 from evermap.survival import CallableHazard, Exponential, GeneralPurpose, LifetimePrior, PeriodicHazard
 from evermap.types import BoolArray, FloatArray
 from evermap.viz.belief_figure import plot_belief
-from evermap.viz.lifetime_figure import plot
+from evermap.viz.lifetime_figures import plot_lifetimes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -78,4 +78,4 @@ def example_priors() -> dict[str, LifetimePrior]:
 
 def draw_prior_example() -> Figure:
     """Figure 2: densities that look alike may come from very different hazards."""
-    return plot(example_priors(), until_s=6.0, log_time=False)
+    return plot_lifetimes(example_priors(), until_s=6.0, log_time=False)

@@ -1,14 +1,14 @@
-"""Objects over time: where they went and rested, seen from above, and when each was where it rested."""
+"""Figures of tracking: objects over time, and what a tracker believes at one instant."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -18,6 +18,7 @@ from evermap.viz.style import (
     MUTED,
     ODOMETRY,
     ONLINE,
+    SHADE,
     house_style,
     legend_name,
     new_figure,
@@ -121,3 +122,59 @@ def _draw_bars(axes: Axes, rests: Rests, start_s: float, end_s: float) -> None:
     axes.set(xlabel=f"time since the first frame [{unit.name}]", yticks=[], ylim=(len(order), -1.0))
     axes.axvline(at(end_s), color=INK, lw=0.6, ls=":")
     axes.set_title(f"{which} at rest")
+
+
+STATIC, DYNAMIC = ESTIMATE, GROUP
+"""The thesis' blue and purple."""
+ARROW_S = 2.0
+"""Arrows show the way of so many seconds."""
+
+
+def draw_tracks(
+    axes: Axes,
+    *,
+    position_m: FloatArray,
+    velocity_mps: FloatArray,
+    static: BoolArray,
+    resting_m: FloatArray,
+    sensor_m: FloatArray,
+    reach_m: float,
+    path_m: FloatArray | None = None,
+    detected_m: FloatArray | None = None,
+) -> None:
+    """Active tracklets by colour, the working set hollow, and the sensor with its radius. Call in `house_style`.
+
+    Args:
+        axes: empty.
+        position_m: (N, 3) of active tracklets.
+        velocity_mps: (N, 3) of the same; arrows for those that move.
+        static: (N,) whether each is static.
+        resting_m: (K, 3) places of the objects in the working set.
+        sensor_m: (3,).
+        reach_m: radius in which the sensor sees.
+        path_m: (F, 3) of the sensor so far.
+        detected_m: (M, 3) detections of the frame.
+    """
+    from matplotlib.patches import Circle
+
+    x, y = sensor_m[:2]
+    axes.add_patch(
+        Circle((x, y), reach_m, facecolor=SHADE, edgecolor=MUTED, lw=0.8, zorder=0.5, label="seen by the sensor")
+    )
+    if path_m is not None:
+        axes.plot(path_m[:, 0], path_m[:, 1], color=MUTED, lw=0.8, ls=":", zorder=1, label="its path")
+    marks: Any = {"ls": "none", "marker": "o", "ms": 5.0}
+    axes.plot(
+        *resting_m[:, :2].T, mfc="none", mec=STATIC, mew=1.0, zorder=2, label="static, in the working set", **marks
+    )
+    axes.plot(*position_m[static, :2].T, color=STATIC, zorder=3, label="static", **marks)
+    axes.plot(*position_m[~static, :2].T, color=DYNAMIC, zorder=3, label="dynamic", **marks)
+    ends = position_m[~static] + ARROW_S * velocity_mps[~static]
+    ways = np.stack([position_m[~static, :2], ends[:, :2]], axis=1)
+    for begin, end in ways:
+        axes.plot(*np.array([begin, end]).T, color=DYNAMIC, lw=1.0, zorder=2.5)
+    if detected_m is not None:
+        axes.plot(*detected_m[:, :2].T, ls="none", marker="x", ms=3.0, mew=0.6, color=INK, zorder=4, label="detection")
+    axes.plot(x, y, ls="none", marker="^", ms=7.0, color=INK, zorder=5, label="sensor")
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set_aspect("equal")

@@ -1,0 +1,403 @@
+"""Lifetimes: priors in four views, survival functions learned from data, maps of chunks, and the censored samples."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import ConfigError, printable
+from evermap.survival.base import LifetimePrior
+from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.hazard_regression import HazardDraws
+from evermap.survival.kaplan_meier import KaplanMeier
+from evermap.survival.parametric_fit import ParametricFit
+from evermap.survival.pooling import Chunk
+from evermap.survival.turnbull import Npmle
+from evermap.types import FloatArray
+from evermap.viz.style import (
+    ALERT,
+    CLASS_COLOURS,
+    ESTIMATE,
+    ESTIMATE_BAND,
+    INK,
+    MUTED,
+    class_looks,
+    house_style,
+    legend_name,
+    new_figure,
+    settle,
+)
+from evermap.viz.time_axis import DURATIONS, TimeUnit, label_durations, unit_for
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_DASHES = ("-", "--", ":")
+_POINTS = 2001
+_WIDE = 1e3
+"""A ratio of long to short lifetimes from which the axis of time is logarithmic."""
+_DECADES = 7.0
+"""Most decades that a logarithmic axis of rates shows."""
+_BOX = "anywhere in a box"
+
+Estimate = Npmle | KaplanMeier | ParametricFit | HazardDraws | LifetimePrior
+
+
+def plot_lifetimes(
+    priors: Mapping[str, LifetimePrior] | LifetimePrior,
+    *,
+    until_s: float | None = None,
+    log_time: bool | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw hazard, cumulative hazard, survival and density over the time since a feature was first seen.
+
+    A prior of which some features never leave (its hazard has a finite integral) says so in the legend, with the
+    level at which its survival ends as a dotted line. A point of mass shows as a step of survival and cumulative
+    hazard; its infinite hazard and density are left out.
+
+    Args:
+        priors: by the names for the legend, or a single one.
+        until_s: end of the time axis in seconds; left out, all but the longest twentieth of the lifetimes.
+        log_time: a logarithmic axis of time; left out, where lifetimes span more than three decades.
+        title: above the figure.
+
+    Raises:
+        ConfigError: no prior, or a time that is not positive.
+    """
+    named = dict(priors) if isinstance(priors, Mapping) else {type(priors).__name__: priors}
+    if not named:
+        raise ConfigError("no lifetime prior to draw", field="priors")
+    time_s, logarithmic = _times(named.values(), until_s, log_time)
+    unit = unit_for(float(time_s[-1]))
+    with house_style():
+        figure = new_figure(7.2, 5.0)
+        panels = figure.subplots(2, 2, sharex=True)
+        styles = _styles(named)
+        for name, prior in named.items():
+            _draw_prior(panels, prior, _legend(name, prior), time_s, unit, styles[name])
+        _finish(panels, unit, logarithmic, time_s)
+        for axes in panels[1]:
+            _time_axis(axes, time_s, unit, logarithmic)
+        figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+        if title:
+            figure.suptitle(title, fontweight="bold")
+        settle(figure)
+    return figure
+
+
+def _draw_prior(
+    panels: Any, prior: LifetimePrior, label: str, time_s: FloatArray, unit: TimeUnit, style: dict[str, Any]
+) -> None:
+    """One prior in all four views, rates per `unit`."""
+    x = time_s / unit.seconds
+    (hazard, cumulative), (survival, density) = panels
+    with np.errstate(over="ignore"):
+        hazard.plot(x, _finite(prior.hazard(time_s) * unit.seconds), **style)
+        density.plot(x, _finite(np.exp(prior.log_density(time_s)) * unit.seconds), **style)
+    cumulative.plot(x, _finite(prior.cumulative_hazard(time_s)), **style)
+    survival.plot(x, np.exp(prior.log_survival(time_s)), label=label, **style)
+    stay = prior.p_never_leaves
+    if 0.0 < stay < 1.0:
+        survival.axhline(stay, color=style["color"], lw=0.8, ls=":")
+        cumulative.axhline(-math.log(stay), color=style["color"], lw=0.8, ls=":")
+
+
+def _finish(panels: Any, unit: TimeUnit, logarithmic: bool, time_s: FloatArray) -> None:
+    (hazard, cumulative), (survival, density) = panels
+    for axes, title, label in (
+        (hazard, "hazard", f"h(t) [1/{unit.name.removesuffix('s') or 's'}]"),
+        (cumulative, "cumulative hazard", "H(t) [1]"),
+        (survival, "survival", "S(t) [1]"),
+        (density, "density", f"p(t) [1/{unit.name.removesuffix('s') or 's'}]"),
+    ):
+        axes.set_title(title)
+        axes.set_ylabel(label)
+        if axes is not survival:
+            _limit(axes, logarithmic)
+    survival.set_ylim(0.0, 1.04)
+    if not logarithmic:
+        hazard.set_xlim(0.0, time_s[-1] / unit.seconds)
+
+
+def _limit(axes: Axes, logarithmic: bool) -> None:
+    """Heights that show the curves and cut their poles."""
+    heights = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for line in axes.lines])
+    heights = heights[np.isfinite(heights) & (heights > 0.0)]
+    if len(heights) == 0:
+        axes.set_ylim(0.0, 1.0)
+        return
+    highest = float(heights.max())
+    if logarithmic:
+        axes.set_yscale("log")
+        lowest = max(float(heights.min()), highest * 10.0**-_DECADES)
+        axes.set_ylim(0.5 * lowest, 2.0 * max(highest, 2.0 * lowest))
+        return
+    typical = float(np.quantile(heights, 0.98))
+    axes.set_ylim(0.0, 1.08 * (highest if highest < 5.0 * typical else 2.0 * typical))
+
+
+def _time_axis(axes: Axes, time_s: FloatArray, unit: TimeUnit, logarithmic: bool) -> None:
+    if logarithmic:
+        label_durations(axes, float(time_s[0]), float(time_s[-1]), unit)
+    else:
+        axes.set_xlabel(f"time since first seen [{unit.name}]")
+
+
+def _legend(name: str, prior: LifetimePrior) -> str:
+    stay = prior.p_never_leaves
+    if stay == 0.0:
+        return name
+    return f"{name} ({100.0 * stay:.3g} % never leave)"
+
+
+def _times(priors: Iterable[LifetimePrior], until_s: float | None, log_time: bool | None) -> tuple[FloatArray, bool]:
+    """Return the times to draw at, and whether their axis is logarithmic.
+
+    Raises:
+        ConfigError: a time that is not positive.
+    """
+    if until_s is not None and not 0.0 < until_s < math.inf:
+        raise ConfigError(f"a time must be positive and finite, not {until_s!r}", field="until_s")
+    priors = list(priors)
+    last_s = until_s or _quantile(priors, 0.95, max)
+    first_s = max(_quantile(priors, 0.05, min), 1e-6 * last_s)
+    logarithmic = log_time if log_time is not None else last_s > _WIDE * first_s
+    if logarithmic:
+        return np.geomspace(min(first_s, 1e-2 * last_s), last_s, _POINTS), True
+    return np.linspace(0.0, last_s, _POINTS), False
+
+
+def _quantile(priors: Iterable[LifetimePrior], p: float, choose: Callable[[list[float]], float]) -> float:
+    """Of those that leave at all; a day where none do."""
+    times = [float(prior.quantile(p * (1.0 - prior.p_never_leaves))) for prior in priors if prior.p_never_leaves < 1.0]
+    finite = [time for time in times if 0.0 < time < math.inf]
+    return choose(finite) if finite else 86400.0
+
+
+def _styles(names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Colour and dashes by name; a class has the colour that it has in every figure."""
+    rank = {name: k for k, name in enumerate(sorted(filter(None, names)))}
+    return {
+        name: {"color": look.colour, "ls": _DASHES[rank.get(name, 0) // len(CLASS_COLOURS) % len(_DASHES)]}
+        for name, look in class_looks(names).items()
+    }
+
+
+def _finite(values: Any) -> FloatArray:
+    """Points of infinite height are left out."""
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def plot_survival(
+    estimates: Mapping[str, Estimate],
+    *,
+    truth: LifetimePrior | None = None,
+    until_s: float | None = None,
+    log_time: bool | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw `P(T > t)` as one or several estimators have it, with 95 % bands where they know them.
+
+    A nonparametric estimate of intervals says nothing of how its mass is spread within a cell: there its survival
+    function is anywhere in a grey box.
+
+    Args:
+        estimates: by the names for the legend.
+        truth: the lifetime that the samples were drawn from, where it is known.
+        until_s: end of the axis in seconds; left out, when all but a twentieth have gone.
+        log_time: a logarithmic axis of time; left out, where lifetimes span more than three decades.
+        title: above the figure.
+
+    Raises:
+        ConfigError: nothing to draw, or a time that is not positive.
+    """
+    if not estimates:
+        raise ConfigError("no survival function to draw", field="estimates")
+    priors = [*map(_prior, estimates.values()), *([truth] if truth is not None else [])]
+    time_s, logarithmic = _times(priors, until_s, log_time)
+    unit = unit_for(float(time_s[-1]))
+    styles = _styles(estimates)
+    with house_style():
+        figure = new_figure(6.4, 3.8)
+        axes = figure.subplots()
+        for name, one in estimates.items():
+            _draw_estimate(axes, one, legend_name(name), time_s, unit, styles[name])
+        _name_boxes_once(axes)
+        if truth is not None:
+            axes.plot(
+                time_s / unit.seconds, np.exp(truth.log_survival(time_s)), color=INK, lw=1.0, ls="--", label="truth"
+            )
+        axes.set(ylim=(0.0, 1.03), ylabel="P(T > t) [1]")
+        if logarithmic:
+            label_durations(axes, float(time_s[0]), float(time_s[-1]), unit)
+        else:
+            axes.set(xlim=(0.0, time_s[-1] / unit.seconds), xlabel=f"time since first seen [{unit.name}]")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        if title:
+            figure.suptitle(title, fontweight="bold")
+        settle(figure)
+    return figure
+
+
+def plot_chunks(
+    chunks: Sequence[Chunk], size_m: float, hazards: Sequence[HazardDraws], *, title: str | None = None
+) -> Figure:
+    """Draw two maps of square chunks: until when half have gone, and how uncertain that is.
+
+    The uncertainty is the factor between the bounds of the 95 % band of the median lifetime.
+
+    Args:
+        chunks: columns and rows.
+        size_m: side of a chunk.
+        hazards: of each chunk, as `PooledHazard.at` gives them.
+        title: above the figure.
+
+    Raises:
+        ConfigError: no chunk, or not as many hazards.
+    """
+    if not len(chunks) == len(hazards) > 0:
+        raise ConfigError(f"{len(chunks)} chunks need as many hazards, at least one", field="hazards")
+    median, lower, upper = np.array([one.quantile(0.5) for one in hazards]).T
+    with house_style():
+        figure = new_figure(7.2, 3.8)
+        left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+        _map(left, chunks, size_m, median, "half have gone after", durations=True)
+        _map(right, chunks, size_m, upper / lower, "upper over lower bound [1]", durations=False)
+        left.set_ylabel("y [m]")
+        if title:
+            figure.suptitle(title, fontweight="bold")
+        settle(figure)
+    return figure
+
+
+def _draw_estimate(
+    axes: Axes, one: Estimate, name: str, time_s: FloatArray, unit: TimeUnit, style: dict[str, Any]
+) -> None:
+    x = time_s / unit.seconds
+    if isinstance(one, Npmle):
+        corners = _corners(one, time_s)
+        lower, upper = one.survival(corners)
+        at = corners / unit.seconds
+        axes.fill_between(at, lower, upper, color=MUTED, alpha=0.35, lw=0, label=_BOX)
+        # outside the boxes both bounds agree
+        axes.plot(at, np.where(lower == upper, lower, np.nan), lw=1.4, label=name, **style)
+        return
+    mean, band = _curve(one, time_s)
+    if band is not None:
+        axes.fill_between(x, *band, color=style["color"], alpha=0.2, lw=0)
+    axes.plot(x, mean, label=name, **style)
+
+
+def _curve(one: Estimate, time_s: FloatArray) -> tuple[FloatArray, tuple[FloatArray, FloatArray] | None]:
+    """Survival function, and its 95 % band where it is known."""
+    match one:
+        case KaplanMeier():
+            return one.survival(time_s), one.band(time_s)
+        case ParametricFit():
+            return np.exp(one.prior.log_survival(time_s)), one.band(time_s)
+        case HazardDraws():
+            mean, lower, upper = one.survival(time_s)
+            return mean, (lower, upper)
+        case _:
+            return np.exp(one.log_survival(time_s)), None  # type: ignore[union-attr]
+
+
+def _name_boxes_once(axes: Axes) -> None:
+    boxes = [drawn for drawn in axes.collections if drawn.get_label() == _BOX]
+    for drawn in boxes[1:]:
+        drawn.set_label("")
+
+
+def _corners(one: Npmle, time_s: FloatArray) -> FloatArray:
+    """Both sides of every end of a cell, within the axis."""
+    ends = np.concatenate([one.support_left, one.support_right])
+    ends = ends[np.isfinite(ends) & (ends > time_s[0]) & (ends < time_s[-1])]
+    return np.unique(np.concatenate([time_s[[0, -1]], np.nextafter(ends, 0.0), ends, np.nextafter(ends, np.inf)]))
+
+
+def _map(
+    axes: Axes, chunks: Sequence[Chunk], size_m: float, values: FloatArray, label: str, *, durations: bool
+) -> None:
+    from matplotlib.collections import PatchCollection
+    from matplotlib.colors import LogNorm
+    from matplotlib.patches import Rectangle
+
+    squares = [Rectangle((x * size_m, y * size_m), size_m, size_m) for x, y in chunks]
+    low, high = float(values.min()), float(values.max())
+    # a colour bar needs some length
+    norm = LogNorm(min(low, 0.9 * high), max(high, 1.1 * low))
+    drawn = PatchCollection(squares, cmap="cividis", norm=norm, edgecolor="white", linewidth=0.5)
+    drawn.set_array(values)
+    axes.add_collection(drawn)
+    axes.autoscale_view()
+    axes.set(aspect="equal", xlabel="x [m]")
+    axes.set_title(label)
+    axes.grid(visible=False)
+    ticks = _duration_ticks(low, high) if durations else _plain_ticks(low, high)
+    bar = axes.figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.9, aspect=30)
+    bar.minorticks_off()
+    bar.set_ticks([value for _, value in ticks], labels=[name for name, _ in ticks])
+
+
+def _duration_ticks(low_s: float, high_s: float) -> list[tuple[str, float]]:
+    """Whole durations in sight; where there is hardly one, a few numbers in the unit that suits."""
+    ticks = [(name, value) for name, value in DURATIONS if low_s <= value <= high_s]
+    if len(ticks) >= 3:
+        return ticks
+    unit = unit_for(high_s)
+    return [(f"{value / unit.seconds:.2g} {unit.name}", value) for value in np.geomspace(low_s, high_s, 4).tolist()]
+
+
+def _plain_ticks(low: float, high: float) -> list[tuple[str, float]]:
+    return [(f"{value:.2g}", value) for value in np.geomspace(low, high, 4).tolist()]
+
+
+def _prior(one: Estimate) -> LifetimePrior:
+    match one:
+        case Npmle() | KaplanMeier() | HazardDraws():
+            return one.prior()
+        case ParametricFit():
+            return one.prior
+        case _:
+            return one
+
+
+def plot_samples(data: CensoredLifetimes, names: Sequence[str]) -> Figure:
+    """Draw a bar from the first sighting, or the entry, to the last, and a pale one over where the end may be.
+
+    Args:
+        data: N samples, few enough to have a row each.
+        names: N words for the rows, from the top.
+
+    Raises:
+        ConfigError: not as many names.
+    """
+    n = len(data.left_s)
+    if len(names) != n:
+        raise ConfigError(f"{n} lifetimes need as many names, not {len(names)}", field="names")
+    finite = np.concatenate([data.left_s, data.right_s[np.isfinite(data.right_s)], data.entry_s])
+    unit = unit_for(float(finite.max()))
+    end = 1.15 * float(finite.max()) / unit.seconds
+    row = np.arange(n)[::-1]
+    entry, right = data.entry_s / unit.seconds, np.minimum(data.right_s / unit.seconds, end)
+    since = np.maximum(data.left_s / unit.seconds, entry)
+    known = np.isfinite(data.right_s)
+    with house_style():
+        figure = new_figure(6.4, 0.7 + 0.32 * n)
+        axes = figure.subplots()
+        axes.hlines(row, 0.0, entry, color=MUTED, lw=1.5, ls=":", label="unknown to us if it had gone by then")
+        axes.barh(row, since - entry, left=entry, height=0.34, color=ESTIMATE, label="seen to be there")
+        axes.barh(row, right - since, left=since, height=0.34, color=ESTIMATE_BAND, label="the end is in here")
+        axes.plot(right[data.exact], row[data.exact], "o", color=ALERT, ms=5, label="the end was watched")
+        axes.plot(right[~known], row[~known], ">", color=ESTIMATE, ms=5, label="never seen gone")
+        axes.set_yticks(row, [printable(name) for name in names])
+        axes.set(xlim=(0.0, 1.01 * end), xlabel=f"age [{unit.name}]")
+        axes.grid(visible=False, axis="y")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+        settle(figure)
+    return figure

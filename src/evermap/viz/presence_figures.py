@@ -1,0 +1,268 @@
+"""Figures of features that come and go: beliefs at one glance, what a model predicts, and calibration."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.errors import InputError, printable
+from evermap.existence.protocol import Instants, Looks, PresenceModel
+from evermap.existence.rhythm import MONDAY_S
+from evermap.metrics.belief import BeliefScores, Reliability
+from evermap.types import Clock, FloatArray
+from evermap.viz.style import (
+    ALERT,
+    ESTIMATE,
+    ESTIMATE_BAND,
+    GRID,
+    INK,
+    MUTED,
+    PAPER,
+    SHADE,
+    house_style,
+    new_figure,
+    settle,
+)
+from evermap.viz.time_axis import DURATIONS, TimeAxis
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_ROW_IN, _LEAST_IN, _MOST_IN = 0.19, 1.1, 8.0
+"""Height of a row, and of the lowest and highest raster."""
+_MOST_LABELS = 40
+
+
+def plot_raster(
+    names: Sequence[str],
+    edge_s: Any,
+    p_exists: Any,
+    *,
+    changes: Sequence[tuple[int, float, bool]] = (),
+    forecast_from_s: float | None = None,
+    title: str | None = None,
+    clock: Clock = Clock.RECORDING,
+) -> Figure:
+    """Figure of F features over T stretches of time.
+
+    Args:
+        names: F labels, from top to bottom.
+        edge_s: (T + 1,) borders of the stretches, increasing.
+        p_exists: (F, T) belief in each; nan where there is none.
+        changes: row, time, and whether the feature returned (else it vanished).
+        forecast_from_s: a line where the forecast begins.
+        title: above the axes.
+        clock: `RECORDING` for an axis of seconds, minutes, hours or days; else dates.
+
+    Raises:
+        InputError: shapes that do not fit.
+    """
+    belief, edge = np.asarray(p_exists, dtype=np.float64), np.asarray(edge_s, dtype=np.float64)
+    if belief.shape != (len(names), len(edge) - 1) or len(names) == 0:
+        raise InputError(f"shape {belief.shape} instead of ({len(names)}, {len(edge) - 1})", field="p_exists")
+    height = float(np.clip(_ROW_IN * len(names), _LEAST_IN, _MOST_IN))
+    row_in = height / len(names)
+    with house_style():
+        figure = new_figure(7.2, height + 1.05)
+        axes = figure.add_subplot()
+        axis = TimeAxis.over(float(edge[0]), float(edge[-1]), clock)
+        _paint(figure, axes, axis.coordinates(edge), belief)
+        _mark(axes, axis, changes, row_in)
+        if forecast_from_s is not None and edge[0] < forecast_from_s < edge[-1]:
+            axes.axvline(
+                axis.coordinates(forecast_from_s), color=INK, lw=0.9, ls=(0, (3, 2)), label="forecast from here"
+            )
+        _label_rows(axes, names)
+        axis.label(axes)
+        if title:
+            axes.set_title(title)
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            figure.legend(
+                handles, labels, loc="outside lower center", ncols=4, markerscale=5.5 / _mark_size(row_in, changes)
+            )
+        settle(figure)
+    return figure
+
+
+def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
+    """Blue is there, orange is not, pale is undecided, hatched is no belief."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    colours = LinearSegmentedColormap.from_list("presence", [ALERT, PAPER, ESTIMATE]).with_extremes(
+        bad=(0.0, 0.0, 0.0, 0.0)
+    )
+    rows = np.arange(len(belief) + 1) - 0.5
+    shown = np.ma.masked_invalid(belief)
+    mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)
+    axes.grid(visible=False)
+    axes.set_facecolor(SHADE)
+    axes.patch.set(hatch="/////", edgecolor=GRID, linewidth=0.0)
+    bar = figure.colorbar(mesh, ax=axes, pad=0.015, fraction=0.03, aspect=12, ticks=[0.0, 0.5, 1.0])
+    bar.set_label("P(exists) [1]")
+    bar.outline.set_visible(False)
+
+
+def _mark(axes: Axes, axis: TimeAxis, changes: Sequence[tuple[int, float, bool]], row_in: float) -> None:
+    size = _mark_size(row_in, changes)
+    for returned, marker, label in ((False, "v", "vanished"), (True, "^", "returned")):
+        mine = [(time_s, row) for row, time_s, back in changes if back == returned]
+        if mine:
+            at, rows = zip(*mine, strict=True)
+            style: Any = {"mfc": INK, "mec": PAPER, "mew": 0.6, "ms": size, "ls": "none", "zorder": 3}
+            axes.plot(axis.coordinates(np.array(at)), rows, marker, label=label, **style)
+
+
+def _mark_size(row_in: float, changes: Sequence[tuple[int, float, bool]]) -> float:
+    """Points, for rows of this height; smaller where many changes share a row."""
+    crowd = max(Counter(row for row, _, _ in changes).values(), default=1)
+    return float(np.clip(min(30.0 * row_in, 150.0 / crowd), 2.0, 5.5))
+
+
+def _label_rows(axes: Axes, names: Sequence[str]) -> None:
+    step = 1 + (len(names) - 1) // _MOST_LABELS
+    shown = range(0, len(names), step)
+    axes.set_yticks(list(shown), [printable(names[k] if len(names[k]) <= 18 else f"{names[k][:17]}…") for k in shown])
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_ylabel("feature")
+    axes.tick_params(axis="y", length=0)
+
+
+MOST_ROWS = 8
+_NOON_S = 12.0 * 3600.0
+_WEEK_STEP_S = 600.0
+_DAYS = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
+_HALF_LIVES = 100.0
+"""How far the forecast is drawn, in times after which half of what the look told is lost."""
+
+
+def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
+    """Figure of forecasts, one row a model: presence after it was certainly seen there, or gone, and over the week.
+
+    Looks are taken on a Monday at noon. The first eight models are drawn.
+
+    Args:
+        models: by name; '' for a model without one.
+    """
+    drawn = dict(list(models.items())[:MOST_ROWS])
+    rhythm = any(map(has_rhythm, drawn.values()))
+    with house_style():
+        figure = new_figure(8.0 if rhythm else 5.0, 0.6 + 1.9 * len(drawn))
+        grid = figure.subplots(len(drawn), 2 if rhythm else 1, squeeze=False, width_ratios=(1, 1.3) if rhythm else (1,))
+        for row, (name, model) in enumerate(drawn.items()):
+            last = row == len(drawn) - 1
+            _after_a_look(grid[row, 0], model, name, last=last, legend=row == 0)
+            if rhythm:
+                _week(grid[row, 1], *week_of_presence(model), last=last)
+        settle(figure)
+    return figure
+
+
+def week_of_presence(model: PresenceModel) -> tuple[FloatArray, FloatArray]:
+    """Presence over a week that nobody looks at, long after the last look.
+
+    Args:
+        model: any model of presence.
+
+    Returns:
+        Times since Monday 00:00 in seconds, and the probabilities.
+    """
+    time_s = np.arange(0.0, 7.0 * 86400.0 + 1.0, _WEEK_STEP_S)
+    nothing = np.zeros(0)
+    unseen = Looks(np.zeros(2, dtype=np.int64), nothing, nothing, nothing, nothing)
+    return time_s, model.track(unseen, Instants.same_for_all(1, MONDAY_S + time_s)).p_present
+
+
+def has_rhythm(model: PresenceModel) -> bool:
+    """Whether the model knows the time of the week."""
+    return any(getattr(model, name, None) for name in ("rhythms", "stay_rhythm", "absence_rhythm"))
+
+
+def _after_a_look(axes: Axes, model: PresenceModel, name: str, *, last: bool, legend: bool) -> None:
+    """Presence ahead of a look that is certain, on a logarithmic axis until it makes no difference."""
+    start = MONDAY_S + _NOON_S
+    ahead = np.geomspace(1e-2, 60.0 * 86400.0, 240)
+    curves = []
+    for seen in (1, 0):
+        look = Looks.from_rows([0], [start], [seen], 0.0, 0.0)
+        curves.append(model.track(look, Instants.same_for_all(1, start + ahead)).p_present)
+    told = np.abs(curves[0] - curves[1])
+    half = ahead[int(np.argmin(told > 0.5))] if (told <= 0.5).any() else ahead[-1]
+    end = min(ahead[min(np.flatnonzero(told > 0.01)[-1] + 8, len(ahead) - 1)], _HALF_LIVES * half)
+    moved = np.flatnonzero((1.0 - curves[0] > 0.005) | (curves[1] > 0.005))
+    begin = ahead[max(moved[0] - 8, 0)] if moved.size else ahead[0]
+    axes.plot(ahead, curves[0], color=ESTIMATE, label="seen there")
+    axes.plot(ahead, curves[1], color=ALERT, label="seen to be gone")
+    ticks = [(text, value) for text, value in DURATIONS if begin <= value <= end][:: 1 if end < 3e4 * begin else 2]
+    axes.set(xscale="log", xlim=(begin, max(end, 2.0 * begin)), ylim=(-0.03, 1.03), ylabel="P(there) [1]")
+    axes.set_xticks([value for _, value in ticks], [text for text, _ in ticks])
+    axes.minorticks_off()
+    if name:
+        axes.set_title(printable(name))
+    if legend:
+        axes.legend(loc="center left")
+    if last:
+        axes.set_xlabel("time since the look")
+
+
+def _week(axes: Axes, time_s: Any, presence: Any, *, last: bool) -> None:
+    """Presence through the week, nights shaded."""
+    day = time_s / 86400.0
+    for k in range(7):
+        axes.axvspan(k - 0.25, k + 0.25, color=SHADE, lw=0, zorder=0)
+    axes.axvspan(6.75, 7.0, color=SHADE, lw=0, zorder=0)
+    axes.fill_between(day, 0.0, presence, color=ESTIMATE, alpha=0.25, lw=0)
+    axes.plot(day, presence, color=ESTIMATE, lw=1.0)
+    axes.set(xlim=(0.0, 7.0), ylim=(-0.03, 1.03))
+    axes.set_xticks(np.arange(7) + 0.5, _DAYS)
+    axes.tick_params(axis="x", length=0)
+    axes.grid(visible=False, axis="x")
+    if last:
+        axes.set_xlabel("local time of the week, 18:00 to 6:00 shaded", color=MUTED)
+
+
+def plot_reliability(bins: Reliability, scores: BeliefScores, *, title: str | None = None) -> Figure:
+    """Figure of the share of truth in each bin of belief, above the count of each bin on a logarithmic scale.
+
+    Args:
+        bins: `reliability(...)`.
+        scores: of the same beliefs, written beside it.
+        title: above the axes.
+    """
+    with house_style():
+        figure = new_figure(4.6, 4.6)
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.2, 1.0))
+        filled = bins.count > 0
+        above.plot([0.0, 1.0], [0.0, 1.0], color=MUTED, lw=0.9, ls="--", zorder=2, label="calibrated")
+        size = 20.0 + 100.0 * np.sqrt(bins.count[filled] / bins.count.max())
+        above.plot(bins.belief[filled], bins.present[filled], color=ESTIMATE, lw=1.2, zorder=3)
+        above.scatter(
+            bins.belief[filled], bins.present[filled], s=size, color=ESTIMATE, zorder=4, label="bin of beliefs"
+        )
+        above.set(xlim=(-0.03, 1.03), ylim=(-0.06, 1.06), ylabel="truly there [1]")
+        numbers = {
+            "Brier": scores.brier,
+            "log loss": scores.log_loss,
+            "calibration error": scores.calibration_error,
+        }
+        above.text(
+            0.97,
+            0.05,
+            "\n".join(f"{name} {value:.4f}" for name, value in numbers.items()),
+            transform=above.transAxes,
+            ha="right",
+            va="bottom",
+            size=8,
+        )
+        above.legend(loc="upper left", markerscale=0.6)
+        if title:
+            above.set_title(title)
+        width = np.diff(bins.edge)
+        below.bar(bins.edge[:-1], bins.count, width=width, align="edge", color=ESTIMATE_BAND, ec=ESTIMATE, lw=0.7)
+        below.set(xlabel="P(exists) [1]", ylabel="beliefs", yscale="log", ylim=(0.5, 2.5 * bins.count.max()))
+        settle(figure)
+    return figure
