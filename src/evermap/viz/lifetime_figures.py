@@ -13,8 +13,8 @@ from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.kaplan_meier import KaplanMeier
-from evermap.survival.locality import Chunk
 from evermap.survival.parametric_fit import ParametricFit
+from evermap.survival.pooling import Chunk
 from evermap.survival.turnbull import Npmle
 from evermap.types import FloatArray
 from evermap.viz.style import (

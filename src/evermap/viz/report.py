@@ -15,7 +15,7 @@ import numpy as np
 
 from evermap.metrics.summary import Evaluation
 from evermap.types import UNKNOWN, ParameterEstimate, Recording, SlamResult
-from evermap.viz.change_words import explanations, near_alternatives
+from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE
 from evermap.viz.run_figures import has_prior, quantity
 from evermap.viz.style import NamedFigure, house_style, inline_svg
@@ -63,7 +63,7 @@ def render_report(
     parts += [
         headline_cards(summary),
         _interrupted(summary),
-        _changes(result),
+        _changes(result, summary),
         _warnings(summary),
         _figures("Where it was", figures, ("map", "errors"), _frames(summary)),
         _figures("What the sensors are like", figures, ("calibration",), _calibration(result)),
@@ -107,9 +107,9 @@ def _warnings(summary: Mapping[str, Any]) -> str:
     return f'<div class="note"><strong>Worth knowing</strong><ul>{items}</ul></div>'
 
 
-def _changes(result: SlamResult) -> str:
+def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
     """What differs from the map, in words and numbers, and what else it may be; '' where nothing is in question."""
-    lines = explanations(result)
+    lines = explanations(result) + grew(summary["counts"].get("landmarks_grown"))
     if not lines:
         return ""
     items = "".join(f"<li>{escape(line)}</li>" for line in lines)
