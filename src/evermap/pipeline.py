@@ -42,6 +42,7 @@ def run_slam(
     """
     from threadpoolctl import threadpool_limits
 
+    from evermap.maps.sessions.session import existing
     from evermap.slam.association.identify import identified
     from evermap.slam.check import odd, valid
     from evermap.slam.estimate import solve
@@ -57,7 +58,8 @@ def run_slam(
     prepared = prepare(recording, prior_map, remarks)
     # small matrices: several threads would only wait for each other, and sum in another order on another machine
     with threadpool_limits(limits=1, user_api="blas"):
-        return concluded(solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress))
+        solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
+        return existing(solved, concluded(solved), config.living)
 
 
 def run_session(

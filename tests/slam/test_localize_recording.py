@@ -160,9 +160,9 @@ def test_a_landmark_of_several_places_has_several_rows():
                          "first_seen_s", "last_seen_s")
         )
     )  # fmt: skip
-    result = located(recording, replace(both, p_exists=np.where(both.p_exists == 1.0, 0.7, 0.3)))
+    result = located(recording, replace(both, p_exists=np.where(both.p_exists != 0.3, 0.7, 0.3)))
     alone = located(recording, landmarks)
-    gone = located(recording, replace(both, p_exists=np.where(both.p_exists == 1.0, 1.0, 0.0)))
+    gone = located(recording, replace(both, p_exists=np.where(both.p_exists != 0.3, 1.0, 0.0)))
     assert (gone.online.pose_world_robot == alone.online.pose_world_robot).all()
     assert result.landmarks.landmark_id.tolist() == landmarks.landmark_id.tolist()
     assert result.landmarks.position_m == pytest.approx(landmarks.position_m)

@@ -282,7 +282,8 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
     """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
     living, estimate = entry.living, visit.outcome.estimate
     names = visit.prepared.landmark_id
-    row = np.flatnonzero((place_of < 0) & estimate.known & np.isin(names, living.members.landmark_id))
+    known = estimate.known[: len(names)]  # a method may have given landmarks further places, behind these
+    row = np.flatnonzero((place_of < 0) & known & np.isin(names, living.members.landmark_id))
     member = np.searchsorted(living.members.landmark_id, names[row])
     place = living.place_row(names[row], living.site_of()[member])
     row, place = row[place >= 0], place[place >= 0]
@@ -395,6 +396,37 @@ def lost(alone: Solved, living: LivingMap, reason: str) -> Session:
     slam = of_slam.result(alone, frame, landmarks)
     slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason}"))
     return Session(living, False, alone.recording, slam, (), Evidence.empty())
+
+
+def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResult:
+    """Return the result of a recording by itself with the belief that each landmark still exists at its end.
+
+    The belief is that of a living map whose first session the recording is.
+    """
+    if not config.existence:
+        return slam
+    mapped = slam.landmarks
+    count = len(mapped)
+    covariance = np.zeros((count, 2, count, 2))
+    covariance[np.arange(count), :, np.arange(count), :] = mapped.covariance_m2
+    nowhere = np.full(count, UNKNOWN, dtype=np.int64)
+    found = Found(
+        landmark_id=mapped.landmark_id,
+        class_id=mapped.class_id,
+        place=nowhere,
+        probability=np.ones(count),
+        position_m=mapped.position_m,
+        covariance_m2=covariance.reshape(2 * count, 2 * count),
+        object_id=nowhere,
+        first_s=mapped.first_seen_s,
+        last_s=mapped.last_seen_s,
+    )
+    empty = LivingMap(clock=visit.recording.clock, class_names=visit.recording.class_names)
+    entry = extended(empty, np.zeros(0), found, config, 0.0)
+    seen, _ = looks(entry, visit, config)
+    believed_in = believed(entry, seen, visit, config).living.landmarks(p_least=0.0)
+    row = np.searchsorted(believed_in.landmark_id, mapped.landmark_id)
+    return replace(slam, landmarks=replace(mapped, p_exists=believed_in.p_exists[row]))
 
 
 def _inliers(visit: Solved) -> tuple[IntArray, IntArray]:
