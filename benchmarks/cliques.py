@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks import persistence, rosen
 from evermap.existence import joint, single
-from evermap.existence.state import Belief
+from evermap.existence.single import Belief
 from evermap.sensing import learned
 from evermap.sensing.learned import CliqueLook, Learned
 from evermap.sensing.profile import Assumed

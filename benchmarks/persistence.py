@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks import rosen
 from evermap.existence import run_length as run_length_filter
 from evermap.existence import single
-from evermap.existence.batch import Look, look_exponential, look_general_purpose, look_two_state
+from evermap.existence.batch import Look, Sight, State, look_exponential, look_general_purpose, look_two_state
 from evermap.existence.one import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LogNormal
 from evermap.types import FloatArray
@@ -154,13 +154,13 @@ def two_state(n: int) -> Case:
     features = fleet(n, exponential=True)
     random = np.random.default_rng(2)
     parameters = (features.low_hz, 10 ** random.uniform(-6, -4, n))
-    columns = (features.inverse_odds, features.before.stamp_s, *parameters, *features.looks)
+    before, sight = State(features.inverse_odds, features.before.stamp_s), Sight(*features.looks)
     out = Look(np.empty(n), np.empty(n))
 
     def ours(threads: bool) -> FloatArray:
-        return look_two_state(*columns, horizon_s=HORIZON_S, out=out, threads=threads).probability
+        return look_two_state(before, *parameters, sight, horizon_s=HORIZON_S, out=out, threads=threads).probability
 
-    moved = sum(column.itemsize for column in (*columns, *out))
+    moved = sum(column.itemsize for column in (*before, *parameters, *sight, *out))
     return Case("leaves and returns, exponential", n, 40.0, lambda: ours(False), lambda: ours(True), moved)
 
 
@@ -258,7 +258,7 @@ def _batch_case(
 ) -> Case:
     n = len(features.low_hz)
     state, looks, out = features.before, features.looks, Look(np.empty(n), np.empty(n))
-    columns = (features.inverse_odds, state.stamp_s, *parameters, *looks)
+    before, sight = State(features.inverse_odds, state.stamp_s), Sight(*looks)
     after, belief = rosen.State(*(np.empty(n) for _ in range(3)), looks.time_s), np.empty(n)
 
     def by_numba() -> FloatArray:
@@ -266,7 +266,7 @@ def _batch_case(
         return belief
 
     def ours(threads: bool) -> FloatArray:
-        return look(*columns, horizon_s=horizon_s, out=out, threads=threads).probability
+        return look(before, *parameters, sight, horizon_s=horizon_s, out=out, threads=threads).probability
 
     return Case(
         name,
@@ -274,7 +274,7 @@ def _batch_case(
         limit_ns,
         lambda: ours(False),
         lambda: ours(True),
-        moved_bytes=sum(column.itemsize for column in (*columns, *out)),
+        moved_bytes=sum(column.itemsize for column in (*before, *parameters, *sight, *out)),
         peers={
             "numba": by_numba,
             "numpy": lambda: rosen.step_numpy(state, looks, features.log_survival, horizon_s)[1],
@@ -361,7 +361,7 @@ def _torch(n: int, seconds: float) -> dict[str, dict[str, float]]:
             ]
 
             def work(look: Callable[..., Any] = look, columns: list[Any] = columns) -> None:
-                look(*columns, horizon_s=HORIZON_S)
+                look(State(*columns[:2]), *columns[2:-4], Sight(*columns[-4:]), horizon_s=HORIZON_S)
                 torch.cuda.synchronize()
 
             name = f"{look.__name__.removeprefix('look_')}_{str(kind).removeprefix('torch.')}"

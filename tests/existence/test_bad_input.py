@@ -7,9 +7,11 @@ import pytest
 
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, NumericalError
 from evermap.existence import single
-from evermap.existence.batch import Look, look_exponential, look_general_purpose
+from evermap.existence.batch import Look
 from evermap.existence.one import PersistenceFilter
 from evermap.survival import Exponential, Uniform
+
+from .rows import look_exponential, look_general_purpose
 
 STATE = single.update(single.init(3, Exponential(0.1)), 5.0, 1, 0.1, 0.1)
 BAD = {
@@ -58,7 +60,7 @@ def test_one_feature(time, detected, p_miss, p_false, kind: type[EvermapError], 
 
 
 def test_streams_name_the_row_as_given() -> None:
-    with pytest.raises(InputError, match="row 1: feature 7 of 3 does not exist"):
+    with pytest.raises(InputError, match="entry 1: row 7 of 3 does not exist"):
         single.run(STATE, [0, 7], [6.0, 6.0], 1, 0.1, 0.1)
     with pytest.raises(InputError, match=r"row 0: time 1\.0 s lies before"):
         single.run(STATE, [0, 1], [1.0, 6.0], 1, 0.1, 0.1)

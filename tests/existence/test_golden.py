@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from evermap.existence import single
-from evermap.existence.batch import look_exponential, look_general_purpose
 from evermap.existence.one import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Uniform
+
+from .rows import look_exponential, look_general_purpose
 
 PRIORS = {
     "exponential": lambda p: Exponential(p["rate"]),

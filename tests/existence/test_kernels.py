@@ -8,12 +8,13 @@ import pytest
 
 from evermap.errors import InputError
 from evermap.existence import single
-from evermap.existence.batch import CHUNK_ROWS, look_exponential, look_general_purpose
-from evermap.existence.death import log_death_odds
+from evermap.existence.batch import CHUNK_ROWS
 from evermap.existence.elementary import exp, expm1
-from evermap.existence.kernels import general_purpose_gap
-from evermap.existence.unknown_rate import scaled_survival
+from evermap.existence.kernels import general_purpose_gap, scaled_survival
+from evermap.existence.lifetimes import log_death_odds
 from evermap.survival import Exponential, GeneralPurpose
+
+from .rows import look_exponential, look_general_purpose
 
 
 def test_exponentials_to_the_last_digits() -> None:

@@ -214,7 +214,7 @@ def test_an_unknown_rate_is_a_mixture_of_a_few() -> None:
     mixture = exponential_mixture_of(prior, 16)
     found = Mixture(mixture.components, mixture.weights).log_survival(t)
     np.testing.assert_allclose(np.exp(found), np.exp(prior.log_survival(t)), atol=1e-6)
-    with pytest.raises(ConfigError, match="no mixture of exponentials"):
+    with pytest.raises(ConfigError, match="not a mixture of exponentials"):
         exponential_mixture_of(Weibull(10.0, 2.0))
 
 

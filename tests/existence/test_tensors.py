@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence.batch import Look, look_exponential, look_general_purpose, look_two_state
+from evermap.existence.batch import Look
 from evermap.types import FloatArray
+
+from .rows import look_exponential, look_general_purpose, look_two_state
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'evermap[torch]'")
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence.batch import Look, look_exponential, look_two_state
+from evermap.existence.batch import Look
+
+from .rows import look_exponential, look_two_state
 
 N = 500
 

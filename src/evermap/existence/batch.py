@@ -1,8 +1,8 @@
 """The fast road: one look at each of many features whose lifetimes have a closed form, compiled or on tensors.
 
 Every row has its own clock, lifetime parameters, `P_M` and `P_F`. State and answers are arrays of the caller: the new
-stamps are `time_s` itself, and `out` may be reused from look to look (but must not overlap the inputs), so that nothing
-is allocated at a million rows.
+stamps are `sight.time_s` itself, and `out` may be reused from look to look (but must not overlap the inputs), so that
+nothing is allocated at a million rows.
 
 Columns are numpy arrays, or torch tensors of float32 or float64 on any one device; tensors give tensors, of the type of
 `inverse_odds`, and stay on their device. Probabilities from float32 are within 1e-6 of those from the same numbers in
@@ -16,7 +16,7 @@ import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -24,48 +24,59 @@ from evermap.errors import InputError, NumericalError
 from evermap.existence import checks
 from evermap.types import FloatArray
 
-Column = TypeVar("Column")
-"""A numpy array or a torch tensor."""
-
 CHUNK_ROWS = 65536
 """Most rows that a thread takes at a time: much longer than handing them out, short enough for busy cores to help."""
 
 
-class Look(NamedTuple, Generic[Column]):
-    """Answers of one look at N features.
+class State(NamedTuple):
+    """Features before a look.
 
     Attributes:
-        inverse_odds: (N,) `(1 - p) / p` right after the look; with `time_s` the state for the next one.
-        probability: (N,) that the feature exists `horizon_s` after the look.
+        inverse_odds: (N,) `(1 - p) / p` after the last look, 0 at birth.
+        stamp_s: (N,) time of that look, in seconds since each feature's birth.
     """
 
-    inverse_odds: Column
-    probability: Column
+    inverse_odds: Any
+    stamp_s: Any
 
 
-def look_exponential(
-    inverse_odds: Column,
-    stamp_s: Column,
-    rate_hz: Column,
-    time_s: Column,
-    detected: Any,
-    p_miss: Column,
-    p_false: Column,
-    *,
-    horizon_s: float = 0.0,
-    out: Look[Column] | None = None,
-    threads: bool = False,
-) -> Look[Column]:
-    """Predict to the look, take it in, predict `horizon_s` further: exponential lifetimes (MATH.md section 2).
+class Sight(NamedTuple):
+    """One look at each of N features.
 
-    Args:
-        inverse_odds: (N,) the state after the last look, 0 at birth.
-        stamp_s: (N,) time of that look, in seconds since each feature's birth.
-        rate_hz: (N,) hazard of each feature in 1/s; 0 never leaves.
-        time_s: (N,) time of the look on each feature's own clock.
+    Attributes:
+        time_s: (N,) when, on each feature's own clock.
         detected: (N,) bool.
         p_miss: (N,) `P(no detection | there)`.
         p_false: (N,) `P(detection | gone)`.
+    """
+
+    time_s: Any
+    detected: Any
+    p_miss: Any
+    p_false: Any
+
+
+class Look(NamedTuple):
+    """Answers of one look at N features.
+
+    Attributes:
+        inverse_odds: (N,) `(1 - p) / p` right after the look; with the time of the look the state for the next one.
+        probability: (N,) that the feature exists `horizon_s` after the look.
+    """
+
+    inverse_odds: Any
+    probability: Any
+
+
+def look_exponential(
+    before: State, rate_hz: Any, sight: Sight, *, horizon_s: float = 0.0, out: Look | None = None, threads: bool = False
+) -> Look:
+    """Predict to the look, take it in, predict `horizon_s` further: exponential lifetimes (MATH.md section 2).
+
+    Args:
+        before: the features before the look.
+        rate_hz: (N,) hazard of each feature in 1/s; 0 never leaves.
+        sight: the look.
         horizon_s: how far after the look the probability is wanted.
         out: arrays to fill; not for tensors.
         threads: spread the rows over all cores; tensors have their own threads.
@@ -74,89 +85,94 @@ def look_exponential(
         InputError: shapes, times running back, numbers out of range; the row is named.
         NumericalError: an observation that is impossible under both states.
     """
-    columns = {"inverse_odds": inverse_odds, "stamp_s": stamp_s, "rate_hz": rate_hz, "time_s": time_s}
-    columns |= {"detected": detected, "p_miss": p_miss, "p_false": p_false}
-    return _look("exponential", columns, horizon_s, out, threads)
+    return _look(_Columns("exponential", before, {"rate_hz": rate_hz}, sight), horizon_s, out, threads)
 
 
 def look_general_purpose(
-    inverse_odds: Column,
-    stamp_s: Column,
-    low_hz: Column,
-    high_hz: Column,
-    time_s: Column,
-    detected: Any,
-    p_miss: Column,
-    p_false: Column,
+    before: State,
+    low_hz: Any,
+    high_hz: Any,
+    sight: Sight,
     *,
     horizon_s: float = 0.0,
-    out: Look[Column] | None = None,
+    out: Look | None = None,
     threads: bool = False,
-) -> Look[Column]:
+) -> Look:
     """As `look_exponential`, for lifetimes of unknown rate between `low_hz` and `high_hz` (Rosen 2016 eqs. 26-29)."""
-    columns = {"inverse_odds": inverse_odds, "stamp_s": stamp_s, "low_hz": low_hz, "high_hz": high_hz}
-    columns |= {"time_s": time_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
-    return _look("general_purpose", columns, horizon_s, out, threads)
+    rates = {"low_hz": low_hz, "high_hz": high_hz}
+    return _look(_Columns("general_purpose", before, rates, sight), horizon_s, out, threads)
 
 
 def look_two_state(
-    inverse_odds: Column,
-    stamp_s: Column,
-    leave_hz: Column,
-    return_hz: Column,
-    time_s: Column,
-    detected: Any,
-    p_miss: Column,
-    p_false: Column,
+    before: State,
+    leave_hz: Any,
+    return_hz: Any,
+    sight: Sight,
     *,
     horizon_s: float = 0.0,
-    out: Look[Column] | None = None,
+    out: Look | None = None,
     threads: bool = False,
-) -> Look[Column]:
+) -> Look:
     """As `look_exponential`, for features that leave and return: exponential stays and absences (MATH.md section 4).
 
     At birth the inverse odds are 0; of a feature that may have come and gone for long they are
     `leave_hz / return_hz`. With `return_hz = 0` this is `look_exponential`.
     """
-    columns = {"inverse_odds": inverse_odds, "stamp_s": stamp_s, "leave_hz": leave_hz, "return_hz": return_hz}
-    columns |= {"time_s": time_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
-    return _look("two_state", columns, horizon_s, out, threads)
+    rates = {"leave_hz": leave_hz, "return_hz": return_hz}
+    return _look(_Columns("two_state", before, rates, sight), horizon_s, out, threads)
 
 
-def _look(kind: str, columns: dict[str, Any], horizon_s: float, out: Look[Any] | None, threads: bool) -> Look[Any]:
+class _Columns(NamedTuple):
+    """All columns of a look, and the kind of lifetimes."""
+
+    kind: str
+    before: State
+    rates: dict[str, Any]
+    sight: Sight
+
+    def by_name(self) -> dict[str, Any]:
+        return {**self.before._asdict(), **self.rates, **self.sight._asdict()}
+
+    def of(self, columns: dict[str, Any]) -> _Columns:
+        """The same with other columns."""
+        before, sight = ([columns[name] for name in kind._fields] for kind in (State, Sight))
+        return _Columns(self.kind, State(*before), {name: columns[name] for name in self.rates}, Sight(*sight))
+
+
+def _look(given: _Columns, horizon_s: float, out: Look | None, threads: bool) -> Look:
     """The look under the lifetimes of this kind, by the kernels or by torch, whichever the columns are of."""
     if not 0.0 <= horizon_s < np.inf:
-        raise InputError(f"{horizon_s} s is no time after the look", field="horizon_s", hint="a finite number >= 0")
-    torch = sys.modules.get("torch")  # who has tensors has loaded it
-    if torch is not None and isinstance(columns["inverse_odds"], torch.Tensor):
+        raise InputError(f"{horizon_s} s is not a time after the look", field="horizon_s", hint="a finite number >= 0")
+    columns, torch = given.by_name(), sys.modules.get("torch")  # who has tensors has loaded it
+    if torch is not None and isinstance(given.before.inverse_odds, torch.Tensor):
         from evermap.existence import tensors
 
         if out is not None:
             raise InputError("is for arrays only", field="out", hint="leave it out: torch keeps memory for reuse")
         _check_tensors(columns, torch)
-        *found, refused = getattr(tensors, kind)(*columns.values(), float(horizon_s))
-        answer: Look[Any] = Look(*found)
+        *found, refused = tensors.look(given.kind, given.before, given.rates.values(), given.sight, float(horizon_s))
         if refused:
-            _refuse({name: column.cpu().numpy() for name, column in columns.items()}, answer[0].cpu().numpy())
-        return answer
+            _refuse({name: column.cpu().numpy() for name, column in columns.items()}, found[0].cpu().numpy())
+        return Look(*found)
 
     from evermap.existence import kernels
 
     columns = _contiguous(columns)
     answer = _space(columns, out)
-    if _apply(getattr(kernels, kind), tuple(columns.values()), float(horizon_s), answer, threads):
+    if _apply(getattr(kernels, given.kind), given.of(columns), float(horizon_s), answer, threads):
         _refuse(columns, answer.inverse_odds)
     return answer
 
 
-def _apply(
-    kernel: Callable[..., bool], columns: tuple[Any, ...], horizon_s: float, answer: Look[Any], threads: bool
-) -> bool:
+def _apply(kernel: Callable[..., bool], given: _Columns, horizon_s: float, answer: Look, threads: bool) -> bool:
     """Run a kernel over all rows, at once or chunk by chunk on all cores; True if it refused a row."""
     n = len(answer.probability)
 
     def chunk(rows: slice) -> bool:
-        return kernel(*(column[rows] for column in columns), horizon_s, *(array[rows] for array in answer))
+        before, rates, sight, after = (
+            [column[rows] for column in part] for part in (given.before, given.rates.values(), given.sight, answer)
+        )
+        return kernel(State(*before), tuple(rates), Sight(*sight), horizon_s, Look(*after))
 
     if not threads or n <= CHUNK_ROWS:
         return chunk(slice(None))
@@ -187,7 +203,7 @@ def _contiguous(columns: dict[str, Any]) -> dict[str, Any]:
     return arrays
 
 
-def _space(columns: dict[str, Any], out: Look[FloatArray] | None) -> Look[FloatArray]:
+def _space(columns: dict[str, Any], out: Look | None) -> Look:
     """The arrays to fill."""
     n = len(columns["time_s"])
     if out is None:

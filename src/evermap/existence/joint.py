@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.existence import checks, single
-from evermap.existence.state import Belief
+from evermap.existence.single import Belief
 from evermap.types import BoolArray, FloatArray, IntArray
 
 

@@ -1,15 +1,15 @@
-"""One feature at a time: the batch filter's arithmetic on plain floats, without an array in sight."""
+"""One feature at a time: the formulas of `recursion` on plain floats, without an array in sight."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from math import exp, expm1, inf, isfinite, log
+from math import expm1, inf, isfinite, log
 
 from evermap.errors import InputError, NumericalError
 from evermap.existence.checks import as_prior, impossible
-from evermap.existence.death import WIDE
-from evermap.existence.state import LARGEST, LOG_LARGEST, SMALLEST
+from evermap.existence.lifetimes import WIDE
+from evermap.existence.recursion import LARGEST, LOG_LARGEST, aged, observed, odds_of
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior
 
 _ANSWERS = (0, 1)
@@ -58,7 +58,7 @@ class PersistenceFilter:
         """
         if not self._stamp <= stamp_s < inf:
             raise self._refusal(stamp_s, 0.0, 0.0)
-        return 1.0 / (1.0 + self._predicted(stamp_s))
+        return float(1.0 / (1.0 + aged(self._inverse_odds, self._death_odds(self._stamp, stamp_s))))
 
     def update(self, stamp_s: float, detected: bool, p_miss: float, p_false: float) -> float:
         """Take in one look at the feature, and return the probability that it exists then.
@@ -77,33 +77,15 @@ class PersistenceFilter:
             raise self._refusal(stamp_s, p_miss, p_false)
         if detected not in _ANSWERS:
             raise InputError(f"{detected} is neither a detection nor a miss", field="detected", hint="True or False")
-        predicted = self._predicted(stamp_s)
+        predicted = aged(self._inverse_odds, self._death_odds(self._stamp, stamp_s))
         there, gone = (1.0 - p_miss, p_false) if detected else (p_miss, 1.0 - p_false)
-        probability = 1.0 / (1.0 + predicted)
-        complement = predicted * probability if predicted < inf else 1.0
-        likelihood = probability * there + complement * gone
+        after, likelihood = observed(predicted, there, gone)
         if likelihood <= 0.0:
             raise NumericalError(impossible(f"time {stamp_s} s"), hint="P_M and P_F strictly between 0 and 1")
-        if there == 0.0 or predicted == inf:
-            after = inf
-        elif gone == 0.0 or predicted == 0.0:
-            after = 0.0
-        else:
-            after = predicted * gone / there
-            # Finite doubt stays finite. Here and below comparisons, for two calls are a fifth of an update.
-            after = LARGEST if after > LARGEST else SMALLEST if after < SMALLEST else after  # noqa: FURB136
         self._inverse_odds = after
         self._stamp = stamp_s
         self._evidence += log(likelihood)
-        return 1.0 / (1.0 + after)
-
-    def _predicted(self, stamp_s: float) -> float:
-        """Inverse odds at a time that has been checked."""
-        before, odds = self._inverse_odds, self._death_odds(self._stamp, stamp_s)
-        if before < inf and odds < inf:
-            after = before + (1.0 + before) * odds
-            return after if after < LARGEST else LARGEST  # noqa: FURB136
-        return inf
+        return float(1.0 / (1.0 + after))
 
     def _refusal(self, stamp_s: float, p_miss: float, p_false: float) -> InputError:
         """What was wrong with an update that is refused."""
@@ -137,4 +119,4 @@ def _of_any_prior(prior: LifetimePrior, start_s: float, stop_s: float) -> float:
     death = float(prior.log_conditional_death(start_s, stop_s))
     if survival == -inf:
         return inf
-    return exp(max(min(death - survival, LOG_LARGEST), -LOG_LARGEST)) if death > -inf else 0.0
+    return float(odds_of(death - survival))

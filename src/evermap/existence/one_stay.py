@@ -8,8 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from evermap.existence.checks import likelihoods
-from evermap.existence.death import log_death_odds
-from evermap.existence.lifetimes import Lifetimes
+from evermap.existence.lifetimes import Lifetimes, log_death_odds
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.survival import LifetimePrior, never_leaves, parse_prior
 from evermap.survival.text import prior_text
@@ -57,7 +56,7 @@ class OneStay:
         Raises:
             NumericalError: a look that is impossible, whether the feature is there or gone.
         """
-        from evermap.existence.kernels import stream
+        from evermap.existence.kernels import Stream, stream
 
         asked = Instants.of_looks(looks) if instants is None else instants
         birth_row = _birth_rows(looks)
@@ -79,7 +78,7 @@ class OneStay:
         gap = np.flatnonzero(age_s > before_s)  # nobody dies in no time, and some priors take long to say so
         odds[gap] = log_death_odds((self.prior,), np.zeros(len(gap), dtype=np.int64), before_s[gap], age_s[gap])
         evidence, belief = np.zeros(looks.n_features), np.empty(len(time))
-        bad = int(stream(feature, odds, there, gone, np.zeros(looks.n_features), evidence, belief))
+        bad = int(stream(Stream(feature, odds, there, gone), np.zeros(looks.n_features), evidence, belief))
         if bad >= 0:
             raise looks.impossible(int(look[bad]))
         p_present = np.full(len(asked.stamp_s), np.nan)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.existence.compiled import kernel
+from evermap.existence.elementary import kernel
 from evermap.existence.phase_kernels import NEGLIGIBLE, advance, observe
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray

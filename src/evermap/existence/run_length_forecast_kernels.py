@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from evermap.existence.compiled import exp, expm1, kernel
+from evermap.existence.elementary import exp, expm1, kernel
 from evermap.existence.rhythm import BIN_S, MONDAY_S, WEEK_S
 from evermap.existence.run_length_kernels import MOST, Law, _hazards, _sum, _week_bin
 from evermap.types import FloatArray, IntArray

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from evermap.existence.compiled import exp, expm1, inlined, kernel, parallel_kernel
+from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel
 from evermap.existence.hazard_table import SHIFT
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.existence.compiled import exp, expm1, kernel
+from evermap.existence.elementary import exp, expm1, kernel
 from evermap.existence.run_length_kernels import (
     MOST,
     NO_MERGE,

@@ -9,19 +9,95 @@ observation multiplies `r` by its likelihood when gone over its likelihood when 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from evermap.errors import InputError, NumericalError
+from evermap.errors import ConfigError, NumericalError
 from evermap.existence import checks
-from evermap.existence.death import log_death_odds
-from evermap.existence.state import LARGEST, LOG_LARGEST, SMALLEST, Belief, init
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.existence.lifetimes import log_death_odds
+from evermap.survival.base import LifetimePrior
+from evermap.types import FloatArray, IntArray
 
-__all__ = ["Belief", "init", "observe", "predict", "run", "update"]
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Persistence of `N` features, one row each.
+
+    Attributes:
+        inverse_odds: (N,) `(1 - p) / p` right after the last observation; 0 is certainly there, inf gone.
+        stamp_s: (N,) time of the last observation, seconds since the feature's birth; 0 before the first.
+        priors: the lifetimes in use.
+        prior_of_row: (N,) which of `priors` each row has.
+        log_evidence: (N,) `log p(y_1:n)` summed so far, or None where nobody asked for it.
+    """
+
+    inverse_odds: FloatArray
+    stamp_s: FloatArray
+    priors: tuple[LifetimePrior, ...]
+    prior_of_row: IntArray
+    log_evidence: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.inverse_odds)
+
+    @property
+    def probability(self) -> FloatArray:
+        """(N,) probability that each feature existed at its own last observation."""
+        return np.asarray(1.0 / (1.0 + self.inverse_odds), dtype=np.float64)
+
+    @property
+    def log_odds(self) -> FloatArray:
+        """(N,) the same as log-odds, with infinities for the two certainties."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(-np.log(self.inverse_odds), dtype=np.float64)
+
+
+def init(
+    n: int,
+    prior: LifetimePrior | str | Sequence[LifetimePrior | str],
+    *,
+    prior_of_row: IntArray | Sequence[int] | None = None,
+    evidence: bool = False,
+) -> Belief:
+    """Beliefs at birth: `n` features that are certainly there, at time 0 of their own clocks.
+
+    Args:
+        n: number of features.
+        prior: one lifetime prior for all rows, or several; each may be a text, as `exponential:half-life=30d`.
+        prior_of_row: (n,) index into `prior`, needed as soon as there is more than one.
+        evidence: keep the running log evidence too (for model choice and for learning priors).
+
+    Raises:
+        ConfigError: a negative `n`, no prior, a text that describes none, or an index that points at none.
+        InputError: something else in place of a prior.
+    """
+    if n < 0:
+        raise ConfigError(f"{n} features cannot be filtered", field="n", hint="a number of rows >= 0")
+    given: Sequence[LifetimePrior | str]
+    given = (prior,) if isinstance(prior, str) or not isinstance(prior, Sequence) else prior
+    priors = tuple(checks.as_prior(one) for one in given)
+    if not priors:
+        raise ConfigError("no lifetime prior was given", field="prior")
+    if prior_of_row is None:
+        if len(priors) > 1:
+            raise ConfigError(
+                f"{len(priors)} priors but nothing says which row has which",
+                field="prior_of_row",
+                hint="an index per row",
+            )
+        index = np.zeros(n, dtype=np.int64)
+    else:
+        index = np.array(prior_of_row, dtype=np.int64)
+        if index.shape != (n,):
+            raise ConfigError(f"shape {index.shape} instead of ({n},)", field="prior_of_row")
+        wrong = np.flatnonzero((index < 0) | (index >= len(priors)))
+        if wrong.size:
+            row = int(wrong[0])
+            raise ConfigError(f"row {row} asks for prior {index[row]} of {len(priors)}", field="prior_of_row")
+    return Belief(np.zeros(n), np.zeros(n), priors, index, np.zeros(n) if evidence else None)
 
 
 def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
@@ -41,7 +117,11 @@ def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
     index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
     time = checks.as_rows(stamp_s, len(index), "stamp_s")
     checks.check_times(time, state.stamp_s[index], index)
-    return 1.0 / (1.0 + _gap(state, index, time))
+    from evermap.existence.kernels import predict_rows
+
+    predicted = np.empty(len(index))
+    predict_rows(state.inverse_odds[index], _gaps(state, index, time), predicted)
+    return 1.0 / (1.0 + predicted)
 
 
 def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None) -> Belief:
@@ -63,12 +143,7 @@ def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any
     columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
     index, (time, hit, miss, false) = _looked_at(state, rows, columns)
     checks.check_looks(time, hit, miss, false, state.stamp_s[index], index)
-    there, gone = checks.likelihoods(hit, miss, false)
-    predicted = _gap(state, index, time)
-    with np.errstate(all="ignore"):
-        after = predicted * gone / there
-    after = _clamp(after, predicted, there > 0.0, gone > 0.0)
-    return _settle(state, index, time, after, lambda: _log_evidence(predicted, there, gone))
+    return _settle(state, index, time, *checks.likelihoods(hit, miss, false))
 
 
 def observe(state: Belief, stamp_s: Any, log_there: Any, log_gone: Any = 0.0, *, rows: Any = None) -> Belief:
@@ -94,15 +169,7 @@ def observe(state: Belief, stamp_s: Any, log_there: Any, log_gone: Any = 0.0, *,
     checks.check_times(time, state.stamp_s[index], index)
     checks.check_log_likelihood(there, "log_there", index)
     checks.check_log_likelihood(gone, "log_gone", index)
-    predicted = _gap(state, index, time)
-    with np.errstate(all="ignore"):
-        ratio = there - gone
-        # Many landmarks may weigh more than exp can hold: in two halves, each cut where the clamp would cut anyway.
-        half = np.where(np.isfinite(ratio), np.clip(0.5 * ratio, -LOG_LARGEST, LOG_LARGEST), ratio)
-        factor = np.exp(-half)
-        after = predicted * factor * factor
-    after = _clamp(after, predicted, ratio > -np.inf, ratio < np.inf)
-    return _settle(state, index, time, after, lambda: _log_evidence_of_logs(predicted, there, gone))
+    return _settle(state, index, time, there, gone, logs=True)
 
 
 def run(
@@ -127,16 +194,10 @@ def run(
     Raises:
         InputError, NumericalError: as `update`; messages count the stream's rows from 0.
     """
-    from evermap.existence.kernels import stream
+    from evermap.existence.kernels import Stream, stream
 
-    entry = np.asarray(feature)
-    if entry.ndim != 1 or (entry.size and entry.dtype.kind not in "iu"):
-        raise InputError("features are row numbers", field="feature", hint="whole numbers from 0")
+    entry = checks.check_rows(feature, len(state), twice=True, field="feature")
     m = len(entry)
-    entry = entry.astype(np.int64)
-    wrong = np.flatnonzero((entry < 0) | (entry >= len(state)))
-    if wrong.size:
-        raise InputError(f"row {wrong[0]}: feature {entry[wrong[0]]} of {len(state)} does not exist", field="feature")
     time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[entry])
 
     order = np.lexsort((time, entry))
@@ -151,7 +212,7 @@ def run(
     inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
     evidence = np.zeros(len(state)) if state.log_evidence is None else state.log_evidence.copy()
     posterior = np.empty(m)
-    bad = int(stream(entry, odds, there[order], gone[order], inverse_odds, evidence, posterior))
+    bad = int(stream(Stream(entry, odds, there[order], gone[order]), inverse_odds, evidence, posterior))
     if bad >= 0:
         row = int(order[bad])
         raise NumericalError(
@@ -165,15 +226,9 @@ def run(
     return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=kept), unsorted
 
 
-def _gap(state: Belief, index: IntArray, time: FloatArray) -> FloatArray:
-    """Inverse odds at `time`, before any new observation; certainties stay exact, the rest within the clamp."""
-    odds = log_death_odds(state.priors, state.prior_of_row[index], state.stamp_s[index], time)
-    inverse_odds = state.inverse_odds[index]
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
-        ratio = np.where(np.isinf(odds), np.exp(odds), np.exp(np.clip(odds, -LOG_LARGEST, LOG_LARGEST)))
-        after = inverse_odds + (1.0 + inverse_odds) * ratio
-    certain = np.isinf(inverse_odds) | np.isposinf(odds)
-    return np.where(certain, np.inf, np.minimum(after, LARGEST))
+def _gaps(state: Belief, index: IntArray, time: FloatArray) -> FloatArray:
+    """Log-odds of dying before `time`."""
+    return log_death_odds(state.priors, state.prior_of_row[index], state.stamp_s[index], time)
 
 
 def _looked_at(state: Belief, rows: Any, columns: dict[str, Any]) -> tuple[IntArray, list[FloatArray]]:
@@ -186,40 +241,21 @@ def _looked_at(state: Belief, rows: Any, columns: dict[str, Any]) -> tuple[IntAr
     return index[looked], [column[looked] for column in values]
 
 
-def _clamp(after: FloatArray, predicted: FloatArray, there: BoolArray, gone: BoolArray) -> FloatArray:
-    """Inverse odds after an observation that is possible if `there` and if `gone`; NaN where under neither state.
-
-    Only what excludes a state makes a certainty; a finite doubt stays one.
-    """
-    after = np.where((predicted > 0.0) & gone, np.maximum(after, SMALLEST), after)
-    return np.where(np.isfinite(predicted) & there, np.minimum(after, LARGEST), after)
-
-
 def _settle(
-    state: Belief, index: IntArray, time: FloatArray, after: FloatArray, log_evidence: Callable[[], FloatArray]
+    state: Belief, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray, *, logs: bool = False
 ) -> Belief:
-    """The state with these rows renewed, and the evidence of their looks if anybody keeps it."""
-    checks.check_possible(after, index)
-    inverse_odds, stamps, evidence = state.inverse_odds.copy(), state.stamp_s.copy(), state.log_evidence
-    inverse_odds[index] = after
+    """The state after looks at some rows, of these likelihoods or their logarithms."""
+    from evermap.existence import kernels
+
+    inverse_odds, stamps = state.inverse_odds.copy(), state.stamp_s.copy()
+    evidence = np.zeros(len(state)) if state.log_evidence is None else state.log_evidence.copy()
+    looks = kernels.Stream(index, _gaps(state, index, time), there, gone)
+    if logs:
+        bad = kernels.stream_of_logs(looks, inverse_odds, evidence)
+    else:
+        bad = kernels.stream(looks, inverse_odds, evidence, np.empty(len(index)))
+    if bad >= 0:
+        raise NumericalError(checks.impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
     stamps[index] = time
-    if evidence is not None:
-        evidence = evidence.copy()
-        evidence[index] += log_evidence()
-    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=evidence)
-
-
-def _log_evidence(predicted: FloatArray, there: FloatArray, gone: FloatArray) -> FloatArray:
-    """`log p(y_n | y_1:n-1)`: the two likelihoods weighted by the predicted belief."""
-    probability = 1.0 / (1.0 + predicted)
-    complement = np.where(np.isinf(predicted), 1.0, np.minimum(predicted, LARGEST) * probability)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(probability * there + complement * gone), dtype=np.float64)
-
-
-def _log_evidence_of_logs(predicted: FloatArray, log_there: FloatArray, log_gone: FloatArray) -> FloatArray:
-    """As `_log_evidence`, of likelihoods that only their logarithms can hold."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_alive = -np.log1p(predicted)
-        log_dead = np.where(np.isinf(predicted), 0.0, np.log(predicted) + log_alive)
-        return np.asarray(np.logaddexp(log_alive + log_there, log_dead + log_gone), dtype=np.float64)
+    kept = None if state.log_evidence is None else evidence
+    return replace(state, inverse_odds=inverse_odds, stamp_s=stamps, log_evidence=kept)

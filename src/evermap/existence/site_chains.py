@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.existence.death import log_death_odds
-from evermap.existence.state import LOG_LARGEST
+from evermap.existence.lifetimes import log_death_odds
+from evermap.existence.recursion import LOG_LARGEST
 from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evermap.existence.death import log_death_odds
+from evermap.existence.lifetimes import log_death_odds
 from evermap.survival import LifetimePrior
 from evermap.tracking.tracklets import Tracklets
 from evermap.types import FloatArray, IntArray

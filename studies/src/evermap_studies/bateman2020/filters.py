@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from evermap.existence import joint, single
-from evermap.existence.state import Belief
+from evermap.existence.single import Belief
 from evermap.sensing.profile import Profile
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray

@@ -20,7 +20,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.existence import checks, joint, single
-from evermap.existence.state import Belief
+from evermap.existence.single import Belief
 from evermap.survival import LifetimePrior
 from evermap.types import FloatArray, IntArray
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.errors import ConfigError, InputError, NumericalError
-from evermap.existence.death import log_death_odds
+from evermap.existence.lifetimes import log_death_odds
 from evermap.survival import Exponential
 from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
