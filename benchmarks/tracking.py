@@ -18,9 +18,9 @@ import numpy as np
 from benchmarks.sort import Sort
 from evermap.config import TrackerConfig
 from evermap.survival import GeneralPurpose
-from evermap.tracking.record import Recorder
+from evermap.tracking.record import Followed, Recorder
 from evermap.tracking.tracker import Tracker
-from evermap.tracking.tracklets import Followed, TrackState
+from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
 from evermap.tracking.working_set import Stored, WorkingSet, empty_rows
 from evermap.types import FloatArray, IntArray
@@ -146,7 +146,8 @@ def tracks_of(scene: Scene, recording: Recording) -> list[Reported]:
     """What our tracker says afterwards, frame by frame."""
     tracker, recorder, view = tracker_of(scene), Recorder(), view_of(recording)
     for k, points in enumerate(recording.detected_m):
-        recorder.add(tracker, tracker.step(FRAME_S * k, points, view=view)[1])
+        events = tracker.step(FRAME_S * k, points, view=view)[1]
+        recorder.add(tracker.followed(), events)
     tracks = recorder.tracks()
     frame = np.rint(tracks.stamp_s / FRAME_S)
     return [(tracks.track_id[frame == k], tracks.position_m[frame == k]) for k in range(len(recording.detected_m))]

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from evermap.tracking.record import Event
 from evermap.tracking.tracker import Tracker
-from evermap.tracking.tracklets import Event, EventKind
+from evermap.tracking.tracklets import EventKind
 from evermap.types import FloatArray
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from evermap.cli.bench import load_benchmarks
 from evermap.config import TrackerConfig
-from evermap.tracking.spells import StaticSpells
+from evermap.tracking.record import StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, FloatArray, IntArray

@@ -10,8 +10,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from evermap.tracking.assignment import NOBODY, assign
-from evermap.tracking.gating import Evidence, candidates
+from evermap.tracking.association import NOBODY, Likelihood, Targets, assign, candidates
+from evermap.tracking.frame import Frame
 
 FORBIDDEN = 1e6
 
@@ -81,10 +81,9 @@ def test_candidates_are_all_pairs_worth_it_with_their_costs(
     seen_look /= np.linalg.norm(seen_look, axis=1, keepdims=True)
     seen_look[0] = 0.0
     odds, p_detect = rng.uniform(0.0, 2.0, n), rng.uniform(0.05, 0.99, n)
-    evidence = Evidence(confusion, np.array([0.2, 0.3, 0.5]), np.log(1e-3), 21.1, 4.0, 0.5, reach_m, np.log(1e-4))
-    pairs = candidates(
-        mean, covariance, class_p, look, odds, p_detect, n, position, noise, seen_class, seen_look, evidence
-    )
+    likelihood = Likelihood(confusion, np.array([0.2, 0.3, 0.5]), np.log(1e-3), 21.1, 4.0, 0.5, reach_m, np.log(1e-4))
+    targets = Targets(mean, covariance, class_p, look, odds, p_detect)
+    pairs = candidates(targets, n, Frame(0.0, position, noise, seen_class, seen_look), likelihood)
     expected = {}
     for i in range(n):
         for j in range(m):
@@ -123,11 +122,9 @@ def test_a_young_tracklet_does_not_steal_the_detection_of_an_old_one() -> None:
     mean[1, 0] = 1.0
     covariance = np.array([np.eye(9) * 0.01, np.eye(9) * 4.0])
     z, noise = np.array([[0.6, 0.0, 0.0]]), np.eye(3)[None] * 0.09
-    evidence = Evidence(np.ones((1, 1)), np.ones(1), np.log(1e-4), 21.1, 1.0, 0.5, 0.0, -np.inf)
+    likelihood = Likelihood(np.ones((1, 1)), np.ones(1), np.log(1e-4), 21.1, 1.0, 0.5, 0.0, -np.inf)
     none = np.zeros((2, 0))
-    pairs = candidates(
-        mean, covariance, np.ones((2, 1)), none, np.full(2, 1e-6), np.full(2, 0.9), 2, z, noise,
-        np.full(1, -1), np.zeros((1, 0)), evidence,
-    )  # fmt: skip
+    targets = Targets(mean, covariance, np.ones((2, 1)), none, np.full(2, 1e-6), np.full(2, 0.9))
+    pairs = candidates(targets, 2, Frame(0.0, z, noise, np.full(1, -1), np.zeros((1, 0))), likelihood)
     assert 0.6**2 / 0.1 > 0.4**2 / 4.09
     assert assign(pairs.start, pairs.column, pairs.cost, 1).tolist() == [0, NOBODY]

@@ -7,7 +7,7 @@ import pytest
 
 from evermap.config import TrackerConfig
 from evermap.survival.censored import lifetimes_of_sightings
-from evermap.tracking.spells import StaticSpells
+from evermap.tracking.record import StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 

@@ -33,7 +33,7 @@ def run(frames: list[np.ndarray], order: np.random.Generator | None = None) -> t
     for k, points in enumerate(frames):
         shuffle = np.arange(len(points)) if order is None else order.permutation(len(points))
         tracks, events = tracker.step(0.1 * k, points[shuffle])
-        recorder.add(tracker, events)
+        recorder.add(tracker.followed(), events)
         back = np.empty_like(tracks)
         back[shuffle] = tracks
         ids.append(back)
@@ -83,7 +83,7 @@ def test_rows_before_the_confirmation_are_kept_and_guesses_at_the_end_are_not() 
     for k in range(60):
         points = ONE if 5 <= k < 40 and k != 20 else np.empty((0, 3))
         _, events = tracker.step(0.1 * k, points)
-        recorder.add(tracker, events)
+        recorder.add(tracker.followed(), events)
     tracks = recorder.tracks()
     assert tracks.stamp_s[[0, -1]] == pytest.approx([0.5, 3.9])
     assert len(tracks) == 35  # the miss in between too

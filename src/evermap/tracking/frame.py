@@ -1,26 +1,13 @@
-"""What the kernels are given and give back: a frame, the rules, and tables for what happens."""
+"""A frame: its detections, checked, as the kernels take them."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from evermap.types import FloatArray, IntArray
+import numpy as np
 
-
-class Rules(NamedTuple):
-    """When tracklets change their state; see `TrackerConfig`."""
-
-    odds_confirm: float
-    odds_dead: float
-    warm_up: int
-    lost_after: int
-    max_missed: int
-    class_speed_mps: FloatArray
-    rest_for_s: float
-    appearance_memory: float
-    sigma_velocity_mps: float
-    sigma_acceleration_mps2: float
-    inverse_odds_new: float
+from evermap.errors import InputError
+from evermap.types import UNKNOWN, FloatArray, IntArray
 
 
 class Frame(NamedTuple):
@@ -41,28 +28,84 @@ class Frame(NamedTuple):
     appearance: FloatArray
 
 
-class EventTable(NamedTuple):
-    """Room for what happens in a frame, one row each.
+def positions(values: Any) -> FloatArray:
+    """(M, 3) finite positions.
 
-    Attributes:
-        kind: (K,) an `EventKind`.
-        row: (K,) the tracklet's row.
+    Raises:
+        InputError: another shape, or a number that is not finite.
     """
+    try:
+        array = np.ascontiguousarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError("not numbers", field="position_m", hint="three coordinates a detection") from error
+    if array.size == 0:
+        return np.empty((0, 3))
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"shape {array.shape} instead of (M, 3)", field="position_m")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
+        raise InputError(f"detection {row}: {array[row].tolist()} is not finite", field="position_m")
+    return array
 
-    kind: IntArray
-    row: IntArray
 
+def classes(values: Any, m: int, n_classes: int) -> IntArray:
+    """(M,) classes, `UNKNOWN` where none is given.
 
-class SpellTable(NamedTuple):
-    """Room for static spells that end in a frame, one row each.
-
-    Attributes:
-        track_id, class_id: (K,) whose.
-        position: (K, 3) where.
-        times: (K, 4) last seen elsewhere, first seen there, last seen there, first seen gone.
+    Raises:
+        InputError: another number of them, no whole numbers, or a class that does not exist.
     """
+    if values is None:
+        return np.full(m, UNKNOWN)
+    array = np.asarray(values)
+    if array.shape != (m,):
+        raise InputError(f"shape {array.shape} instead of ({m},)", field="class_id")
+    if array.size and array.dtype.kind not in "iu":
+        raise InputError("classes are whole numbers", field="class_id")
+    ids = array.astype(np.int64)
+    if m and not (ids.min() >= UNKNOWN and ids.max() < n_classes):
+        row = int(np.flatnonzero((ids < UNKNOWN) | (ids >= n_classes))[0])
+        raise InputError(
+            f"detection {row}: class {ids[row]} of {n_classes} does not exist",
+            field="class_id",
+            hint=f"0 to {n_classes - 1}, or {UNKNOWN} for unknown",
+        )
+    return ids
 
-    track_id: IntArray
-    class_id: IntArray
-    position: FloatArray
-    times: FloatArray
+
+def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
+    """(M, 3, 3) covariances, or `default` (1, 3, 3) where none are given.
+
+    Raises:
+        InputError: another shape, or a matrix that is not symmetric and positive definite.
+    """
+    if values is None or m == 0:
+        return default
+    array = np.ascontiguousarray(values, dtype=np.float64)
+    if array.shape != (m, 3, 3):
+        raise InputError(f"shape {array.shape} instead of ({m}, 3, 3)", field="covariance_m2")
+    symmetric = np.isclose(array, array.transpose(0, 2, 1), rtol=1e-6, atol=1e-12).all(axis=(1, 2))
+    minors = np.stack([array[:, 0, 0], np.linalg.det(array[:, :2, :2]), np.linalg.det(array)])
+    wrong = np.flatnonzero(~(symmetric & (minors > 0.0).all(axis=0) & np.isfinite(array).all(axis=(1, 2))))
+    if wrong.size:
+        raise InputError(
+            f"detection {wrong[0]}: the matrix is not symmetric and positive definite", field="covariance_m2"
+        )
+    return array
+
+
+def appearances(values: Any, m: int, n_appearance: int) -> FloatArray:
+    """(M, A) unit vectors; a row of zeros, or without a finite length, has no appearance.
+
+    Raises:
+        InputError: another shape than the tracker was made for.
+    """
+    if values is None:
+        return np.zeros((m, n_appearance))
+    array = np.asarray(values, dtype=np.float64)
+    if array.size == 0 and m == 0:
+        return np.zeros((0, n_appearance))
+    if array.shape != (m, n_appearance):
+        raise InputError(f"shape {array.shape} instead of ({m}, {n_appearance})", field="appearance")
+    length = np.linalg.norm(array, axis=1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.ascontiguousarray(np.where((length > 0.0) & np.isfinite(length), array / length, 0.0))

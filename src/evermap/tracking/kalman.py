@@ -1,15 +1,69 @@
-"""Constant-acceleration and constant-velocity Kalman filters in space, over all tracklets at once.
+"""How kernels of this package are compiled, small linear algebra, and Kalman filters over all tracklets at once.
 
-One path for every measurement covariance: the axes are independent filters only where all noise is diagonal, which that
-of a camera or a lidar, long in its line of sight, never is; and the whole nine states cost half a microsecond.
+Filters have constant acceleration or constant velocity in space. One path for every measurement covariance: the axes
+are independent filters only where all noise is diagonal, which that of a camera or a lidar, long in its line of sight,
+never is; and the whole nine states cost half a microsecond.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from evermap.tracking.kernels import invert, kernel
+from evermap.compiled import drop_stale_code, kept
 from evermap.types import FloatArray
+
+drop_stale_code(__file__)
+
+kernel = kept(error_model="numpy")
+inlined = kept(error_model="numpy", forceinline=True)
+
+
+Vector = tuple[float, float, float]
+Symmetric = tuple[float, float, float, float, float, float]
+"""Entries xx, xy, xz, yy, yz and zz of a symmetric (3, 3)."""
+
+
+@inlined
+def sum_of(a: FloatArray, b: FloatArray) -> Symmetric:
+    """Return the sum of two symmetric (3, 3), or of their first three rows and columns."""
+    return (
+        a[0, 0] + b[0, 0], a[0, 1] + b[0, 1], a[0, 2] + b[0, 2],
+        a[1, 1] + b[1, 1], a[1, 2] + b[1, 2], a[2, 2] + b[2, 2],
+    )  # fmt: skip
+
+
+@inlined
+def distance_and_log_det(offset: Vector, matrix: Symmetric) -> tuple[float, float]:
+    """Return the squared Mahalanobis length of a vector under a symmetric (3, 3), and the log of its determinant.
+
+    By the factors `L D L'`; infinite where the matrix is not positive definite.
+    """
+    x, y, z = offset
+    xx, xy, xz, yy, yz, zz = matrix
+    a, b = xy / xx, xz / xx
+    d1 = yy - a * xy
+    rest = yz - b * xy
+    c = rest / d1
+    d2 = zz - b * xz - c * rest
+    if not (xx > 0.0 and d1 > 0.0 and d2 > 0.0):
+        return math.inf, math.inf
+    u = y - a * x
+    v = z - b * x - c * u
+    return x * x / xx + u * u / d1 + v * v / d2, math.log(xx * d1 * d2)
+
+
+@inlined
+def invert(m: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with the inverse of a symmetric positive definite (3, 3)."""
+    xx, xy, xz, yy, yz, zz = m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2]
+    cxx, cxy, cxz = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    scale = 1.0 / (xx * cxx + xy * cxy + xz * cxz)
+    out[0, 0], out[1, 1], out[2, 2] = cxx * scale, (xx * zz - xz * xz) * scale, (xx * yy - xy * xy) * scale
+    out[0, 1] = out[1, 0] = cxy * scale
+    out[0, 2] = out[2, 0] = cxz * scale
+    out[1, 2] = out[2, 1] = (xy * xz - xx * yz) * scale
 
 
 @kernel
@@ -73,7 +127,7 @@ def predict(mean: FloatArray, covariance: FloatArray, n: int, gap_s: float, dens
 
 @kernel
 def update(mean: FloatArray, covariance: FloatArray, position: FloatArray, noise: FloatArray) -> None:
-    """Take in one measured position, in place; with D = 3 the filter is that of a place that does not move.
+    """Update a filter with one measured position, in place; with D = 3 it is the filter of a place at rest.
 
     Args:
         mean: (D,) of one filter; its first three states are the position.

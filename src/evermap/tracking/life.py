@@ -8,17 +8,15 @@ tracklets, and kills them; an object that cannot be seen (`P_D = 0`) loses nothi
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from evermap.tracking.assignment import NOBODY, assign
-from evermap.tracking.frame import EventTable, Frame, Rules, SpellTable
-from evermap.tracking.gating import NEVER_SURE, Evidence, candidates
-from evermap.tracking.kalman import update
-from evermap.tracking.kernels import kernel
-from evermap.tracking.rest import DISPLACED, displacement, end_spell, settle, start_rest
-from evermap.tracking.rows import noise_of, place_filter
-from evermap.tracking.tracklets import EventKind, Tracklets, TrackState
+from evermap.tracking.association import NEVER_SURE, NOBODY, Likelihood, Targets, assign, candidates
+from evermap.tracking.frame import Frame
+from evermap.tracking.kalman import kernel, update
+from evermap.tracking.rows import DISPLACED, displacement, end_spell, noise_of, place_filter, settle, start_rest
+from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, Tracklets, TrackState
 from evermap.types import BoolArray, FloatArray, IntArray
 
 BIRTH, ALIVE, LOST = int(TrackState.BIRTH), int(TrackState.ALIVE), int(TrackState.LOST)
@@ -28,6 +26,34 @@ EVENT_STORED, EVENT_DIED = int(EventKind.STORED), int(EventKind.DIED)
 NOTHING = -1
 MOST, LEAST = 1e30, 1e-12
 """Bounds of inverse odds: however long an object was watched, a dozen misses may undo it."""
+
+
+class InSight(NamedTuple):
+    """What a frame can say of N tracklets.
+
+    Attributes:
+        p_detect: (N,) probability to detect each, if it is there.
+        view_known: whether that comes from a view; otherwise a confirmed object that is missed may be out of view.
+        death_odds: odds of having ceased to exist since the last frame, `(1 - q) / q`.
+    """
+
+    p_detect: FloatArray
+    view_known: bool
+    death_odds: float
+
+
+class Happened(NamedTuple):
+    """Room for what happens in a frame.
+
+    Attributes:
+        track_of_detection: (M,) ids of the detections that have an object.
+        events: one a row.
+        spells: static spells that end now.
+    """
+
+    track_of_detection: IntArray
+    events: EventTable
+    spells: SpellTable
 
 
 @kernel
@@ -54,17 +80,7 @@ def recognise(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray,
 
 @kernel
 def live(
-    t: Tracklets,
-    n: int,
-    frame: Frame,
-    p_detect: FloatArray,
-    view_known: bool,
-    death_odds: float,
-    evidence: Evidence,
-    rules: Rules,
-    track_of_detection: IntArray,
-    events: EventTable,
-    spells: SpellTable,
+    t: Tracklets, n: int, frame: Frame, in_sight: InSight, likelihood: Likelihood, rules: Rules, happened: Happened
 ) -> tuple[int, int, int]:
     """Give a frame's detections to the first `n` tracklets, which have been predicted to it, and draw the consequences.
 
@@ -72,32 +88,18 @@ def live(
         t: changed in place.
         n: rows in use.
         frame: its detections.
-        p_detect: (N,) probability to detect each, if it is there.
-        view_known: whether that comes from a view; otherwise a confirmed object that is missed may be out of view.
-        death_odds: odds of having ceased to exist since the last frame, `(1 - q) / q`.
-        evidence: numbers of the settings.
+        in_sight: what the frame can say of each.
+        likelihood: numbers of the settings.
         rules: when states change.
-        track_of_detection: (M,) out, ids of those that have an object.
-        events: out.
-        spells: out, static spells that end now.
+        happened: filled in.
 
     Returns:
         How many events, how many static spells, and how many tracklets that are no longer active.
     """
-    pairs = candidates(
-        t.mean,
-        t.covariance,
-        t.class_p,
-        t.appearance,
-        t.inverse_odds,
-        p_detect,
-        n,
-        frame.position,
-        frame.noise,
-        frame.class_id,
-        frame.appearance,
-        evidence,
-    )
+    p_detect, view_known, death_odds = in_sight
+    track_of_detection, events, spells = happened
+    targets = Targets(t.mean, t.covariance, t.class_p, t.appearance, t.inverse_odds, p_detect)
+    pairs = candidates(targets, n, frame, likelihood)
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
     n_events, n_spells, n_gone = 0, 0, 0
     for i in range(n):
@@ -108,20 +110,10 @@ def live(
             gain = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0)) / max(p_detect[i], NEVER_SURE)
             t.inverse_odds[i] = max(predicted * gain, LEAST)
             update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
-            recognise(t, i, frame, j, evidence.confusion, rules.appearance_memory)
+            recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
             t.n_hits[i] += 1
             t.n_missed[i] = 0
-            n_spells = settle(
-                t,
-                i,
-                frame.stamp_s,
-                frame.position[j],
-                noise_of(frame, j),
-                rules.class_speed_mps,
-                rules.rest_for_s,
-                spells,
-                n_spells,
-            )
+            n_spells = settle(t, i, frame, j, rules, spells, n_spells)
             if t.state[i] == LOST:
                 t.state[i] = ALIVE
                 events.kind[n_events], events.row[n_events] = EVENT_FOUND, i
@@ -156,37 +148,14 @@ def live(
 
 
 @kernel
-def match(
-    place: FloatArray,
-    covariance: FloatArray,
-    class_p: FloatArray,
-    appearance: FloatArray,
-    inverse_odds: FloatArray,
-    p_detect: FloatArray,
-    frame: Frame,
-    evidence: Evidence,
-) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
-    """The best assignment of detections to K places of rest.
+def match(targets: Targets, frame: Frame, likelihood: Likelihood) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:
+    """Return the best assignment of detections to K places of rest.
 
     Returns:
         (F,) places that have one, (F,) the detections, (F,) log-likelihood ratio of each to being of nobody known,
         (F,) whether each is elsewhere than its place.
     """
-    n = place.shape[0]
-    pairs = candidates(
-        place,
-        covariance,
-        class_p,
-        appearance,
-        inverse_odds,
-        p_detect,
-        n,
-        frame.position,
-        frame.noise,
-        frame.class_id,
-        frame.appearance,
-        evidence,
-    )
+    pairs = candidates(targets, targets.mean.shape[0], frame, likelihood)
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
     found = np.flatnonzero(chosen != NOBODY)
     pair = chosen[found]
@@ -194,7 +163,10 @@ def match(
     moved = np.empty(found.shape[0], dtype=np.bool_)
     for k in range(found.shape[0]):
         squared = displacement(
-            frame.position[detection[k]], noise_of(frame, detection[k]), place[found[k]], covariance[found[k]]
+            frame.position[detection[k]],
+            noise_of(frame, detection[k]),
+            targets.mean[found[k]],
+            targets.covariance[found[k]],
         )
         moved[k] = squared > DISPLACED
     return found, detection, pairs.log_ratio[pair], moved

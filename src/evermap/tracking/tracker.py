@@ -14,10 +14,9 @@ import numpy as np
 from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
 from evermap.survival import GeneralPurpose, LifetimePrior
-from evermap.tracking import detections
-from evermap.tracking.frame import EventTable, Frame, Rules, SpellTable
-from evermap.tracking.spells import SpellLog, StaticSpells
-from evermap.tracking.tracklets import Event, EventKind, Followed, TrackState, grown, room_for
+from evermap.tracking.frame import Frame, appearances, classes, covariances, positions
+from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
+from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, TrackState, grown, room_for
 from evermap.tracking.views import View, ViewMemory
 from evermap.tracking.working_set import WorkingSet
 from evermap.types import UNKNOWN, FloatArray, IntArray
@@ -50,15 +49,15 @@ class Tracker:
         n_appearance: int = 0,
         priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
     ) -> None:
-        from evermap.tracking import gating, kalman, life, rows
+        from evermap.tracking import association, kalman, life, rows
 
         if n_classes < 1:
             raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
-        self._gating, self._kalman, self._life, self._rows = gating, kalman, life, rows
+        self._association, self._kalman, self._life, self._rows = association, kalman, life, rows
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
         lifetimes = _as_priors(priors, n_classes)
-        self._evidence = gating.Evidence(
+        self._likelihood = association.Likelihood(
             confusion=s.confusion_matrix(n_classes, confusion),
             class_prior=np.full(n_classes, 1.0 / n_classes),
             log_clutter=float(np.log(s.clutter_per_m3)),
@@ -68,10 +67,10 @@ class Tracker:
             moved_reach_m=0.0,
             log_moved=-np.inf,
         )
-        self._evidence_at_rest = self._evidence
+        self._likelihood_at_rest = self._likelihood
         if s.moved_reach_m > 0.0:
             volume_m3 = 4.0 / 3.0 * np.pi * s.moved_reach_m**3
-            self._evidence_at_rest = self._evidence._replace(
+            self._likelihood_at_rest = self._likelihood._replace(
                 moved_reach_m=float(s.moved_reach_m), log_moved=float(np.log(s.p_moved / volume_m3))
             )
         self._rules = Rules(
@@ -168,14 +167,14 @@ class Tracker:
                 field="stamp_s",
                 hint="frames in the order of their stamps, all detections of one instant in one frame",
             )
-        position = detections.positions(position_m)
+        position = positions(position_m)
         m = len(position)
         return Frame(
             stamp_s=stamp,
             position=position,
-            noise=detections.covariances(covariance_m2, m, self._noise),
-            class_id=detections.classes(class_id, m, self._n_classes),
-            appearance=detections.appearances(appearance, m, self._n_appearance),
+            noise=covariances(covariance_m2, m, self._noise),
+            class_id=classes(class_id, m, self._n_classes),
+            appearance=appearances(appearance, m, self._n_appearance),
         )
 
     def _predict(self, stamp_s: float) -> None:
@@ -192,10 +191,9 @@ class Tracker:
         p_detect = np.full(n, self.settings.p_detect) if view is None else view.probability(t.mean[:n, :3])
         track_of_detection = np.full(len(frame.position), UNKNOWN)
         table, spells = self._event_table, self._spell_table
-        n_events, n_spells, n_gone = self._life.live(
-            t, n, frame, p_detect, view is not None, self._death_odds, self._evidence, self._rules,
-            track_of_detection, table, spells,
-        )  # fmt: skip
+        in_sight = self._life.InSight(p_detect, view is not None, self._death_odds)
+        happened = self._life.Happened(track_of_detection, table, spells)
+        n_events, n_spells, n_gone = self._life.live(t, n, frame, in_sight, self._likelihood, self._rules, happened)
         for kind, row in zip(table.kind[:n_events].tolist(), table.row[:n_events].tolist(), strict=True):
             events.append(Event(frame.stamp_s, EventKind(kind), int(t.track_id[row])))
             if kind == EventKind.BORN and np.isneginf(t.elsewhere_s[row]):
@@ -218,7 +216,7 @@ class Tracker:
         position = frame.position[free]
         noise = frame.noise if len(frame.noise) == 1 else frame.noise[free]
         widest = noise[:, [0, 1, 2], [0, 1, 2]].max(axis=1) + w.widest_m2 + place_m2
-        reach = np.maximum(np.sqrt(3.0 * self._evidence.gate * widest), s.moved_reach_m)
+        reach = np.maximum(np.sqrt(3.0 * self._likelihood.gate * widest), s.moved_reach_m)
         reach = np.broadcast_to(reach, len(free))
         rows = w.near(position, np.ascontiguousarray(reach))
         if len(rows) == 0:
@@ -227,20 +225,16 @@ class Tracker:
         covariance[:, [0, 1, 2], [0, 1, 2]] += place_m2
         place = w.stored.position[rows]
         p_detect = np.full(len(rows), s.p_detect) if view is None else view.probability(place)
+        appearance, inverse_odds = w.stored.appearance[rows].astype(np.float64), w.inverse_odds(rows, frame.stamp_s)
         found, detection, log_ratio, moved = self._life.match(
-            place,
-            covariance,
-            w.class_p(rows),
-            w.stored.appearance[rows].astype(np.float64),
-            w.inverse_odds(rows, frame.stamp_s),
-            p_detect,
+            self._association.Targets(place, covariance, w.class_p(rows), appearance, inverse_odds, p_detect),
             frame._replace(
                 position=position,
                 noise=np.ascontiguousarray(noise),
                 class_id=frame.class_id[free],
                 appearance=frame.appearance[free],
             ),
-            self._evidence_at_rest,
+            self._likelihood_at_rest,
         )
         if len(found) == 0:
             return
@@ -248,7 +242,7 @@ class Tracker:
         t, n = self._tracklets, self._n
         self._wake(rows[found], covariance[found], p_detect[found], log_ratio, frame.stamp_s)
         n_spells = self._life.resume(
-            t, n, frame, free[detection], moved, self._evidence.confusion, self._rules, self._spell_table
+            t, n, frame, free[detection], moved, self._likelihood.confusion, self._rules, self._spell_table
         )
         self._spells.add(self._spell_table, n_spells)
         self._n = n + len(found)
@@ -262,7 +256,7 @@ class Tracker:
         """Copy objects of the working set behind the active tracklets, as they were."""
         t, w = self._tracklets, self.working_set
         into = slice(self._n, self._n + len(rows))
-        gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self._gating.NEVER_SURE)
+        gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self._association.NEVER_SURE)
         t.track_id[into] = w.stored.track_id[rows]
         t.class_p[into] = w.class_p(rows)
         t.appearance[into] = w.stored.appearance[rows]
@@ -284,7 +278,7 @@ class Tracker:
         free = free[np.lexsort(frame.position[free].T)]
         self._reserve(self._n + len(free))
         self._rows.start_all(
-            self._tracklets, self._n, self._next_id, frame, free, self._evidence.confusion, self._rules,
+            self._tracklets, self._n, self._next_id, frame, free, self._likelihood.confusion, self._rules,
             track_of_detection,
         )  # fmt: skip
         self._n += len(free)

@@ -1,14 +1,13 @@
-"""What the tracker remembers of the objects that it follows: a struct of arrays, one row a tracklet."""
+"""What the tracker remembers of the objects that it follows: a struct of arrays, one row a tracklet; and its states."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
 
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import FloatArray, IntArray
 
 
 class TrackState(IntEnum):
@@ -38,6 +37,22 @@ class EventKind(IntEnum):
     """Put into the working set."""
     REIDENTIFIED = 4
     DIED = 5
+
+
+class Rules(NamedTuple):
+    """When tracklets change their state; see `TrackerConfig`."""
+
+    odds_confirm: float
+    odds_dead: float
+    warm_up: int
+    lost_after: int
+    max_missed: int
+    class_speed_mps: FloatArray
+    rest_for_s: float
+    appearance_memory: float
+    sigma_velocity_mps: float
+    sigma_acceleration_mps2: float
+    inverse_odds_new: float
 
 
 class Tracklets(NamedTuple):
@@ -116,42 +131,28 @@ def grown(tracklets: Tracklets, n: int) -> Tracklets:
     return Tracklets(*(np.concatenate([a, np.zeros((n - len(a), *a.shape[1:]), dtype=a.dtype)]) for a in tracklets))
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
-    """What happened to a tracklet, and when."""
-
-    stamp_s: float
-    kind: EventKind
-    track_id: int
-
-
-@dataclass(frozen=True, slots=True)
-class Followed:
-    """The active tracklets at one instant, one row each, in no order. Copies.
+class EventTable(NamedTuple):
+    """Room for what happens in a frame, one row each.
 
     Attributes:
-        stamp_s: when.
-        track_id: (N,).
-        state: (N,) a `TrackState`.
-        position_m, velocity_mps: (N, 3) in the world.
-        position_covariance_m2, velocity_covariance_m2ps2: (N, 3, 3).
-        class_p: (N, C) posterior over classes.
-        p_exists: (N,) probability of being a real object that is there.
-        n_missed: (N,) frames in a row without a detection.
-        static: (N,) whether it has been where it is for long enough to be static.
+        kind: (K,) an `EventKind`.
+        row: (K,) the tracklet's row.
     """
 
-    stamp_s: float
-    track_id: IntArray
-    state: IntArray
-    position_m: FloatArray
-    velocity_mps: FloatArray
-    position_covariance_m2: FloatArray
-    velocity_covariance_m2ps2: FloatArray
-    class_p: FloatArray
-    p_exists: FloatArray
-    n_missed: IntArray
-    static: BoolArray
+    kind: IntArray
+    row: IntArray
 
-    def __len__(self) -> int:
-        return len(self.track_id)
+
+class SpellTable(NamedTuple):
+    """Room for static spells that end in a frame, one row each.
+
+    Attributes:
+        track_id, class_id: (K,) whose.
+        position: (K, 3) where.
+        times: (K, 4) last seen elsewhere, first seen there, last seen there, first seen gone.
+    """
+
+    track_id: IntArray
+    class_id: IntArray
+    position: FloatArray
+    times: FloatArray

@@ -86,7 +86,7 @@ class WorkingSet:
     """
 
     def __init__(self, chunk_m: float, priors: tuple[LifetimePrior, ...], n_classes: int, n_appearance: int) -> None:
-        from evermap.tracking import chunks
+        from evermap.tracking import grid as chunks
 
         self._chunks = chunks
         self._chunk_m = chunk_m

@@ -15,10 +15,8 @@ from evermap.runs.track.detections import DetectionTable, said_of
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
-from evermap.tracking.record import Recorder, Tracks
-from evermap.tracking.spells import StaticSpells
+from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
-from evermap.tracking.tracklets import Event
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
@@ -165,7 +163,7 @@ def _follow(
             appearance=None if table.appearance is None else table.appearance[rows],
             view=_view(table, config, k),
         )
-        recorder.add(tracker, events)
+        recorder.add(tracker.followed(), events)
         if k + 1 < table.n_frames and table.stamp_s[k + 1] - stamp_s > gap_s:
             n_gaps += 1
             centre_m = np.zeros(3) if table.sensor_m is None else table.sensor_m[k]

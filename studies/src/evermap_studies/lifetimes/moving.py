@@ -11,9 +11,9 @@ import numpy as np
 from evermap.config import TrackerConfig
 from evermap.survival.censored import lifetimes_of_sightings
 from evermap.survival.parametric_fit import ParametricFit, fit_sightings
-from evermap.tracking.spells import StaticSpells
+from evermap.tracking.record import Followed, StaticSpells
 from evermap.tracking.tracker import Tracker
-from evermap.tracking.tracklets import Followed, TrackState
+from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
 from evermap.types import FloatArray
 from evermap_studies.lifetimes.tracking_scores import TrackingScores, score_tracks

@@ -1,10 +1,14 @@
-"""Which detections may be of which tracklet, and what each pair costs.
+"""Which detections may be of which tracklet, what each pair costs, and the best assignment.
 
 The cost of a pair is the negative log of how much better 'this detection is of this object' explains it than 'the
 object was missed, and the detection is of nobody known': half the squared Mahalanobis distance, half the log
 determinant of the innovation's covariance (without it young tracklets, whose gates are wide, steal detections), the
 class and the appearance, against the density of everything else. Pairs that cost more than nothing cannot be part of
 a best assignment, and are not listed.
+
+The assignment is by shortest augmenting paths with dual prices (Jonker and Volgenant 1987), one row after the other. A
+path never leaves the connected component that it starts in, and most components of gated tracklets are one pair,
+settled by the first pass; so the work is that of the components by themselves, without searching for them.
 """
 
 from __future__ import annotations
@@ -14,13 +18,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.tracking.frame import Frame
 from evermap.tracking.grid import bucket_of, cell_of, fill
-from evermap.tracking.kernels import distance_and_log_det, inlined, kernel
+from evermap.tracking.kalman import distance_and_log_det, inlined, kernel, sum_of
 from evermap.types import FloatArray, IntArray
 
 
-class Evidence(NamedTuple):
-    """What a detection says, whoever asks: numbers of the settings.
+class Likelihood(NamedTuple):
+    """What a detection says of every object: numbers of the settings.
 
     Attributes:
         confusion: (C, C) `P(detected class | true class)`, a row a true class.
@@ -40,6 +45,26 @@ class Evidence(NamedTuple):
     appearance_neutral: float
     moved_reach_m: float
     log_moved: float
+
+
+class Targets(NamedTuple):
+    """Where N objects are expected, and what they look like.
+
+    Attributes:
+        mean: (N, D) of a filter; the first three states are the position.
+        covariance: (N, D, D).
+        class_p: (N, C) posterior over classes.
+        appearance: (N, A) unit vectors, or zeros.
+        inverse_odds: (N,) `(1 - p) / p` of being there.
+        p_detect: (N,) probability to detect each, if it is there.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    class_p: FloatArray
+    appearance: FloatArray
+    inverse_odds: FloatArray
+    p_detect: FloatArray
 
 
 class Pairs(NamedTuple):
@@ -87,36 +112,17 @@ def appearance_log_ratio(mine: FloatArray, theirs: FloatArray, nats: float, neut
 
 
 @kernel
-def candidates(
-    mean: FloatArray,
-    covariance: FloatArray,
-    class_p: FloatArray,
-    appearance: FloatArray,
-    inverse_odds: FloatArray,
-    p_detect: FloatArray,
-    n: int,
-    position: FloatArray,
-    noise: FloatArray,
-    detected_class: IntArray,
-    detected_appearance: FloatArray,
-    evidence: Evidence,
-) -> Pairs:
+def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -> Pairs:
     """List all pairs inside their gate that are worth being matched.
 
     Args:
-        mean: (N, D) as in `Tracklets`; the first three states are the position.
-        covariance: (N, D, D).
-        class_p: (N, C).
-        appearance: (N, A).
-        inverse_odds: (N,).
-        p_detect: (N,) probability to detect each object, if it is there.
-        n: rows in use.
-        position: (M, 3) detections.
-        noise: (M, 3, 3) their covariances, or (1, 3, 3) for all.
-        detected_class: (M,) or `UNKNOWN`.
-        detected_appearance: (M, A) unit vectors or zeros.
-        evidence: numbers of the settings.
+        targets: where objects are expected.
+        n: rows of these in use.
+        frame: M detections.
+        likelihood: numbers of the settings.
     """
+    mean, covariance, class_p, appearance, inverse_odds, p_detect = targets
+    position, noise = frame.position, frame.noise
     m = position.shape[0]
     start = np.zeros(n + 1, dtype=np.int64)
     room = 4 * (n + m) + 16
@@ -132,8 +138,8 @@ def candidates(
     total = 0.0
     for i in range(n):
         for a in range(3):
-            reach[i, a] = math.sqrt(evidence.gate * max(covariance[i, a, a] + widest[a], 0.0))
-            reach[i, a] = max(reach[i, a], evidence.moved_reach_m)
+            reach[i, a] = math.sqrt(likelihood.gate * max(covariance[i, a, a] + widest[a], 0.0))
+            reach[i, a] = max(reach[i, a], likelihood.moved_reach_m)
             total += reach[i, a]
     cell_m = max(2.0 * total / (3 * n), 1e-9)
     bucket_start, member, cell = fill(position, cell_m)
@@ -169,26 +175,16 @@ def candidates(
                 j = found[k]
                 r = 0 if shared else j
                 dx, dy, dz = position[j, 0] - mean[i, 0], position[j, 1] - mean[i, 1], position[j, 2] - mean[i, 2]
-                squared, log_det = distance_and_log_det(
-                    dx,
-                    dy,
-                    dz,
-                    covariance[i, 0, 0] + noise[r, 0, 0],
-                    covariance[i, 0, 1] + noise[r, 0, 1],
-                    covariance[i, 0, 2] + noise[r, 0, 2],
-                    covariance[i, 1, 1] + noise[r, 1, 1],
-                    covariance[i, 1, 2] + noise[r, 1, 2],
-                    covariance[i, 2, 2] + noise[r, 2, 2],
-                )
-                log_density = -0.5 * (squared + log_det + 3.0 * LOG_TWO_PI) if squared <= evidence.gate else -math.inf
-                if dx * dx + dy * dy + dz * dz <= evidence.moved_reach_m * evidence.moved_reach_m:
-                    log_density = max(log_density, evidence.log_moved)
+                squared, log_det = distance_and_log_det((dx, dy, dz), sum_of(covariance[i], noise[r]))
+                log_density = -0.5 * (squared + log_det + 3.0 * LOG_TWO_PI) if squared <= likelihood.gate else -math.inf
+                if dx * dx + dy * dy + dz * dz <= likelihood.moved_reach_m * likelihood.moved_reach_m:
+                    log_density = max(log_density, likelihood.log_moved)
                 if log_density == -math.inf:
                     continue
-                ratio = log_density - evidence.log_clutter
-                ratio += class_log_ratio(class_p[i], evidence.confusion, evidence.class_prior, detected_class[j])
+                ratio = log_density - likelihood.log_clutter
+                ratio += class_log_ratio(class_p[i], likelihood.confusion, likelihood.class_prior, frame.class_id[j])
                 ratio += appearance_log_ratio(
-                    appearance[i], detected_appearance[j], evidence.appearance_nats, evidence.appearance_neutral
+                    appearance[i], frame.appearance[j], likelihood.appearance_nats, likelihood.appearance_neutral
                 )
                 if missed_over_hit - ratio >= 0.0:
                     continue
@@ -201,3 +197,98 @@ def candidates(
                 e += 1
         start[i + 1] = e
     return Pairs(start, column[:e], cost[:e], log_ratio[:e])
+
+
+NOBODY = -1
+
+
+@kernel
+def assign(start: IntArray, column: IntArray, cost: FloatArray, n_columns: int) -> IntArray:
+    """The matching of least total cost; only pairs that cost less than 0 can be in it.
+
+    Args:
+        start: (N + 1,) first pair of every row.
+        column: (E,) column of every pair, none twice in a row.
+        cost: (E,) finite.
+        n_columns: how many columns there are.
+
+    Returns:
+        (N,) pair of every row, or `NOBODY`.
+    """
+    n = start.shape[0] - 1
+    pair_of_row = np.full(n, NOBODY, dtype=np.int64)
+    row_of_column = np.full(n_columns, NOBODY, dtype=np.int64)
+    price = np.zeros(n_columns)
+    late = np.empty(n, dtype=np.int64)
+    n_late = 0
+    for i in range(n):  # whoever wants a column that is free has it
+        best, least = NOBODY, 0.0
+        for e in range(start[i], start[i + 1]):
+            if cost[e] < least:
+                best, least = e, cost[e]
+        if best == NOBODY:
+            continue
+        if row_of_column[column[best]] == NOBODY:
+            row_of_column[column[best]] = i
+            pair_of_row[i] = best
+        else:
+            late[n_late] = i
+            n_late += 1
+    if n_late == 0:
+        return pair_of_row
+
+    distance = np.full(n_columns, np.inf)
+    via = np.empty(n_columns, dtype=np.int64)  # the pair that reaches a column
+    via_row = np.empty(n_columns, dtype=np.int64)
+    done = np.zeros(n_columns, dtype=np.bool_)
+    reached = np.empty(n_columns, dtype=np.int64)
+    for f in range(n_late):
+        n_reached = 0
+        row, so_far = late[f], 0.0
+        alone_row, alone = row, 0.0  # the row for which staying alone ends the path, and that path's length
+        target = NOBODY
+        while True:
+            for e in range(start[row], start[row + 1]):
+                k = column[e]
+                if done[k]:
+                    continue
+                length = so_far + cost[e] - price[k]
+                if length < distance[k]:
+                    if distance[k] == np.inf:
+                        reached[n_reached] = k
+                        n_reached += 1
+                    distance[k], via[k], via_row[k] = length, e, row
+            nearest, least = NOBODY, np.inf
+            for r in range(n_reached):
+                k = reached[r]
+                if not done[k] and distance[k] < least:
+                    nearest, least = k, distance[k]
+            if alone <= least:
+                least = alone
+                break
+            if row_of_column[nearest] == NOBODY:
+                target = nearest
+                break
+            done[nearest] = True
+            row = row_of_column[nearest]
+            own = pair_of_row[row]
+            so_far = least - (cost[own] - price[nearest])
+            if so_far < alone:
+                alone_row, alone = row, so_far
+        for r in range(n_reached):
+            k = reached[r]
+            if done[k]:
+                price[k] += distance[k] - least
+        if target == NOBODY and alone_row != late[f]:
+            target = column[pair_of_row[alone_row]]
+            pair_of_row[alone_row] = NOBODY
+        while target != NOBODY:  # back along the path: everybody moves on by one
+            row = via_row[target]
+            freed = NOBODY if pair_of_row[row] == NOBODY else column[pair_of_row[row]]
+            pair_of_row[row] = via[target]
+            row_of_column[target] = row
+            target = NOBODY if row == late[f] else freed
+        for r in range(n_reached):
+            distance[reached[r]] = np.inf
+            done[reached[r]] = False
+    return pair_of_row
