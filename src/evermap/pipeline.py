@@ -51,7 +51,7 @@ def run_slam(
 
     config = config or Config()
     recording = valid(recording, config.sensor, prior_map)
-    remarks = odd(recording, identities=not config.slam.unknown_ids)
+    remarks = odd(recording, identities=not config.slam.unknown_ids, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
     if config.slam.unknown_ids:
         recording = identified(recording, prior, noise, prior_map=prior_map)
@@ -108,9 +108,9 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.slam.intake import beliefs, prepare
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
-    recording, _ = admitted(clean(recording), living)
+    recording, _ = admitted(clean(recording, config.slam.cleaning), living)
     prior, noise = beliefs(recording.sensor, config.slam)
-    prepared = prepare(recording, remarks=odd(recording))
+    prepared = prepare(recording, remarks=odd(recording, settings=config.slam.check))
     # what moved is asked when it lies over the map
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
     with threadpool_limits(limits=1, user_api="blas"):
@@ -171,9 +171,9 @@ def run_localization(
 
     config = config or Config()
     if not len(living.places):
-        raise DataError("the map is empty", field="--map", hint="evermap slam RECORDING --map FILE, without --localize")
+        raise DataError("the map is empty", field="living", hint="enter a session first")
     recording = valid(recording, config.sensor)
-    remarks = odd(recording)
+    remarks = odd(recording, settings=config.slam.check)
     recording, living = admitted(recording, living)
     p_site = predicted(living, config.living, float(recording.frames.stamp_s[0]))
     prior, noise = beliefs(recording.sensor, config.slam)

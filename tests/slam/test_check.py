@@ -15,7 +15,7 @@ from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
 from evermap.sim import BuildingConfig, simulate_building
-from evermap.slam.check import FAR_OFF, far_off
+from evermap.slam.check import USUAL, far_off
 from evermap.types import ParameterEstimate, Recording
 
 
@@ -170,7 +170,7 @@ def test_a_calibration_state_far_outside_of_its_prior_is_told() -> None:
     def state(value: float, fixed: bool = False) -> ParameterEstimate:
         return ParameterEstimate("odometry_forward_scale", value, 0.01, 1.0, 0.05, "1", fixed=fixed)
 
-    assert far_off([state(1.0 + 0.99 * FAR_OFF * 0.05)]) == ()
+    assert far_off([state(1.0 + 0.99 * USUAL.far_off * 0.05)]) == ()
     assert far_off([state(2.0, fixed=True)]) == ()
     (told,) = far_off([state(1.3)])
     assert "odometry_forward_scale = 1.3 is 6 standard deviations" in told

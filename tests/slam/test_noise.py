@@ -11,7 +11,7 @@ from dense import DensePosterior
 from problems import QUIET, World, default_prior, integrated, make_world
 
 from evermap.slam.arrow import Smoother
-from evermap.slam.noise import PSEUDO_COUNT, START, NoiseFit, refine_noise
+from evermap.slam.noise import START, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Noise
 
 # sensors that look backwards have a range law that jumps there; not what is tested here
@@ -56,7 +56,7 @@ def log_marginal_likelihood(world: World, noise: Noise, start: Estimate) -> floa
         odometry = integrated(drive, a, b, estimate.states).covariance(noise.odometry**2)
         normaliser += 0.5 * np.linalg.slogdet(odometry)[1]
     believed = levels(world.noise) / levels(noise)
-    pseudo = -PSEUDO_COUNT * (np.log(levels(noise)) + 0.5 * believed**2).sum()
+    pseudo = -START.pseudo_count * (np.log(levels(noise)) + 0.5 * believed**2).sum()
     return -posterior.cost() - normaliser + 0.5 * spread + pseudo
 
 
@@ -85,7 +85,7 @@ def test_given_sigmas_are_left_alone():
     weights = smoother.inlier_probability(estimate)
     fit = refine_noise(world.problem, estimate, smoother.marginals(estimate), weights, QUIET, START)
     assert fit.noise.detection[1] == pytest.approx(START.detection[1])  # nobody speaks of it but the start
-    assert fit.detection_relative[1] == pytest.approx(1 / np.sqrt(2 * PSEUDO_COUNT))
+    assert fit.detection_relative[1] == pytest.approx(1 / np.sqrt(2 * START.pseudo_count))
     assert fit.detection_relative[0] < 0.5 * fit.detection_relative[1]
 
 
@@ -102,7 +102,7 @@ def test_outliers_do_not_count():
         weights = smoother.inlier_probability(estimate)
         fit = refine_noise(spoilt.problem, estimate, smoother.marginals(estimate), weights, noise, QUIET)
         noise = fit.noise
-    assert fit.detection_relative[0] > 1 / np.sqrt(2 * (len(reading) - wrong.sum() + PSEUDO_COUNT))
+    assert fit.detection_relative[0] > 1 / np.sqrt(2 * (len(reading) - wrong.sum() + START.pseudo_count))
     assert noise.detection == pytest.approx(QUIET.detection, rel=0.1)
 
 

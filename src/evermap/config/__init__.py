@@ -21,7 +21,17 @@ from pydantic import Field, ValidationError
 
 from evermap.config.living import LivingConfig
 from evermap.config.section import Section, config_error
-from evermap.config.slam import CalibrationConfig, ChangesConfig, ModesConfig, OutputConfig, SensorConfig, SlamConfig
+from evermap.config.slam import (
+    CalibrationConfig,
+    ChangesConfig,
+    CheckConfig,
+    CleaningConfig,
+    ModesConfig,
+    NoiseConfig,
+    OutputConfig,
+    SensorConfig,
+    SlamConfig,
+)
 from evermap.config.tables import PersistConfig, SurvivalConfig, TrackConfig, TrackerConfig
 from evermap.errors import ConfigError
 
@@ -170,9 +180,12 @@ def _toml_text(value: Any) -> str:
 __all__ = [
     "CalibrationConfig",
     "ChangesConfig",
+    "CheckConfig",
+    "CleaningConfig",
     "Config",
     "LivingConfig",
     "ModesConfig",
+    "NoiseConfig",
     "OutputConfig",
     "PersistConfig",
     "Section",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
-from evermap.config.section import Positive, Probability, Section
+from evermap.config.section import Count, Positive, Probability, Section, Share
 from evermap.errors import ConfigError
 from evermap.types import Sensor
 
@@ -52,6 +52,79 @@ class ChangesConfig(Section):
     p_rotated: Probability = Field(default=0.1, description="share of moves that also turn the group")
 
 
+class CheckConfig(Section):
+    """What makes a recording odd; see `slam.check`."""
+
+    lags_s: tuple[Positive, ...] = Field(
+        default=(1.0, 4.0),
+        min_length=1,
+        description="sightings that are compared are at least so far apart, and at most twice as far [s]",
+    )
+    most_pairs: Count = Field(default=1000, description="pairs of sightings compared for each lag, at most")
+    fits: Positive = Field(
+        default=0.03, description="difference between two readings that surprises nobody: share of the range, and rad"
+    )
+    apart: Positive = Field(
+        default=3.0, description="a pair distinguishes two explanations that differ by so many median residuals"
+    )
+    agreed: Share = Field(
+        default=0.8, description="share of those pairs that a mistake has to explain before it is reported"
+    )
+    fewest: Count = Field(default=20, description="pairs that decide, at least")
+    gain: Positive = Field(default=20.0, description="log likelihood of all pairs that a mistake must raise by")
+    off: Positive = Field(
+        default=0.3, description="median residual beyond which readings and odometry have nothing to do with each other"
+    )
+    own_ids: Count = Field(
+        default=50, description="landmarks, hardly any seen twice, from which on it is no recording of landmarks"
+    )
+    far_off: Positive = Field(
+        default=5.0, description="standard deviations of its prior beyond which a calibration state is reported"
+    )
+
+
+class CleaningConfig(Section):
+    """What is left out of the recording of a session as impossible; see `slam.cleaning`."""
+
+    fastest: Positive = Field(default=100.0, description="speed beyond which odometry is left out [m/s, rad/s]")
+    hardest: Positive = Field(default=20.0, description="acceleration that makes a spike of odometry [m/s^2, rad/s^2]")
+    sharpest: Positive = Field(default=2.0, description="change of speed that is never a spike [m/s, rad/s]")
+    too_far: float = Field(
+        default=2.0, ge=1.0, description="factor on the largest range beyond which a reading is left out"
+    )
+    far_from_median: float = Field(
+        default=100.0, ge=1.0, description="the same on the median range, for a sensor without a largest range"
+    )
+    moved: Positive = Field(
+        default=0.1, description="motion after which no sensor gives the very same readings again [m, rad]"
+    )
+    stray_s: Positive = Field(
+        default=10.0, description="stamps farther from those around, and frames from odometry, are left out [s]"
+    )
+    step_s: Positive = Field(default=1.0, description="smallest step of a clock that is repaired [s]")
+    around: int = Field(default=9, ge=3, le=999, description="messages that a stamp is compared with; an odd number")
+
+    @field_validator("around")
+    @classmethod
+    def _odd(cls, around: int) -> int:
+        if around % 2 == 0:
+            raise ValueError(f"must be an odd number, not {around}")
+        return around
+
+
+class NoiseConfig(Section):
+    """Noise levels that a run starts from, where the sensor states none."""
+
+    sigma_range_m: Positive = Field(default=0.1, description="standard deviation of ranges [m]")
+    sigma_bearing_rad: Positive = Field(default=0.02, description="standard deviation of bearings [rad]")
+    forward_by_distance: Positive = Field(default=0.05, description="of forward motion, by distance [m/sqrt(m)]")
+    forward_by_turn: Positive = Field(default=0.05, description="of forward motion, by angle turned [m/sqrt(rad)]")
+    sideways_by_distance: Positive = Field(default=0.03, description="of sideways motion, by distance [m/sqrt(m)]")
+    turn_by_time: Positive = Field(default=0.01, description="of turning, by time [rad/sqrt(s)]")
+    turn_by_turn: Positive = Field(default=0.05, description="of turning, by angle turned [rad/sqrt(rad)]")
+    pseudo_count: Positive = Field(default=1.0, description="residuals that these levels count for in what is learned")
+
+
 class SlamConfig(Section):
     """The estimator."""
 
@@ -93,6 +166,11 @@ class SlamConfig(Section):
     )
     changes: ChangesConfig = Field(
         default_factory=ChangesConfig, description="method 'joint': which landmarks moved together"
+    )
+    noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise levels to start from")
+    check: CheckConfig = Field(default_factory=CheckConfig, description="what makes a recording odd")
+    cleaning: CleaningConfig = Field(
+        default_factory=CleaningConfig, description="what is impossible in the recording of a session"
     )
 
 

@@ -19,32 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from evermap.config import Config, SensorConfig
+from evermap.config import CheckConfig, Config, SensorConfig
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Odometry, ParameterEstimate, Recording
 from evermap.valid import check_landmarks, validate
 
-LAGS_S = (1.0, 4.0)
-"""Pairs of sightings are at least so far apart in time, and at most twice as far."""
-MOST_PAIRS = 1000
-"""Pairs that are compared for each lag; more say no more."""
-FITS = 0.03
-"""Difference between two readings of one landmark that surprises nobody, as a share of the range and in radians."""
-APART = 3.0
-"""A pair tells two explanations apart if they differ by so many median residuals."""
-AGREED = 0.8
-"""Share of the pairs that tell apart which have to come nearer by undoing a mistake, before it is told."""
-FEWEST = 20
-"""Fewest pairs that decide."""
-GAIN = 20.0
-"""A mistake raises the log likelihood of all pairs by more than this."""
-OFF = 0.3
-"""Median residual beyond which readings and odometry have nothing to do with each other."""
-OWN_IDS = 50
-"""From so many landmarks on, hardly any seen twice, it is no recording of landmarks at all."""
-FAR_OFF = 5.0
-"""A calibration state so many standard deviations of its prior away is told."""
+USUAL = CheckConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +61,9 @@ class Check:
     warnings: tuple[str, ...]
 
     @classmethod
-    def of(cls, recording: Recording, *, identities: bool = True) -> Check:
+    def of(cls, recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> Check:
         """Count and compare; arguments as `findings`."""
-        found = findings(recording, identities=identities)
+        found = findings(recording, identities=identities, settings=settings)
         return cls(recording.name, recording.source, _contents(recording), found, recording.warnings)
 
     @property
@@ -202,40 +183,41 @@ def _longer(factor: float) -> Mistake:
     return Mistake("length-unit", message, lengths=factor)
 
 
-def findings(recording: Recording, *, identities: bool = True) -> tuple[Finding, ...]:
+def findings(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[Finding, ...]:
     """Everything that is odd about a valid recording, the worst first.
 
     Args:
         recording: valid, with the sensor's limits in force. Its truth is not looked at.
         identities: False where the identities of its detections are not used.
+        settings: what counts as odd.
     """
-    found = [*_motion(recording), *_limits(recording)]
+    found = [*_motion(recording, settings), *_limits(recording)]
     if identities:
-        found += _identities(recording)
+        found += _identities(recording, settings)
     return tuple(sorted(found, key=lambda finding: finding.usable))
 
 
-def odd(recording: Recording, *, identities: bool = True) -> tuple[str, ...]:
+def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
     """What `findings` has, as warnings of a run.
 
     Raises:
         DataError: identities that would cost gigabytes and tell nothing.
     """
-    found = findings(recording, identities=identities)
+    found = findings(recording, identities=identities, settings=settings)
     for finding in found:
         if finding.code == "own-identities" and not finding.usable:
-            raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and --unknown-ids")
+            raise DataError(f"{recording.name}: {finding.message}", hint="leave landmark_id empty, and `unknown_ids`")
     return tuple(finding.message for finding in found)
 
 
-def far_off(parameters: Sequence[ParameterEstimate]) -> tuple[str, ...]:
-    """A warning for every calibration state that a run found far outside of what its prior expects."""
+def far_off(parameters: Sequence[ParameterEstimate], settings: CheckConfig = USUAL) -> tuple[str, ...]:
+    """Return a warning for every calibration state that a run found far outside of what its prior expects."""
     told = []
     for state in parameters:
         if state.fixed or not state.prior_sigma > 0.0:
             continue
         away = abs(state.value - state.prior_mean) / state.prior_sigma
-        if away > FAR_OFF:
+        if away > settings.far_off:
             told.append(
                 f"{state.name} = {state.value:.3g} {state.unit}".removesuffix(" 1")
                 + f" is {away:.0f} standard deviations from what sensors do: {_CAUSES[state.name]}"
@@ -335,33 +317,33 @@ def _limits(recording: Recording) -> list[Finding]:
     return found
 
 
-def _identities(recording: Recording) -> list[Finding]:
+def _identities(recording: Recording, settings: CheckConfig) -> list[Finding]:
     """Identities that never come back."""
     detections = recording.detections
     known = detections.landmark_id != UNKNOWN
     pairs = np.unique(np.column_stack([detections.landmark_id, detections.frame])[known], axis=0)
     frames_of_landmark = np.unique(pairs[:, 0], return_counts=True)[1]
     count, again = len(frames_of_landmark), int(np.sum(frames_of_landmark > 1))
-    if count < FEWEST or again > 0.1 * count:
+    if count < settings.fewest or again > 0.1 * count:
         return []
     message = (
         f"{count} landmarks in {int(known.sum())} detections, {again} of them seen more than once: landmark_id has to "
         "name the thing that was seen, the same each time, not the detection"
     )
-    return [Finding("own-identities", message, usable=count < OWN_IDS)]
+    return [Finding("own-identities", message, usable=count < settings.own_ids)]
 
 
-def _motion(recording: Recording) -> list[Finding]:
+def _motion(recording: Recording, settings: CheckConfig) -> list[Finding]:
     """Mistakes that make landmarks move that stand still."""
-    first, second = _pairs(recording)
-    if len(first) < FEWEST:
+    first, second = _pairs(recording, settings)
+    if len(first) < settings.fewest:
         return []
     pairs = _Pairs(recording, first, second)
     odometry = recording.odometry
     speed = np.abs(np.concatenate([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps]))
     if speed.max() < 1e-9:
         moved = np.hypot(*pairs.residual(_HONEST)) > 0.1
-        if np.sum(moved) < FEWEST or np.mean(moved) < 0.1:
+        if np.sum(moved) < settings.fewest or np.mean(moved) < 0.1:
             return []
         message = (
             f"the odometry is zero throughout, but {np.mean(moved):.0%} of the landmarks seen again within seconds "
@@ -371,13 +353,13 @@ def _motion(recording: Recording) -> list[Finding]:
     undone = _HONEST
     found: list[Finding] = []
     for _ in range(3):
-        mistake = _likeliest(pairs, undone, {finding.code for finding in found})
+        mistake = _likeliest(pairs, undone, {finding.code for finding in found}, settings)
         if mistake is None:
             break
         found.append(Finding(mistake.code, mistake.message, usable=False))
         undone = mistake.after(undone)
     off = float(np.median(np.hypot(*pairs.residual(undone))))
-    if off > OFF:
+    if off > settings.off:
         message = (
             "landmarks do not stand still: seen again within seconds, half of them are over "
             f"{off:.2g} rad or {off:.0%} of their range from where odometry says; mixed identities, or a mistake in "
@@ -387,7 +369,7 @@ def _motion(recording: Recording) -> list[Finding]:
     return found
 
 
-def _likeliest(pairs: _Pairs, undone: Mistake, told: set[str]) -> Mistake | None:
+def _likeliest(pairs: _Pairs, undone: Mistake, told: set[str], settings: CheckConfig) -> Mistake | None:
     """The mistake that explains most of what is left, if it surely explains anything."""
     before = pairs.residual(undone)
     candidates = [*_UNITS, *_ANGLES, *(_longer(factor) for factor in _FACTORS)]
@@ -396,17 +378,21 @@ def _likeliest(pairs: _Pairs, undone: Mistake, told: set[str]) -> Mistake | None
         (loss, mistake)
         for mistake in candidates
         if mistake.code not in told
-        for loss in [_nearer(before, pairs.residual(mistake.after(undone)))]
+        for loss in [_nearer(before, pairs.residual(mistake.after(undone)), settings)]
         if loss is not None
     ]
     if not scored:
         return None
     least, best = min(scored, key=lambda pair: pair[0])
+
+    def left(mistake: Mistake) -> float:
+        return _loss(pairs.residual(mistake.after(undone)), settings)
+
     if best.code == "clock":
         near_s = [best.delay_s + 0.1 * step for step in range(-5, 6)]
-        return min(map(_late, near_s), key=lambda mistake: _loss(pairs.residual(mistake.after(undone))))
+        return min(map(_late, near_s), key=left)
     if best.code == "length-unit":  # a unit that has a name is likelier than a factor that has none
-        gain = _loss(before) - least
+        gain = _loss(before, settings) - least
         named = [
             mistake
             for loss, mistake in scored
@@ -415,27 +401,27 @@ def _likeliest(pairs: _Pairs, undone: Mistake, told: set[str]) -> Mistake | None
         if named:
             return named[0]
         near = [_longer(best.lengths * 10.0 ** (0.01 * step)) for step in range(-10, 11)]
-        return min(near, key=lambda mistake: _loss(pairs.residual(mistake.after(undone))))
+        return min(near, key=left)
     return best
 
 
-def _nearer(before: FloatArray, after: FloatArray) -> float | None:
+def _nearer(before: FloatArray, after: FloatArray, settings: CheckConfig) -> float | None:
     """Loss of the residuals (2, P) after undoing a mistake, if almost all pairs that tell come nearer by it."""
     was, now = np.hypot(*before), np.hypot(*after)
     apart = np.hypot(after[0] - before[0], se2.wrap(after[1] - before[1]))
-    telling = apart > max(FITS, APART * min(float(np.median(was)), float(np.median(now))))
-    if np.sum(telling) < FEWEST or np.mean(now[telling] < was[telling]) < AGREED:
+    telling = apart > max(settings.fits, settings.apart * min(float(np.median(was)), float(np.median(now))))
+    if np.sum(telling) < settings.fewest or np.mean(now[telling] < was[telling]) < settings.agreed:
         return None
-    loss = _loss(after)
-    return loss if len(was) * (_loss(before) - loss) > GAIN else None
+    loss = _loss(after, settings)
+    return loss if len(was) * (_loss(before, settings) - loss) > settings.gain else None
 
 
-def _loss(residual: FloatArray) -> float:
+def _loss(residual: FloatArray, settings: CheckConfig) -> float:
     """Mean Cauchy loss of residuals (2, P): one wrong identity costs little."""
-    return float(np.mean(np.log1p((np.minimum(np.hypot(*residual), 10.0) / FITS) ** 2)))
+    return float(np.mean(np.log1p((np.minimum(np.hypot(*residual), 10.0) / settings.fits) ** 2)))
 
 
-def _pairs(recording: Recording) -> tuple[IntArray, IntArray]:
+def _pairs(recording: Recording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
     """Rows of detections: two of the same landmark each, within a few seconds and within the odometry's time."""
     detections = recording.detections
     stamp_s = recording.frames.stamp_s[detections.frame]
@@ -448,14 +434,14 @@ def _pairs(recording: Recording) -> tuple[IntArray, IntArray]:
     rows = rows[np.lexsort((stamp_s[rows], detections.landmark_id[rows]))]
     landmark = np.unique(detections.landmark_id[rows], return_inverse=True)[1]
     time_s = stamp_s[rows]
-    spread_s = (np.ptp(time_s) if len(rows) else 0.0) + 4.0 * LAGS_S[-1]
+    spread_s = (np.ptp(time_s) if len(rows) else 0.0) + 4.0 * settings.lags_s[-1]
     place = landmark * spread_s + time_s - (time_s.min() if len(rows) else 0.0)
     chosen = []
-    for lag_s in LAGS_S:
+    for lag_s in settings.lags_s:
         later = np.searchsorted(place, place + lag_s)
         found = np.flatnonzero(later < len(rows))
         found = found[place[later[found]] - place[found] <= 2.0 * lag_s]
-        found = found[np.linspace(0, len(found) - 1, min(len(found), MOST_PAIRS)).astype(np.int64)]
+        found = found[np.linspace(0, len(found) - 1, min(len(found), settings.most_pairs)).astype(np.int64)]
         chosen.append(np.stack([rows[found], rows[later[found]]]))
     first, second = np.concatenate(chosen, axis=1)
     return first, second
@@ -542,4 +528,4 @@ def check_recording(recording: Recording, config: Config | None = None) -> Check
         DataError: nothing can be estimated from it.
     """
     config = config or Config()
-    return Check.of(valid(recording, config.sensor), identities=not config.slam.unknown_ids)
+    return Check.of(valid(recording, config.sensor), identities=not config.slam.unknown_ids, settings=config.slam.check)

@@ -10,29 +10,20 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap.config import CleaningConfig
 from evermap.errors import DataError
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
 
-FASTEST = 100.0
-"""No robot drives [m/s] or turns [rad/s] faster."""
-HARDEST = 20.0
-"""No robot speeds up and slows down again by more than this, [m/s^2] or [rad/s^2]: that is a spike of an encoder."""
-SHARPEST = 2.0
-"""But by so much [m/s or rad/s] it may at any rate: some robots log what they were told, not what they did."""
-TOO_FAR = 2.0
-"""Readings beyond the sensor's largest range by this factor are none; calibration and noise explain less."""
-FAR_FROM_MEDIAN = 100.0
-"""The same, as a factor on the median of all ranges, for a sensor without a largest range."""
-MOVED = 0.1
-"""A robot that moved by so much [m or rad] does not read the very same numbers again, not even in whole pixels."""
+USUAL = CleaningConfig()
 
 
-def clean(recording: Recording) -> Recording:
+def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
     """The recording with what is impossible left out, in the order of time; every kind of repair is a counted warning.
 
     Args:
         recording: columns of equal length; everything else may be wrong. Rows stand in the order of arrival.
+        settings: what is impossible.
 
     Returns:
         A valid recording, maybe an empty one; the same object where nothing was wrong. Repaired are:
@@ -42,27 +33,27 @@ def clean(recording: Recording) -> Recording:
         * clocks that were set back by over 1 s, and clocks of one sensor set forward by over 2 s: taken back,
           to within a few periods of the sensor;
         * frames more than 10 s before or after the odometry: left out;
-        * odometry that is no number, beyond `FASTEST`, or a spike: left out, the row before holds on;
+        * odometry that is no number, faster than any robot, or a spike: left out, the row before holds on;
         * readings that are no number, not positive, or beyond the sensor's reach: left out;
         * readings repeated in the same frame, or in the next one though the robot moved: left out;
         * identities below -1 and classes without a name: unknown; standard deviations that are none: not given.
     """
     remarks: list[str] = []
-    odometry = _odometry(recording.odometry, remarks)
-    detections = _readings(recording, remarks)
-    frames, detections = _in_time(recording.frames, detections, remarks)
-    frames, odometry = _one_clock(frames, odometry, remarks)
-    frames, detections = _while_driving(frames, detections, odometry, remarks)
-    frames, detections = _fresh(frames, detections, odometry, remarks)
+    odometry = _odometry(recording.odometry, settings, remarks)
+    detections = _readings(recording, settings, remarks)
+    frames, detections = _in_time(recording.frames, detections, settings, remarks)
+    frames, odometry = _one_clock(frames, odometry, settings, remarks)
+    frames, detections = _while_driving(frames, detections, odometry, settings, remarks)
+    frames, detections = _fresh(frames, detections, odometry, settings, remarks)
     if not remarks:
         return recording
     warnings = (*recording.warnings, *remarks)
     return replace(recording, odometry=odometry, frames=frames, detections=detections, warnings=warnings)
 
 
-def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
+def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) -> Odometry:
     """Possible velocities at increasing stamps."""
-    stamps = _mended("odometry", odometry.stamp_s, remarks)
+    stamps = _mended("odometry", odometry.stamp_s, settings, remarks)
     order = np.argsort(stamps, kind="stable")
     order = order[np.isfinite(stamps[order])]
     last = np.append(stamps[order][1:] != stamps[order][:-1], True)[: len(order)]
@@ -71,7 +62,7 @@ def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
     if len(kept) < len(stamps) or np.any(np.diff(kept) != 1) or np.any(stamps != odometry.stamp_s):
         odometry = replace(rows_of(odometry, kept), stamp_s=stamps[kept])
     velocity = np.stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
-    possible = np.all(np.abs(velocity) <= FASTEST, axis=0)
+    possible = np.all(np.abs(velocity) <= settings.fastest, axis=0)
     _remark(remarks, "odometry rows that no robot can drive left out", int(np.sum(~possible)))
     odometry, velocity = rows_of(odometry, possible), velocity[:, possible]
     if len(odometry) < 3:
@@ -79,25 +70,24 @@ def _odometry(odometry: Odometry, remarks: list[str]) -> Odometry:
     step_s = np.diff(odometry.stamp_s)
     step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
     step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
-    usual = np.stack([running_median(column) for column in velocity])
-    spike = np.any(np.abs(velocity - usual) > np.maximum(HARDEST * step_s, SHARPEST), axis=0)
+    usual = np.stack([running_median(column, settings.around) for column in velocity])
+    spike = np.any(np.abs(velocity - usual) > np.maximum(settings.hardest * step_s, settings.sharpest), axis=0)
     _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
     return rows_of(odometry, ~spike)
 
 
-def _readings(recording: Recording, remarks: list[str]) -> Detections:
+def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Detections:
     """Detections that a sensor can have made, of frames that exist."""
     detections, sensor = recording.detections, recording.sensor
     ranges = detections.range_m
     real = np.isfinite(ranges) & (ranges > 0.0)
-    reach_m = TOO_FAR * sensor.range_max_m
+    reach_m = settings.too_far * sensor.range_max_m
     if not np.isfinite(reach_m):
-        reach_m = FAR_FROM_MEDIAN * float(np.median(ranges[real])) if real.any() else 0.0
+        reach_m = settings.far_from_median * float(np.median(ranges[real])) if real.any() else 0.0
     far = real & (ranges > reach_m)
     if np.sum(far) > 0.5 * np.sum(real):  # a mistake in the unit, not outliers
-        problem = (
-            f"{int(far.sum())} of {len(far)} ranges lie beyond {TOO_FAR:g} times range_max_m = {sensor.range_max_m:g}"
-        )
+        limit = f"{settings.too_far:g} times range_max_m = {sensor.range_max_m:g}"
+        problem = f"{int(far.sum())} of {len(far)} ranges lie beyond {limit}"
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
     real &= ~far & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
@@ -120,9 +110,11 @@ def _readings(recording: Recording, remarks: list[str]) -> Detections:
     return detections
 
 
-def _in_time(frames: Frames, detections: Detections, remarks: list[str]) -> tuple[Frames, Detections]:
+def _in_time(
+    frames: Frames, detections: Detections, settings: CleaningConfig, remarks: list[str]
+) -> tuple[Frames, Detections]:
     """Frames at increasing stamps, those with equal stamps united, and detections sorted by frame."""
-    stamps = _mended("sensor", frames.stamp_s, remarks)
+    stamps = _mended("sensor", frames.stamp_s, settings, remarks)
     instants: FloatArray = np.unique(stamps[np.isfinite(stamps)])
     sorted_already = np.all(np.diff(detections.frame) >= 0)
     if len(instants) == len(frames) and np.array_equal(instants, frames.stamp_s) and sorted_already:
@@ -140,14 +132,16 @@ def _in_time(frames: Frames, detections: Detections, remarks: list[str]) -> tupl
     return replace(frames, stamp_s=instants), rows_of(detections, np.sort(first))
 
 
-def _one_clock(frames: Frames, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Odometry]:
+def _one_clock(
+    frames: Frames, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
+) -> tuple[Frames, Odometry]:
     """Steps forward that one of the two clocks made alone are taken back, the last one first."""
     for _ in range(len(frames)):
-        step = set_forward(frames.stamp_s, odometry.stamp_s)
+        step = set_forward(frames.stamp_s, odometry.stamp_s, settings)
         if step is not None:
             frames = replace(frames, stamp_s=_taken_back(frames.stamp_s, step, "sensor", remarks))
             continue
-        step = set_forward(odometry.stamp_s, frames.stamp_s)
+        step = set_forward(odometry.stamp_s, frames.stamp_s, settings)
         if step is None:
             break
         odometry = replace(odometry, stamp_s=_taken_back(odometry.stamp_s, step, "odometry", remarks))
@@ -161,15 +155,19 @@ def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks
 
 
 def _while_driving(
-    frames: Frames, detections: Detections, odometry: Odometry, remarks: list[str]
+    frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
 ) -> tuple[Frames, Detections]:
     """Without frames far before the first or after the last odometry: nobody knows what the robot did then."""
     if len(odometry) == 0:
         return frames, detections
-    near = (frames.stamp_s >= odometry.stamp_s[0] - STRAY_S) & (frames.stamp_s <= odometry.stamp_s[-1] + STRAY_S)
+    near = (frames.stamp_s >= odometry.stamp_s[0] - settings.stray_s) & (
+        frames.stamp_s <= odometry.stamp_s[-1] + settings.stray_s
+    )
     if near.all():
         return frames, detections
-    _remark(remarks, f"frames more than {STRAY_S:g} s before or after the odometry left out", int(np.sum(~near)))
+    _remark(
+        remarks, f"frames more than {settings.stray_s:g} s before or after the odometry left out", int(np.sum(~near))
+    )
     return _some_frames(frames, detections, near)
 
 
@@ -180,7 +178,9 @@ def _some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tup
     return replace(frames, stamp_s=frames.stamp_s[kept]), replace(seen, frame=row[seen.frame])
 
 
-def _fresh(frames: Frames, detections: Detections, odometry: Odometry, remarks: list[str]) -> tuple[Frames, Detections]:
+def _fresh(
+    frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
+) -> tuple[Frames, Detections]:
     """Without frames that repeat the one before, number by number, though the robot moved: the sensor hangs.
 
     A single reading may repeat by chance, where a camera counts whole pixels.
@@ -196,25 +196,27 @@ def _fresh(frames: Frames, detections: Detections, odometry: Odometry, remarks: 
         column = getattr(detections, name)
         alike &= column == column[at]
     repeated = (count > 1) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
-    repeated &= _moved_since(np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry)
+    repeated &= _moved_since(
+        np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry, settings.moved
+    )
     if not repeated.any():
         return frames, detections
     _remark(remarks, "frames left out that repeat the one before, though the robot moved", int(repeated.sum()))
     return _some_frames(frames, detections, ~repeated)
 
 
-def _moved_since(row: IntArray, frames: Frames, odometry: Odometry) -> BoolArray:
-    """(F,) whether the robot drove or turned by more than `MOVED` since the frames in `row` (F,)."""
+def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: float) -> BoolArray:
+    """Return (F,) whether the robot drove or turned by more than `most` since the frames in `row` (F,)."""
     speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
     way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
     at = np.stack([np.interp(frames.stamp_s, odometry.stamp_s, column) for column in way])
-    moved: BoolArray = np.any(at - at[:, row] > MOVED, axis=0)
+    moved: BoolArray = np.any(at - at[:, row] > most, axis=0)
     return moved
 
 
-def _mended(what: str, stamp_s: FloatArray, remarks: list[str]) -> FloatArray:
+def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: list[str]) -> FloatArray:
     """(N,) stamps as a clock that is never set back would have shown them, nan where one is none."""
-    stamps, back_s = restored(stamp_s)
+    stamps, back_s = restored(stamp_s, settings)
     real = stamps[np.isfinite(stamps)]
     _remark(remarks, f"stamps of the {what} that are none left out with their rows", len(stamps) - len(real))
     late = int(np.sum(real < np.maximum.accumulate(real))) if len(real) else 0
@@ -230,19 +232,12 @@ def _remark(remarks: list[str], what: str, count: int) -> None:
         remarks.append(f"{what}: {count}")
 
 
-STRAY_S = 10.0
-"""A stamp farther than this from those that arrive around it is none."""
-STEP_S = 1.0
-"""Smallest step of a clock that is noticed; less is taken for messages that come late."""
-AROUND = 9
-"""Messages that a stamp is compared with: fewer than half of them may be late or wrong."""
-
-
-def restored(stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray, FloatArray]:
     """The stamps as a clock that is never set back would have shown them.
 
     Args:
         stamp_s: (N,) in the order of arrival, anything.
+        settings: what is a step, and what a stray stamp.
 
     Returns:
         (N,) stamps, nan where one is none; late ones still stand where they arrived. And (K,) by how much the clock was
@@ -253,29 +248,29 @@ def restored(stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         return stamps, np.zeros(0)
     found = np.flatnonzero(np.isfinite(stamps))
     told = stamps[found]
-    kept = np.abs(told - running_median(told)) <= STRAY_S
+    kept = np.abs(told - running_median(told, settings.around)) <= settings.stray_s
     stamps[found[~kept]] = np.nan
     found, told = found[kept], told[kept]
     forward = np.diff(told)
     forward = forward[forward > 0.0]
     # against a clock that ticks once a message, a loss is a step up, and only a clock that is set back a step down
-    ahead = running_median(told - np.arange(len(told)) * (np.median(forward) if len(forward) else 0.0))
+    ahead = running_median(told - np.arange(len(told)) * (np.median(forward) if len(forward) else 0.0), settings.around)
     fall = np.diff(ahead, prepend=ahead[:1])
-    set_back = fall < -STEP_S
+    set_back = fall < -settings.step_s
     stamps[found] = told - np.cumsum(np.where(set_back, fall, 0.0))
     return stamps, -fall[set_back]
 
 
-def running_median(values: FloatArray) -> FloatArray:
-    """(N,) median of the `AROUND` values centred on each; the first and last are repeated beyond the ends."""
+def running_median(values: FloatArray, around: int) -> FloatArray:
+    """Return (N,) the median of the `around` values centred on each; ends are padded with their values."""
     if len(values) == 0:
         return values
-    padded = np.pad(values, AROUND // 2, mode="edge")
-    middle: FloatArray = np.median(np.lib.stride_tricks.sliding_window_view(padded, AROUND), axis=1)
+    padded = np.pad(values, around // 2, mode="edge")
+    middle: FloatArray = np.median(np.lib.stride_tricks.sliding_window_view(padded, around), axis=1)
     return middle
 
 
-def set_forward(stamp_s: FloatArray, other_s: FloatArray) -> tuple[int, float] | None:
+def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:
     """Whether a clock was set forward, judged by another stream of the same robot.
 
     It was, if this stream seems to end later than the other, and has a pause of just that length in which the other
@@ -284,19 +279,20 @@ def set_forward(stamp_s: FloatArray, other_s: FloatArray) -> tuple[int, float] |
     Args:
         stamp_s: (N,) increasing.
         other_s: (M,) increasing.
+        settings: what is a step.
 
     Returns:
         First row after the step and the step's size [s]; None if it was not.
     """
-    if len(stamp_s) < AROUND or len(other_s) < AROUND:
+    if len(stamp_s) < settings.around or len(other_s) < settings.around:
         return None
     later_s = stamp_s[-1] - other_s[-1]
-    if later_s < 2.0 * STEP_S:
+    if later_s < 2.0 * settings.step_s:
         return None
     pause = np.diff(stamp_s)
     step_s = pause - np.median(pause)
     row = int(np.argmin(np.abs(step_s - later_s)))
-    if abs(step_s[row] - later_s) > STEP_S:
+    if abs(step_s[row] - later_s) > settings.step_s:
         return None
     between = other_s[(other_s > stamp_s[row]) & (other_s < stamp_s[row + 1])]
     longest_s = np.max(np.diff(between, prepend=stamp_s[row], append=min(stamp_s[row + 1], other_s[-1])))

@@ -37,6 +37,7 @@ class Solved:
         prior: of the calibration states.
         step_s: (F,) seconds per processed frame.
         interrupted: True where it was stopped before its end.
+        settings: that it was solved with.
     """
 
     recording: Recording
@@ -46,6 +47,7 @@ class Solved:
     prior: CalibrationPrior
     step_s: FloatArray
     interrupted: bool
+    settings: SlamConfig
 
     @property
     def start_s(self) -> float:
@@ -96,7 +98,7 @@ def solve(
     step_s, interrupted = fed(
         prepared.problem.stamp_s, lambda _: slam.step(), least=2, realtime=realtime, progress=progress
     )
-    return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted)
+    return Solved(recording, prepared, slam.finish(), slam, prior, step_s, interrupted, settings)
 
 
 def fed(

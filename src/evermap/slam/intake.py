@@ -11,7 +11,7 @@ from evermap.config import SlamConfig
 from evermap.errors import DataError
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.noise import START
+from evermap.slam.noise import start_noise
 from evermap.slam.problem import Drive, Noise, Problem, independent
 from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
@@ -107,12 +107,12 @@ def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noi
     prior = CalibrationPrior.from_settings(
         calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix
     )
+    start = start_noise(settings.noise, settings.outlier_log_odds)
     nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]
     detection = np.array(
-        [default if given is None else given for given, default in zip(nominal, START.detection, strict=True)]
+        [default if given is None else given for given, default in zip(nominal, start.detection, strict=True)]
     )
-    odometry = START.odometry * settings.odometry_noise_factor
-    return prior, replace(START, detection=detection, odometry=odometry, outlier_log_odds=settings.outlier_log_odds)
+    return prior, replace(start, detection=detection, odometry=start.odometry * settings.odometry_noise_factor)
 
 
 def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:

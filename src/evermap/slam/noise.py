@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import NoiseConfig
 from evermap.slam.kernels import (
     detection_residual,
     kernel,
@@ -26,14 +27,31 @@ from evermap.slam.preintegration import Intervals, linearise_interval
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
 
-START = Noise(
-    detection=np.array([0.1, 0.02]),
-    odometry=np.array([0.05, 0.05, 0.03, 0.01, 0.05]),
-    outlier_log_odds=7.0,
-)
-"""Deliberately wide: too much noise converges from far away, too little locks the first mistake in."""
-PSEUDO_COUNT = 1.0
-"""Weight of the start values, in residuals: keeps levels finite that a recording says nothing about."""
+
+def start_noise(settings: NoiseConfig, outlier_log_odds: float = 7.0) -> Noise:
+    """Return the levels that a run starts from; wide: too little noise would lock the first mistake in.
+
+    Args:
+        settings: the levels.
+        outlier_log_odds: see `Noise`.
+    """
+    return Noise(
+        detection=np.array([settings.sigma_range_m, settings.sigma_bearing_rad]),
+        odometry=np.array(
+            [
+                settings.forward_by_distance,
+                settings.forward_by_turn,
+                settings.sideways_by_distance,
+                settings.turn_by_time,
+                settings.turn_by_turn,
+            ]
+        ),
+        outlier_log_odds=outlier_log_odds,
+        pseudo_count=settings.pseudo_count,
+    )
+
+
+START = start_noise(NoiseConfig())
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +80,9 @@ def refine_noise(
         marginals: covariances at `estimate`, made with `noise`.
         weights: (M,) inlier probabilities.
         noise: levels so far.
-        start: levels that `PSEUDO_COUNT` imaginary residuals vouch for.
+        start: levels that `start.pseudo_count` imaginary residuals vouch for.
     """
-    free = problem.prior.free
+    free, pseudo = problem.prior.free, start.pseudo_count
     squares, counts = _detection_sums(
         estimate.pose,
         estimate.landmark,
@@ -81,7 +99,7 @@ def refine_noise(
         marginals.pose_shared,
         marginals.shared,
     )
-    detection = np.sqrt((squares + PSEUDO_COUNT * start.detection**2) / (counts + PSEUDO_COUNT))
+    detection = np.sqrt((squares + pseudo * start.detection**2) / (counts + pseudo))
     pulls, chances, fisher = _odometry_sums(
         estimate.pose,
         problem.drive.between(problem.stamp_s, estimate.states),
@@ -95,11 +113,11 @@ def refine_noise(
     # tr(W P_k) is a count only after multiplying by the variance
     count = np.maximum(noise.odometry**2 * chances, 0.0)
     squares_odometry = noise.odometry**4 * pulls
-    odometry = np.sqrt((squares_odometry + PSEUDO_COUNT * start.odometry**2) / (count + PSEUDO_COUNT))
+    odometry = np.sqrt((squares_odometry + pseudo * start.odometry**2) / (count + pseudo))
     return NoiseFit(
         Noise(detection, odometry, noise.outlier_log_odds),
-        1.0 / np.sqrt(2.0 * (counts + PSEUDO_COUNT)),
-        np.sqrt(_inflation(fisher) / (2.0 * (count + PSEUDO_COUNT))),
+        1.0 / np.sqrt(2.0 * (counts + pseudo)),
+        np.sqrt(_inflation(fisher) / (2.0 * (count + pseudo))),
     )
 
 

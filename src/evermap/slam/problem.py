@@ -212,11 +212,14 @@ class Noise:
         detection: (2,) range [m] and bearing [rad].
         odometry: (5,) in the order of `kernels.NOISE_NAMES`.
         outlier_log_odds: half the squared normalised residual at which an outlier is as likely as an inlier.
+        pseudo_count: residuals that these levels count for where others are learned from them: keeps levels finite that
+            a recording says nothing about.
     """
 
     detection: FloatArray
     odometry: FloatArray
     outlier_log_odds: float
+    pseudo_count: float = 1.0
 
     def of_detections(self, sigma_given: FloatArray) -> FloatArray:
         """(M, 2) standard deviation of every detection: its own where it came with one."""

@@ -74,7 +74,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None 
         misses = find_misses(rows, poses, recording.detections, in_map, recording.frames.stamp_s, recording.sensor)
         in_map = with_misses(in_map, misses)
     states = described(outcome.estimate.states, outcome.states_covariance, outcome.noise, solved.prior)
-    warnings = [*prepared.warnings, *far_off(states)]
+    warnings = [*prepared.warnings, *far_off(states, solved.settings.check)]
     if solved.interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
         warnings.append(f"interrupted after {done_s:.0f} of {all_s:.0f} s of the recording")
