@@ -82,7 +82,7 @@ class watched(_Block):  # noqa: N801 (used as a function)
 
 
 def raises() -> bool:
-    """Whether a signal may raise an exception here; after `leave_on_signals` none does."""
+    """Return whether a signal may raise an exception here; after `leave_on_signals` none does."""
     return signal.getsignal(signal.SIGINT) is not _leave
 
 

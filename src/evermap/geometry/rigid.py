@@ -22,7 +22,7 @@ def consensus(
     landmark: IntArray | None = None,
     weight: FloatArray | None = None,
 ) -> tuple[FloatArray, BoolArray]:
-    """The motion that brings most points near their partners: every motion that two of them suggest is asked.
+    """Return the motion that brings most points near their partners: every motion that two of them suggest is asked.
 
     Args:
         source: (k, 2) points.
@@ -57,7 +57,7 @@ def consensus(
 
 
 def rigid(source: FloatArray, target: FloatArray, weight: FloatArray | None = None) -> FloatArray:
-    """(..., 3) rotation and translation that brings points (..., k, 2) onto others, least squares; weights (..., k)."""
+    """Return the least-squares motion (..., 3) of points (..., k, 2) onto others, with weights (..., k)."""
     share = np.ones(source.shape[:-1]) if weight is None else weight
     share = (share / share.sum(axis=-1, keepdims=True))[..., None]
     middle, to = (share * source).sum(axis=-2), (share * target).sum(axis=-2)

@@ -12,13 +12,13 @@ from evermap.types import FloatArray, IntArray
 
 
 def wrap(angle_rad: ArrayLike) -> FloatArray:
-    """Angles wrapped to (-pi, pi]."""
+    """Return angles wrapped to (-pi, pi]."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
 
 
 def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """`a * b`: the pose `b`, given in the frame `a`. Shapes (..., 3), broadcast."""
+    """Return `a * b`: the pose `b`, given in the frame `a`. Shapes (..., 3), broadcast."""
     a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
@@ -27,7 +27,7 @@ def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
 
 
 def inverse(a: ArrayLike) -> FloatArray:
-    """The motion that undoes `a`. Shape (..., 3)."""
+    """Return the motion that undoes `a`. Shape (..., 3)."""
     a = np.asarray(a, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
     x = -c * a[..., 0] - s * a[..., 1]
@@ -36,12 +36,12 @@ def inverse(a: ArrayLike) -> FloatArray:
 
 
 def between(a: ArrayLike, b: ArrayLike) -> FloatArray:
-    """`a^-1 * b`: the pose `b` seen from `a`. Shapes (..., 3), broadcast."""
+    """Return `a^-1 * b`: the pose `b` seen from `a`. Shapes (..., 3), broadcast."""
     return compose(inverse(a), b)
 
 
 def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
-    """Points (..., 2) of the frame `pose` in the frame that `pose` is given in."""
+    """Return points (..., 2) of the frame `pose` in the frame that `pose` is given in."""
     pose, point = np.asarray(pose, dtype=np.float64), np.asarray(point, dtype=np.float64)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = pose[..., 0] + c * point[..., 0] - s * point[..., 1]
@@ -50,7 +50,7 @@ def transform(pose: ArrayLike, point: ArrayLike) -> FloatArray:
 
 
 def move_together(point: ArrayLike, displacement: ArrayLike, turn_rad: float = 0.0) -> FloatArray:
-    """Points (N, 2) moved as one rigid body: turned about their centroid, which itself moves by `displacement`.
+    """Return points (N, 2) moved as one rigid body: turned about their centroid, which itself moves by `displacement`.
 
     `move_together(moved, -displacement, -turn_rad)` undoes it.
     """
@@ -60,7 +60,7 @@ def move_together(point: ArrayLike, displacement: ArrayLike, turn_rad: float = 0
 
 
 def exp(twist: ArrayLike) -> FloatArray:
-    """Motion along a constant twist (forward, left, turn) for unit time. Shape (..., 3)."""
+    """Return motion along a constant twist (forward, left, turn) for unit time. Shape (..., 3)."""
     twist = np.asarray(twist, dtype=np.float64)
     turn = twist[..., 2]
     sinc = np.sinc(turn / np.pi)
@@ -72,7 +72,7 @@ def exp(twist: ArrayLike) -> FloatArray:
 
 
 def log(pose: ArrayLike) -> FloatArray:
-    """The twist whose `exp` is `pose`, of smallest turn. Shape (..., 3)."""
+    """Return the twist whose `exp` is `pose`, of smallest turn. Shape (..., 3)."""
     pose = np.asarray(pose, dtype=np.float64)
     turn = wrap(pose[..., 2])
     half = turn / 2
@@ -85,7 +85,7 @@ def log(pose: ArrayLike) -> FloatArray:
 
 
 def adjoint(pose: ArrayLike) -> FloatArray:
-    """Adjoint matrices (..., 3, 3): `pose * exp(xi) = exp(Ad xi) * pose`."""
+    """Return adjoint matrices (..., 3, 3): `pose * exp(xi) = exp(Ad xi) * pose`."""
     pose = np.asarray(pose, dtype=np.float64)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     out = np.zeros((*pose.shape[:-1], 3, 3))
@@ -96,19 +96,19 @@ def adjoint(pose: ArrayLike) -> FloatArray:
 
 
 def rotation(angle_rad: ArrayLike) -> FloatArray:
-    """Rotation matrices (..., 2, 2)."""
+    """Return rotation matrices (..., 2, 2)."""
     angle = np.asarray(angle_rad, dtype=np.float64)
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
 
 
 def xy_rows(rows: ArrayLike) -> IntArray:
-    """(2 k,) rows of x and y, by turns, of points (k,) in a vector or covariance of all points together."""
+    """Return (2 k,) rows of x and y, interleaved, of points (k,) in a vector or covariance of all points together."""
     return np.asarray(2 * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(2)).ravel()
 
 
 def rigid_directions(point: ArrayLike) -> FloatArray:
-    """(2 k, 3) how points (k, 2) move, x and y by turns, when all of them are shifted along x, along y, and turned."""
+    """Return (2 k, 3) derivatives of points (k, 2), x and y interleaved, by a shift along x, along y, and a turn."""
     at = np.asarray(point, dtype=np.float64)
     columns = np.zeros((2 * len(at), 3))
     columns[0::2, 0] = columns[1::2, 1] = 1.0

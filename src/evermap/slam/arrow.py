@@ -197,7 +197,7 @@ def assemble(
 
 @kernel
 def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
-    """Newton step (Levenberg-Marquardt with `damping`) and, if wanted, covariances.
+    """Return the Newton step (Levenberg-Marquardt with `damping`) and, if wanted, covariances.
 
     Eliminates pose after pose (block Cholesky of the chain), solves the border's Schur complement, and returns along
     the chain.
@@ -279,7 +279,7 @@ def solve(normal: Normal, damping: float, covariances: bool) -> Solution:
 
 @kernel
 def eliminate_chain(normal: Normal) -> tuple[FloatArray, FloatArray]:
-    """Information (3 + G, 3 + G) and right side (3 + G,) that are left for the last pose and the shared numbers."""
+    """Return information (3 + G, 3 + G) and right side (3 + G,) of the last pose and the shared numbers."""
     n, shared = len(normal.diagonal), len(normal.corner)
     off = normal.off
     border, gain = normal.border.copy(), np.empty((n - 1, 3, shared))
@@ -332,7 +332,7 @@ class Smoother:
             )
 
     def optimum(self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6) -> Estimate:
-        """Damped Gauss-Newton from `start` until no step moves anything by more than `tolerance` (m or rad)."""
+        """Run damped Gauss-Newton from `start` until no step moves anything by more than `tolerance` (m or rad)."""
         estimate = start
         normal = self.normal(estimate)
         damping = 0.0
@@ -355,15 +355,15 @@ class Smoother:
         return estimate
 
     def cost(self, estimate: Estimate) -> float:
-        """Negative log posterior up to a constant."""
+        """Return the negative log posterior up to a constant."""
         return float(self.normal(estimate).cost)
 
     def inlier_probability(self, estimate: Estimate) -> FloatArray:
-        """(M,) probability of every detection to be no outlier, given the estimate."""
+        """Return (M,) probability of every detection to be no outlier, given the estimate."""
         return self.normal(estimate).weights
 
     def marginals(self, estimate: Estimate) -> Marginals:
-        """Covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero."""
+        """Return covariances of the Gaussian approximation at `estimate`; rows of unknown landmarks are zero."""
         known = np.append(np.repeat(estimate.known, 2), np.ones(9, dtype=bool))
         solved = solve(self.normal(estimate), 0.0, True)
         shared = np.zeros((len(known), len(known)))
@@ -373,7 +373,7 @@ class Smoother:
         return Marginals(solved.cov_pose, solved.cov_next, cross, shared)
 
     def summary(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-        """What the problem says about its last pose, its known landmarks and the states, linearised at `estimate`.
+        """Return information on the last pose, the known landmarks and the states, linearised at `estimate`.
 
         Returns:
             `R` upper triangular (n, n) and `d` (n,), n = 3 + 2 known landmarks + 9: the cost of a step `x` is
@@ -384,7 +384,7 @@ class Smoother:
         return root, solve_triangular(root, right, trans="T")
 
     def newest(self, estimate: Estimate) -> FloatArray:
-        """(3 + 2 K + 9,) squared: joint covariance of the last pose, the known landmarks and the states."""
+        """Return (3 + 2 K + 9,) squared: joint covariance of the last pose, the known landmarks and the states."""
         information, _ = eliminate_chain(self.normal(estimate))
         try:
             root = np.linalg.inv(np.linalg.cholesky(0.5 * (information + information.T)))
@@ -400,7 +400,7 @@ class Smoother:
         return self._information
 
     def normal(self, estimate: Estimate) -> Normal:
-        """The problem linearised at `estimate`; landmarks without position are left out."""
+        """Return the problem linearised at `estimate`; landmarks without position are left out."""
         if self._last is not None and self._last[0] is estimate:
             return self._last[1]
         problem, noise = self.problem, self.noise

@@ -1,4 +1,4 @@
-"""Between two stock-takings: one Gaussian of the newest pose and the border, step by step.
+"""One Gaussian of the newest pose and the border, step by step.
 
 The border, that is the calibration states and the places of landmarks, is small, and given the newest pose the older
 ones say nothing more about the next detection. So a step predicts the newest pose by its odometry, marginalises the
@@ -60,7 +60,7 @@ class BorderFilter:
         self._new_pose: list[FloatArray] = []
 
     def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
-        """Begin anew at an optimum of all poses so far."""
+        """Restart at an optimum of all poses so far."""
         self.problem, self._noise = problem, noise
         smoother = Smoother(problem.until(len(estimate.pose)), noise, heavy=True, robust=self._robust)
         covariance = smoother.newest(estimate)
@@ -98,30 +98,30 @@ class BorderFilter:
         self._new_pose.append(self._pose.copy())
 
     def last_pose(self) -> FloatArray:
-        """(3,) the newest pose."""
+        """Return (3,) the newest pose."""
         return self._pose.copy()
 
     def last_covariance(self) -> FloatArray:
-        """(3, 3) its covariance, in its own frame."""
+        """Return (3, 3) its covariance, in its own frame."""
         return self._covariance[:3, :3].copy()
 
     def states(self) -> FloatArray:
-        """(9,) calibration states."""
+        """Return (9,) calibration states."""
         return self._states.copy()
 
     def landmark(self, row: int) -> FloatArray:
-        """(2,) one place; nan where it is not known yet."""
+        """Return (2,) one place; nan where it is not known yet."""
         slot = self._slot.get(row)
         return np.full(2, np.nan) if slot is None else self._place[slot].copy()
 
     def estimate(self) -> Estimate:
-        """Values of everything so far; poses since the last restart as they were when they were added."""
+        """Return values of everything so far; poses since the last restart as they were when they were added."""
         landmark = np.full((len(self.problem.landmark_mean), 2), np.nan)
         landmark[list(self._slot)] = self._place
         return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self._states.copy())
 
     def joint_covariance(self, places: IntArray) -> FloatArray:
-        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
+        """Return (12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
         slots = np.array([self._slot[j] for j in places.tolist()], dtype=np.int64)
         columns = AT_PLACES + (2 * slots[:, None] + [0, 1]).ravel()
         rows = np.concatenate([np.arange(AT_PLACES), columns])
@@ -158,7 +158,7 @@ class BorderFilter:
 def drive_on(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
 ) -> None:
-    """The newest pose becomes the next one, in place: its pose and the joint covariance."""
+    """Advance the newest pose and the joint covariance to the next pose, in place."""
     pose[:] = composed(pose, increment)
     pose[2] = wrapped(pose[2])
     size = len(covariance)

@@ -36,7 +36,7 @@ def bridged(
     states: FloatArray,
     noise: Noise,
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses and covariances at any stamps, given the smoothed ones.
+    """Return poses and covariances at any stamps, given the smoothed ones.
 
     Args:
         stamp_s: (K,) where poses are wanted; before the first and after the last pose it is dead reckoning.
@@ -78,7 +78,7 @@ def _semidefinite(covariance: FloatArray) -> FloatArray:
 
 
 def dead_reckoned(stamp_s: FloatArray, drive: Drive, states: FloatArray, noise: Noise) -> tuple[FloatArray, FloatArray]:
-    """Odometry alone from (0, 0, 0) at the first stamp: (K, 3) poses and (K, 3, 3) covariances."""
+    """Return odometry alone from (0, 0, 0) at the first stamp: (K, 3) poses and (K, 3, 3) covariances."""
     out, spread = np.zeros((len(stamp_s), 3)), np.zeros((len(stamp_s), 3, 3))
     _reckon(stamp_s, drive.stamp_s, drive.velocity, drive.unknown, states, noise.odometry**2, out, spread)
     return out, spread

@@ -60,7 +60,7 @@ class CalibrationPrior:
 
     @classmethod
     def from_settings(cls, *, calibrated: bool, fix: dict[str, float]) -> CalibrationPrior:
-        """The default priors, all states free unless `calibrated` is False, and some fixed by name.
+        """Return the default priors, all states free unless `calibrated` is False, and some fixed by name.
 
         Raises:
             ConfigError: `fix` names an unknown state.
@@ -80,7 +80,7 @@ class CalibrationPrior:
         return cls(mean, sigma, free)
 
     def without_scale(self) -> CalibrationPrior:
-        """The prior of the states that a recording without a prior map can tell, in the metres of the range sensor.
+        """Return the prior of the states that are observable without a prior map, in the metres of the range sensor.
 
         Range slope, forward scale and the size of the whole map trade off exactly: `1 + a1` times the map with
         `k_v / (1 + a1)` explains every reading as well. So the graph holds `a1` at its mean, lets the forward scale

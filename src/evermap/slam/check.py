@@ -72,7 +72,7 @@ class Check:
         return all(finding.usable for finding in self.findings)
 
     def as_dict(self) -> dict[str, Any]:
-        """Everything as plain values with stable keys, for JSON."""
+        """Return everything as plain values with stable keys, for JSON."""
         return {
             "usable": self.usable,
             "recording": {"name": self.name, "source": self.source},
@@ -104,7 +104,7 @@ class Mistake:
     delay_s: float = 0.0
 
     def after(self, other: Mistake) -> Mistake:
-        """Both, the other one undone first."""
+        """Return both, the other one undone first."""
         return Mistake(
             self.code,
             self.message,
@@ -184,7 +184,7 @@ def _longer(factor: float) -> Mistake:
 
 
 def findings(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[Finding, ...]:
-    """Everything that is odd about a valid recording, the worst first.
+    """Return everything that is odd about a valid recording, the worst first.
 
     Args:
         recording: valid, with the sensor's limits in force. Its truth is not looked at.
@@ -198,7 +198,7 @@ def findings(recording: Recording, *, identities: bool = True, settings: CheckCo
 
 
 def odd(recording: Recording, *, identities: bool = True, settings: CheckConfig = USUAL) -> tuple[str, ...]:
-    """What `findings` has, as warnings of a run.
+    """Return what `findings` has, as warnings of a run.
 
     Raises:
         DataError: identities that would cost gigabytes and tell nothing.
@@ -462,7 +462,7 @@ class _Pairs:
         self._motions: dict[tuple[float, float, float], tuple[FloatArray, FloatArray]] = {}
 
     def residual(self, mistake: Mistake) -> FloatArray:
-        """(2, P) second reading minus what the first one and the odometry predict: log range, and bearing."""
+        """Return (2, P) second reading minus what the first one and the odometry predict: log range, and bearing."""
         start, stop = self._poses(mistake.forward, mistake.turn, mistake.delay_s)
         metres = np.array([1.0 / mistake.lengths, 1.0 / mistake.lengths, 1.0])
         mount = self._mount * metres

@@ -19,7 +19,7 @@ USUAL = CleaningConfig()
 
 
 def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
-    """The recording with what is impossible left out, in the order of time; every kind of repair is a counted warning.
+    """Return the recording in order of time, impossible values left out; every kind of repair is a counted warning.
 
     Args:
         recording: columns of equal length; everything else may be wrong. Rows stand in the order of arrival.
@@ -233,7 +233,7 @@ def _remark(remarks: list[str], what: str, count: int) -> None:
 
 
 def restored(stamp_s: FloatArray, settings: CleaningConfig) -> tuple[FloatArray, FloatArray]:
-    """The stamps as a clock that is never set back would have shown them.
+    """Return the stamps as a clock that is never set back would have shown them.
 
     Args:
         stamp_s: (N,) in the order of arrival, anything.
@@ -271,7 +271,7 @@ def running_median(values: FloatArray, around: int) -> FloatArray:
 
 
 def set_forward(stamp_s: FloatArray, other_s: FloatArray, settings: CleaningConfig) -> tuple[int, float] | None:
-    """Whether a clock was set forward, judged by another stream of the same robot.
+    """Return whether a clock was set forward, judged by another stream of the same robot.
 
     It was, if this stream seems to end later than the other, and has a pause of just that length in which the other
     goes on.

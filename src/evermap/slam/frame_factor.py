@@ -36,7 +36,7 @@ def whitened_odometry(
     by_pose: FloatArray,
     by_states: FloatArray,
 ) -> None:
-    """Odometry residual times the inverse Cholesky factor of its covariance; all outputs have three rows."""
+    """Whiten the odometry residual by the inverse Cholesky factor of its covariance; all outputs have three rows."""
     increment, motion, noise, covariance = np.zeros(3), np.zeros((3, 4)), np.zeros((5, 3, 3)), np.zeros((3, 3))
     integrate_odometry(odometry_stamp, velocity, unknown, start, stop, states, increment, motion, noise, covariance)
     for kind in range(len(variance)):
@@ -67,7 +67,7 @@ def whitened_detections(
     by_points: FloatArray,
     by_states: FloatArray,
 ) -> None:
-    """Detection residuals over their sigma and times the root of their robust weight, two rows a detection."""
+    """Whiten the detection residuals, with the root of their robust weight; two rows a detection."""
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     for m in range(len(reading)):
         detection_residual(pose, points[column[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
@@ -100,7 +100,7 @@ def linearise_frame(
     jacobian: FloatArray,
     column: IntArray,
 ) -> None:
-    """Residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
+    """Compute residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
 
     The step of the pose is told in the frame of where it started, from which it has `turned` by now.
     """
@@ -126,7 +126,7 @@ def linearise_frame(
 def spread_of_frame(
     covariance: FloatArray, jacobian: FloatArray, column: IntArray, gain: FloatArray, spread: FloatArray
 ) -> None:
-    """`H P` (2 M, size) and `H P H'` (2 M, 2 M)."""
+    """Compute `H P` (2 M, size) and `H P H'` (2 M, 2 M)."""
     gain[:] = 0.0
     for row in range(len(jacobian)):
         for a in range(10):
@@ -144,7 +144,7 @@ def spread_of_frame(
 
 @kernel
 def turn_pose(covariance: FloatArray, turned: float) -> None:
-    """The covariance of the pose belongs to its own frame, which has turned."""
+    """Rotate the covariance of the pose into its own frame, which has turned."""
     c, s = math.cos(turned), math.sin(turned)
     for k in range(len(covariance)):
         x, y = covariance[0, k], covariance[1, k]

@@ -45,7 +45,7 @@ class Prepared:
     names: Mapping[int, str] = field(default_factory=dict)
 
     def given_map(self) -> GivenMap | None:
-        """The prior map as the joint search compares with it: landmark by landmark, with covariances."""
+        """Return the prior map as the joint search compares with it: landmark by landmark, with covariances."""
         if self.prior_map is None:
             return None
         given, rows = self.prior_map.given, np.arange(len(self.landmark_id))

@@ -40,14 +40,14 @@ kernel = kept(error_model="numpy")
 
 @kernel
 def inverse_of(matrix: FloatArray) -> FloatArray:
-    """Inverse of a small matrix, row after row in memory as all others."""
+    """Return the inverse of a small matrix, row after row in memory as all others."""
     inverted: Any = np.linalg.inv(matrix)
     return np.ascontiguousarray(inverted)
 
 
 @kernel
 def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """A (r, 3) times a (3, n), without a temporary."""
+    """Multiply a (r, 3) with a (3, n) matrix, without a temporary."""
     for i in range(a.shape[0]):
         a0, a1, a2 = a[i, 0], a[i, 1], a[i, 2]
         for k in range(b.shape[1]):
@@ -56,7 +56,7 @@ def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def sandwich(j: FloatArray, cov: FloatArray, part: FloatArray, out: FloatArray) -> None:
-    """`j cov j'` for j (r, n) and a symmetric cov, with room for `j cov` in `part` (r, n)."""
+    """Compute `j cov j'` for j (r, n) and a symmetric cov, with room for `j cov` in `part` (r, n)."""
     size = j.shape[1]
     for a in range(j.shape[0]):
         for b in range(size):
@@ -73,7 +73,7 @@ def sandwich(j: FloatArray, cov: FloatArray, part: FloatArray, out: FloatArray) 
 
 @kernel
 def invert_3x3(matrix: FloatArray, out: FloatArray) -> None:
-    """Inverse of a symmetric positive definite (3, 3) by its factors `L D L'`, without a temporary; may be in place."""
+    """Invert a symmetric positive definite (3, 3) by its factors `L D L'`, without a temporary; may be in place."""
     a, b, c, f = matrix[0, 0], matrix[0, 1], matrix[0, 2], matrix[2, 2]
     l10, l20 = b / a, c / a
     d1, rest = matrix[1, 1] - l10 * b, matrix[1, 2] - l20 * b
@@ -89,27 +89,27 @@ def invert_3x3(matrix: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def wrapped(angle: float) -> float:
-    """`angle` in [-pi, pi)."""
+    """Return `angle` in [-pi, pi)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
 @kernel
 def composed(a: FloatArray, b: FloatArray) -> FloatArray:
-    """`a * b`, as `se2.compose`, but the heading is not wrapped."""
+    """Return `a * b`, as `se2.compose`, but the heading is not wrapped."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]])
 
 
 @kernel
 def inverted(a: FloatArray) -> FloatArray:
-    """As `se2.inverse`, but the heading is not wrapped."""
+    """Return the inverse as `se2.inverse`, but the heading is not wrapped."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return np.array([-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]])
 
 
 @kernel
 def adjoint(a: FloatArray) -> FloatArray:
-    """As `se2.adjoint`. That of an inverted motion carries perturbations at its start to its end."""
+    """Return the adjoint as `se2.adjoint`. That of an inverted motion carries perturbations at its start to its end."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return np.array([[c, -s, a[1]], [s, c, -a[0]], [0.0, 0.0, 1.0]])
 
@@ -127,7 +127,7 @@ def integrate_odometry(
     noise: FloatArray,
     floor: FloatArray,
 ) -> None:
-    """Motion between two instants, its derivatives and its noise, from velocities held between odometry stamps.
+    """Integrate the motion between two instants, its derivatives and noise; velocities hold between odometry stamps.
 
     Args:
         stamp: (N,) odometry stamps; row i of `velocity` holds from stamp i to stamp i + 1.
@@ -242,7 +242,7 @@ def integrate_odometry(
 
 @kernel
 def odometry_covariance(noise: FloatArray, floor: FloatArray, variance: FloatArray, out: FloatArray) -> None:
-    """Covariance (3, 3) of an interval: `floor` and what (5,) variances make of `noise` (5, 3, 3)."""
+    """Compute the covariance (3, 3) of an interval: `floor` and what (5,) variances make of `noise` (5, 3, 3)."""
     for i in range(3):
         for j in range(i + 1):
             total = floor[i, j]
@@ -292,7 +292,7 @@ def _carried(
 def odometry_residual(
     pose: FloatArray, following: FloatArray, increment: FloatArray, residual: FloatArray, j1: FloatArray, j2: FloatArray
 ) -> None:
-    """`increment^-1 * between(pose, following)` as (x, y, theta), with (3, 3) derivatives by both poses."""
+    """Compute `increment^-1 * between(pose, following)` as (x, y, theta), with (3, 3) derivatives by both poses."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     dx, dy = following[0] - pose[0], following[1] - pose[1]
     bx, by = c * dx + s * dy, -s * dx + c * dy
@@ -332,7 +332,7 @@ def detection_residual(
     j_landmark: FloatArray,
     j_states: FloatArray,
 ) -> None:
-    """Measured minus predicted (range, bearing), with derivatives by pose (2, 3), landmark (2, 2), states (2, 5)."""
+    """Compute (range, bearing) measured minus predicted, derivatives by pose (2, 3), landmark (2, 2), states (2, 5)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     lever_x, lever_y = c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]
     dx, dy = landmark[0] - pose[0] - lever_x, landmark[1] - pose[1] - lever_y
@@ -360,7 +360,7 @@ def detection_residual(
 
 @kernel
 def inlier_weight(squared: float, log_odds: float, heavy: bool) -> float:
-    """Weight of a detection with squared normalised residual `squared`.
+    """Return the weight of a detection with squared normalised residual `squared`.
 
     `heavy`: Cauchy with scale 3, which never lets go while the estimate is still far away. Otherwise the posterior
     probability of 'no outlier' when an outlier is as likely as an inlier at `squared = 2 log_odds`.
@@ -372,7 +372,7 @@ def inlier_weight(squared: float, log_odds: float, heavy: bool) -> float:
 
 @kernel
 def outlier_loss(squared: float, log_odds: float, heavy: bool) -> float:
-    """Negative log likelihood, 0 at 0; `inlier_weight` is twice its derivative by `squared`."""
+    """Return the negative log likelihood, 0 at 0; `inlier_weight` is twice its derivative by `squared`."""
     if heavy:
         return 4.5 * math.log1p(squared / 9.0)
     # -log(exp(-s/2) + exp(-log_odds)) without overflow, 0 at s = 0

@@ -43,7 +43,7 @@ class KnownPlaces:
     def of(
         cls, landmark_id: IntArray, position_m: FloatArray, covariance_m2: FloatArray, p_here: FloatArray
     ) -> KnownPlaces:
-        """Places in any order; the covariance as blocks (P, 2, 2) or joint (2 P, 2 P)."""
+        """Return the places in any order; the covariance as blocks (P, 2, 2) or joint (2 P, 2 P)."""
         order = np.argsort(landmark_id, kind="stable")
         joint = None
         if covariance_m2.ndim == 2:
@@ -57,18 +57,18 @@ class KnownPlaces:
 
     @classmethod
     def from_landmarks(cls, landmarks: Landmarks) -> KnownPlaces:
-        """Records of a map; here, other than elsewhere, a landmark may have several."""
+        """Return records of a map; here, other than elsewhere, a landmark may have several."""
         return cls.of(landmarks.landmark_id, landmarks.position_m, landmarks.covariance_m2, landmarks.p_exists)
 
     def rows_of(self, landmark_id: IntArray) -> tuple[IntArray, IntArray]:
-        """First row of each of (M,) landmarks, and the one after its last; both equal where the map lacks it."""
+        """Return the first row of (M,) landmarks, and the one after the last; both equal where the map lacks one."""
         return (
             np.searchsorted(self.landmark_id, landmark_id, side="left"),
             np.searchsorted(self.landmark_id, landmark_id, side="right"),
         )
 
     def most_probable(self) -> IntArray:
-        """(L,) row of the most probable place of every landmark, by id."""
+        """Return (L,) row of the most probable place of every landmark, by id."""
         order = np.lexsort((self.p_here, self.landmark_id))
         last = np.append(self.landmark_id[1:] != self.landmark_id[:-1], True)[: len(order)]
         rows: IntArray = order[last]
@@ -165,11 +165,11 @@ class LocalTrack:
         self._tried: tuple[float, frozenset[int]] = (-np.inf, frozenset())
 
     def drive(self, increment: FloatArray) -> None:
-        """On by (3,)."""
+        """Advance the pose by a motion (3,)."""
         self._pose = se2.compose(self._pose, increment)
 
     def see(self, stamp_s: float, landmark_id: IntArray, reading: FloatArray, states: FloatArray) -> None:
-        """Landmarks of the map in range and bearing (M, 2); what was seen too long ago is forgotten."""
+        """Add sightings (M, 2) of landmarks of the map, range and bearing; forget what was seen too long ago."""
         if np.isnan(self._began_s):
             self._began_s = stamp_s
         at = sighted_at(self._pose, reading, states, self._mount)
@@ -200,7 +200,7 @@ class LocalTrack:
         return Placed(se2.compose(motion, self._pose), *self._uncertainty(motion[2], local[agree], row[agree]))
 
     def agreement(self, pose_map_robot: FloatArray, places: KnownPlaces) -> float:
-        """How well its landmarks fit the map if the robot is at a pose (3,): 1 for each that is exactly at a place."""
+        """Return how well the track fits the map with the robot at a pose (3,): 1 per landmark exactly at a place."""
         local, row = self._candidates(places)
         motion = se2.compose(pose_map_robot, se2.inverse(self._pose))
         gap = np.linalg.norm(se2.transform(motion, local) - places.position_m[row], axis=1)

@@ -44,7 +44,7 @@ def localize(
     realtime: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> SlamResult:
-    """Causal poses of one recording in a map that is not changed, from an unknown start.
+    """Localise a recording in a map that is not changed: causal poses, from an unknown start.
 
     Args:
         recording: what a reader returned; its truth is not looked at.
@@ -117,7 +117,7 @@ class _Run:
         return np.array([bool(np.isfinite(one.pose[0])) for one in self.located], dtype=np.bool_)
 
     def all(self, name: str) -> Any:
-        """One column of all frames, one row a detection."""
+        """Return one column of all frames, one row a detection."""
         return np.concatenate([getattr(one, name) for one in self.located])
 
     @property
@@ -127,7 +127,7 @@ class _Run:
         return np.concatenate(rows).astype(np.int64)
 
     def innovations(self, recording: Recording) -> Innovations:
-        """Of every detection that was compared with the map."""
+        """Return innovations of every detection that was compared with the map."""
         told = self.all("place") != UNKNOWN
         rows = self.detection[told]
         return Innovations(
@@ -139,7 +139,7 @@ class _Run:
         )
 
     def misses(self, places: KnownPlaces) -> Misses:
-        """Landmarks that were well in view and not detected."""
+        """Return landmarks that were well in view and not detected."""
         missed = self.all("missed")
         count = [int(one.missed.sum()) for one in self.located]
         return Misses(

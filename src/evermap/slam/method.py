@@ -60,10 +60,10 @@ class Explanation:
 
 
 class Method(Protocol):
-    """Decides for every frame to which places its detections belong, and thinks again when stock is taken."""
+    """Decides for every frame to which places its detections belong, and thinks again at relinearisations."""
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
-        """Places (k,) of the detections of pose `row`, before they are used.
+        """Return places (k,) of the detections of pose `row`, before they are used.
 
         Args:
             problem: the measurements, with the places decided so far; `landmark_row[detections]` still says whose
@@ -79,14 +79,14 @@ class Method(Protocol):
         ...
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """The problem, and values to start from, on which noise levels are learned before the last revisions.
+        """Return the problem, and values to start from, on which noise levels are learned before the last revisions.
 
         As they are, for a method that has no prejudice: nothing that it believes bends the solution.
         """
         return problem, estimate
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
-        """The best explanation of everything so far.
+        """Return the best explanation of everything so far.
 
         Args:
             problem: the measurements so far, with the places decided so far.
@@ -105,11 +105,11 @@ class Static(Method):
         self._current = np.arange(n_landmarks)
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
-        """The place of each detection's landmark."""
+        """Return the place of each detection's landmark."""
         del row, compare
         return problem.landmark_row[detections]
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
-        """Nothing to think about."""
+        """Return the problem as it is."""
         del noise, heavy, final
         return Explanation(problem, estimate, self._current)

@@ -72,7 +72,7 @@ class NoiseFit:
 def refine_noise(
     problem: Problem, estimate: Estimate, marginals: Marginals, weights: FloatArray, noise: Noise, start: Noise = START
 ) -> NoiseFit:
-    """One step towards the restricted-likelihood noise levels.
+    """Take one step towards the restricted-likelihood noise levels.
 
     Args:
         problem: the measurements.
@@ -133,7 +133,7 @@ def _inflation(fisher: FloatArray) -> FloatArray:
 def joint_covariance(
     pose: int, place: int, cov_pose: FloatArray, cov_cross: FloatArray, cov_shared: FloatArray, out: FloatArray
 ) -> None:
-    """Covariance (10, 10) of one pose, one place and the five sensor states, from the parts of `Marginals`."""
+    """Compute the covariance (10, 10) of one pose, one place and the five sensor states, from `Marginals`."""
     at_states = len(cov_shared) - 9
     out[:3, :3] = cov_pose[pose]
     for a in range(7):

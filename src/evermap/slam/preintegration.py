@@ -50,7 +50,7 @@ class Preintegration:
     def between(
         self, stamp_s: FloatArray, states: FloatArray, odometry: tuple[FloatArray, FloatArray, FloatArray]
     ) -> Intervals:
-        """Intervals between consecutive poses.
+        """Return the intervals between consecutive poses.
 
         Args:
             stamp_s: (N,) instants of the poses.
@@ -102,7 +102,7 @@ def linearise_interval(
     jacobian: FloatArray,
     information: FloatArray,
 ) -> None:
-    """What the odometry of interval `i` says against poses `i` and `i + 1`.
+    """Linearise the odometry of interval `i` at poses `i` and `i + 1`.
 
     Args:
         intervals: the odometry.

@@ -34,12 +34,12 @@ class Drive:
     _preintegration: Preintegration = field(init=False, repr=False, compare=False, default_factory=Preintegration)
 
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
-        """Motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""
+        """Return motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""
         return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
     def from_rows(cls, stamp_s: FloatArray, velocity: FloatArray) -> Drive:
-        """Velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'.
+        """Return velocities as reported; silences longer than `SILENCE_S` become 'standing still, but who knows'.
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
         to that of `LONGEST_SILENCE_S`.
@@ -74,7 +74,7 @@ class ConditionalPrior:
     gain: FloatArray
 
     def place(self, landmark: FloatArray, landmark_mean: FloatArray) -> FloatArray:
-        """(2,) where the landmark is expected with the others at `landmark` (L, 2)."""
+        """Return (2,) where the landmark is expected with the others at `landmark` (L, 2)."""
         place: FloatArray = self.mean + self.gain @ (landmark[self.given] - landmark_mean[self.given]).ravel()
         return place
 
@@ -118,7 +118,7 @@ class Problem:
         return held
 
     def with_places(self, count: int) -> Problem:
-        """The problem with room for so many places; new ones have no prior."""
+        """Return the problem with room for so many places; new ones have no prior."""
         new = max(0, count - len(self.landmark_mean))
         return replace(
             self,
@@ -127,7 +127,7 @@ class Problem:
         )
 
     def prior_information(self, known: BoolArray) -> FloatArray:
-        """(2 K, 2 K) what the prior says about the K `known` landmarks alone, the others marginalised out.
+        """Return (2 K, 2 K) what the prior says about the K `known` landmarks alone, the others marginalised out.
 
         Leaving rows out of an information matrix would hold the others at their means; out of a covariance it is exact,
         which in terms of information is the Schur complement.
@@ -143,7 +143,7 @@ class Problem:
         return marginal
 
     def conditional_prior(self, row: int, known: BoolArray) -> ConditionalPrior:
-        """What the prior says about landmark `row`, given the `known` ones (of which it is none)."""
+        """Return what the prior says about landmark `row`, given the `known` ones (of which it is none)."""
         column = slice(2 * row, 2 * row + 2)
         own = self.landmark_information[column, column]
         if np.count_nonzero(self.landmark_information[column]) == np.count_nonzero(own):
@@ -159,7 +159,7 @@ class Problem:
         return ConditionalPrior(self.landmark_mean[row], own, given, gain[:, np.repeat(tied, 2)])
 
     def until(self, n_poses: int, *, last_is_blind: bool = False) -> Problem:
-        """The problem as it stood after `n_poses` poses; landmarks keep their rows.
+        """Return the problem as it stood after `n_poses` poses; landmarks keep their rows.
 
         With `last_is_blind`, before the detections of the last of them.
         """
@@ -175,7 +175,7 @@ class Problem:
 
 
 def independent(blocks: FloatArray) -> FloatArray:
-    """(2 L, 2 L) with the (L, 2, 2) blocks on its diagonal: the joint information of landmarks that nothing ties."""
+    """Return the joint information (2 L, 2 L) of independent landmarks with blocks (L, 2, 2)."""
     count = len(blocks)
     joint = np.zeros((count, 2, count, 2))
     rows = np.arange(count)
@@ -222,7 +222,7 @@ class Noise:
     pseudo_count: float = 1.0
 
     def of_detections(self, sigma_given: FloatArray) -> FloatArray:
-        """(M, 2) standard deviation of every detection: its own where it came with one."""
+        """Return (M, 2) standard deviation of every detection: its own where it came with one."""
         return np.where(np.isfinite(sigma_given), sigma_given, self.detection)
 
 

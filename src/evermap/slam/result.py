@@ -57,7 +57,7 @@ def concluded(solved: Solved) -> SlamResult:
 
 
 def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None = None) -> SlamResult:
-    """Bridge the blind stretches, and count the misses where nobody has.
+    """Return bridge the blind stretches, and count the misses where nobody has.
 
     Args:
         solved: the recording and its estimate.
@@ -93,7 +93,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None 
 
 
 def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Trajectory:
-    """Smoothed poses at all frames, and in between so that no step is longer than `TRAJECTORY_STEP_S`."""
+    """Return smoothed poses at all frames, and in between so that no step is longer than `TRAJECTORY_STEP_S`."""
     stamps = _dense_stamps(recording, outcome, prepared.start_s)
     pose, covariance = bridged(
         stamps - prepared.start_s,
@@ -111,13 +111,13 @@ def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame
 
 
 def rows_at(trajectory: Trajectory, recording: Recording, rows: IntArray) -> IntArray:
-    """Rows of a trajectory that holds all frames, at some of the frames."""
+    """Return rows of a trajectory that holds all frames, at some of the frames."""
     found = np.searchsorted(trajectory.stamp_s, recording.frames.stamp_s[rows] - 1e-9)
     return np.minimum(found, len(trajectory) - 1)
 
 
 def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> Landmarks:
-    """The map of a session: positions with covariance, and how often and when each landmark was seen."""
+    """Return the map of a session: positions with covariance, and how often and when each landmark was seen."""
     current = outcome.revision.current
     return _records(
         prepared, outcome, recording, frame, outcome.graph_estimate.landmark[current],
@@ -126,7 +126,7 @@ def landmarks(prepared: Prepared, outcome: Outcome, recording: Recording, frame:
 
 
 def alternatives(prepared: Prepared, outcome: Outcome, recording: Recording, frame: str) -> tuple[Alternative, ...]:
-    """Other explanations of the session, each with its map."""
+    """Return other explanations of the session, each with its map."""
     return tuple(
         Alternative(
             changes=changes(prepared, outcome, rival.changes),
@@ -176,7 +176,7 @@ def _records(
 
 
 def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) -> tuple[MapChange, ...]:
-    """What moved, with the recording's ids and stamps, in metres."""
+    """Return what moved, with the recording's ids and stamps, in metres."""
     return tuple(
         replace(
             change,
@@ -190,13 +190,13 @@ def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) 
 
 
 def with_misses(landmarks: Landmarks, misses: Misses) -> Landmarks:
-    """The map with its misses counted."""
+    """Return the map with its misses counted."""
     columns = np.searchsorted(landmarks.landmark_id, misses.landmark_id)
     return replace(landmarks, n_misses=np.bincount(columns, minlength=len(landmarks)).astype(np.int64))
 
 
 def online(prepared: Prepared, slam: StreamingSlam, recording: Recording, frame: str) -> Trajectory:
-    """What the robot knew at the time: the newest pose after every processed frame."""
+    """Return what the robot knew at the time: the newest pose after every processed frame."""
     done = np.isfinite(slam.online_pose[:, 0])
     pose = slam.online_pose[done].copy()
     pose[:, 2] = se2.wrap(pose[:, 2])
@@ -205,7 +205,7 @@ def online(prepared: Prepared, slam: StreamingSlam, recording: Recording, frame:
 
 
 def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recording: Recording) -> Innovations:
-    """Consistency of every detection that was predicted."""
+    """Return consistency of every detection that was predicted."""
     told = np.flatnonzero(np.isfinite(slam.nis[: len(outcome.inlier)]))
     detection = prepared.used[told]
     return Innovations(
@@ -220,7 +220,7 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
 def described(
     states: FloatArray, covariance: FloatArray, fit: NoiseFit, prior: CalibrationPrior
 ) -> tuple[ParameterEstimate, ...]:
-    """Calibration states (9,) with their covariance (9, 9), and noise levels, as records."""
+    """Return calibration states (9,) with their covariance (9, 9), and noise levels, as records."""
     estimates = [
         ParameterEstimate(
             name=spec.name,
@@ -256,7 +256,7 @@ def described(
 
 
 def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
-    """Odometry alone, believed as reported, from the first pose on."""
+    """Return odometry alone, believed as reported, from the first pose on."""
     plain = CalibrationPrior.from_settings(calibrated=False, fix={})
     pose, covariance = dead_reckoned(trajectory.stamp_s - prepared.start_s, prepared.problem.drive, plain.mean, START)
     pose = se2.compose(trajectory.pose_world_robot[0], pose)

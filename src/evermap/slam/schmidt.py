@@ -46,7 +46,7 @@ def choose_places(
     free: Any,
     chosen: IntArray,
 ) -> None:
-    """Which of its known places a landmark was seen at: the most probable one (max-mixture, MATH.md section 5).
+    """Choose the known place at which each landmark was seen: the most probable one (max-mixture, MATH.md section 5).
 
     Args:
         pose: (3,) of the filter, before the frame.
@@ -118,7 +118,7 @@ def update_considering(
     nis: FloatArray,
     weight: FloatArray,
 ) -> None:
-    """All detections of a frame at once, relinearised and re-weighted until nothing moves.
+    """Update by all detections of a frame at once, relinearised and re-weighted until nothing moves.
 
     A detection's weight is its probability to be no outlier, given its innovation (`kernels.inlier_weight`). While the
     pose is uncertain many innovations are credible, so there a second one is asked: that which is left when the other

@@ -1,4 +1,4 @@
-"""What the streaming estimator asks of an incremental solver between two stock-takings of the batch smoother."""
+"""What the streaming estimator asks of an incremental solver between two relinearisations by the batch smoother."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Motion:
 
     @classmethod
     def between(cls, problem: Problem, noise: Noise, row: int, states: FloatArray) -> Motion:
-        """From pose `row - 1` to pose `row`."""
+        """Return from pose `row - 1` to pose `row`."""
         return cls.over(
             problem.drive, problem.stamp_s[row - 1], problem.stamp_s[row], states, problem.prior.free, noise
         )
@@ -49,7 +49,7 @@ class Motion:
     def over(
         cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
     ) -> Motion:
-        """Between two instants, with (9,) calibration states of which some are `free`."""
+        """Return between two instants, with (9,) calibration states of which some are `free`."""
         increment, by_states = np.zeros(3), np.zeros((3, 4))
         kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
         integrate_odometry(
@@ -80,7 +80,7 @@ class IncrementalSolver(Protocol):
     problem: Problem
 
     def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
-        """Begin anew at `estimate`, an optimum of the first poses, with other noise, other places or other priors."""
+        """Restart at `estimate`, an optimum of the first poses, with other noise, other places or other priors."""
         ...
 
     def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
@@ -94,34 +94,34 @@ class IncrementalSolver(Protocol):
         ...
 
     def last_pose(self) -> FloatArray:
-        """(3,) the newest pose."""
+        """Return (3,) the newest pose."""
         ...
 
     def last_covariance(self) -> FloatArray:
-        """(3, 3) its covariance, in its own frame."""
+        """Return (3, 3) its covariance, in its own frame."""
         ...
 
     def states(self) -> FloatArray:
-        """(9,) calibration states."""
+        """Return (9,) calibration states."""
         ...
 
     def landmark(self, row: int) -> FloatArray:
-        """(2,) one place; nan where it is not known yet."""
+        """Return (2,) one place; nan where it is not known yet."""
         ...
 
     def estimate(self) -> Estimate:
-        """Values of everything so far; old poses may be from when they were added."""
+        """Return values of everything so far; old poses may be from when they were added."""
         ...
 
     def joint_covariance(self, places: IntArray) -> FloatArray:
-        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states, and k different known places, in order."""
+        """Return (12 + 2 k, 12 + 2 k) of the newest pose, the calibration states, and k known places, in order."""
         ...
 
 
 def compare(
     solver: IncrementalSolver, noise: Noise, motion: Motion, detections: IntArray, places: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What detections of the pose that is about to be added say before they are used, if they were of these places.
+    """Return innovations of detections of the coming pose, before they are used, if they were of these places.
 
     Args:
         solver: with all poses before.

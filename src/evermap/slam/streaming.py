@@ -1,9 +1,9 @@
 """Landmark SLAM of one recording, frame after frame.
 
 Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental solver.
-Whenever the number of poses has doubled, the batch smoother takes stock: it finds the optimum of all so far,
+Whenever the number of poses has doubled, the batch smoother relinearises: it finds the optimum of all so far,
 re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments. A
-method decides which places detections belong to: of a frame before it is used, and of all when stock is taken.
+method decides which places detections belong to: of a frame before it is used, and of all at relinearisations.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import IncrementalSolver, Motion, compare
 from evermap.types import BoolArray, FloatArray, IntArray
 
-FIRST_STOCK = 40
-"""Poses before the batch smoother takes stock for the first time."""
+FIRST_RELINEARISATION = 40
+"""Poses before the batch smoother relinearises for the first time."""
 SHORTEST_SPELL = 5
 LONGEST_SPELL = 1 / 8
 """Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
@@ -97,7 +97,7 @@ class StreamingSlam:
         prior_map: where to localise; None maps from scratch.
         robust: explain outliers instead of believing every identity.
         estimate_noise: learn noise levels from the recording, else keep `noise`.
-        solver: of the steps between two stock-takings.
+        solver: of the steps between two relinearisations.
         method: how landmarks that moved are explained; None takes the world to be static.
     """
 
@@ -126,7 +126,7 @@ class StreamingSlam:
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._n_surprising = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._n_poses = 0
-        self._next_stock = FIRST_STOCK
+        self._next_relinearisation = FIRST_RELINEARISATION
         self._relinearised_at = 0
         self._align_tried = 0
         self._scale = 1.0
@@ -139,7 +139,7 @@ class StreamingSlam:
         """(M,) squared Mahalanobis distance of every innovation; nan where the landmark was new."""
 
     def step(self) -> None:
-        """Process the next pose: predict, compare, add, and take stock when it is time."""
+        """Process the next pose: predict, compare, add, and relinearise when it is time."""
         row = self._n_poses
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
         states = self._solver.states()
@@ -150,11 +150,11 @@ class StreamingSlam:
         self._meet_new_landmarks(motion, states, detections)
         self._solver.add(row, motion, self._landmark)
         self._n_poses += 1
-        if self._n_poses == self._next_stock:
-            self._take_stock()
-            self._next_stock *= 2
+        if self._n_poses == self._next_relinearisation:
+            self._relinearise_all()
+            self._next_relinearisation *= 2
         elif self._robust and self._is_disputed(detections):
-            self._take_stock()
+            self._relinearise_all()
         elif self._n_poses - self._relinearised_at >= max(SHORTEST_SPELL, int(LONGEST_SPELL * self._n_poses)):
             self._relinearise()
         if self._prior_map is not None and not self._aligned and self._can_align():
@@ -264,7 +264,7 @@ class StreamingSlam:
                     pose = se2.compose(pose, motion.increment)
                 self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
 
-    def _take_stock(self) -> None:
+    def _relinearise_all(self) -> None:
         """Optimum and noise levels of everything so far, from where the solver goes on."""
         problem = self._problem.until(self._n_poses)
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
@@ -351,7 +351,7 @@ class StreamingSlam:
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
         self._landmark = moved.landmark
         self._restart(moved)
-        self._take_stock()
+        self._relinearise_all()
 
     def _divided(
         self, revision: Explanation, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
@@ -399,7 +399,7 @@ MIN_SIGHTINGS = 3
 
 
 def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray) -> FloatArray:
-    """Positions (..., 2) that readings (..., 2) of range and bearing from poses (..., 3) point to.
+    """Return positions (..., 2) that readings (..., 2) of range and bearing from poses (..., 3) point to.
 
     The range law is inverted at the corrected bearing.
     """
@@ -411,7 +411,7 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
 
 
 def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estimate:
-    """The estimate with landmarks moved to the median of their sightings where most sightings disagree with them.
+    """Move landmarks to the median of their sightings where most sightings disagree with them.
 
     A landmark whose first sighting carried the wrong identity starts in the wrong place, from where all right
     sightings look like outliers.

@@ -14,13 +14,13 @@ from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem
-from evermap.slam.streaming import FIRST_STOCK, StreamingSlam
+from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
 
 
 @functools.cache
 def warm_up() -> None:
-    """A drive past one landmark, through everything that is compiled. Once in a process; compiled code is kept."""
-    count = FIRST_STOCK + 2
+    """Drive past one landmark, through all compiled functions, once per process; compiled code is kept."""
+    count = FIRST_RELINEARISATION + 2
     stamps = np.linspace(0.0, 0.1 * count, count)
     prior = CalibrationPrior.from_settings(calibrated=True, fix={})
     forward = 0.1 * stamps

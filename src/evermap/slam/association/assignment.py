@@ -58,7 +58,7 @@ class Assignment:
         return together
 
     def with_shared_errors(self, joint: FloatArray) -> FloatArray:
-        """Covariance (G, G) of landmarks and states with what sightings from one place have in common.
+        """Return the covariance (G, G) of landmarks and states with what sightings from one place have in common.
 
         A robot that stands still makes the same error a hundred times, and the smoother believes it was a hundredth.
         """
@@ -74,7 +74,7 @@ class Assignment:
         return out
 
     def problem(self) -> Problem:
-        """The least-squares problem of the detections that belong to a landmark."""
+        """Return the least-squares problem of the detections that belong to a landmark."""
         used = np.flatnonzero(self.landmark_row >= 0)
         count = self.n_landmarks
         return replace(
@@ -88,12 +88,12 @@ class Assignment:
         )
 
     def without(self, landmarks: BoolArray) -> Assignment:
-        """Some landmarks (L,) forgotten, their detections nobody's."""
+        """Return the assignment without some landmarks (L,), their detections unassigned."""
         rank = np.where(landmarks, NOBODY, np.cumsum(~landmarks) - 1)
         return self._renumbered(rank, ~landmarks)
 
     def merged(self, pairs: list[tuple[int, int]]) -> Assignment:
-        """Pairs (younger, older) made one: the older's place, the detections of both."""
+        """Return the assignment with pairs (younger, older) merged: the older's place, the detections of both."""
         becomes = np.arange(self.n_landmarks)
         for younger, older in sorted(pairs, key=lambda pair: pair[0]):
             becomes[younger] = becomes[older]  # the older one may have been merged itself, with a still older

@@ -255,7 +255,7 @@ class Associator:
 
 
 def density_of_unmet(place: FloatArray) -> float:
-    """Landmarks a square metre that one may still meet, by the area that those at `place` (L, 2) span."""
+    """Return landmarks a square metre that one may still meet, by the area that those at `place` (L, 2) span."""
     area_m2 = float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0
     return UNMET / max(area_m2, SMALLEST_M2)
 
@@ -277,11 +277,11 @@ class SightingNoise:
 
     @classmethod
     def constant(cls, sigma: FloatArray) -> SightingNoise:
-        """The same at all ranges: sigma (2,) of range [m] and bearing [rad]."""
+        """Return noise that is the same at all ranges: sigma (2,) of range [m] and bearing [rad]."""
         return cls(float(sigma[0] ** 2), 0.0, float(sigma[1] ** 2))
 
     def of_detections(self, problem: Problem) -> FloatArray:
-        """(M, 2) standard deviation of every detection: its own where it came with one."""
+        """Return (M, 2) standard deviation of every detection: its own where it came with one."""
         fourth = problem.reading[:, 0] ** 4
         modelled = np.column_stack(
             [self.range_variance + self.range_growth * fourth, np.full(len(fourth), self.bearing_variance)]
@@ -290,7 +290,7 @@ class SightingNoise:
 
 
 def fit_sighting_noise(problem: Problem, estimate: Estimate, start: FloatArray) -> SightingNoise:
-    """Noise by the residuals of associated detections, which came without their own.
+    """Estimate noise from the residuals of associated detections, which came without their own.
 
     Args:
         problem: detections with their landmarks.
@@ -317,7 +317,7 @@ def fit_sighting_noise(problem: Problem, estimate: Estimate, start: FloatArray) 
 
 
 def residuals(problem: Problem, estimate: Estimate) -> FloatArray:
-    """(M, 2) measured minus predicted range [m] and bearing [rad]."""
+    """Return (M, 2) measured minus predicted range [m] and bearing [rad]."""
     out = np.empty((len(problem.pose_row), 2))
     jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     for m, (i, j) in enumerate(zip(problem.pose_row, problem.landmark_row, strict=True)):

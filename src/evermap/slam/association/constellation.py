@@ -61,7 +61,7 @@ class Alignment:
 
 
 def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float) -> list[Alignment]:
-    """Ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
+    """Return ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
 
     Args:
         source: the local map, its landmarks in order of trust.
@@ -81,7 +81,7 @@ def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density:
 def agreed_pairs(
     source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float, probability: float
 ) -> list[tuple[int, int]]:
-    """Pairs (source, target) that are certain: of an overlay far better than any other, without doubt in it.
+    """Return pairs (source, target) that are certain: of an overlay far better than any other, without doubt in it.
 
     Empty where the maps can be laid over each other in several ways, or in none.
 
@@ -223,7 +223,7 @@ cost does not know: it rises by some tens for one landmark, by hundreds for two.
 def propose_merges(
     assignment: Assignment, marginals: Marginals, *, density: float, probability: float
 ) -> list[tuple[int, int]]:
-    """Pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
+    """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
 
     Args:
         assignment: at its optimum.
@@ -254,7 +254,7 @@ def propose_constellation(
     probability: float,
     refused: set[tuple[int, int]],
 ) -> list[tuple[int, int]]:
-    """Pairs (younger, older) by which a part of the map that is loose lies on the rest in one way only."""
+    """Return pairs (younger, older) by which a part of the map that is loose lies on the rest in one way only."""
     joint, place = marginals.shared, assignment.estimate.landmark
     apart, sightings = assignment.apart, assignment.sightings
     root, loose = stiff_and_loose(assignment, marginals)
@@ -273,7 +273,7 @@ def propose_constellation(
 
 
 def stiff_and_loose(assignment: Assignment, marginals: Marginals) -> tuple[IntArray, IntArray]:
-    """Landmarks that hang together with the oldest, each well known against the next; and all others."""
+    """Return landmarks that hang together with the oldest, each well known against the next; and all others."""
     joint = marginals.shared
     seen = np.flatnonzero(assignment.sightings >= MIN_SIGHTINGS)
     within = np.array(
@@ -308,7 +308,7 @@ def _spread(joint: FloatArray, u: int, o: int) -> FloatArray:
 
 
 def pairs_in_reach(assignment: Assignment, marginals: Marginals) -> list[tuple[int, int]]:
-    """Pairs (younger, older) whose difference is insignificant by itself, sorted."""
+    """Return pairs (younger, older) whose difference is insignificant by itself, sorted."""
     joint, gate = marginals.shared, gates(1, CONFIDENCE)[1]
     estimate, sightings, apart = assignment.estimate, assignment.sightings, assignment.apart
     found = []
@@ -324,7 +324,7 @@ def pairs_in_reach(assignment: Assignment, marginals: Marginals) -> list[tuple[i
 
 
 def differences(estimate: Estimate, marginals: Marginals, pairs: list[tuple[int, int]], density: float) -> Pairings:
-    """Pairs (younger, older), sorted, as pairings whose innovation is their difference."""
+    """Return pairs (younger, older), sorted, as pairings whose innovation is their difference."""
     n = len(pairs)
     select = np.zeros((2 * n, len(marginals.shared)))
     for k, (u, o) in enumerate(pairs):

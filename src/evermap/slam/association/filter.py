@@ -39,13 +39,13 @@ class PoseBelief:
 
     @classmethod
     def first(cls, problem: Problem) -> PoseBelief:
-        """Before the first frame: the start pose, the priors of the states, no landmark."""
+        """Return the belief before the first frame: the start pose, the priors of the states, no landmark."""
         spread = np.append(np.full(3, 1.0 / problem.start_information), (problem.prior.sigma * problem.prior.free) ** 2)
         return cls(problem.start_pose.copy(), problem.prior.mean.copy(), np.zeros((0, 2)), np.diag(spread))
 
     @classmethod
     def at(cls, estimate: Estimate, marginals: Marginals, row: int) -> PoseBelief:
-        """The smoothed belief about pose `row`; every landmark has to be known."""
+        """Return the smoothed belief about pose `row`; every landmark has to be known."""
         n = 2 * len(estimate.landmark)
         order = np.append(n + np.arange(9), np.arange(n))
         covariance = np.zeros((12 + n, 12 + n))
@@ -56,7 +56,7 @@ class PoseBelief:
         return cls(estimate.pose[row], estimate.states, estimate.landmark, covariance)
 
     def may_be_one(self, a: int, b: int, confidence: float) -> bool:
-        """Whether the difference of two landmarks is insignificant."""
+        """Return whether the difference of two landmarks is insignificant."""
         rows, others = AT_PLACES + 2 * a + np.arange(2), AT_PLACES + 2 * b + np.arange(2)
         p = self.covariance
         cross = p[np.ix_(rows, others)]
@@ -66,7 +66,7 @@ class PoseBelief:
 
 
 def predicted(belief: PoseBelief, problem: Problem, noise: Noise, row: int) -> PoseBelief:
-    """The belief about pose `row` by odometry from the pose before; the first one as it is."""
+    """Return the belief about pose `row` by odometry from the pose before; the first one as it is."""
     if row == 0:
         return belief
     motion = Motion.between(problem, noise, row, belief.states)
@@ -78,7 +78,7 @@ def predicted(belief: PoseBelief, problem: Problem, noise: Noise, row: int) -> P
 def pairings_of_frame(
     belief: PoseBelief, problem: Problem, sigma: FloatArray, detections: IntArray, *, confidence: float, density: float
 ) -> tuple[Pairings, FloatArray]:
-    """Detections of a frame with the landmarks whose gates they pass.
+    """Return detections of a frame with the landmarks whose gates they pass.
 
     Args:
         belief: about the pose that made the detections.
@@ -152,7 +152,7 @@ def _in_gate(
 
 
 def updated(belief: PoseBelief, pairings: Pairings, derivative: FloatArray, taken: IntArray) -> PoseBelief:
-    """The belief after the pairings `taken` (rows of `pairings`)."""
+    """Return the belief after the pairings `taken` (rows of `pairings`)."""
     rows = np.column_stack([2 * taken, 2 * taken + 1]).ravel()
     h = derivative[rows]
     cross = belief.covariance @ h.T
@@ -168,7 +168,7 @@ def updated(belief: PoseBelief, pairings: Pairings, derivative: FloatArray, take
 
 
 def with_landmark(belief: PoseBelief, problem: Problem, sigma: FloatArray, detection: int) -> PoseBelief:
-    """The belief with one more landmark, where the detection points."""
+    """Return the belief with one more landmark, where the detection points."""
     reading = problem.reading[detection]
     place = sighted_at(belief.pose, reading, belief.states, problem.mount)
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))

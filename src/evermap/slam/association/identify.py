@@ -25,7 +25,7 @@ MAP_FLOOR_M = 1e-3
 def identified(
     recording: Recording, prior: CalibrationPrior, noise: Noise, *, prior_map: Landmarks | None = None
 ) -> Recording:
-    """The recording with landmark ids by geometry; its own are not looked at.
+    """Return the recording with landmark ids by geometry; its own are not looked at.
 
     Args:
         recording: what a reader returned.

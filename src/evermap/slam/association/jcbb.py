@@ -69,14 +69,14 @@ class Matching:
 
 @functools.cache
 def gates(n: int, confidence: float) -> FloatArray:
-    """(n + 1,) chi-square quantiles with 2 k degrees of freedom for k = 0..n pairings."""
+    """Return (n + 1,) chi-square quantiles with 2 k degrees of freedom for k = 0..n pairings."""
     bounds: FloatArray = np.append(0.0, chi2.ppf(confidence, 2 * np.arange(1, n + 1)))
     bounds.setflags(write=False)
     return bounds
 
 
 def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES) -> Matching:
-    """The jointly compatible set with most pairings and, of those, the smallest distance."""
+    """Return the jointly compatible set with most pairings and, of those, the smallest distance."""
     found, distance, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
     return Matching(found, distance, complete)
 
@@ -84,7 +84,7 @@ def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: in
 def pairing_probability(
     pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES
 ) -> tuple[FloatArray, bool]:
-    """(K,) probability of every pairing over all jointly compatible sets, and whether all sets were weighed."""
+    """Return (K,) probability of every pairing over all jointly compatible sets, and whether all sets were weighed."""
     _, _, probability, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
     return probability, complete
 

@@ -50,14 +50,14 @@ class WindowEvidence:
     log_constant: float = 0.0
 
     def first_seen(self, otherwise: FloatArray) -> FloatArray:
-        """(L, 2) the first copy of every landmark; `otherwise` (L, 2) for those that have none."""
+        """Return (L, 2) the first copy of every landmark; `otherwise` (L, 2) for those that have none."""
         position = otherwise.copy()
         landmark, first = np.unique(self.landmark, return_index=True)
         position[landmark] = self.position[first]
         return position
 
     def without(self, copies: BoolArray) -> WindowEvidence:
-        """With some copies (R,) left out, as if their sightings had not been made."""
+        """Return the evidence with some copies (R,) left out, as if their sightings had not been made."""
         kept = ~copies
         rows = np.repeat(kept, 2)
         out = np.repeat(copies, 2)
@@ -74,7 +74,7 @@ class WindowEvidence:
         )
 
     def softened(self, sigma_m: float) -> WindowEvidence:
-        """With an error of its own in every copy: what is wrong with sightings is not new at every sighting."""
+        """Return the evidence with an error of its own in every copy: errors of sightings are correlated."""
         if sigma_m == 0.0:
             return self
         factor = cho_factor(self.information + np.eye(len(self.pull)) / sigma_m**2)
@@ -311,7 +311,7 @@ def _without_inner_poses(normal: Normal) -> tuple[FloatArray, FloatArray]:
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:
-    """The same explanation with the range slope at its mean: what it was goes into the size of everything.
+    """Return the same explanation with the range slope at its mean: what it was goes into the size of everything.
 
     Only their product is measured; where the odometry's noise is fixed in metres, a likelihood that may choose the size
     prefers a small world (see `CalibrationPrior.without_scale`).

@@ -38,7 +38,7 @@ class GivenMap:
 
     @classmethod
     def empty(cls, count: int) -> GivenMap:
-        """No map of `count` landmarks."""
+        """Return an empty map of `count` landmarks."""
         return cls(np.zeros((count, 2)), np.zeros((count, 2, 2)), np.zeros(count, dtype=np.bool_))
 
 
@@ -63,7 +63,7 @@ class MovedGroup:
     between_s: tuple[float, float] | None = None
 
     def same_as(self, other: MovedGroup) -> bool:
-        """Same landmarks, same kind of motion, same time."""
+        """Return whether landmarks, kind of motion and time are the same."""
         return (
             np.array_equal(self.members, other.members)
             and self.turns == other.turns
@@ -72,14 +72,14 @@ class MovedGroup:
         )
 
     def moved(self, position: FloatArray) -> FloatArray:
-        """(k, 2) the members' positions after the motion."""
+        """Return (k, 2) the members' positions after the motion."""
         own = position[self.members]
         centre = own.mean(axis=0)
         moved: FloatArray = centre + self.motion[:2] + (own - centre) @ se2.rotation(float(self.motion[2])).T
         return moved
 
     def motion_prior(self, position: FloatArray, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean (k, 2) and covariance (2 k, 2 k) of the members' displacements, linearised at the angle found."""
+        """Return mean (k, 2) and covariance (2 k, 2 k) of the members' displacements, linearised at the angle found."""
         own = position[self.members] - position[self.members].mean(axis=0)
         columns = np.tile(np.eye(2), (len(own), 1))
         mean = np.zeros_like(own)
@@ -96,7 +96,7 @@ class MovedGroup:
 def explained(
     problem: Problem, estimate: Estimate, given: GivenMap, groups: tuple[MovedGroup, ...], spread: FloatArray
 ) -> tuple[Problem, Estimate, IntArray]:
-    """The problem in a world where `groups` moved.
+    """Return the problem in a world where `groups` moved.
 
     Args:
         problem: the measurements; `landmark_row` says which landmark was seen.
@@ -152,7 +152,7 @@ HELD_M = 0.005
 
 
 def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArray) -> Estimate:
-    """The estimate with poses that no sighting of the members has bent.
+    """Return the estimate with poses that no sighting of the members has bent.
 
     Sightings that were given to the wrong places have drawn the poses towards these, and would be right again there.
     """
@@ -181,7 +181,7 @@ def parting_time(
     new: FloatArray,
     within_s: tuple[float, float],
 ) -> tuple[float, tuple[float, float]]:
-    """First stamp [s] at the new places, and two stamps between which the change happened.
+    """Return the first stamp [s] at the new places, and two stamps between which the change happened.
 
     Args:
         problem: the measurements; `landmark_row` says which landmark was seen.

@@ -40,7 +40,7 @@ def hypothesis_gain(
     log_prior: FloatArray,
     log_onset: FloatArray,
 ) -> tuple[float, FloatArray]:
-    """Gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
+    """Return the gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
 
     Args:
         label: (L,) group of every landmark, 0 = static, groups are 1..G.
@@ -231,7 +231,7 @@ class ChangePrior:
         return np.array([self.move_sigma_m, self.move_sigma_m, self.turn_sigma_rad])
 
     def log_prior(self, n_landmarks: int, largest: int) -> FloatArray:
-        """(largest + 1, 2) of a group by its size, if it only moves and if it also turns: `eps 2^-n / C(N, n)`."""
+        """Return (largest + 1, 2) log priors of a group by size, moved only and also turned: `eps 2^-n / C(N, n)`."""
         size = np.arange(largest + 1)
         choices = gammaln(n_landmarks + 1) - gammaln(size + 1) - gammaln(n_landmarks - size + 1)
         group = np.log(self.p_moved) - np.log1p(-self.p_moved) - size * np.log(2.0) - choices
@@ -242,7 +242,7 @@ class ChangePrior:
         return table
 
     def log_onset(self, n_windows: int) -> FloatArray:
-        """(W,) of the window from which on a group has moved: before the session as likely as within it."""
+        """Return (W,) of the window from which on a group has moved: before the session as likely as within it."""
         if n_windows == 1:
             return np.zeros(1)
         log_prior: FloatArray = np.log(np.append(0.5, np.full(n_windows - 1, 0.5 / (n_windows - 1))))

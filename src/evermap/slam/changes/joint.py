@@ -83,13 +83,13 @@ class Joint(Method):
         self.verdict: Verdict | None = None
 
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
-        """The place where the landmark is by now."""
+        """Return the place where the landmark is by now."""
         del row, compare
         current: IntArray = self._current()[problem.landmark_row[detections]]
         return current
 
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
-        """With the map believed to a metre: one that is wrong bends the solution, or makes it look noisy."""
+        """Return the problem with the map believed to 1 m: a wrong one bends the solution or looks noisy."""
         if self._given is None or not self._in_map(problem):
             return problem, estimate
         free = replace(
@@ -385,7 +385,7 @@ class Swap(NamedTuple):
 
 
 def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: GivenMap) -> Swap | None:
-    """The two landmarks that gain most by taking each other's place; None if that gains less than it costs.
+    """Return the two landmarks that gain most by taking each other's place; None if that gains less than it costs.
 
     Args:
         evidence: of the copies.
@@ -415,7 +415,7 @@ def likeliest_swap(evidence: WindowEvidence, comparison: Comparison, given: Give
 
 
 def with_swap(given: GivenMap, first: int, second: int) -> GivenMap:
-    """The map with two landmarks at each other's place."""
+    """Return the map with two landmarks at each other's place."""
     order = np.arange(len(given.mean))
     order[[first, second]] = second, first
     return replace(given, mean=given.mean[order], covariance=given.covariance[order])

@@ -50,7 +50,7 @@ def find_changes(
     *,
     start: Hypotheses | None = None,
 ) -> Hypotheses:
-    """The most probable sets of changes, and all that were weighed on the way.
+    """Return the most probable sets of changes, and all that were weighed on the way.
 
     Args:
         evidence: of the copies.
@@ -113,7 +113,7 @@ def _candidates(
 def item_columns(
     evidence: WindowEvidence, comparison: Comparison, position: FloatArray, n_windows: int, candidates: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """`T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
+    """Return `T'AT` and `T'b`: the four columns of every item 'this candidate, from this window on'.
 
     With one window for all of the session's, the items are 'this candidate, always'.
     """
@@ -181,7 +181,7 @@ class Weighed(NamedTuple):
 
     @classmethod
     def nothing(cls, landmarks: int, groups: int) -> Weighed:
-        """Before the search."""
+        """Return the state before the search."""
         return cls(
             np.zeros(SLOTS, np.int64),
             np.zeros(SLOTS),
@@ -430,7 +430,7 @@ def climb_from_many_starts(
 def weigh_neighbours(
     label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed
 ) -> None:
-    """All that one move makes of a hypothesis is weighed."""
+    """Weigh all that one move makes of a hypothesis."""
     n_windows = len(tables.log_onset)
     trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
     for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):

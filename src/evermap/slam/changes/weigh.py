@@ -165,7 +165,7 @@ class _Seen(NamedTuple):
         return cls(first, last, given.given)
 
     def shows(self, members: IntArray, window: int) -> BoolArray:
-        """Whether each would show that it has moved from a window on: known from before, and seen since."""
+        """Return whether each would show that it has moved from a window on: known from before, and seen since."""
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
@@ -226,7 +226,7 @@ Search = Callable[[WindowEvidence, Hypotheses | None], tuple[Comparison, Hypothe
 def without_transients(
     evidence: WindowEvidence, position: FloatArray, prior: ChangePrior, search: Search
 ) -> WindowEvidence:
-    """The evidence without copies that are displaced alone.
+    """Return the evidence without copies that are displaced alone.
 
     Args:
         evidence: of all copies.
