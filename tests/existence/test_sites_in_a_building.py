@@ -16,8 +16,7 @@ from evermap.existence.sites import SiteDynamics, SiteLooks, follow_sites
 from evermap.geometry import se2
 from evermap.sensing.sightlines import CLEAR, P_HIDDEN, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import NominalField
-from evermap.sim.classes import Duration
-from evermap.sim.config import BuildingConfig
+from evermap.sim.config import BuildingConfig, Duration
 from evermap.sim.world import BuildingSimulation, simulate_building
 from evermap.survival import Exponential, LifetimePrior
 from evermap.types import BoolArray, Detections, FloatArray, IntArray, Recording, rows_of

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
-from evermap.sim.classes import DAY_S, ObjectClass
+from evermap.sim.config import DAY_S, ObjectClass
 from evermap.types import FloatArray
 
 

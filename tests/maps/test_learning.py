@@ -14,7 +14,7 @@ from evermap.maps.history import NEWEST
 from evermap.maps.learning import class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
-from evermap.sim.classes import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
+from evermap.sim.config import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.types import UNKNOWN
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evermap.sim import BuildingConfig, ChangeKind, Duration, ObjectClass, simulate_building
+from evermap.sim import BuildingConfig, Duration, EventKind, ObjectClass, simulate_building
 from evermap.sim.building import ROUTE_CLEARANCE_M
 from evermap.sim.changes import Timeline
-from evermap.sim.classes import DAY_S
+from evermap.sim.config import DAY_S
 from evermap.sim.patrol import patrol_route
 
 SHORT = BuildingConfig(days=6, patrol_s=5.0)
@@ -73,7 +73,7 @@ def test_events_replayed_give_the_landmarks_of_every_session(seed):
     config = replace(SHORT, days=12, change_rate=2.0)
     simulation = simulate_building(config, seed)
     pose = {}
-    appeared = {event.object_id for event in simulation.events if event.kind is ChangeKind.APPEARED}
+    appeared = {event.object_id for event in simulation.events if event.kind is EventKind.APPEARED}
     for item in simulation.objects:
         if item.object_id not in appeared:
             pose[item.object_id] = item.home
@@ -82,9 +82,9 @@ def test_events_replayed_give_the_landmarks_of_every_session(seed):
     for recording, truth in zip(simulation.sessions, simulation.truths, strict=True):
         while events and events[0].stamp_s <= truth.start_s:
             event = events.pop(0)
-            assert pose.get(event.object_id) == event.pose_before or event.kind is ChangeKind.RETURNED
+            assert pose.get(event.object_id) == event.pose_before or event.kind is EventKind.RETURNED
             if event.pose_after is None:
-                assert event.kind is ChangeKind.VANISHED
+                assert event.kind is EventKind.VANISHED
                 del pose[event.object_id]
             else:
                 pose[event.object_id] = event.pose_after
@@ -104,17 +104,17 @@ def test_events_replayed_give_the_landmarks_of_every_session(seed):
 def test_events_say_what_they_mean():
     simulation = simulate_building(replace(SHORT, days=30), 5)
     seen = {event.kind for event in simulation.events}
-    assert seen == set(ChangeKind)
-    moves = [event.displacement_m for event in simulation.events if event.kind is ChangeKind.MOVED]
+    assert seen == set(EventKind)
+    moves = [event.displacement_m for event in simulation.events if event.kind is EventKind.MOVED]
     assert min(moves) > 0.0
-    back = np.array([event.displacement_m for event in simulation.events if event.kind is ChangeKind.RETURNED])
+    back = np.array([event.displacement_m for event in simulation.events if event.kind is EventKind.RETURNED])
     assert (back == 0.0).any()
     assert (back > 0.3).any()
     for event in simulation.events:
         item = simulation.objects[event.object_id]
         assert event.landmark_ids == item.landmark_ids
         assert event.class_name == item.kind.name
-        if event.kind in (ChangeKind.OPENED, ChangeKind.CLOSED):
+        if event.kind in (EventKind.OPENED, EventKind.CLOSED):
             # the handle travels a quarter circle's chord
             assert item.kind.mount == "hinge"
             assert event.displacement_m == pytest.approx(item.kind.size_m[0] * math.sqrt(2.0))

@@ -25,7 +25,7 @@ from evermap.sim import (
     looked_at,
     simulate_building,
 )
-from evermap.sim.floorplan import DOORWAY_M
+from evermap.sim.building import DOORWAY_M
 
 LENGTHS_S = (20.0, 40.0, 60.0, 165.0)
 HARD = BuildingConfig(

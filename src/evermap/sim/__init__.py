@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
-from evermap.sim.changes import ChangeEvent, ChangeKind, Stay
-from evermap.sim.classes import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, Duration, ObjectClass
-from evermap.sim.config import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig
-from evermap.sim.floorplan import FloorPlan, Room
+from evermap.sim.building import FloorPlan, Room
+from evermap.sim.changes import ChangeEvent, EventKind, Stay
+from evermap.sim.config import (
+    CLUTTER,
+    DEFAULT_CLASSES,
+    ROOM_DOORS,
+    BuildingConfig,
+    DriveConfig,
+    Duration,
+    ObjectClass,
+    OdometryConfig,
+    SensorConfig,
+)
 from evermap.sim.looked import LookedAt, looked_at
 from evermap.sim.world import BuildingSimulation, SessionTruth, simulate_building
 
@@ -16,9 +25,9 @@ __all__ = [
     "BuildingConfig",
     "BuildingSimulation",
     "ChangeEvent",
-    "ChangeKind",
     "DriveConfig",
     "Duration",
+    "EventKind",
     "FloorPlan",
     "LookedAt",
     "ObjectClass",

@@ -16,14 +16,13 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.sim.building import Circles, Placer, SceneObject, attach_landmarks
-from evermap.sim.classes import DAY_S
-from evermap.sim.config import BuildingConfig
+from evermap.sim.config import DAY_S, BuildingConfig
 from evermap.types import FloatArray
 
 Pose = tuple[float, float, float]
 
 
-class ChangeKind(StrEnum):
+class EventKind(StrEnum):
     """What happened to an object."""
 
     APPEARED = "appeared"
@@ -70,7 +69,7 @@ class ChangeEvent:
     object_id: int
     landmark_ids: tuple[int, ...]
     class_name: str
-    kind: ChangeKind
+    kind: EventKind
     displacement_m: float
     pose_before: Pose | None
     pose_after: Pose | None
@@ -90,7 +89,7 @@ class Timeline:
     sessions_s: FloatArray
 
     def defer(self, stamp_s: float) -> float:
-        """The stamp itself, or the end of the session that it falls in."""
+        """Return the stamp itself, or the end of the session that it falls in."""
         row = int(np.searchsorted(self.sessions_s[:, 0], stamp_s, side="right")) - 1
         return max(stamp_s, float(self.sessions_s[row, 1])) if row >= 0 else stamp_s
 
@@ -98,7 +97,7 @@ class Timeline:
 def live(
     objects: list[SceneObject], config: BuildingConfig, placer: Placer, timeline: Timeline, seed: np.random.SeedSequence
 ) -> tuple[list[SceneObject], list[Stay]]:
-    """The history of a building from its objects on day 0.
+    """Simulate the history of a building from its objects on day 0.
 
     Every object draws from its own random stream, so its history does not depend on how many others there are.
 
@@ -235,10 +234,10 @@ def _new_place(
 
 
 def events_of(objects: Sequence[SceneObject], stays: Sequence[Stay], timeline: Timeline) -> tuple[ChangeEvent, ...]:
-    """All changes between the start and the end of the timeline, in order of time."""
+    """Return all changes between the start and the end of the timeline, in order of time."""
     events: list[ChangeEvent] = []
 
-    def add(stamp_s: float, item: SceneObject, kind: ChangeKind, before: Stay | None, after: Stay | None) -> None:
+    def add(stamp_s: float, item: SceneObject, kind: EventKind, before: Stay | None, after: Stay | None) -> None:
         if not timeline.start_s < stamp_s < timeline.end_s:
             return
         shift = 0.0
@@ -248,7 +247,7 @@ def events_of(objects: Sequence[SceneObject], stays: Sequence[Stay], timeline: T
         events.append(
             ChangeEvent(
                 stamp_s, item.object_id, item.landmark_ids, item.kind.name, kind, shift,
-                None if before is None or kind is ChangeKind.RETURNED else before.pose,
+                None if before is None or kind is EventKind.RETURNED else before.pose,
                 None if after is None else after.pose,
             )
         )  # fmt: skip
@@ -260,15 +259,15 @@ def events_of(objects: Sequence[SceneObject], stays: Sequence[Stay], timeline: T
         previous: Stay | None = None
         for stay in by_object.get(item.object_id, []):
             if previous is None:
-                add(stay.start_s, item, ChangeKind.APPEARED, None, stay)
+                add(stay.start_s, item, EventKind.APPEARED, None, stay)
             elif previous.end_s < stay.start_s:
-                add(previous.end_s, item, ChangeKind.VANISHED, previous, None)
-                add(stay.start_s, item, ChangeKind.RETURNED, previous, stay)
+                add(previous.end_s, item, EventKind.VANISHED, previous, None)
+                add(stay.start_s, item, EventKind.RETURNED, previous, stay)
             elif item.kind.mount == "hinge":
-                add(stay.start_s, item, ChangeKind.OPENED if stay.is_open else ChangeKind.CLOSED, previous, stay)
+                add(stay.start_s, item, EventKind.OPENED if stay.is_open else EventKind.CLOSED, previous, stay)
             elif stay.pose != previous.pose:
-                add(stay.start_s, item, ChangeKind.MOVED, previous, stay)
+                add(stay.start_s, item, EventKind.MOVED, previous, stay)
             previous = stay
         if previous is not None:
-            add(previous.end_s, item, ChangeKind.VANISHED, previous, None)
+            add(previous.end_s, item, EventKind.VANISHED, previous, None)
     return tuple(sorted(events, key=lambda event: (event.stamp_s, event.object_id)))

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.sim.building import FloorPlan
 from evermap.sim.config import SensorConfig
-from evermap.sim.floorplan import FloorPlan
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray
 
 
@@ -34,7 +34,7 @@ class Scene:
 def in_view(
     pose_world_sensor: FloatArray, scene: Scene, plan: FloorPlan, config: SensorConfig
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
-    """Which landmarks (rows) are in view of which sensor poses (columns).
+    """Return which landmarks (rows) are in view of which sensor poses (columns).
 
     Args:
         pose_world_sensor: (F, 3).
@@ -56,7 +56,7 @@ def in_view(
 
 
 def sticky_uniform(rng: np.random.Generator, rows: int, columns: int, stickiness: float) -> FloatArray:
-    """(rows, columns) uniform numbers, each equal to its left neighbour with the given probability, else fresh."""
+    """Draw (rows, columns) uniform numbers, each equal to its left neighbour with the given probability, else fresh."""
     fresh = rng.random((rows, columns, 2))
     renewed = fresh[..., 1] >= stickiness
     renewed[:, 0] = True
@@ -67,7 +67,7 @@ def sticky_uniform(rng: np.random.Generator, rows: int, columns: int, stickiness
 def detect(
     pose_world_robot: FloatArray, scene: Scene, plan: FloorPlan, config: SensorConfig, seed: np.random.SeedSequence
 ) -> tuple[Detections, IntArray]:
-    """Simulated detections, one frame a robot pose (F, 3), sorted by frame, then by true landmark.
+    """Simulate detections, one frame a robot pose (F, 3), sorted by frame, then by true landmark.
 
     Returns:
         The detections, and (M,) the landmark that each truly came from, `UNKNOWN` for one of nothing.

@@ -37,12 +37,12 @@ class LookedAt:
 
     @property
     def looked_at(self) -> BoolArray:
-        """(S, P) whether the place was really looked at."""
+        """Return (S, P) whether the place was really looked at."""
         return np.asarray(self.p_seen >= LOOKED_AT)
 
 
 def looked_at(building: BuildingSimulation) -> LookedAt:
-    """The truth about looks at every place of every landmark of a simulated building."""
+    """Return the truth about looks at every place of every landmark of a simulated building."""
     landmark_id, position_m, spans = _places(building)
     start_s = np.array([truth.start_s for truth in building.truths])
     present = np.zeros((len(start_s), len(landmark_id)), dtype=np.bool_)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.sim.building import ROOM_INSET_M, FloorPlan
 from evermap.sim.config import DriveConfig, OdometryConfig
-from evermap.sim.floorplan import ROOM_INSET_M, FloorPlan
 from evermap.types import Clock, FloatArray, Odometry
 
 LANE_M: float = 0.4
@@ -41,7 +41,7 @@ class Drive:
     twist: FloatArray
 
     def pose_at(self, stamp_s: FloatArray) -> FloatArray:
-        """(K, 3) exact poses at stamps (K,) within the drive."""
+        """Return exact poses (K, 3) at stamps (K,) within the drive."""
         row = np.clip(np.searchsorted(self.stamp_s, stamp_s, side="right") - 1, 0, len(self.stamp_s) - 1)
         passed_s = stamp_s - self.stamp_s[row]
         return se2.compose(self.pose_world_robot[row], se2.exp(self.twist[row] * passed_s[:, None]))
@@ -56,7 +56,7 @@ def patrol_route(
     wing_shut: bool = False,
     start: float = 0.0,
 ) -> FloatArray:
-    """One closed lap from the dock (west end of the corridor) through all rooms, (N, 2) about 5 cm apart.
+    """Plan a closed lap from the dock (west end of the corridor) through all rooms, (N, 2) about 5 cm apart.
 
     Args:
         plan: the building.
@@ -191,7 +191,7 @@ def drive(route: FloatArray, config: DriveConfig, start_s: float, duration_s: fl
 
 
 def report_odometry(path: Drive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
-    """What the encoders say about a drive: delayed, scaled and noisy forward and angular velocity."""
+    """Simulate what the encoders report of a drive: delayed, scaled and noisy forward and angular velocity."""
     start_s, end_s = path.stamp_s[0], path.stamp_s[-1]
     period_s = 1.0 / config.rate_hz
     # the last row's period ends within the drive

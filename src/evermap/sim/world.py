@@ -14,12 +14,10 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.geometry import se2
-from evermap.sim.building import Placer, SceneObject, furnish
+from evermap.sim.building import FloorPlan, Placer, SceneObject, draw_floor_plan, furnish
 from evermap.sim.changes import ChangeEvent, Stay, Timeline, events_of, live
-from evermap.sim.classes import DAY_S
-from evermap.sim.config import BuildingConfig
+from evermap.sim.config import DAY_S, BuildingConfig
 from evermap.sim.detect import Scene, detect
-from evermap.sim.floorplan import FloorPlan, draw_floor_plan
 from evermap.sim.patrol import drive, patrol_route, report_odometry
 from evermap.types import Clock, FloatArray, Frames, IntArray, Landmarks, Recording, Trajectory
 
@@ -88,27 +86,27 @@ class BuildingSimulation:
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Names of the object classes; row = class id."""
+        """Return the names of the object classes; row = class id."""
         return tuple(kind.name for kind in self.config.classes)
 
     @property
     def n_landmarks(self) -> int:
-        """Landmarks that were ever there; their ids count from 0."""
+        """Count the landmarks that were ever there; their ids count from 0."""
         return sum(len(item.landmark_ids) for item in self.objects)
 
     def plan_in(self, session: int) -> FloorPlan:
-        """The plan with what was shut during a session as walls: what blocked the sensor's view."""
+        """Return the plan of a session, with shut doors and a shut wing as walls, as they blocked the sensor's view."""
         truth = self.truths[session]
         return self.plan.shut(truth.shut_rooms, wing=truth.wing_shut)
 
     def landmarks_at(self, stamp_s: float) -> Landmarks:
-        """True landmarks that are there at a time, exact, in the frame 'truth'."""
+        """Return the true landmarks at a time, exact, in the frame 'truth'."""
         position = positions_at(self.objects, self.stays, stamp_s)
         return _as_landmarks(position, _class_ids(self.objects), self.class_names)
 
 
 def positions_at(objects: tuple[SceneObject, ...], stays: tuple[Stay, ...], stamp_s: float) -> FloatArray:
-    """(L, 2) landmark positions at a time, row = landmark id, nan where it is not there."""
+    """Return landmark positions (L, 2) at a time, row = landmark id, nan where it is not there."""
     position = np.full((sum(len(item.landmark_ids) for item in objects), 2), np.nan)
     for stay in stays:
         if stay.start_s <= stamp_s < stay.end_s:
