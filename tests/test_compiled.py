@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import os
 import stat
@@ -65,6 +66,64 @@ def test_two_that_compile_at_the_same_moment_keep_the_code_of_both(
     assert (later(2), later(0.5)) == (4, 1.0)
     assert not later.stats.cache_misses
     assert len(later.stats.cache_hits) == 2
+
+
+CALLED = """
+from evermap.compiled import kept
+
+FACTOR = 2.0
+
+
+@kept(error_model="numpy")
+def scaled(value):
+    return FACTOR * value
+
+
+def plain():
+    return 1
+"""
+CALLER = """
+from evermap.compiled import kept
+from made_for_a_test_of_calls import scaled
+
+
+@kept(error_model="numpy")
+def twice(value):
+    return below(value) + scaled(value)
+
+
+@kept(error_model="numpy")
+def below(value):
+    return scaled(value)
+"""
+
+
+def test_code_is_kept_until_a_formula_or_a_constant_changes_wherever_it_stands(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kernel holds the code of what it calls; what is plain Python around it does not matter."""
+    caller, called = tmp_path / "caller.py", tmp_path / "made_for_a_test_of_calls.py"
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def result(of_caller: str, of_called: str) -> tuple[float, bool]:
+        """What it computes, and whether kept code did."""
+        caller.write_text(of_caller)
+        called.write_text(of_called)
+        sys.modules.pop("made_for_a_test_of_calls", None)
+        importlib.invalidate_caches()
+        kernel = kernel_of_a_process(caller)
+        return kernel(1.5), not kernel.stats.cache_misses
+
+    assert result(CALLER, CALLED) == (6.0, False)
+    assert result(CALLER, CALLED) == (6.0, True)
+    around = CALLED.replace("FACTOR = ", "# a comment moves what follows\nFACTOR = ").replace("return 1", "return 2")
+    assert result("import os\n" + CALLER, around) == (6.0, True)
+    assert result(CALLER, around.replace("2.0", "3.0")) == (9.0, False)
+    assert result(CALLER, around.replace("FACTOR * value", "FACTOR + value")) == (7.0, False)
+    assert result(CALLER.replace("return scaled(value)", "return value"), CALLED) == (4.5, False)
+    fast = CALLED.replace('error_model="numpy"', 'error_model="numpy", fastmath=True')
+    assert result(CALLER, fast) == (6.0, False)
 
 
 def reader_of_a_shipped_package(folder: Path) -> Any:

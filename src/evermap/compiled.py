@@ -1,15 +1,19 @@
-"""Machine code of kernels: how it is kept, where, and when to throw it away."""
+"""Machine code of kernels: how it is kept, where, and until when."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 import os
 import stat
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator
+from enum import Enum
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType, NoneType
 from typing import Any, TypeVar, cast
 
 from evermap.errors import EvermapWarning
@@ -19,9 +23,10 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def kept(**options: Any) -> Callable[[_Function], _Function]:
-    """A decorator: compile a function at its first call, and keep the machine code for all processes.
+    """Return a decorator that compiles a function at its first call and keeps the machine code for all processes.
 
-    It is kept beside the source, or where that is read-only in the user's cache folder, or in a temporary one.
+    It is kept beside the source, or where that is read-only in the user's cache folder, or in a temporary one. It is
+    compiled again when the function, what it calls, or a constant that either of them reads has changed.
 
     Args:
         options: as for numba's `njit`.
@@ -35,6 +40,7 @@ def kept(**options: Any) -> Callable[[_Function], _Function]:
 
         dispatcher = njit(**options)(function)
         dispatcher._cache = _keeper()(function)
+        dispatcher._cache.of = dispatcher
         dispatcher.compile = _whole(dispatcher.compile)
         return cast("_Function", dispatcher)
 
@@ -60,19 +66,36 @@ def _keeper() -> Callable[[Any], Any]:
     """Numba's keeper of machine code, for several processes, and for an installation that nobody may write to.
 
     Its own reads the index of what is kept, chooses a file and writes both, without a lock. Of processes that compile
-    a function for different arguments at the same moment, one could be given the machine code of the other's.
+    a function for different arguments at the same moment, one could be given the machine code of the other's. And it
+    compares kept code with the file of the function only, though that holds the code of all that the function calls.
     """
     from numba import config
-    from numba.core.caching import FunctionCache
+    from numba.core.caching import CompileResultCacheImpl, FunctionCache
+
+    class NamedWithoutLine(CompileResultCacheImpl):
+        def get_filename_base(self, fullname: str, abiflags: str) -> str:
+            name = fullname.replace("<", "").replace(">", "")
+            return f"{name}.py{sys.version_info[0]}{sys.version_info[1]}{abiflags}"
 
     class OneProcessAtATime(FunctionCache):
+        _impl_class = NamedWithoutLine
+        of: Any = None
+        """The dispatcher that it keeps code for."""
+
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             with _locked(Path(self.cache_path)):
+                self._stamp()
                 return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
         def save_overload(self, sig: Any, data: Any) -> None:
             with _locked(Path(self.cache_path)):
+                self._stamp()
                 super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+        def _stamp(self) -> None:
+            """Not before the first call: a kernel may call others that stand below it."""
+            if self.of is not None:
+                self._cache_file._source_stamp = _stamp_of(self.of)
 
     def keeper(function: Any) -> Any:
         try:
@@ -126,19 +149,66 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def drop_stale_code(module_file: str, *called: str) -> None:
-    """Delete the kept machine code of a package that is older than any of its sources, or than others that it calls.
+@functools.cache
+def _stamp_of(dispatcher: Any) -> str:
+    """A digest of everything of ours that the machine code of a kernel depends on, and of nothing else.
 
-    A compiled function contains the compiled functions that it calls, but its keeper compares it with its own file
-    only; after an edit elsewhere in the package old and new formulas would be mixed.
-
-    Args:
-        module_file: `__file__` of a module of the package.
-        called: `__file__` of modules elsewhere whose compiled functions its kernels call.
+    Line numbers, comments and the plain Python around it are no part of it.
     """
-    folder = Path(module_file).parent
-    newest = max(path.stat().st_mtime for path in (*folder.glob("*.py"), *map(Path, called)))
-    for index in (folder / "__pycache__").glob("*.nbi"):
-        with contextlib.suppress(OSError):  # someone else's installation: its files do not change under us
-            if index.stat().st_mtime < newest:
-                index.unlink()
+    import numpy as np
+
+    digest = hashlib.sha256(np.__version__.encode())
+    for part in _parts(dispatcher, {}):
+        digest.update(part.encode())
+        digest.update(b"\0")
+    return digest.hexdigest()
+
+
+def _parts(value: Any, seen: dict[int, int]) -> Iterator[str]:
+    """What a value that a kernel refers to means for its machine code, as texts; a function with all it refers to."""
+    function = getattr(value, "py_func", getattr(value, "_defn", value))  # a dispatcher's, an intrinsic's, or itself
+    if isinstance(function, FunctionType):
+        number = seen.setdefault(id(function), len(seen))
+        yield f"function {number}"
+        if number == len(seen) - 1:
+            captured = [cell.cell_contents for cell in function.__closure__ or ()]
+            options = getattr(value, "targetoptions", {})
+            for part in (*sorted(options), *map(options.get, sorted(options)), function.__defaults__, captured):
+                yield from _parts(part, seen)
+            yield from _parts_of_code(function.__code__, function.__doc__, function.__globals__, seen)
+    elif isinstance(value, ModuleType):
+        yield f"module {value.__name__}"
+    elif isinstance(value, type):
+        yield f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}"
+        if issubclass(value, Enum):
+            yield repr([(member.name, member.value) for member in value])
+    elif type(value).__module__ == "numpy" and hasattr(value, "tobytes"):
+        yield f"{value.dtype} {value.shape} {value.tobytes().hex()}"
+    elif isinstance(value, set | frozenset):
+        yield repr(sorted(map(repr, value)))
+    elif isinstance(value, tuple | list):
+        yield f"{type(value).__qualname__} {len(value)}"
+        for item in value:
+            yield from _parts(item, seen)
+    elif isinstance(value, bool | int | float | complex | str | bytes | NoneType):
+        yield repr(value)
+    else:  # numba's types and the like: as they were when numba was built
+        yield f"{type(value).__module__}.{type(value).__qualname__} {getattr(value, '__name__', '')}"
+
+
+def _parts_of_code(code: CodeType, doc: str | None, around: dict[str, Any], seen: dict[int, int]) -> Iterator[str]:
+    yield from (code.co_code.hex(), repr(code.co_varnames), repr(code.co_names), repr(code.co_freevars))
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _parts_of_code(constant, None, around, seen)
+        elif constant is None or constant is not doc:
+            yield from _parts(constant, seen)
+    for name in code.co_names:
+        value = around.get(name)
+        if value is not None:
+            yield name
+            yield from _parts(value, seen)
+        if isinstance(value, ModuleType) and value.__name__.partition(".")[0].startswith("evermap"):
+            for read in code.co_names:
+                if hasattr(value, read):
+                    yield from _parts(getattr(value, read), seen)

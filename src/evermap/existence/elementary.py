@@ -12,9 +12,7 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic
 
-from evermap.compiled import drop_stale_code, kept
-
-drop_stale_code(__file__)
+from evermap.compiled import kept
 
 kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 """Products and sums may fuse, nothing else is relaxed. A call lets go of the interpreter's lock: kernels run side by

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.compiled import drop_stale_code, kept
+from evermap.compiled import kept
 from evermap.types import BoolArray, FloatArray, IntArray
-
-drop_stale_code(__file__)
 
 HIGHEST = 0.98
 """No landmark is detected with more than this: a model that is certain cannot learn that it is wrong."""

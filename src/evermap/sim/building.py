@@ -180,7 +180,7 @@ class SceneObject:
 
     @property
     def radius_m(self) -> float:
-        """Return the radius of the circle about the origin that holds the footprint (of a door: the swing of its leaf)."""
+        """Return the radius of the circle about the origin that holds the footprint (a door's leaf swings)."""
         if self.kind.mount == "hinge":
             return self.kind.size_m[0]
         return math.hypot(*self.kind.size_m) / 2

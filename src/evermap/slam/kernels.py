@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.compiled import drop_stale_code, kept
+from evermap.compiled import kept
 from evermap.types import FloatArray
 
 NOISE_NAMES = (
@@ -32,8 +32,6 @@ FLOOR_VARIANCE = 1e-8
 MAX_STEP_S = 0.1
 AT_PLACES = 12
 """Where places begin in a joint covariance: behind the newest pose (3) and the calibration states (9)."""
-
-drop_stale_code(__file__)
 
 kernel = kept(error_model="numpy")
 

@@ -15,10 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.compiled import drop_stale_code, kept
+from evermap.compiled import kept
 from evermap.types import BoolArray, FloatArray, IntArray
-
-drop_stale_code(__file__)
 
 kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 

@@ -11,14 +11,11 @@ import math
 
 import numpy as np
 
-from evermap.compiled import drop_stale_code, kept
+from evermap.compiled import kept
 from evermap.types import FloatArray
-
-drop_stale_code(__file__)
 
 kernel = kept(error_model="numpy")
 inlined = kept(error_model="numpy", forceinline=True)
-
 
 Vector = tuple[float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]

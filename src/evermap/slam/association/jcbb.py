@@ -19,16 +19,11 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from evermap.compiled import drop_stale_code, kept
-from evermap.slam import kernels
+from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
 
 MAX_NODES = 200_000
 """Nodes of the tree that are visited at most; a tenth of a second."""
-
-drop_stale_code(__file__, kernels.__file__)
-
-kernel = kept(error_model="numpy")
 
 
 @dataclass(frozen=True, slots=True)

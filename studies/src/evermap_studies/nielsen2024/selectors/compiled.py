@@ -2,13 +2,8 @@
 
 import math
 
-from evermap.compiled import drop_stale_code
-from evermap.existence import elementary
 from evermap.existence.elementary import kernel
-from evermap.slam import kernels
 from evermap.slam.kernels import detection_residual
-
-drop_stale_code(__file__, elementary.__file__, kernels.__file__)
 
 __all__ = ["detection_residual", "kernel", "log_add"]
 
