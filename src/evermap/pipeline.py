@@ -138,7 +138,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
             if config.living.search == "joint" and not steps.fits(visit, alone):
                 return steps.lost(alone, before, "most sightings contradict it; it is bent, or of another place")
         # judged twice: the second time by the lifetimes that the first has learned
-        known = steps.judged(living, where, visit, config.living).living
+        known = steps.judged(living, where, visit, config.living)
         return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
 
 

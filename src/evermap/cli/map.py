@@ -77,7 +77,7 @@ def show(
     Example:
       evermap map show site.evermap --ahead 3d --figure map.png
     """
-    from evermap.cli.map_content import landmark_dicts, landmark_row
+    from evermap.cli.map_content import landmark_dicts, landmark_row, prior_dicts
     from evermap.maps.stamps import stamp_text
     from evermap.maps.store import open_store
     from evermap.survival.durations import parse_duration_s
@@ -95,7 +95,7 @@ def show(
         write_picture(figure, plot_living_map(**_picture(living), title=f"{Path(file).name}, revision {number}"))
     if as_json:
         about = {"map": file, "revision": number, "stamp_s": _finite(living.stamp_s), "clock": living.clock.value}
-        print_json({**about, "ahead_s": ahead_s, "landmarks": content})
+        print_json({**about, "ahead_s": ahead_s, "landmarks": content, "priors": prior_dicts(living)})
         return
     listed = [
         item for item in content if everything or item["pinned"] or (item["p_exists"] >= 0.5 and not item["deleted"])
@@ -103,6 +103,10 @@ def show(
     head = ("landmark", "class", "P(exists)", f"in {ahead}", "place [m]", "+-", "since", "last seen", "sites", "")
     title = f"{file}, revision {number}, seen until {stamp_text(living.stamp_s, living.clock)}"
     print_rows(title, head, [landmark_row(item, living.clock) for item in listed], numbers=(0, 2, 3, 5, 8))
+    for said in prior_dicts(living):
+        of = f"of class {said['class']}" if said["class"] else "of all other classes"
+        away = f", absences {said['absence']}" if said["absence"] else ""
+        echo(f"lifetimes {of} start from {said['stay']}{away}, worth {said['worth_stays']} stays")
     if len(listed) < len(content):
         say(f"{len(content) - len(listed)} more are believed gone or deleted; --all lists them")
 
@@ -148,34 +152,56 @@ def diff(
 @app.command("export")
 def export(
     file: _File,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="What to write: .parquet, .geojson or .csv.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Where to write the landmarks: .parquet, .geojson or .csv.", show_default=False
+        ),
+    ] = None,
+    lifetimes: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Where to write how long things stay, by class.", show_default=False),
+    ] = None,
     revision: _AtRevision = None,
     p_least: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Leave out what exists with a smaller probability.")
     ] = 0.5,
     as_json: _AsJson = False,
 ) -> None:
-    """Write the landmarks that exist as a table.
+    """Write the landmarks that exist as a table, or what was learned of lifetimes.
 
-    For other tools, and for `evermap slam --prior-map`.
+    For other tools, for `evermap slam --prior-map`, and for `--prior` of another map.
 
     \b
-    Example:
+    Examples:
       evermap map export site.evermap --out map.geojson
+      evermap map export site.evermap --lifetimes lifetimes.json
     """
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
 
-    write = _writer(out)
-    check_output_file(out, inputs=[file])
+    if out is None and lifetimes is None:
+        raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
+    write = None if out is None else _writer(out)
+    for path in (out, lifetimes):
+        if path is not None:
+            check_output_file(path, inputs=[file], ending=".json" if path is lifetimes else "")
     with open_store(file) as store:
         number = store.head() if revision is None else revision
-        landmarks = store.load(number).landmarks(p_least=p_least)
-    write(landmarks, out)
+        living = store.load(number)
+    landmarks = living.landmarks(p_least=p_least)
+    if write is not None:
+        write(landmarks, out)
+    classes = [] if lifetimes is None else _write_lifetimes(living, lifetimes)
     if as_json:
-        print_json({"map": file, "revision": number, "out": str(out), "landmarks": len(landmarks)})
+        told = {"out": None if out is None else str(out), "landmarks": len(landmarks)}
+        said = {"lifetimes": None if lifetimes is None else str(lifetimes), "classes": classes}
+        print_json({"map": file, "revision": number, **told, **said})
         return
-    say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}")
+    if out is not None:
+        say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}")
+    if lifetimes is not None:
+        say(f"wrote lifetimes of {len(classes)} classes to {lifetimes}; use it with: evermap slam --prior {lifetimes}")
 
 
 @app.command("why")
@@ -226,6 +252,17 @@ def _p_ahead(living: LivingMap, ahead_s: float) -> FloatArray:
 
     later = replace(living.sites, p_here=predicted(living, LivingConfig(), living.stamp_s + ahead_s))
     return replace(living, sites=later).p_exists()
+
+
+def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:
+    """The lifetimes of a map as a file of models; returns the classes in it."""
+    from evermap.existence.run_length import RunLength
+    from evermap.existence.storage import NamedModels, save_models
+    from evermap.maps.learning import lifetimes_by_class
+
+    models = {name: RunLength.from_lifetimes(found) for name, found in lifetimes_by_class(living).items()}
+    save_models(NamedModels(models, "class"), path)
+    return list(models)
 
 
 def _writer(out: Path) -> Any:

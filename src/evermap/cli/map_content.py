@@ -131,6 +131,21 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
     ]
 
 
+def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
+    """Return what users said of lifetimes, by class; '' for all classes of which they said nothing."""
+    from evermap.survival.text import prior_text
+
+    return [
+        {
+            "class": class_name(living, class_id),
+            "stay": prior_text(life.stay),
+            "absence": prior_text(life.absence) if life.tells_absence else None,
+            "worth_stays": life.n_stays,
+        }
+        for class_id, life in zip(living.lives.prior_class_id.tolist(), living.lives.prior, strict=True)
+    ]
+
+
 def answer_dict(answer: Answer) -> dict[str, Any]:
     """Everything behind a 'why', with every look."""
     from evermap.runs.summary import change_dict

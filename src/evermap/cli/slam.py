@@ -89,6 +89,15 @@ def slam(
             show_default=False,
         ),
     ] = None,
+    priors: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--prior",
+            metavar="[CLASS=]PRIOR|FILE.json",
+            help="With --map: how long things stay, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
+            "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
+        ),
+    ] = None,
     localize: Annotated[
         bool, typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map stays.")
     ] = False,
@@ -122,6 +131,7 @@ def slam(
       evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
       evermap slam monday --map building.evermap
       evermap slam tuesday --map building.evermap --localize
+      evermap slam monday --map building.evermap --prior "cart=exponential:half-life=2d" --prior wall=never-leaves
     """
     if init is not None:
         _write_template(init)
@@ -146,6 +156,8 @@ def slam(
     if shifts and prior_map is None:
         raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
+    if priors and (map_file is None or localize):
+        raise ConfigError("is for a session of a map", field="--prior", hint="--map FILE, without --localize")
     inputs = [recording_path, config_file, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force, inputs=inputs)
@@ -161,6 +173,7 @@ def slam(
             config,
             map_file,
             out,
+            priors=priors or [],
             localize=localize,
             realtime=realtime,
             as_json=as_json,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ def run_in_map(
     map_file: Path,
     out: Path,
     *,
+    priors: Sequence[str],
     localize: bool,
     realtime: bool,
     as_json: bool,
@@ -34,13 +36,15 @@ def run_in_map(
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
     from evermap.runs.folder import RunInfo, write_run
-    from evermap.runs.sessions import at_time, enter_session
+    from evermap.runs.sessions import at_time, enter_session, priors_of
     from evermap.viz.change_words import explanations, grew
 
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
+    with _of_option("prior"):
+        said = priors_of(priors)
     warm_up()
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
@@ -53,7 +57,8 @@ def run_in_map(
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
-                entered = enter_session(store, recording, config, progress=progress)
+                with _of_option("prior"):
+                    entered = enter_session(store, recording, config, priors=said, progress=progress)
                 session = entered.session
                 result, recording = replace(session.slam, changes=entered.changes), session.recording
         elapsed_s = time.perf_counter() - start
@@ -82,3 +87,14 @@ def run_in_map(
         if entered.replayed:
             again = ", ".join(entered.replayed)
             say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
+
+
+@contextmanager
+def _of_option(name: str) -> Iterator[None]:
+    """Errors about an argument of this name, or about none, are about the option."""
+    try:
+        yield
+    except ConfigError as error:
+        if error.path is not None or error.field not in (None, name, f"--{name}"):
+            raise
+        raise ConfigError(error.problem, field=f"--{name}", hint=error.hint) from None

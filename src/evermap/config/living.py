@@ -25,6 +25,12 @@ class LivingConfig(Section):
     learn_lifetimes: bool = Field(
         default=True, description="learn from this map's history how long things stay; off: anything is possible"
     )
+    prior_stays: int = Field(
+        default=20,
+        ge=1,
+        le=100_000,
+        description="stays that a given prior of a lifetime is worth, beside those that the map sees",
+    )
     learn_sight: bool = Field(
         default=True, description="learn from where to where the sensor sees; off: its nominal field of view"
     )

@@ -6,66 +6,124 @@ looks only the outcome is known; `history` says what could have been.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evermap.errors import ConfigError, suggestion
+from evermap.existence.lifetimes import Lifetimes
 from evermap.maps.history import History
-from evermap.maps.lives import EVERYWHERE, Life, Lives
-from evermap.maps.living import Stays
+from evermap.maps.lives import EVERYWHERE, Life, Lives, general_purpose
+from evermap.maps.living import LivingMap, Stays
+from evermap.survival import LifetimePrior, PiecewiseConstantHazard
 from evermap.survival.class_lifetimes import (
+    LOG_MEAN,
+    LOG_SHAPE,
+    LOGIT_RETURN,
     ClassPosterior,
     absence_log_likelihood,
     absence_posterior,
+    finer,
     stay_log_likelihood,
     stay_posterior,
 )
-from evermap.survival.hazards import PiecewiseConstantHazard
-from evermap.types import UNKNOWN, FloatArray, IntArray, rows_of
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
 LEAST_ENDED = 5
 """Ends in a chunk before it has lifetimes of its own."""
 SURE = 0.999
 """Ends of stays that are more probable than this count as ends."""
+QUANTILES = 64
+"""Lengths of stays that stand for a prior that a user gives."""
+_SHORTEST_S, _LONGEST_S = 60.0, 1.5e9
 _FIRMNESS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 """Ends that the lifetimes of a class may count for in those of a chunk; how many is learned."""
 
 
 def learned_lives(stays: Stays, before: Lives, now_s: float) -> Lives:
-    """Lifetimes by class and place from all stays of a map until now.
+    """Learn lifetimes by class and place from all stays of a map until now.
 
     Args:
         stays: of all cliques, also those that go on.
-        before: what was learned after the session before; its chunks and looks are kept.
+        before: what was learned after the session before; its chunks, looks and priors are kept.
         now_s: end of the session.
     """
-    looks_s = np.append(before.looks_s[before.looks_s < now_s], now_s)
-    if not len(stays):
-        return replace(before, looks_s=looks_s)
-    history = History.of(stays, looks_s)
-    learned = _learned(history)
-    entries: list[tuple[int, tuple[int, int], Life]] = []
-    for row, class_id in enumerate(history.class_ids.tolist()):
-        life = learned.life(row)
-        entries.append((class_id, (EVERYWHERE, EVERYWHERE), life))
-        entries += [(class_id, chunk, own) for chunk, own in _of_chunks(history, row, life, before.chunk_m)]
-    if UNKNOWN not in history.class_ids:
-        entries.append((UNKNOWN, (EVERYWHERE, EVERYWHERE), learned.life(-1)))
-    return Lives(
-        class_id=np.array([class_id for class_id, _, _ in entries], dtype=np.int64),
-        chunk=np.array([chunk for _, chunk, _ in entries], dtype=np.int64),
-        life=tuple(life for _, _, life in entries),
-        chunk_m=before.chunk_m,
-        looks_s=looks_s,
-    )
+    return ClassLives.of(stays, before, now_s).lives
+
+
+@dataclass(frozen=True, slots=True)
+class ClassLives:
+    """What the stays of a map say of the lifetimes of its classes; the last row of all is of a class never seen.
+
+    Attributes:
+        lives: the same as lifetimes by class and place.
+        class_ids: (C,) classes there are.
+        stay: posterior of the stays of each.
+    """
+
+    lives: Lives
+    class_ids: IntArray
+    stay: ClassPosterior
+
+    @classmethod
+    def of(cls, stays: Stays, before: Lives, now_s: float | None = None) -> Self:
+        """Learn from all stays of a map; see `learned_lives`.
+
+        Args:
+            stays: of all cliques.
+            before: what was learned before, whose looks are told of.
+            now_s: end of the newest session; None where `before` tells of it, too.
+        """
+        looks_s = before.looks_s if now_s is None else np.append(before.looks_s[before.looks_s < now_s], now_s)
+        if not len(stays):
+            nothing = stay_posterior(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
+            return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
+        history = History.of(stays, looks_s)
+        learned = _learned(history, before)
+        entries: list[tuple[int, tuple[int, int], Life]] = []
+        for row, class_id in enumerate(history.class_ids.tolist()):
+            life = learned.life(row)
+            entries.append((class_id, (EVERYWHERE, EVERYWHERE), life))
+            entries += [(class_id, chunk, own) for chunk, own in _of_chunks(history, row, life, before.chunk_m)]
+        if UNKNOWN not in history.class_ids:
+            said, of_all = before.prior_of(UNKNOWN), learned.life(-1)
+            entries.append((UNKNOWN, (EVERYWHERE, EVERYWHERE), of_all if said is None else of_all.as_said(said)))
+        kinds, chunks, found = zip(*entries, strict=True)
+        lives = replace(before, class_id=np.array(kinds), chunk=np.array(chunks), life=found, looks_s=looks_s)
+        return cls(lives, history.class_ids, learned.stay)
+
+    def band(
+        self, class_id: int, ages_s: ArrayLike, confidence: float = 0.95
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return `P(stay > age)` of a class at ages (N,), and the bounds of its credible interval.
+
+        Args:
+            class_id: of the class; any that was never seen for a new one.
+            ages_s: (N,) in seconds.
+            confidence: probability that the truth lies between the bounds, at each age by itself.
+
+        Returns:
+            (N,) posterior mean, lower and upper bound.
+        """
+        found = np.flatnonzero(self.class_ids == class_id)
+        return self.stay.band(int(found[0]) if len(found) else -1, ages_s, confidence)
+
+    def longest(self, class_id: IntArray, age_s: FloatArray, confidence: float) -> FloatArray:
+        """Return (N,) upper bounds of `P(stay > age)`, of classes (N,) at ages (N,): the longest credible lifetimes."""
+        upper = np.empty(len(class_id))
+        for kind in np.unique(class_id):
+            mine = class_id == kind
+            upper[mine] = self.band(int(kind), age_s[mine], confidence)[2]
+        return upper
 
 
 def class_survival(
     stays: Stays, lives: Lives, class_id: int, ages_s: ArrayLike, confidence: float = 0.95
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What the stays of a map say about one class: `P(stay > age)`, and the bounds of its credible interval.
+    """Return what the stays of a map say about one class, as `ClassLives.band` does.
 
     Args:
         stays: of all cliques; the classes learn from each other.
@@ -73,36 +131,8 @@ def class_survival(
         class_id: of the class; any that was never seen for a new one.
         ages_s: (N,) in seconds.
         confidence: probability that the truth lies between the bounds, at each age by itself.
-
-    Returns:
-        (N,) posterior mean, lower and upper bound.
     """
-    history = History.of(stays, lives.looks_s)
-    found = np.flatnonzero(history.class_ids == class_id)
-    return _learned(history).stay.band(int(found[0]) if len(found) else -1, ages_s, confidence)
-
-
-@dataclass(frozen=True, slots=True)
-class LongestLives:
-    """The longest lifetimes that are credible: upper bounds of the survival functions of classes."""
-
-    class_ids: IntArray
-    stay: ClassPosterior
-    confidence: float
-
-    @classmethod
-    def of(cls, stays: Stays, looks_s: FloatArray, confidence: float) -> Self:
-        """From all stays of a map, with the ends (M,) of its sessions."""
-        history = History.of(stays, looks_s)
-        return cls(history.class_ids, _learned(history).stay, confidence)
-
-    def survival(self, class_id: IntArray, age_s: FloatArray) -> FloatArray:
-        """(N,) upper bounds of `P(stay > age)`, of classes (N,) at ages (N,)."""
-        upper = np.empty(len(class_id))
-        for kind in np.unique(class_id):
-            mine, row = class_id == kind, np.flatnonzero(self.class_ids == kind)
-            upper[mine] = self.stay.band(int(row[0]) if len(row) else -1, age_s[mine], self.confidence)[2]
-        return upper
+    return ClassLives.of(stays, lives).band(class_id, ages_s, confidence)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,15 +157,18 @@ class _Learned:
         )
 
 
-def _learned(history: History) -> _Learned:
+def _learned(history: History, before: Lives) -> _Learned:
     stays, n_classes = history.stays, len(history.class_ids)
     ended = np.isfinite(stays.gone_s)
+    said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
     away = np.flatnonzero(history.recent & history.away)
     log_likelihood = absence_log_likelihood(
         stays.last_s[away], stays.gone_s[away], history.seen_away_s[away], history.back_s[away]
     )
     log_likelihood *= stays.p_gone[away, None, None]
-    absence = absence_posterior(_by_class(log_likelihood, history.kind[away], n_classes))
+    log_likelihood = _by_class(log_likelihood, history.kind[away], n_classes)
+    of_absence = [life.n_stays * absence_said(life.absence) if life and life.tells_absence else None for life in said]
+    absence = absence_posterior(log_likelihood, _stacked(of_absence))
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
     here_again = history.shares(history.back_here, history.away & np.isfinite(history.back_s))
@@ -153,9 +186,90 @@ def _learned(history: History) -> _Learned:
         going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
         log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
     log_likelihood = _by_class(log_likelihood, kind, n_classes)
+    of_stay = [life.n_stays * stay_said(life.stay) if life else None for life in said]
+    stay = stay_posterior(log_likelihood, _stacked(of_stay))
     p_known = history.shares(history.to_known, history.had_choice)
     counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
-    return _Learned(stay_posterior(log_likelihood), absence, p_hop, p_known, *counts)
+    return _Learned(stay, absence, p_hop, p_known, *counts)
+
+
+def stay_said(prior: LifetimePrior) -> FloatArray:
+    """Return the (M, A) mean log likelihood of one stay that lasts as a user says, where `stay_posterior` lives.
+
+    `n` times this is what `n` stays say whose lengths spread as the prior does (a power prior, Ibrahim and Chen 2000);
+    of those beyond `_LONGEST_S` only that is known.
+    """
+    from scipy.special import gammaln
+
+    age_s, ended = _spread(prior)
+    log_shape = finer(LOG_SHAPE)
+    shape = np.exp(log_shape)
+    log_scale = finer(LOG_MEAN)[:, None] - gammaln(1.0 + 1.0 / shape)
+    log_ratio = shape * (np.log(age_s)[:, None, None] - log_scale)
+    log_density = log_shape - np.log(age_s)[:, None, None] + log_ratio
+    return np.asarray((np.where(ended[:, None, None], log_density, 0.0) - np.exp(log_ratio)).mean(axis=0))
+
+
+def absence_said(prior: LifetimePrior) -> FloatArray:
+    """Return the (M, A) same of one absence, where `absence_posterior` lives."""
+    age_s, ended = _spread(prior)
+    age_s, ended = age_s[:, None, None], ended[:, None, None]
+    share, log_mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), finer(LOG_MEAN)[:, None]
+    gone = age_s * np.exp(-log_mean)
+    return np.asarray(
+        np.where(ended, np.log(share) - gone - log_mean, np.log(share * np.exp(-gone) + 1.0 - share)).mean(axis=0)
+    )
+
+
+def _stacked(parts: list[FloatArray | None]) -> FloatArray | float:
+    """(C, M, A) of what is said of some of the classes; 0 where that is nothing."""
+    shape = next((part.shape for part in parts if part is not None), None)
+    return 0.0 if shape is None else np.stack([np.zeros(shape) if part is None else part for part in parts])
+
+
+def _spread(prior: LifetimePrior) -> tuple[FloatArray, BoolArray]:
+    """(Q,) ages by which equal shares of lifetimes end, and whether they do before `_LONGEST_S`."""
+    age_s = np.asarray(prior.quantile((np.arange(QUANTILES) + 0.5) / QUANTILES), dtype=np.float64)
+    return np.clip(age_s, _SHORTEST_S, _LONGEST_S), np.asarray(age_s < _LONGEST_S)
+
+
+def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: Sequence[str], worth: int) -> LivingMap:
+    """Return a map in which the lifetimes of some classes are what a user says, until its own stays say otherwise.
+
+    Args:
+        living: the map; what it was told of the same classes before is replaced.
+        said: by the name of a class; '' is for all that have no entry of their own. An absence that never ends says
+            nothing: things return as the map learns.
+        class_names: classes of the recording that is to come, beside those of the map.
+        worth: number of stays that each is worth.
+
+    Raises:
+        ConfigError: neither the map nor the recording has such a class.
+    """
+    names = living.class_names + tuple(name for name in class_names if name not in living.class_names)
+    known = dict(zip(living.lives.prior_class_id.tolist(), living.lives.prior, strict=True))
+    for name, lifetimes in said.items():
+        if name and name not in names:
+            raise ConfigError(
+                f"no landmark is of class '{name}'", field="prior", hint=suggestion(name, names) if names else None
+            )
+        absence = lifetimes.absence if lifetimes.absence.p_never_leaves < 1.0 else general_purpose()
+        life = Life(stay=lifetimes.stay, absence=absence, n_stays=worth)
+        known[names.index(name) if name else UNKNOWN] = life
+    class_id = np.array(sorted(known), dtype=np.int64)
+    lives = replace(living.lives, prior_class_id=class_id, prior=tuple(known[k] for k in class_id.tolist()))
+    return replace(living, class_names=names, lives=lives)
+
+
+def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
+    """Return the lifetimes that a map has learned, or was told of, by class; '' for a class that it does not know."""
+    lives, names = living.lives, dict(enumerate(living.class_names))
+    kinds = np.union1d(lives.class_id, lives.prior_class_id).tolist()
+    found = {}
+    for kind in [*(k for k in kinds if k != UNKNOWN), UNKNOWN]:
+        life = lives.of(kind)
+        found[names.get(kind, "")] = Lifetimes(life.stay, life.absence)
+    return found
 
 
 def _of_chunks(history: History, row: int, life: Life, chunk_m: float) -> list[tuple[tuple[int, int], Life]]:

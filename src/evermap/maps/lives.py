@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,16 @@ class Life:
     n_stays: int = 0
     n_ended: int = 0
 
+    @property
+    def tells_absence(self) -> bool:
+        """Whether it says more of absences than that anything is possible."""
+        return self.absence != general_purpose()
+
+    def as_said(self, said: Life) -> Life:
+        """Return the same with the stay, and the absence if it tells of it, that a user has said."""
+        absence = said.absence if said.tells_absence else self.absence
+        return replace(self, stay=said.stay, absence=absence, n_stays=0, n_ended=0)
+
 
 @dataclass(frozen=True, slots=True)
 class Lives:
@@ -48,6 +58,9 @@ class Lives:
         life: (E,) what was learned.
         chunk_m: side of a chunk.
         looks_s: (M,) ends of the sessions that were learned from: between two of them things come back unseen.
+        prior_class_id: (R,) classes of which a user said how long they stay; `UNKNOWN` for all that have no own entry.
+        prior: (R,) what he said; `n_stays` is the number of stays that it is worth. `with_priors` of
+            `maps.learning` makes them.
     """
 
     class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -55,15 +68,41 @@ class Lives:
     life: tuple[Life, ...] = ()
     chunk_m: float = 10.0
     looks_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    prior_class_id: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    prior: tuple[Life, ...] = ()
 
-    def of(self, class_id: int, position_m: FloatArray) -> Life:
-        """What is known of a class (or `UNKNOWN`) at a position (2,)."""
-        here = np.floor(np.asarray(position_m) / self.chunk_m).astype(np.int64)
-        for kind, chunk in ((class_id, here), (class_id, _ANYWHERE), (UNKNOWN, _ANYWHERE)):
-            found = np.flatnonzero((self.class_id == kind) & np.all(self.chunk == chunk, axis=1))
+    def of(self, class_id: int, position_m: FloatArray | None = None) -> Life:
+        """Return what is known of a class (or `UNKNOWN`): learned of it, else said, else learned of all classes.
+
+        Args:
+            class_id: of the class.
+            position_m: (2,) where; None for the whole floor.
+        """
+        if position_m is not None:
+            here = np.floor(np.asarray(position_m) / self.chunk_m).astype(np.int64)
+            if (learned := self._learned(class_id, here)) is not None:
+                return learned
+        if (learned := self._learned(class_id, _ANYWHERE)) is not None:
+            return learned
+        of_all, said = self._learned(UNKNOWN, _ANYWHERE) or Life(), self.prior_of(class_id)
+        return of_all if said is None else of_all.as_said(said)
+
+    def said(self, class_id: int) -> Life:
+        """Return what a user said of a class, else that anything is possible: what holds where nothing is learned."""
+        prior = self.prior_of(class_id)
+        return Life() if prior is None else Life().as_said(prior)
+
+    def prior_of(self, class_id: int) -> Life | None:
+        """Return what a user said of a class, or of all that he said nothing of; None for nothing."""
+        for kind in (class_id, UNKNOWN):
+            found = np.flatnonzero(self.prior_class_id == kind)
             if len(found):
-                return self.life[int(found[0])]
-        return Life()
+                return self.prior[int(found[0])]
+        return None
+
+    def _learned(self, class_id: int, chunk: IntArray) -> Life | None:
+        found = np.flatnonzero((self.class_id == class_id) & np.all(self.chunk == chunk, axis=1))
+        return self.life[int(found[0])] if len(found) else None
 
 
 EVERYWHERE = np.iinfo(np.int64).min

@@ -7,17 +7,18 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import DataError, InputError
+from evermap.errors import DataError, InputError, suggestion
 from evermap.maps.store import Attachment, MapStore, Provenance, Revision, RevisionKind
 
 if TYPE_CHECKING:
     from evermap.config import Config
+    from evermap.existence.lifetimes import Lifetimes
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
     from evermap.types import IntArray, MapChange, Recording
@@ -103,7 +104,12 @@ class _Step:
 
 
 def enter_session(
-    store: MapStore, recording: Recording, config: Config | None = None, *, progress: Progress | None = None
+    store: MapStore,
+    recording: Recording,
+    config: Config | None = None,
+    *,
+    priors: Mapping[str, Lifetimes] | None = None,
+    progress: Progress | None = None,
 ) -> Entered:
     """Bring a session into the newest map of a store, at its place in time.
 
@@ -111,13 +117,18 @@ def enter_session(
         store: the map.
         recording: the session.
         config: settings of this session; the others are brought in again with their own.
+        priors: how long things of a class stay, and stay away, as `maps.learning.with_priors` takes them; they stay in
+            the map.
         progress: told after every frame of this session.
 
     Raises:
         InputError: it is in the map already, or it is late and a later session kept no recording.
+        ConfigError: a prior of a class that neither the map nor the recording has.
         DataError, NumericalError: as `pipeline.run_session`.
     """
+    from evermap.config import Config
     from evermap.maps.diff import net
+    from evermap.maps.learning import with_priors
     from evermap.maps.store.recorded import RECORDING, pack_recording
     from evermap.pipeline import run_session
     from evermap.valid import check_type
@@ -130,8 +141,10 @@ def enter_session(
     _refuse_twice(store, kept, data, recording)
     stamps = recording.frames.stamp_s
     start_s = float(stamps[0]) if len(stamps) else np.inf
+    worth = (config or Config()).living.prior_stays
+    said = with_priors(newest, priors or {}, recording.class_names, worth) if priors else newest
     if not start_s < newest.session_start_s:
-        session = run_session(recording, newest, config, progress=progress)
+        session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
     steps = _history(store, kept)
     first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
@@ -139,6 +152,10 @@ def enter_session(
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
+    # what users said of lifetimes is of no time
+    names, lives = said.class_names, said.lives
+    lives = replace(base.lives, prior_class_id=lives.prior_class_id, prior=lives.prior)
+    living = replace(living, class_names=names, lives=lives) if len(lives.prior) else living
     if not len(living.places):
         living = replace(living, clock=recording.clock)
     told = [(store.changes(step.revision.number)[::-1], True) for step in reversed(steps[first:])]
@@ -157,6 +174,31 @@ def enter_session(
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
     found = tuple(change.named(living.landmark_names) for change in net(told, newest, living))
     return Entered(session, newest, living, found, names, head, {RECORDING: data})
+
+
+def priors_of(sources: Sequence[str]) -> dict[str, Lifetimes]:
+    """Read lifetimes that a user gives for a map, by class; '' is for every class that is not named.
+
+    Args:
+        sources: each `CLASS=PRIOR`, or `PRIOR` for all other classes, where a prior is its text, as
+            `weibull:scale=3d,shape=1.5`, or a file of models, as `survival fit`, `survival learn` and
+            `map export --lifetimes` write it. What a class is given by name goes before what a file says of it.
+
+    Raises:
+        ConfigError: the text of no prior, or two for one class.
+        InputError: a file that cannot be read, or that says nothing of the class.
+    """
+    from evermap.existence.storage import lifetimes_of
+    from evermap.runs.persist.config import split_priors
+
+    common, by_class = split_priors(sources)
+    found = {} if common is None else lifetimes_of(common)
+    for name, source in by_class.items():
+        told = lifetimes_of(source)
+        if name not in told and "" not in told:
+            raise InputError(f"says nothing of class '{name}'", path=source, hint=suggestion(name, told))
+        found[name] = told[name if name in told else ""]
+    return found
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:

@@ -86,18 +86,28 @@ class ClassPosterior:
         return survival @ weight, lower, upper
 
 
-def stay_posterior(log_likelihood: FloatArray) -> ClassPosterior:
-    """Compute the posterior of stays from log likelihoods (C, M, A) of C classes on `LOG_MEAN` and `LOG_SHAPE`."""
-    second = _finer(LOG_SHAPE)
-    weight = _posterior(log_likelihood, -0.5 * np.square(second / SHAPE_SPREAD))
-    return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), np.exp(second), improper=False)
+def stay_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -> ClassPosterior:
+    """Compute the posterior of stays from log likelihoods (C, M, A) of C classes on `LOG_MEAN` and `LOG_SHAPE`.
+
+    Args:
+        log_likelihood: of what was seen; it is interpolated to a finer grid.
+        said: (C, M', A') log likelihoods on that grid, `finer` of both, of what else is known; none where it is 0.
+    """
+    second = finer(LOG_SHAPE)
+    weight = _posterior(log_likelihood, -0.5 * np.square(second / SHAPE_SPREAD), said)
+    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), np.exp(second), improper=False)
 
 
-def absence_posterior(log_likelihood: FloatArray) -> ClassPosterior:
-    """Compute the posterior of absences from log likelihoods (C, M, A) on `LOG_MEAN` and `LOGIT_RETURN`."""
-    share = 1.0 / (1.0 + np.exp(-_finer(LOGIT_RETURN)))
-    weight = _posterior(log_likelihood, np.log(share * (1.0 - share)))  # even over probabilities
-    return ClassPosterior(weight, np.exp(_finer(LOG_MEAN)), share, improper=True)
+def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0) -> ClassPosterior:
+    """Compute the posterior of absences from log likelihoods (C, M, A) on `LOG_MEAN` and `LOGIT_RETURN`.
+
+    Args:
+        log_likelihood: of what was seen.
+        said: as of `stay_posterior`.
+    """
+    share = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN)))
+    weight = _posterior(log_likelihood, np.log(share * (1.0 - share)), said)  # even over probabilities
+    return ClassPosterior(weight, np.exp(finer(LOG_MEAN)), share, improper=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,13 +218,13 @@ def _ages(
     return first[:, None] - begin, last[:, None] - begin, after[:, None] - begin
 
 
-def _posterior(log_likelihood: FloatArray, log_second: FloatArray) -> FloatArray:
+def _posterior(log_likelihood: FloatArray, log_second: FloatArray, said: FloatArray | float) -> FloatArray:
     """Return the posterior (C + 1, M, A) on the finer grid, with level and spread of the classes summed over."""
-    fine = _cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T
+    fine = _cubic(len(LOG_MEAN)) @ log_likelihood @ _cubic(log_likelihood.shape[2]).T + said
     fine = np.exp(fine - fine.max(axis=(1, 2), keepdims=True, initial=-np.inf))
     second = np.exp(log_second - log_second.max())
     second /= second.sum()
-    means = _finer(LOG_MEAN)
+    means = finer(LOG_MEAN)
     common = np.exp(-0.5 * np.square((means - _LEVELS[:, None, None]) / _SPREADS[:, None])).reshape(-1, len(means))
     common /= common.sum(axis=1, keepdims=True)  # (H, M)
     evidence = np.maximum((fine @ second) @ common.T, _LEAST)  # (C, H)
@@ -230,7 +240,8 @@ def _posterior(log_likelihood: FloatArray, log_second: FloatArray) -> FloatArray
     return np.asarray(weight / weight.sum(axis=(1, 2), keepdims=True))
 
 
-def _finer(nodes: FloatArray) -> FloatArray:
+def finer(nodes: FloatArray) -> FloatArray:
+    """Return the grid between the nodes on which posteriors live."""
     return np.asarray(np.interp(np.arange(FINE * (len(nodes) - 1) + 1) / FINE, np.arange(len(nodes)), nodes))
 
 
@@ -262,5 +273,5 @@ def _survival(ages_s: FloatArray, mean_s: FloatArray, second: FloatArray, improp
 def _survival_table(improper: bool) -> FloatArray:
     """Return the survival (J, M A) at the edges of curves."""
     nodes = LOGIT_RETURN if improper else LOG_SHAPE
-    second = 1.0 / (1.0 + np.exp(-_finer(nodes))) if improper else np.exp(_finer(nodes))
-    return _survival(_EDGES_S, np.exp(_finer(LOG_MEAN)), second, improper)
+    second = 1.0 / (1.0 + np.exp(-finer(nodes))) if improper else np.exp(finer(nodes))
+    return _survival(_EDGES_S, np.exp(finer(LOG_MEAN)), second, improper)

@@ -397,5 +397,5 @@ def site_middles(living: LivingMap) -> FloatArray:
 
 
 def _life(living: LivingMap, config: LivingConfig, class_id: int, position_m: FloatArray) -> Life:
-    life = living.lives.of(class_id, position_m) if config.learn_lifetimes else Life()
+    life = living.lives.of(class_id, position_m) if config.learn_lifetimes else living.lives.said(class_id)
     return life if config.returns else replace(life, absence=never_leaves())

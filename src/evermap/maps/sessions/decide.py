@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from evermap.maps.diff import SAME_SPOT_M, motion_of, with_swaps
-from evermap.maps.learning import LongestLives
+from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays
 from evermap.maps.sessions.arrive import Arrivals
 from evermap.maps.sessions.believe import Looks, class_of, clique_rows, site_middles
@@ -17,6 +17,8 @@ from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 LEAST_EVIDENCE = 1.5
 """What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
+CREDIBLE = 0.6
+"""Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
 SURELY_AWAY = 0.02
 FORGOTTEN_P = 0.05
 """Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
@@ -54,7 +56,7 @@ def decided(
     log_evidence: FloatArray,
     arrivals: Arrivals,
     start_s: float,
-    longest: LongestLives | None = None,
+    longest: ClassLives | None = None,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date, and what changed since it was told last, by clique.
 
@@ -68,8 +70,8 @@ def decided(
         log_evidence: (C,) what they say for 'it stands somewhere' against 'it is away', by clique.
         arrivals: what earlier looks said of the places of new sites.
         start_s: beginning of the session.
-        longest: lifetimes that are credible: a clique is told to have vanished where the looks outweigh even these.
-            None where nothing is known of lifetimes.
+        longest: how long things stay: a clique is told to have vanished where the looks outweigh the longest lifetimes
+            that are credible. None where nothing is known of lifetimes.
     """
     session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest)
     told = _told(before, after)
@@ -138,7 +140,7 @@ class _Session:
         log_evidence: FloatArray,
         arrivals: Arrivals,
         start_s: float,
-        longest: LongestLives | None,
+        longest: ClassLives | None,
     ) -> Self:
         """Before anything is decided."""
         sites, stays = after.sites, after.stays
@@ -151,7 +153,8 @@ class _Session:
         np.maximum.at(newest_s, row, sites.seen_s)
         least = np.full(count, LEAST_EVIDENCE)
         if longest is not None:
-            p_stays = longest.survival(class_of(after, cliques), np.maximum(after.stamp_s - newest_s, 0.0))
+            age_s = np.maximum(after.stamp_s - newest_s, 0.0)
+            p_stays = longest.longest(class_of(after, cliques), age_s, CREDIBLE)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
             least = np.maximum(least, np.log(p_stays / (1.0 - p_stays)))
         return cls(

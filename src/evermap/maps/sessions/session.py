@@ -9,7 +9,7 @@ import numpy as np
 from evermap.config import LivingConfig
 from evermap.errors import DataError
 from evermap.geometry.rigid import rigid
-from evermap.maps.learning import LongestLives, learned_lives
+from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, Evidence, LivingMap
 from evermap.maps.missed import without_missed
 from evermap.maps.sessions import arrive, believe, decide
@@ -28,8 +28,6 @@ from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Misses, Reco
 INLIER = 0.5
 LEAST_FIT = 0.75
 """Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
-CREDIBLE = 0.6
-"""Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
 GLIMPSE_M = 0.4
 """A landmark that was seen once, this close to its place, was seen there."""
 
@@ -190,16 +188,18 @@ class Judged:
         changes: what changed since the session before.
         evidence: what was seen of every clique, frame by frame.
         misses: of landmarks at the places where they most probably stand, as the map counts them.
+        classes: what was learned of the lifetimes of classes; None where nothing is.
     """
 
     living: LivingMap
     changes: tuple[MapChange, ...]
     evidence: Evidence
     misses: Misses
+    classes: ClassLives | None
 
 
 def judged(
-    living: LivingMap, where: Laid | None, visit: Solved, config: LivingConfig, known: LivingMap | None = None
+    living: LivingMap, where: Laid | None, visit: Solved, config: LivingConfig, known: Judged | None = None
 ) -> Judged:
     """Return the map after the session, what changed, and what was seen and missed.
 
@@ -210,18 +210,18 @@ def judged(
         where: the session lies in the map; None for a map's first.
         visit: the session, solved with the map as its prior.
         config: which parts of the engine are on.
-        known: a map that knows how long things stay, with what the session found; None for nothing.
+        known: the same, judged without knowing what the session teaches of lifetimes; None for the first time.
     """
     if known is not None:
-        living = replace(living, lives=replace(known.lives, looks_s=living.lives.looks_s))
+        living = replace(living, lives=replace(known.living.lives, looks_s=living.lives.looks_s))
     aged = believe.aged(living, config, visit.start_s)
     living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
     entry = entered(living, aged.p_here, where, visit, config)
     seen, eye = looks(entry, visit, config)
     now = believed(entry, seen, visit, config)
-    after, changes = decided(entry.before, now, seen, visit, config, known)
-    after = learned(after, seen, replace(entry, living=now.living), eye, config)
-    return Judged(after, changes, now.evidence, missed(now.living, seen, visit))
+    after, changes = decided(entry.before, now, seen, visit, config, known.classes if known is not None else None)
+    after, classes = learned(after, seen, replace(entry, living=now.living), eye, config)
+    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes)
 
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Solved, config: LivingConfig) -> Extended:
@@ -342,7 +342,7 @@ def missed(living: LivingMap, seen: Looks, visit: Solved) -> Misses:
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Solved, config: LivingConfig, known: LivingMap | None = None
+    before: LivingMap, now: Believed, seen: Looks, visit: Solved, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date and without what is forgotten, and what changed since the session before.
 
@@ -352,13 +352,10 @@ def decided(
         seen: looks of the session.
         visit: the session.
         config: which parts of the engine are on.
-        known: a map that knows how long things stay, with what the session found; None for nothing.
+        classes: how long things stay, as the session teaches; None for nothing.
     """
-    longest = None
-    if known is not None and config.learn_lifetimes:
-        longest = LongestLives.of(known.stays, known.lives.looks_s, CREDIBLE)
     arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
-    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s, longest)
+    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s, classes)
     changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)
@@ -367,7 +364,9 @@ def decided(
     return decide.without_forgotten(after, config.most_sites), changes
 
 
-def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, config: LivingConfig) -> LivingMap:
+def learned(
+    after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, config: LivingConfig
+) -> tuple[LivingMap, ClassLives | None]:
     """The map with what the session taught of lifetimes, and of from where places are seen."""
     if config.learn_sight and config.existence:
         names = entry.living.places.site_id, entry.living.places.landmark_id
@@ -375,9 +374,10 @@ def learned(after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, con
         weight = np.where(seen.settled, 1.0, p_there)
         lines = after.sightlines.learned(names, seen.place, seen.cell, seen.rows.hit, weight)
         after = replace(after, sightlines=lines, views=after.views.seen_from(eye, after.stamp_s))
-    if config.learn_lifetimes:
-        after = replace(after, lives=learned_lives(after.stays, after.lives, after.stamp_s))
-    return after
+    if not config.learn_lifetimes:
+        return after, None
+    classes = ClassLives.of(after.stays, after.lives, after.stamp_s)
+    return replace(after, lives=classes.lives), classes
 
 
 def told(found: Judged, where: Laid | None, visit: Solved) -> Session:

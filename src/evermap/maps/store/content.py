@@ -36,7 +36,9 @@ _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
 NAME_BYTES = 32
-_LIFE = "lives.life"
+_LIFE = ("lives.life", "lives.prior")
+_PRIOR = ("lives.prior_class_id", "lives.prior")
+"""Not written where there is none, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
 """Stored bytes of chunks by their names, all of them; `DamagedError` if one is missing."""
@@ -204,7 +206,9 @@ def flaw(living: LivingMap) -> str:
     for table, rows in (("members", members), ("sites", sites), ("places", places), ("stays", stays)):
         if len({len(getattr(rows, item.name)) for item in fields(rows)}) > 1:
             return f"columns of different lengths in '{table}'"
-    if len({len(lives.class_id), len(lives.chunk), len(lives.life)}) > 1:
+    if len({len(lives.class_id), len(lives.chunk), len(lives.life)}) > 1 or len(lives.prior_class_id) != len(
+        lives.prior
+    ):
         return "columns of different lengths in 'lives'"
     if len({len(getattr(lines, name)) for name in ("site_id", "landmark_id", "cell", "hits", "looks")}) > 1:
         return "columns of different lengths in 'sightlines'"
@@ -230,6 +234,7 @@ def flaw(living: LivingMap) -> str:
         ("members.class_id", members.class_id, UNKNOWN),
         ("stays.class_id", stays.class_id, UNKNOWN),
         ("lives.class_id", lives.class_id, UNKNOWN),
+        ("lives.prior_class_id", lives.prior_class_id, UNKNOWN),
         ("members.clique_id", members.clique_id, 0),
         ("sites.clique_id", sites.clique_id, 0),
         ("stays.clique_id", stays.clique_id, 0),
@@ -302,7 +307,9 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
-        if name == _LIFE:
+        if name in _PRIOR and not len(part):
+            continue
+        if name in _LIFE:
             text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
             arrays[name] = np.frombuffer(text.encode(), np.uint8)
         elif isinstance(part, np.ndarray):
@@ -326,7 +333,7 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
             content[item.name] = _build(part, name + ".", parts)
         elif name not in parts:
             content[item.name] = part
-        elif name == _LIFE:
+        elif name in _LIFE:
             content[item.name] = _lives_from_bytes(parts.pop(name))
         elif isinstance(part, np.ndarray):
             content[item.name] = _column(name, part, parts.pop(name))

@@ -1,0 +1,210 @@
+"""What users say of lifetimes: in the map, in what it learns, and out of it again as a file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_maps import assert_same, random_map
+from scipy import stats
+from simulated_stays import DAY_S
+from typer.testing import CliRunner
+
+from evermap.cli.main import app
+from evermap.errors import ConfigError, InputError
+from evermap.existence.lifetimes import Lifetimes
+from evermap.existence.run_length import RunLength
+from evermap.existence.storage import NamedModels, lifetimes_of, save_models
+from evermap.maps.learning import absence_said, learned_lives, lifetimes_by_class, stay_said, with_priors
+from evermap.maps.lives import Life
+from evermap.maps.living import LivingMap, Stays
+from evermap.maps.store.content import Chunk, pack, unpack
+from evermap.runs.sessions import priors_of
+from evermap.survival import Exponential, Mixture, Weibull, never_leaves
+from evermap.survival.class_lifetimes import LOG_MEAN, LOG_SHAPE, LOGIT_RETURN, finer
+from evermap.types import UNKNOWN
+
+WEIBULL = Weibull(3.0 * DAY_S, 1.5)
+ENDLESS = never_leaves()
+
+
+def told(**stays: object) -> dict[str, Lifetimes]:
+    return {name: Lifetimes(prior, ENDLESS) for name, prior in stays.items()}
+
+
+def stays_of(class_id: int, lasted_days: list[float], gone: bool = True) -> Stays:
+    """Stays that were watched from beginning to end, one clique each."""
+    count, last = len(lasted_days), 100.0 * DAY_S
+    first = last - np.array(lasted_days) * DAY_S
+    names = np.arange(count)
+    return Stays(
+        names, names, np.full(count, class_id), np.zeros((count, 2)), first - 60.0, first, np.full(count, last),
+        np.full(count, last + 60.0 if gone else np.inf), np.full(count, float(gone)),
+    )  # fmt: skip
+
+
+def test_before_anything_is_learned_a_prior_holds_as_it_was_said() -> None:
+    living = with_priors(LivingMap(), told(cart=WEIBULL), ["cart", "wall"], worth=20)
+    assert living.class_names == ("cart", "wall")
+    assert living.lives.of(0, np.zeros(2)).stay == WEIBULL
+    assert living.lives.of(0).absence == Life().absence  # nothing was said of absences
+    assert living.lives.of(1) == Life()
+    everything = with_priors(living, {"": Lifetimes(Exponential.from_mean(DAY_S), Exponential.from_mean(9.0))}, [], 5)
+    assert everything.lives.of(1).stay == Exponential.from_mean(DAY_S)
+    assert everything.lives.of(UNKNOWN).absence == Exponential.from_mean(9.0)
+    assert everything.lives.of(0).stay == WEIBULL
+    again = with_priors(everything, told(cart=Exponential.from_mean(1.0)), [], 7)
+    assert (again.lives.of(0).stay, again.lives.prior_of(0).n_stays) == (Exponential.from_mean(1.0), 7)
+
+
+def test_an_unknown_class_is_named_with_the_likely_one() -> None:
+    with pytest.raises(ConfigError, match=r"no landmark is of class 'crat'.*cart"):
+        with_priors(LivingMap(class_names=("cart",)), told(crat=WEIBULL), ["wall"], 20)
+
+
+def test_a_stay_that_was_said_counts_as_one_that_was_seen() -> None:
+    """Mean log density over the prior's quantiles, against scipy's; what outlasts everything is censored."""
+    age_s = stats.weibull_min.ppf((np.arange(64) + 0.5) / 64, 1.5, scale=3.0 * DAY_S)
+    shape = np.exp(finer(LOG_SHAPE))[None]
+    scale = np.exp(finer(LOG_MEAN))[:, None] / np.vectorize(stats.weibull_min.mean)(shape)
+    expected = np.mean([stats.weibull_min.logpdf(age, shape, scale=scale) for age in age_s], axis=0)
+    np.testing.assert_allclose(stay_said(WEIBULL), expected, rtol=1e-9)
+    censored = stats.weibull_min.logsf(1.5e9, shape, scale=scale)
+    np.testing.assert_allclose(stay_said(ENDLESS), censored, rtol=1e-9)
+    share, mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), np.exp(finer(LOG_MEAN))[:, None]
+    quantiles = stats.expon.ppf((np.arange(64) + 0.5) / 64, scale=DAY_S)
+    away = np.mean([np.log(share) + stats.expon.logpdf(t, scale=mean) for t in np.maximum(quantiles, 60.0)], axis=0)
+    np.testing.assert_allclose(absence_said(Exponential.from_mean(DAY_S)), away, rtol=1e-9)
+
+
+@pytest.mark.parametrize("prior", [WEIBULL, Exponential.from_mean(10.0 * DAY_S), Weibull(0.2 * DAY_S, 0.8)])
+def test_one_stay_that_goes_on_hardly_moves_a_prior_and_hundreds_do(prior) -> None:
+    ages_s = prior.quantile(np.array([0.2, 0.5, 0.8]))
+    living = with_priors(LivingMap(), told(cart=prior), ["cart"], worth=50)
+    lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+    one = learned_lives(stays_of(0, [0.01], gone=False), lives, 100.0 * DAY_S).of(0)
+    np.testing.assert_allclose(np.exp(one.stay.log_survival(ages_s)), [0.8, 0.5, 0.2], atol=0.07)
+    assert (one.n_stays, one.n_ended) == (1, 0)
+    days = stats.weibull_min.ppf((np.arange(250) + 0.5) / 250, 2.0, scale=20.0)
+    many = learned_lives(stays_of(0, days.tolist()), lives, 100.0 * DAY_S + 60.0).of(0)
+    without = learned_lives(stays_of(0, days.tolist()), replace(lives, prior=(), prior_class_id=np.zeros(0, np.int64)),
+                            100.0 * DAY_S + 60.0).of(0)  # fmt: skip
+    at_s = 20.0 * DAY_S
+    far = abs(np.exp(prior.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
+    near = abs(np.exp(many.stay.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
+    assert near < max(0.35 * far, 0.02)
+
+
+def test_more_worth_holds_a_prior_longer() -> None:
+    days = [20.0] * 10
+    survival = []
+    for worth in (2, 20, 200):
+        living = with_priors(LivingMap(), told(cart=WEIBULL), ["cart"], worth)
+        lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
+        stay = learned_lives(stays_of(0, days), lives, 100.0 * DAY_S + 60.0).of(0).stay
+        survival.append(float(np.exp(stay.log_survival(6.0 * DAY_S))))
+    assert survival[0] > survival[1] > survival[2] > float(np.exp(WEIBULL.log_survival(6.0 * DAY_S)))
+
+
+def unpacked(living: LivingMap) -> LivingMap:
+    name, chunks = pack(living)
+    return unpack(name, lambda names: {key: chunks[key].stored() for key in names})
+
+
+def test_a_stored_map_keeps_what_was_said() -> None:
+    living = random_map(3)
+    mixed = Lifetimes(Mixture.of([WEIBULL, ENDLESS], [0.9, 0.1]), Exponential.from_mean(DAY_S))
+    said = {"pallet": mixed, "": Lifetimes(WEIBULL, ENDLESS)}
+    assert_same(unpacked(with_priors(living, said, [], 20)), with_priors(living, said, [], 20))
+    _, chunks = pack(living)  # one of which nothing was said is written as it always was
+    manifests = [chunk.raw for chunk in chunks.values() if isinstance(chunk, Chunk) and b'"columns"' in chunk.raw]
+    assert not any(b"lives.prior" in raw for raw in manifests)
+
+
+def test_texts_and_files_by_class(tmp_path: Path) -> None:
+    models = NamedModels(
+        {"cart": RunLength(WEIBULL, Exponential.from_mean(DAY_S), 60.0), "": RunLength(ENDLESS, ENDLESS, 60.0)}, "class"
+    )
+    file = save_models(models, tmp_path / "lifetimes.json")
+    found = priors_of([str(file), "door=exponential:half-life=2d"])
+    assert found["cart"] == Lifetimes(WEIBULL, Exponential.from_mean(DAY_S))
+    assert found["door"].stay == Exponential.from_half_life(2.0 * DAY_S)
+    assert found[""].stay == ENDLESS
+    assert priors_of([f"wagon={file}"])["wagon"].stay == ENDLESS
+    only = save_models(NamedModels({"cart": RunLength(WEIBULL, ENDLESS, 60.0)}, "class"), tmp_path / "cart.json")
+    with pytest.raises(InputError, match=r"says nothing of class 'crat'.*cart"):
+        priors_of([f"crat={only}"])
+    with pytest.raises(ConfigError, match="given twice"):
+        priors_of(["cart=never-leaves", "cart=never-leaves"])
+
+
+# --- from the command line ---
+
+
+def run(*arguments: str | Path):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of two sessions, the first of them with what a user says of pallets and of all else."""
+    from evermap.io import write_native
+    from evermap.sim import BuildingConfig, SensorConfig, simulate_building
+
+    folder = tmp_path_factory.mktemp("priors")
+    priors = ["--prior", "pallet=weibull:scale=3d,shape=1.5", "--prior", "unknown:1d..1y"]
+    config = BuildingConfig(days=2, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1,
+                            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0))  # fmt: skip
+    for day, recording in enumerate(simulate_building(config, seed=4).sessions):
+        write_native(recording, folder / f"day{day}")
+        result = run("slam", folder / f"day{day}", "--map", folder / "site.evermap", "--out", folder / f"out{day}",
+                     *([] if day else priors), "--set", "output.figures=false", "--set", "output.report=false",
+                     "--set", "output.rerun=false", "--set", "slam.calibration.fix.range_slope=0.0")  # fmt: skip
+        assert result.exit_code == 0, result.output
+    return folder / "site.evermap"
+
+
+def test_a_map_tells_what_it_was_told_and_gives_what_it_learned(site: Path, tmp_path: Path) -> None:
+    from evermap.maps.store import open_store
+
+    shown = json.loads(run("map", "show", site, "--json").stdout)["priors"]
+    assert [(said["class"], said["worth_stays"]) for said in shown] == [("", 20), ("pallet", 20)]
+    assert "lifetimes of class pallet start from weibull:" in run("map", "show", site).stdout
+    file = tmp_path / "lifetimes.json"
+    result = run("map", "export", site, "--lifetimes", file, "--json")
+    assert result.exit_code == 0, result.output
+    with open_store(site) as store:
+        learned = lifetimes_by_class(store.load())
+    assert json.loads(result.stdout)["classes"] == list(learned)
+    assert lifetimes_of(file) == learned  # bit by bit
+    assert set(learned) >= {"pallet", ""}
+
+    fresh = with_priors(LivingMap(), priors_of([str(file)]), list(learned), 20)
+    for name, lifetimes in lifetimes_by_class(fresh).items():
+        assert lifetimes.stay == learned[name].stay
+        assert lifetimes.absence == learned[name].absence
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        ("palet=never-leaves", ["no landmark is of class 'palet'", "pallet", "--prior"]),
+        ("pallet=weibul:scale=3d", ["weibul", "weibull", "--prior"]),
+        ("nowhere.json", ["nowhere.json"]),
+    ],
+)
+def test_mistakes_are_one_line(site: Path, tmp_path: Path, prior: str, words: list[str]) -> None:
+    result = run("slam", site.parent / "day1", "--map", tmp_path / "new.evermap", "--out", tmp_path / "out", "--prior",
+                 prior)  # fmt: skip
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert all(word in result.stderr for word in words), result.stderr
+
+
+def test_a_prior_needs_a_map(tmp_path: Path) -> None:
+    result = run("slam", tmp_path, "--prior", "never-leaves")
+    assert result.exit_code == 2
+    assert "--map" in result.stderr
