@@ -129,16 +129,14 @@ def test_texts_and_files_by_class(tmp_path: Path) -> None:
         {"cart": RunLength(WEIBULL, Exponential.from_mean(DAY_S), 60.0), "": RunLength(ENDLESS, ENDLESS, 60.0)}, "class"
     )
     file = save_models(models, tmp_path / "lifetimes.json")
-    found = priors_of([str(file), "door=exponential:half-life=2d"])
+    found = priors_of(str(file), {"door": "exponential:half-life=2d"})
     assert found["cart"] == Lifetimes(WEIBULL, Exponential.from_mean(DAY_S))
     assert found["door"].stay == Exponential.from_half_life(2.0 * DAY_S)
     assert found[""].stay == ENDLESS
-    assert priors_of([f"wagon={file}"])["wagon"].stay == ENDLESS
+    assert priors_of(None, {"wagon": str(file)})["wagon"].stay == ENDLESS
     only = save_models(NamedModels({"cart": RunLength(WEIBULL, ENDLESS, 60.0)}, "class"), tmp_path / "cart.json")
     with pytest.raises(InputError, match=r"says nothing of class 'crat'.*cart"):
-        priors_of([f"crat={only}"])
-    with pytest.raises(ConfigError, match="given twice"):
-        priors_of(["cart=never-leaves", "cart=never-leaves"])
+        priors_of(None, {"crat": str(only)})
 
 
 # --- from the command line ---
@@ -182,7 +180,7 @@ def test_a_map_tells_what_it_was_told_and_gives_what_it_learned(site: Path, tmp_
     assert lifetimes_of(file) == learned  # bit by bit
     assert set(learned) >= {"pallet", ""}
 
-    fresh = with_priors(LivingMap(), priors_of([str(file)]), list(learned), 20)
+    fresh = with_priors(LivingMap(), priors_of(str(file)), list(learned), 20)
     for name, lifetimes in lifetimes_by_class(fresh).items():
         assert lifetimes.stay == learned[name].stay
         assert lifetimes.absence == learned[name].absence

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from evermap.cli.options import priors_by_class
 from evermap.cli.summary import show_run
 from evermap.cli.terminal import command_line, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
@@ -43,8 +43,7 @@ def run_in_map(
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
-    with _of_option("prior"):
-        said = priors_of(priors)
+    said = priors_of(*priors_by_class(priors))
     warm_up()
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
@@ -57,8 +56,7 @@ def run_in_map(
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
-                with _of_option("prior"):
-                    entered = enter_session(store, recording, config, priors=said, progress=progress)
+                entered = enter_session(store, recording, config, priors=said, progress=progress)
                 session = entered.session
                 result, recording = replace(session.slam, changes=entered.changes), session.recording
         elapsed_s = time.perf_counter() - start
@@ -87,14 +85,3 @@ def run_in_map(
         if entered.replayed:
             again = ", ".join(entered.replayed)
             say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
-
-
-@contextmanager
-def _of_option(name: str) -> Iterator[None]:
-    """Errors about an argument of this name, or about none, are about the option."""
-    try:
-        yield
-    except ConfigError as error:
-        if error.path is not None or error.field not in (None, name, f"--{name}"):
-            raise
-        raise ConfigError(error.problem, field=f"--{name}", hint=error.hint) from None

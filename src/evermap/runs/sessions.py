@@ -7,13 +7,13 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import DataError, InputError, suggestion
+from evermap.errors import ConfigError, DataError, InputError, suggestion
 from evermap.maps.store import Attachment, MapStore, Provenance, Revision, RevisionKind
 
 if TYPE_CHECKING:
@@ -176,28 +176,29 @@ def enter_session(
     return Entered(session, newest, living, found, names, head, {RECORDING: data})
 
 
-def priors_of(sources: Sequence[str]) -> dict[str, Lifetimes]:
+def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> dict[str, Lifetimes]:
     """Read lifetimes that a user gives for a map, by class; '' is for every class that is not named.
 
     Args:
-        sources: each `CLASS=PRIOR`, or `PRIOR` for all other classes, where a prior is its text, as
-            `weibull:scale=3d,shape=1.5`, or a file of models, as `survival fit`, `survival learn` and
-            `map export --lifetimes` write it. What a class is given by name goes before what a file says of it.
+        common: text of a prior for all classes, as `weibull:scale=3d,shape=1.5`, or a file of models, as
+            `survival fit`, `survival learn` and `map export --lifetimes` write it.
+        by_class: the same for single classes; goes before what a file says of them. None for none.
 
     Raises:
-        ConfigError: the text of no prior, or two for one class.
+        ConfigError: the text of no prior.
         InputError: a file that cannot be read, or that says nothing of the class.
     """
     from evermap.existence.storage import lifetimes_of
-    from evermap.runs.persist.config import split_priors
 
-    common, by_class = split_priors(sources)
-    found = {} if common is None else lifetimes_of(common)
-    for name, source in by_class.items():
-        told = lifetimes_of(source)
-        if name not in told and "" not in told:
-            raise InputError(f"says nothing of class '{name}'", path=source, hint=suggestion(name, told))
-        found[name] = told[name if name in told else ""]
+    try:
+        found = {} if common is None else lifetimes_of(common)
+        for name, source in (by_class or {}).items():
+            told = lifetimes_of(source)
+            if name not in told and "" not in told:
+                raise InputError(f"says nothing of class '{name}'", path=source, hint=suggestion(name, told))
+            found[name] = told[name if name in told else ""]
+    except ConfigError as error:
+        raise ConfigError(error.problem, field="prior", hint=error.hint) from None
     return found
 
 
