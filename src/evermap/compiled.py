@@ -114,7 +114,7 @@ def find_place() -> None:
 
 @functools.cache
 def temporary_folder() -> str:
-    """Where machine code goes if it can go nowhere else, said once by a warning.
+    """Return where machine code goes if it can go nowhere else, said once by a warning.
 
     The next process of the same user finds it again. Code is loaded from there, so it is a folder that belongs to this
     user and that nobody else may write to, or else a new one of this process.

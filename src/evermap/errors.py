@@ -32,7 +32,7 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def similar(name: str, known: Iterable[str], *, cutoff: float = 0.5) -> str | None:
-    """The known name that resembles another most, None where none does by the share `cutoff` of difflib."""
+    """Return the known name that resembles another most, None where none does by the share `cutoff` of difflib."""
     import difflib
 
     close = difflib.get_close_matches(name.strip(), list(known), n=1, cutoff=cutoff)
@@ -40,7 +40,7 @@ def similar(name: str, known: Iterable[str], *, cutoff: float = 0.5) -> str | No
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """A hint where a name is not known: the one that was probably meant, or all of them."""
+    """Return a hint where a name is not known: the one that was probably meant, or all of them."""
     names = list(known)
     return similar(name, names) or ("one of " if len(names) > 1 else "") + ", ".join(names)
 
@@ -76,7 +76,9 @@ class EvermapError(Exception):
         super().__init__(self.one_line())
 
     def one_line(self) -> str:
-        """`file:line: field 'name': problem (try: hint)`, with the parts that are known, each `printable` and short."""
+        """Return `file:line: field 'name': problem (try: hint)`, with the parts that are known, each `printable` and
+        short.
+        """
         where = ""
         if self.path is not None:
             path = _short(str(self.path))

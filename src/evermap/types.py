@@ -84,7 +84,7 @@ def _as_kind(array: Any, owner: str, name: str, *, whole: bool) -> Any:
 
 
 def landmark_id_of(name: str) -> int:
-    """The identity of a landmark that is called by a text, the same on every machine and in every session.
+    """Return the identity of a landmark that is called by a text, the same on every machine and in every session.
 
     52 bits of a hash (BLAKE2b of the text in UTF-8, normal form C), above all ids that people count with and below
     2^53, so that it passes through float64 and JSON unharmed. Two of 100,000 names meet with probability 1e-6.
@@ -331,7 +331,9 @@ class Landmarks:
         class_names: tuple[str, ...] = (),
         frame: str = "truth",
     ) -> Landmarks:
-        """Known positions with one standard deviation each (scalar, (L,) or (L, 2) metres), e.g. a surveyed map."""
+        """Return known positions with one standard deviation each (scalar, (L,) or (L, 2) metres), e.g. a surveyed
+        map.
+        """
         ids = np.asarray(landmark_id, dtype=np.int64)
         order = np.argsort(ids, kind="stable")
         count = len(ids)
@@ -476,7 +478,7 @@ class MapChange:
     names: tuple[str, ...] = field(default=(), compare=False)
 
     def named(self, names: Mapping[int, str]) -> MapChange:
-        """The same with what its landmarks are called, where a text is behind any of their ids."""
+        """Return the same with what its landmarks are called, where a text is behind any of their ids."""
         labels = tuple(names.get(identity, str(identity)) for identity in self.landmark_ids)
         return replace(self, names=labels) if names.keys() & set(self.landmark_ids) else self
 
@@ -538,7 +540,7 @@ _Table = TypeVar("_Table", bound="DataclassInstance")
 
 
 def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
-    """Some rows of a table of columns, by number, in that order, or by a mask; what is no column stays."""
+    """Return some rows of a table of columns, by number, in that order, or by a mask; what is no column stays."""
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
     return replace(table, **some)

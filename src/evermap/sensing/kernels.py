@@ -28,7 +28,7 @@ kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 
 @kernel
 def normal_cdf(z: float) -> float:
-    """`P(x < z)` of a standard normal."""
+    """Return `P(x < z)` of a standard normal."""
     if z > FAR_OUT:
         return 1.0
     if z < -FAR_OUT:
@@ -38,7 +38,7 @@ def normal_cdf(z: float) -> float:
 
 @kernel
 def edge_distance(along: float, across: float, sine: float, cosine: float) -> float:
-    """How far inside the edge of half an angle a point lies; behind the apex it is the apex that is nearest."""
+    """Return how far inside the edge of half an angle a point lies; behind the apex it is the apex that is nearest."""
     distance = along * sine - across * cosine
     if along * cosine + across * sine < 0.0:
         return math.copysign(math.sqrt(along * along + across * across), distance)
@@ -47,7 +47,7 @@ def edge_distance(along: float, across: float, sine: float, cosine: float) -> fl
 
 @kernel
 def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -> float:
-    """Probability that a point of the sensor's frame is in the field; `limits` as `learned` packs them."""
+    """Return the probability that a point of the sensor's frame is in the field; `limits` as `learned` packs them."""
     range_max, sin_az, cos_az, sin_el, cos_el, spherical, all_around, sigma_m, sigma_rad = limits
     inside = normal_cdf((range_max - range_m) / sigma_m)
     if inside < OUT_OF_FIELD:
@@ -62,7 +62,7 @@ def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -
 
 @kernel
 def face_of(x: float, y: float, z: float) -> int:
-    """Which of the six faces of a cube a direction goes through."""
+    """Return which of the six faces of a cube a direction goes through."""
     a, b, c = abs(x), abs(y), abs(z)
     if a >= b and a >= c:
         return 0 if x > 0.0 else 1
@@ -73,7 +73,9 @@ def face_of(x: float, y: float, z: float) -> int:
 
 @kernel
 def between(value: float, count: int) -> tuple[int, float]:
-    """The middle below `value`, in units of bins from the first one's lower edge, and how far it is to the next."""
+    """Return the middle below `value`, in units of bins from the first one's lower edge, and how far it is to the
+    next.
+    """
     shifted = value - 0.5
     if shifted <= 0.0:
         return 0, 0.0

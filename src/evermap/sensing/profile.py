@@ -109,7 +109,7 @@ class Profile:
 
     @classmethod
     def of(cls, assumed: Assumed) -> Profile:
-        """The profile before anything was seen."""
+        """Return the profile before anything was seen."""
         near, far = np.zeros(FACING_BINS), range_middles(assumed.field.range_max_m)
         by_range = assumed.fades.probability(_sight(far, np.ones(RANGE_BINS)))
         by_facing = np.maximum(assumed.faces.probability(_sight(near, facing_middles())), SMALLEST_RATE)
@@ -191,12 +191,12 @@ class Occlusion:
 
 
 def range_middles(range_max_m: float) -> FloatArray:
-    """(16,) middles of the range bins [m]."""
+    """Return (16,) middles of the range bins [m]."""
     return np.asarray((np.arange(RANGE_BINS) + 0.5) * (range_max_m / RANGE_BINS))
 
 
 def facing_middles() -> FloatArray:
-    """(16,) middles of the bins of the cosine of incidence."""
+    """Return (16,) middles of the bins of the cosine of incidence."""
     return np.asarray((np.arange(FACING_BINS) + 0.5) * (2.0 / FACING_BINS) - 1.0)
 
 

@@ -108,19 +108,19 @@ class SightLines:
         return np.asarray((P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown))
 
     def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
-        """With expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""
+        """Return the profile with expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""
         hidden, shown = self.hidden + hidden, self.shown + shown
         fade = np.minimum(1.0, MOST_SESSIONS / np.maximum(hidden + shown, 1.0))
         return replace(self, hidden=fade * hidden, shown=fade * shown)
 
     @classmethod
     def empty(cls, cell_m: float = 0.5) -> SightLines:
-        """Nothing learned yet."""
+        """Return a table in which nothing is learned yet."""
         none = np.zeros(0, dtype=np.int64)
         return cls(none, none, none, np.zeros(0), np.zeros(0), cell_m=cell_m)
 
     def cells(self, sensor_m: FloatArray, place_m: FloatArray) -> IntArray:
-        """(N,) cells of sensors (N, 2), counted from places (N, 2).
+        """Return (N,) cells of sensors (N, 2), counted from places (N, 2).
 
         Raises:
             InputError: a position that is not finite, or 1,000 m and more from the sensor.
@@ -138,7 +138,7 @@ class SightLines:
     def lines(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray, p_detect: FloatArray
     ) -> tuple[Lines, FloatArray, BoolArray]:
-        """What is known of lines of sight.
+        """Return what is known of lines of sight.
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
@@ -170,7 +170,8 @@ class SightLines:
         hit: BoolArray,
         weight: FloatArray,
     ) -> SightLines:
-        """The table after looks at what was there with some probability; lines to places that are no more are left out.
+        """Return the table after looks at what was there with some probability; lines to places that are no more are
+        left out.
 
         Args:
             places: (P,) sites and (P,) landmarks of the places of the map, sorted by both.
@@ -242,13 +243,13 @@ class SightLines:
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:
-    """(N, 2) middles of cells (`SightLines.cells`), counted from the place."""
+    """Return (N, 2) middles of cells (`SightLines.cells`), counted from the place."""
     middle = np.column_stack([cell // _REACH, cell % _REACH]) - _REACH // 2 + 0.5
     return np.asarray(middle * cell_m, dtype=np.float64)
 
 
 def nominal_lines(p_detect: FloatArray) -> Lines:
-    """Lines of a sensor whose nominal field of view (N,) is taken for the truth."""
+    """Return lines of a sensor whose nominal field of view (N,) is taken for the truth."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
     return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), BLOCKED)
 
@@ -303,7 +304,7 @@ class Views:
 
     @classmethod
     def empty(cls, cell_m: float = 0.5) -> Views:
-        """Nobody looked yet."""
+        """Return a table before any look."""
         none = np.zeros(0, dtype=np.int64)
         return cls(np.zeros((0, 2), dtype=np.int64), none, np.zeros(0), np.zeros(0), cell_m)
 
@@ -313,7 +314,7 @@ class Views:
         return np.column_stack([(self.cell + 0.5) * self.cell_m, (self.heading + 0.5) * (2.0 * np.pi / HEADINGS)])
 
     def seen_from(self, pose_map_sensor: FloatArray, stamp_s: float) -> Views:
-        """The table after a session that ended at `stamp_s`, with sensor poses (F, 3)."""
+        """Return the table after a session that ended at `stamp_s`, with sensor poses (F, 3)."""
         cell = np.floor(pose_map_sensor[:, :2] / self.cell_m).astype(np.int64)
         turn = np.floor(np.mod(pose_map_sensor[:, 2], 2.0 * np.pi) * (HEADINGS / (2.0 * np.pi))).astype(np.int64)
         own, counts = np.unique(np.column_stack([cell, turn % HEADINGS]), axis=0, return_counts=True)

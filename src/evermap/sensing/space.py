@@ -53,20 +53,20 @@ class Field:
                 raise ConfigError(f"must be above 0 and at most {most:.4f}, not {value!r}", field=name)
 
     def angles(self, point_sensor_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Azimuth and elevation [rad] of points (..., 3) in the sensor's frame; each of shape (...)."""
+        """Return azimuth and elevation [rad] of points (..., 3) in the sensor's frame; each of shape (...)."""
         x, y, z = np.moveaxis(point_sensor_m, -1, 0)
         ahead = np.hypot(x, y) if self.projection is Projection.SPHERICAL else x
         return np.arctan2(y, x), np.arctan2(z, ahead)
 
     def contains(self, point_sensor_m: FloatArray) -> BoolArray:
-        """Whether points (..., 3) in the sensor's frame lie in the field; shape (...)."""
+        """Return whether points (..., 3) in the sensor's frame lie in the field; shape (...)."""
         azimuth, elevation = self.angles(point_sensor_m)
         near = np.linalg.norm(point_sensor_m, axis=-1) <= self.range_max_m
         inside = (np.abs(azimuth) <= self.half_azimuth_rad) & (np.abs(elevation) <= self.half_elevation_rad)
         return np.asarray(near & inside)
 
     def outline(self, range_m: float) -> FloatArray:
-        """(7, 65, 3) lines in the sensor's frame that a picture shows the field by, cut off at `range_m`.
+        """Return (7, 65, 3) lines in the sensor's frame that a picture shows the field by, cut off at `range_m`.
 
         The first two are the lower and the upper edge; each of the others comes from the sensor, goes up between the
         two, and returns to it.

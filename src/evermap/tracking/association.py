@@ -90,7 +90,9 @@ LOG_TWO_PI = math.log(2.0 * math.pi)
 
 @inlined
 def class_log_ratio(class_p: FloatArray, confusion: FloatArray, prior: FloatArray, detected: int) -> float:
-    """How much likelier a detected class is for an object of these probabilities than for any object; 0 if unknown."""
+    """Return how much likelier a detected class is for an object of these probabilities than for any object; 0 if
+    unknown.
+    """
     if detected < 0:
         return 0.0
     its, anyone = 0.0, 0.0
@@ -102,7 +104,7 @@ def class_log_ratio(class_p: FloatArray, confusion: FloatArray, prior: FloatArra
 
 @inlined
 def appearance_log_ratio(mine: FloatArray, theirs: FloatArray, nats: float, neutral: float) -> float:
-    """Log-likelihood ratio of two unit vectors, linear in their cosine; 0 where either is zero."""
+    """Return the log-likelihood ratio of two unit vectors, linear in their cosine; 0 where either is zero."""
     cosine, mine_is, theirs_is = 0.0, False, False
     for k in range(mine.shape[0]):
         cosine += mine[k] * theirs[k]
@@ -204,7 +206,7 @@ NOBODY = -1
 
 @kernel
 def assign(start: IntArray, column: IntArray, cost: FloatArray, n_columns: int) -> IntArray:
-    """The matching of least total cost; only pairs that cost less than 0 can be in it.
+    """Return the matching of least total cost; only pairs that cost less than 0 can be in it.
 
     Args:
         start: (N + 1,) first pair of every row.

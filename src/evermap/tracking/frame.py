@@ -29,7 +29,7 @@ class Frame(NamedTuple):
 
 
 def positions(values: Any) -> FloatArray:
-    """(M, 3) finite positions.
+    """Return (M, 3) finite positions.
 
     Raises:
         InputError: another shape, or a number that is not finite.
@@ -49,7 +49,7 @@ def positions(values: Any) -> FloatArray:
 
 
 def classes(values: Any, m: int, n_classes: int) -> IntArray:
-    """(M,) classes, `UNKNOWN` where none is given.
+    """Return (M,) classes, `UNKNOWN` where none is given.
 
     Raises:
         InputError: another number of them, no whole numbers, or a class that does not exist.
@@ -73,7 +73,7 @@ def classes(values: Any, m: int, n_classes: int) -> IntArray:
 
 
 def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
-    """(M, 3, 3) covariances, or `default` (1, 3, 3) where none are given.
+    """Return (M, 3, 3) covariances, or `default` (1, 3, 3) where none are given.
 
     Raises:
         InputError: another shape, or a matrix that is not symmetric and positive definite.
@@ -94,7 +94,7 @@ def covariances(values: Any, m: int, default: FloatArray) -> FloatArray:
 
 
 def appearances(values: Any, m: int, n_appearance: int) -> FloatArray:
-    """(M, A) unit vectors; a row of zeros, or without a finite length, has no appearance.
+    """Return (M, A) unit vectors; a row of zeros, or without a finite length, has no appearance.
 
     Raises:
         InputError: another shape than the tracker was made for.

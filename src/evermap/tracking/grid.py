@@ -19,13 +19,13 @@ FAR = 2.0**40
 
 @inlined
 def cell_of(value: float, cell_m: float) -> int:
-    """Cell along one axis."""
+    """Return the cell along one axis."""
     return math.floor(min(max(value / cell_m, -FAR), FAR))
 
 
 @inlined
 def bucket_of(x: int, y: int, z: int, mask: int) -> int:
-    """Where a cell is kept: large primes, and the high bits, which the products mix best (Teschner 2003)."""
+    """Return where a cell is kept: large primes, and the high bits, which the products mix best (Teschner 2003)."""
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     return (mixed ^ (mixed >> 17)) & mask
 
@@ -95,7 +95,7 @@ def unlink(rows: IntArray, position: FloatArray, chunk_m: float, head: Rows, fol
 def rows_near(
     centre: FloatArray, reach_m: FloatArray, position: FloatArray, chunk_m: float, head: Rows, following: Rows
 ) -> IntArray:
-    """Rows within `reach_m` (K,) of any of the points `centre` (K, 3), each once, in order.
+    """Return rows within `reach_m` (K,) of any of the points `centre` (K, 3), each once, in order.
 
     Where the discs hold more chunks than there are buckets, all buckets are looked through.
     """

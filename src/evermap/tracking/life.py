@@ -58,7 +58,7 @@ class Happened(NamedTuple):
 
 @kernel
 def recognise(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray, memory: float) -> None:
-    """Class and appearance of tracklet `i` after detection `j`."""
+    """Update class and appearance of tracklet `i` after detection `j`."""
     detected = frame.class_id[j]
     if detected >= 0:
         total = 0.0

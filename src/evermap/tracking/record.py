@@ -102,7 +102,7 @@ class Recorder:
         self.events.extend(events)
 
     def tracks(self) -> Tracks:
-        """Everything about tracklets that were confirmed sooner or later, their first frames too.
+        """Return everything about tracklets that were confirmed sooner or later, their first frames too.
 
         Rows after the last detection before a tracklet was given up are left out: they were guesses.
 
@@ -174,7 +174,7 @@ class SpellLog:
         self._parts: list[StaticSpells] = []
 
     def add(self, table: SpellTable, n: int) -> None:
-        """The first `n` rows of a kernel's table."""
+        """Note the first `n` rows of a kernel's table."""
         if n:
             times = table.times[:n].copy()
             self._parts.append(
@@ -182,12 +182,12 @@ class SpellLog:
             )
 
     def add_stored(self, stored: Stored, rows: IntArray, gone_s: float) -> None:
-        """Rows of the working set, whose objects are gone."""
+        """Note rows of the working set whose objects are gone."""
         if len(rows):
             self._parts.append(_of_stored(stored, rows, gone_s))
 
     def with_open(self, t: Tracklets, n: int, working_set: WorkingSet) -> StaticSpells:
-        """These, and those that go on: of the first `n` tracklets, and of the working set."""
+        """Return ended tracklets, and those that go on: of the first `n` tracklets, and of the working set."""
         rows = np.flatnonzero((t.static[:n] == 1) & (t.state[:n] != TrackState.BIRTH))
         going_on = StaticSpells(
             track_id=t.track_id[rows],

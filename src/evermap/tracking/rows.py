@@ -40,7 +40,7 @@ def noise_of(frame: Frame, j: int) -> FloatArray:
 
 @inlined
 def speed_score(mean: FloatArray, covariance: FloatArray, threshold_mps: float) -> float:
-    """Standard deviations by which the squared speed, without its bias, is above the squared threshold."""
+    """Return standard deviations by which the squared speed, without its bias, is above the squared threshold."""
     squared, trace, spread = 0.0, 0.0, 0.0
     for a in range(3):
         squared += mean[3 + a] * mean[3 + a]
@@ -53,7 +53,9 @@ def speed_score(mean: FloatArray, covariance: FloatArray, threshold_mps: float) 
 
 @inlined
 def displacement(mean: FloatArray, covariance: FloatArray, place: FloatArray, place_covariance: FloatArray) -> float:
-    """Squared Mahalanobis distance of a filter from a place; both have seen the same, so it comes out too small."""
+    """Return the squared Mahalanobis distance of a filter from a place; both have seen the same, so it comes out too
+    small.
+    """
     offset = mean[0] - place[0], mean[1] - place[1], mean[2] - place[2]
     squared, _ = distance_and_log_det(offset, sum_of(covariance, place_covariance))
     return squared
@@ -75,7 +77,7 @@ def end_spell(t: Tracklets, i: int, gone_s: float, spells: SpellTable, n_spells:
 
 @kernel
 def start_rest(t: Tracklets, i: int, stamp_s: float, position: FloatArray, noise: FloatArray) -> None:
-    """From now on, the place is that of this detection."""
+    """Set the place of rest to that of this detection."""
     t.rest_mean[i] = position
     t.rest_covariance[i] = noise
     t.rest_since_s[i] = t.rest_seen_s[i] = stamp_s
@@ -84,7 +86,7 @@ def start_rest(t: Tracklets, i: int, stamp_s: float, position: FloatArray, noise
 
 @inlined
 def departure(t: Tracklets, i: int, stamp_s: float) -> float:
-    """When an object that is found moved set off, at the earliest: with constant jerk `d = v t / 3`."""
+    """Return when an object that is found moved set off, at the earliest: with constant jerk `d = v t / 3`."""
     d, v = 0.0, 1e-300
     for a in range(3):
         d += (t.mean[i, a] - t.rest_mean[i, a]) ** 2
@@ -139,7 +141,7 @@ def start(t: Tracklets, i: int, track_id: int, frame: Frame, j: int, confusion: 
 
 @kernel
 def place_filter(t: Tracklets, i: int, position: FloatArray, covariance: FloatArray, rules: Rules) -> None:
-    """A filter that knows a position, and of its derivatives how large they usually are."""
+    """Set a filter to a position, and its derivatives to their usual spread."""
     t.mean[i] = 0.0
     t.covariance[i] = 0.0
     t.mean[i, :3] = position

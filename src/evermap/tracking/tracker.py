@@ -139,7 +139,7 @@ class Tracker:
         return track_of_detection, events
 
     def followed(self) -> Followed:
-        """The active tracklets after the last frame."""
+        """Return the active tracklets after the last frame."""
         t, n = self._tracklets, self._n
         return Followed(
             stamp_s=self._stamp_s,
@@ -156,7 +156,7 @@ class Tracker:
         )
 
     def static_spells(self) -> StaticSpells:
-        """All static spells so far: those that have ended, and those that go on, whose end is open."""
+        """Return all static spells so far: those that have ended, and those that go on, whose end is open."""
         return self._spells.with_open(self._tracklets, self._n, self.working_set)
 
     def _frame(self, stamp_s: Any, position_m: Any, class_id: Any, covariance_m2: Any, appearance: Any) -> Frame:

@@ -96,7 +96,7 @@ class Tracklets(NamedTuple):
 
 
 def room_for(n: int, order: int, n_classes: int, n_appearance: int) -> Tracklets:
-    """Room for `n` tracklets, with `order` derivatives of the position, itself included."""
+    """Return room for `n` tracklets, with `order` derivatives of the position, itself included."""
     d = 3 * order
 
     def numbers(*shape: int) -> FloatArray:
@@ -127,7 +127,7 @@ def room_for(n: int, order: int, n_classes: int, n_appearance: int) -> Tracklets
 
 
 def grown(tracklets: Tracklets, n: int) -> Tracklets:
-    """The same tracklets with room for `n`."""
+    """Return the same tracklets with room for `n`."""
     return Tracklets(*(np.concatenate([a, np.zeros((n - len(a), *a.shape[1:]), dtype=a.dtype)]) for a in tracklets))
 
 

@@ -41,7 +41,7 @@ class View:
 
     @classmethod
     def ball(cls, centre_m: FloatArray, reach_m: float, p_detect: float) -> Self:
-        """Everything up to `reach_m` from the sensor is seen equally well."""
+        """Return a view that sees everything up to `reach_m` equally well."""
 
         def within(position_m: FloatArray) -> FloatArray:
             return np.where(np.linalg.norm(position_m - centre_m, axis=1) <= reach_m, p_detect, 0.0)
@@ -49,7 +49,7 @@ class View:
         return cls(centre_m, reach_m, within)
 
     def probability(self, position_m: FloatArray) -> FloatArray:
-        """(N,) `p_detect`, checked.
+        """Return (N,) `p_detect`, checked.
 
         Raises:
             InputError: not one probability a position.
@@ -104,7 +104,8 @@ class ViewMemory:
             self._kept.setdefault(self._chunk_of(old.centre_m), []).append((stamp, old))
 
     def last_empty_s(self, position_m: FloatArray, before_s: float) -> float:
-        """Last stamp before `before_s` from which on an object at `position_m` (3,) would surely have been detected.
+        """Return the last stamp before `before_s` from which on an object at `position_m` (3,) would surely have been
+        detected.
 
         Returns:
             -inf where the place had not been looked at well enough.

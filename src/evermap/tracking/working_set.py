@@ -51,7 +51,7 @@ class Stored(NamedTuple):
 
 
 def empty_rows(n: int, n_appearance: int) -> Stored:
-    """Room for `n` objects with appearances of a length."""
+    """Return room for `n` objects with appearances of a length."""
 
     def numbers(*shape: int) -> FloatArray:
         return np.zeros((n, *shape))
@@ -167,7 +167,7 @@ class WorkingSet:
         self._free.extend(rows.tolist())
 
     def near(self, centre_m: FloatArray, reach_m: FloatArray) -> IntArray:
-        """Rows within `reach_m` (K,) of any of the points `centre_m` (K, 3), each once, in order."""
+        """Return rows within `reach_m` (K,) of any of the points `centre_m` (K, 3), each once, in order."""
         return np.asarray(
             self._chunks.rows_near(
                 centre_m, reach_m, self._stored.position, self._chunk_m, self._head, self._stored.following
@@ -176,7 +176,7 @@ class WorkingSet:
         )
 
     def inverse_odds(self, rows: IntArray, stamp_s: float) -> FloatArray:
-        """(K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""
+        """Return (K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""
         s = self._stored
         prior = s.class_id[rows].astype(np.int64) if len(self._priors) > 1 else np.zeros(len(rows), dtype=np.int64)
         since = s.rest_since_s[rows]
@@ -185,21 +185,21 @@ class WorkingSet:
         return np.asarray(before + (1.0 + before) * np.exp(np.minimum(log_odds, 690.0)), dtype=np.float64)
 
     def missed(self, rows: IntArray, stamp_s: float, p_detect: FloatArray) -> FloatArray:
-        """(K,) inverse odds after the places of these objects were looked at, and nothing was seen there."""
+        """Return (K,) inverse odds after the places of these objects were looked at, and nothing was seen there."""
         after = np.minimum(self.inverse_odds(rows, stamp_s) / np.maximum(1.0 - p_detect, 1e-12), 1e300)
         self._stored.inverse_odds[rows] = after
         self._stored.judged_s[rows] = stamp_s
         return np.asarray(after, dtype=np.float64)
 
     def covariance(self, rows: IntArray) -> FloatArray:
-        """(K, 3, 3) of places."""
+        """Return (K, 3, 3) of places."""
         full = np.empty((len(rows), 3, 3))
         full[:, UPPER[0], UPPER[1]] = self._stored.covariance[rows]
         full[:, UPPER[1], UPPER[0]] = self._stored.covariance[rows]
         return full
 
     def class_p(self, rows: IntArray) -> FloatArray:
-        """(K, C) posterior over classes, as far as it is kept."""
+        """Return (K, C) posterior over classes, as far as it is kept."""
         top = self._stored.class_p[rows].astype(np.float64)
         others = max(self._n_classes - 1, 1)
         out = np.repeat((1.0 - top)[:, None] / others, self._n_classes, axis=1)
