@@ -18,7 +18,6 @@ USED_FOR_SEVERAL = {
     "ChangeKind",
     "Drive",
     "Estimate",
-    "Evidence",
     "Frames",
     "Learned",
     "Looks",
