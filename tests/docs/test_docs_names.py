@@ -51,3 +51,12 @@ def test_modules_and_files_that_a_page_names_exist(page: Path) -> None:
         elif dotted is not None:
             missing += [] if exists(dotted[1]) or span in OTHERS else [span]
     assert not missing
+
+
+def test_the_page_on_calibration_has_every_state_with_its_prior() -> None:
+    from evermap.slam.calibration import SPECS
+
+    page = (REPOSITORY / "docs" / "calibration.md").read_text(encoding="utf-8")
+    for spec in SPECS:
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{spec.name}`"))
+        assert f"{spec.mean:g} ± {spec.sigma:g}" in row

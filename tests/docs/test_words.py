@@ -1,0 +1,47 @@
+"""The documents are in plain technical English: none of the literal translations that readers could not grep."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+PAGES = [
+    *(REPOSITORY / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((REPOSITORY / "docs").rglob("*.md")),
+]
+AVOIDED = {
+    r"takes? stock": "relinearise",
+    r"foretell\w*|foretold": "predict",
+    r"told apart|tells? apart": "distinguish",
+    r"on the mean": "on average",
+    r"that are none|that is none\b": "invalid",
+    r"that are no numbers|that is no number": "non-finite",
+    r"whoever|somebody|nobody|who is told": "name the robot, the user or the object",
+    r"stood in the way|stands in the way|stands before it": "occluded",
+    r"is to be had|are to be had": "is available",
+    r"by turns": "interleaved",
+    r"how dear|how sure": "cost; calibration",
+    r"for want of": "without",
+}
+
+
+def prose(page: Path) -> str:
+    """A page without its blocks, generated tables and code spans, in one line."""
+    text = page.read_text(encoding="utf-8")
+    text = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    text = re.sub(r"^\|.*$", "", text, flags=re.MULTILINE)
+    return " ".join(re.sub(r"`[^`]*`", "", text).split())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_a_page_has_no_literal_translations(page: Path) -> None:
+    text = prose(page)
+    found = {
+        text[max(match.start() - 30, 0) : match.end() + 30]: better
+        for pattern, better in AVOIDED.items()
+        for match in re.finditer(rf"\b(?:{pattern})\b", text, re.IGNORECASE)
+    }
+    assert not found
