@@ -21,31 +21,45 @@ if TYPE_CHECKING:
 
     from evermap.config import Config, PersistConfig, load_config
     from evermap.errors import EvermapError
+    from evermap.existence.one import PersistenceFilter
     from evermap.io import read_recording, write_native
+    from evermap.maps.diff import diff
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
     from evermap.maps.store import open_store
+    from evermap.maps.why import why
     from evermap.pipeline import run_localization, run_session, run_slam
     from evermap.runs.folder import write_run
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.table import read_looks
     from evermap.runs.sessions import Entered, enter_session
+    from evermap.runs.track.run import run_track
     from evermap.slam.check import check_recording
+    from evermap.slam.localize import Localizer
+    from evermap.survival.text import parse_prior
+    from evermap.tracking.tracker import Tracker
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
 _HOME = {
     "evermap.config": ("Config", "PersistConfig", "load_config"),
     "evermap.errors": ("EvermapError",),
+    "evermap.existence.one": ("PersistenceFilter",),
     "evermap.io": ("read_recording", "write_native"),
+    "evermap.maps.diff": ("diff",),
     "evermap.maps.living": ("LivingMap",),
-    "evermap.maps.store": ("open_store",),
     "evermap.maps.sessions.session": ("Session",),
-    "evermap.slam.check": ("check_recording",),
+    "evermap.maps.store": ("open_store",),
+    "evermap.maps.why": ("why",),
     "evermap.pipeline": ("run_localization", "run_session", "run_slam"),
+    "evermap.runs.folder": ("write_run",),
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),
-    "evermap.runs.folder": ("write_run",),
     "evermap.runs.sessions": ("Entered", "enter_session"),
+    "evermap.runs.track.run": ("run_track",),
+    "evermap.slam.check": ("check_recording",),
+    "evermap.slam.localize": ("Localizer",),
+    "evermap.survival.text": ("parse_prior",),
+    "evermap.tracking.tracker": ("Tracker",),
     "evermap.types": (
         "Detections",
         "Frames",
@@ -67,24 +81,31 @@ __all__ = [
     "Frames",
     "Landmarks",
     "LivingMap",
+    "Localizer",
     "Odometry",
     "PersistConfig",
+    "PersistenceFilter",
     "Recording",
     "Sensor",
     "Session",
     "SlamResult",
+    "Tracker",
     "Trajectory",
     "__version__",
     "check_recording",
+    "diff",
     "enter_session",
     "load_config",
     "open_store",
+    "parse_prior",
     "read_looks",
     "read_recording",
     "run_localization",
     "run_persist",
     "run_session",
     "run_slam",
+    "run_track",
+    "why",
     "write_native",
     "write_run",
 ]

@@ -1,4 +1,4 @@
-"""The nouns of evermap: frozen dataclasses of arrays, one row an item. Imports nothing of ours but the errors.
+"""The nouns of evermap: frozen dataclasses of arrays, one row an item, which show themselves briefly.
 
 Conventions that hold everywhere:
 
@@ -24,9 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import InputError
+from evermap.show import Shown, ShownTable, draw, extent, span
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from matplotlib.figure import Figure
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -108,7 +110,7 @@ class Clock(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
+class Odometry(ShownTable):
     """Body velocities; row `i` holds from `stamp_s[i]` until `stamp_s[i + 1]` (zero-order hold).
 
     Attributes:
@@ -130,9 +132,12 @@ class Odometry:
     def __len__(self) -> int:
         return len(self.stamp_s)
 
+    def _facts(self) -> dict[str, Any]:
+        return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
+
 
 @dataclass(frozen=True, slots=True)
-class Frames:
+class Frames(ShownTable):
     """Every instant at which the sensor looked, also when it saw nothing.
 
     Attributes:
@@ -150,9 +155,12 @@ class Frames:
     def __len__(self) -> int:
         return len(self.stamp_s)
 
+    def _facts(self) -> dict[str, Any]:
+        return {"rows": len(self), **span(self.stamp_s), "complete": self.complete, "clock": self.clock.value}
+
 
 @dataclass(frozen=True, slots=True)
-class Detections:
+class Detections(ShownTable):
     """Hits: one row a detection, sorted by frame.
 
     Attributes:
@@ -190,9 +198,13 @@ class Detections:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def _facts(self) -> dict[str, Any]:
+        known = self.landmark_id[self.landmark_id != UNKNOWN]
+        return {"rows": len(self), "landmarks": len(np.unique(known)), "range_m": extent(self.range_m)}
+
 
 @dataclass(frozen=True, slots=True)
-class Misses:
+class Misses(ShownTable):
     """Misses: landmarks that were expected in a frame and not detected; one row a (frame, landmark).
 
     Attributes:
@@ -207,6 +219,9 @@ class Misses:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def _facts(self) -> dict[str, Any]:
+        return {"rows": len(self), "landmarks": len(np.unique(self.landmark_id))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,7 +248,7 @@ class Sensor:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotSightings:
+class RobotSightings(ShownTable):
     """Sightings of other robots: read and reported, not used as landmarks. One row a sighting."""
 
     stamp_s: FloatArray
@@ -248,9 +263,12 @@ class RobotSightings:
     def __len__(self) -> int:
         return len(self.stamp_s)
 
+    def _facts(self) -> dict[str, Any]:
+        return {"rows": len(self), "robots": len(np.unique(self.robot_id)), **span(self.stamp_s)}
+
 
 @dataclass(frozen=True, slots=True)
-class Trajectory:
+class Trajectory(ShownTable):
     """Stamped planar poses.
 
     Attributes:
@@ -272,9 +290,23 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.stamp_s)
 
+    @property
+    def length_m(self) -> float:
+        """Return the length of the path between the poses [m]."""
+        return float(np.hypot(*np.diff(self.pose_world_robot[:, :2], axis=0).T).sum())
+
+    def _facts(self) -> dict[str, Any]:
+        stamps = span(self.stamp_s)
+        return {"poses": len(self), **stamps, "length_m": round(self.length_m, 3), "frame": self.frame}
+
+    def plot(self) -> Figure:
+        """Draw the path; returns a matplotlib figure."""
+        figure: Figure = draw("plot_trajectory", self)
+        return figure
+
 
 @dataclass(frozen=True, slots=True)
-class Landmarks:
+class Landmarks(ShownTable):
     """Map records, one row a landmark, sorted by id. Estimates, a prior map and surveyed truth share this form.
 
     Attributes:
@@ -320,6 +352,30 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.landmark_id)
 
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "rows": len(self),
+            "x_m": extent(self.position_m[:, 0]),
+            "y_m": extent(self.position_m[:, 1]),
+            "p_exists": extent(self.p_exists),
+            "classes": self.class_names,
+            "frame": self.frame,
+        }
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the columns, with names and classes in words where there are any."""
+        found = ShownTable._columns(self)
+        if self.names:
+            found["name"] = [self.names.get(identity, "") for identity in self.landmark_id.tolist()]
+        if self.class_names:
+            found["class"] = [self.class_names[k] if k >= 0 else "" for k in self.class_id.tolist()]
+        return found
+
+    def plot(self) -> Figure:
+        """Draw the map with 2-sigma ellipses; returns a matplotlib figure."""
+        figure: Figure = draw("plot_landmarks", self)
+        return figure
+
     @classmethod
     def at(
         cls,
@@ -358,7 +414,7 @@ class Landmarks:
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class Recording(Shown):
     """One robot's session: what a reader returns and the pipeline consumes.
 
     Attributes:
@@ -388,9 +444,28 @@ class Recording:
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
 
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            **span(self.frames.stamp_s),
+            "odometry": len(self.odometry),
+            "frames": len(self.frames),
+            "detections": len(self.detections),
+            "landmarks": self.detections._facts()["landmarks"],
+            "truth": self.truth is not None,
+            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
+            "warnings": len(self.warnings),
+            "source": self.source,
+        }
+
+    def plot(self) -> Figure:
+        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
+        figure: Figure = draw("plot_recording", self)
+        return figure
+
 
 @dataclass(frozen=True, slots=True)
-class ParameterEstimate:
+class ParameterEstimate(Shown):
     """One calibration state or noise level: what was assumed, what the recording says.
 
     Attributes:
@@ -413,7 +488,7 @@ class ParameterEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Innovations:
+class Innovations(ShownTable):
     """What each detection said before it was used: one row a detection that had a prediction.
 
     Attributes:
@@ -452,7 +527,7 @@ class ChangeKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MapChange:
+class MapChange(Shown):
     """One way in which the world differs from the map: some landmarks moved together.
 
     Attributes:
@@ -489,7 +564,7 @@ class MapChange:
 
 
 @dataclass(frozen=True, slots=True)
-class Alternative:
+class Alternative(Shown):
     """Another explanation that the recording cannot rule out.
 
     Attributes:
@@ -504,7 +579,7 @@ class Alternative:
 
 
 @dataclass(frozen=True, slots=True)
-class SlamResult:
+class SlamResult(Shown):
     """Everything a run estimated.
 
     Attributes:
@@ -534,6 +609,24 @@ class SlamResult:
     interrupted: bool = False
     changes: tuple[MapChange, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            **self.trajectory._facts(),
+            "landmarks": len(self.landmarks),
+            "parameters": len(self.parameters),
+            "innovations": len(self.innovations),
+            "misses": len(self.misses),
+            "changes": len(self.changes),
+            "alternatives": len(self.alternatives),
+            "warnings": len(self.warnings),
+            "interrupted": self.interrupted,
+        }
+
+    def plot(self, recording: Recording | None = None) -> Figure:
+        """Draw path and map; with its recording also the truth and what was seen. Returns a matplotlib figure."""
+        figure: Figure = draw("plot_result", self, recording)
+        return figure
 
 
 _Table = TypeVar("_Table", bound="DataclassInstance")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import InputError
+from evermap.show import Shown
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SURE = 1e-9
@@ -20,7 +21,7 @@ BINS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class Reliability:
+class Reliability(Shown):
     """Mean belief and observed share, in bins of equal width (a reliability diagram).
 
     Attributes:

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.geometry.se2 import wrap
+from evermap.show import Shown
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange, SlamResult
 
 
 @dataclass(frozen=True, slots=True)
-class ChangeErrors:
+class ChangeErrors(Shown):
     """Errors of the changes of a run; G groups are matched, each true one with at most one found.
 
     Attributes:

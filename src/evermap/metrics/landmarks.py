@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,13 +11,14 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.metrics.consistency import nees
 from evermap.metrics.trajectory import align_points, rotate_covariance
+from evermap.show import ShownTable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, Innovations, IntArray, Landmarks, Recording, rows_of
 
 MIN_SIGHTINGS = 10
 
 
 @dataclass(frozen=True, slots=True)
-class LandmarkErrors:
+class LandmarkErrors(ShownTable):
     """Errors of L landmarks that are both mapped and surveyed.
 
     Attributes:
@@ -38,6 +40,11 @@ class LandmarkErrors:
     scored: BoolArray
     pose_truth_estimate: FloatArray
     unmapped: int
+    _besides: ClassVar = frozenset({"pose_truth_estimate"})
+
+    def _facts(self) -> dict[str, Any]:
+        count = {"landmarks": len(self.landmark_id), "scored": int(self.scored.sum()), "unmapped": self.unmapped}
+        return {**count, "rmse_m": self.rmse_m, "max_m": self.max_m}
 
     @property
     def rmse_m(self) -> float | None:

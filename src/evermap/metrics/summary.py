@@ -11,6 +11,7 @@ import numpy as np
 from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
+from evermap.show import Shown
 from evermap.types import BoolArray, FloatArray, Recording, SlamResult
 
 RATE_HZ = 2.0
@@ -20,7 +21,7 @@ ONLINE_MAX_GAP_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Evaluation:
+class Evaluation(Shown):
     """Comparison of a run with the truth; None where the truth is not known.
 
     Attributes:

@@ -7,6 +7,7 @@ one planar motion, `pose_truth_estimate`, without scale. It serves evaluation on
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.metrics.consistency import nees
+from evermap.show import ShownTable
 from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
 
 ANCHOR_SLACK_S = 1.0
@@ -95,7 +97,7 @@ def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class PoseErrors:
+class PoseErrors(ShownTable):
     """Errors of a trajectory at K stamps of the truth.
 
     **Alignment and NEES.** `nees` uses the aligned errors. Alignment removes the three degrees of freedom of the
@@ -132,6 +134,11 @@ class PoseErrors:
     pose_truth_anchor: FloatArray | None
     drift_m_per_m: float | None
     skipped: int
+    _besides: ClassVar = frozenset({"pose_truth_estimate", "pose_truth_anchor"})
+
+    def _facts(self) -> dict[str, Any]:
+        error = {"rmse_m": self.rmse_m, "max_m": self.max_m, "heading_rmse_deg": self.heading_rmse_deg}
+        return {"stamps": len(self.stamp_s), **error, "drift_m_per_m": self.drift_m_per_m, "alignment": self.alignment}
 
     @property
     def rmse_m(self) -> float:

@@ -12,14 +12,18 @@ import itertools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
+from evermap.show import Shown, draw
 from evermap.survival.logmath import log_one_minus_exp_of_minus_exp
 from evermap.types import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Seed = np.random.Generator | int
 """A generator, or the seed of a new one."""
@@ -80,7 +84,7 @@ class LifetimePrior(Protocol):
         ...
 
 
-class Lifetime(ABC):
+class Lifetime(Shown, ABC):
     """Base of the lifetime models: implements `LifetimePrior` on top of two formulas.
 
     A model overrides `_log_hazard`, `mean`, and at least one of `_log_integrated_hazard` and `_integrated_hazard`;
@@ -150,6 +154,11 @@ class Lifetime(ABC):
         with np.errstate(all="ignore"):
             return _plain(self._time_of_log_hazard(np.log(-np.log1p(-values))))
 
+    def plot(self, **options: Any) -> Figure:
+        """Draw hazard, survival and density, with the options of `viz.lifetime_figures.plot_lifetimes`."""
+        figure: Figure = draw("plot_lifetime", self, **options)
+        return figure
+
     def _time_of_log_hazard(self, log_target: FloatArray) -> FloatArray:
         """Return the smallest `t` with `log H(t) >= log_target`; by bisection in log t unless overridden."""
         low = np.full(log_target.shape, _LOG_TIME_RANGE[0])
@@ -161,6 +170,17 @@ class Lifetime(ABC):
             enough = self._log_integrated_hazard(zero, np.exp(middle)) >= log_target
             low, high = np.where(enough, low, middle), np.where(enough, middle, high)
         return np.where(np.isneginf(log_target), 0.0, np.where(reached, np.exp(high), np.inf))
+
+
+class SurvivalEstimate(Shown):
+    """Mixin of estimates of a survival function."""
+
+    __slots__ = ()
+
+    def plot(self, **options: Any) -> Figure:
+        """Draw the survival function and its band, with the options of `viz.lifetime_figures.plot_survival`."""
+        figure: Figure = draw("plot_estimate", self, **options)
+        return figure
 
 
 def _plain(values: FloatArray) -> FloatArray:

@@ -33,12 +33,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError
+from evermap.show import ShownTable
 from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CensoredLifetimes:
+class CensoredLifetimes(ShownTable):
     """N samples `left < T <= right`, each known only because `T > entry`.
 
     ```

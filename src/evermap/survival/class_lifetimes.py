@@ -23,6 +23,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evermap.show import Shown
 from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import FloatArray
 
@@ -47,7 +48,7 @@ _LEAST = 1e-300
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClassPosterior:
+class ClassPosterior(Shown):
     """Posterior of the durations of C classes, and of a class without data.
 
     Attributes:
@@ -111,7 +112,7 @@ def absence_posterior(log_likelihood: FloatArray, said: FloatArray | float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
-class Sightings:
+class Sightings(Shown):
     """K stays as they were seen, and what may have interrupted them between looks.
 
     Attributes:

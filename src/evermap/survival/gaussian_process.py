@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError, NumericalError
+from evermap.show import Shown
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import (
     Exposures,
@@ -46,7 +47,7 @@ _NEGLECTED = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Covariates:
+class Covariates(Shown):
     """Covariates of N things, each None where unknown.
 
     Attributes:
@@ -90,7 +91,7 @@ class Covariates:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GpHazard:
+class GpHazard(Shown):
     """Posterior of a hazard over age and covariates.
 
     Attributes:

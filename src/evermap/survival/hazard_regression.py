@@ -22,7 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import NumericalError
-from evermap.survival.base import check_open_share, check_times
+from evermap.show import Shown
+from evermap.survival.base import SurvivalEstimate, check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazards import PiecewiseConstantHazard
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -64,7 +65,7 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class Posterior(Shown):
     """Laplace's approximation of the posterior of all `u`, concatenated.
 
     Attributes:
@@ -89,7 +90,7 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HazardDraws:
+class HazardDraws(SurvivalEstimate):
     """An uncertain piecewise constant hazard, as equally probable draws.
 
     Attributes:

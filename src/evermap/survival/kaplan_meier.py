@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError
-from evermap.survival.base import check_open_share, check_times
+from evermap.show import ShownTable
+from evermap.survival.base import SurvivalEstimate, check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class KaplanMeier:
+class KaplanMeier(SurvivalEstimate, ShownTable):
     """A survival function with D steps.
 
     Attributes:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.survival.base import LifetimePrior, check_open_share
+from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share
 from evermap.survival.censored import CensoredLifetimes, log_sighting
 from evermap.survival.exponential import Exponential
 from evermap.survival.gamma import Gamma
@@ -98,7 +98,7 @@ KINDS: Mapping[str, Kind] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ParametricFit:
+class ParametricFit(SurvivalEstimate):
     """Maximum likelihood estimate within a family.
 
     Attributes:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import DataError
+from evermap.show import Shown
 from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.gaussian_process import curve_terms, weibull_baseline
@@ -41,7 +42,7 @@ _PLACE, _OWN, _CLASS = "place", "own", "class x own"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PooledHazard:
+class PooledHazard(Shown):
     """Posterior of a hazard by class and chunk.
 
     Attributes:

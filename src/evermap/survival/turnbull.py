@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import NumericalError
-from evermap.survival.base import check_times
+from evermap.show import ShownTable
+from evermap.survival.base import SurvivalEstimate, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.step import StepLifetime
 from evermap.types import FloatArray
@@ -42,7 +43,7 @@ TRACE = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Npmle:
+class Npmle(SurvivalEstimate, ShownTable):
     """A nonparametric estimate: mass on s cells in order of time.
 
     Attributes:

@@ -1,0 +1,134 @@
+"""Pictures of single objects, as their methods `plot` return them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.metrics.summary import compare_with_truth
+from evermap.survival.base import LifetimePrior
+from evermap.types import UNKNOWN, Detections, Frames, Landmarks, Odometry, Recording, SlamResult, Trajectory
+from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
+from evermap.viz.map_figure import draw_map
+from evermap.viz.style import (
+    ESTIMATE,
+    INK,
+    LANDMARK,
+    MUTED,
+    PAPER,
+    class_looks,
+    house_style,
+    label_points,
+    legend_name,
+    new_figure,
+    settle,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_MAX_LABELS = 40
+
+
+def plot_result(result: SlamResult, recording: Recording | None = None) -> Figure:
+    """Draw path, odometry and map of a run, in the frame of the recording's truth where there is one."""
+    whole = recording or _nothing_but_frames(result)
+    with house_style():
+        return draw_map(whole, result, compare_with_truth(whole, result)).figure
+
+
+def plot_landmarks(landmarks: Landmarks) -> Figure:
+    """Draw a map by class with 2-sigma ellipses; landmarks that may be gone are fainter."""
+    from matplotlib.collections import EllipseCollection
+
+    names = [landmarks.class_names[k] if 0 <= k < len(landmarks.class_names) else "" for k in landmarks.class_id]
+    with house_style():
+        figure, axes = _plan()
+        variance, axis = np.linalg.eigh(landmarks.covariance_m2)
+        size = 4.0 * np.sqrt(np.maximum(variance, 0.0))
+        angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
+        place: Any = {"offsets": landmarks.position_m, "offset_transform": axes.transData, "units": "xy"}
+        line: Any = {"facecolors": "none", "edgecolors": MUTED, "linewidths": 0.8}
+        axes.add_collection(EllipseCollection(size[:, 1], size[:, 0], angle, **place, **line))
+        for name, look in class_looks(names).items():
+            rows = np.array([one == name for one in names], dtype=np.bool_)
+            if not rows.any():
+                continue
+            x, y = landmarks.position_m[rows].T
+            colour: Any = [(look.colour, 0.25 + 0.75 * p) for p in landmarks.p_exists[rows]]
+            axes.scatter(x, y, s=18, lw=0, marker=look.marker, c=colour, label=legend_name(name or "no class"))
+        if landmarks.class_names:
+            figure.legend(loc="outside upper center", ncols=4)
+        if len(landmarks) <= _MAX_LABELS:
+            texts = (landmarks.names.get(identity, str(identity)) for identity in landmarks.landmark_id.tolist())
+            label_points(axes, landmarks.position_m, texts)
+        settle(figure)
+    return figure
+
+
+def plot_trajectory(trajectory: Trajectory) -> Figure:
+    """Draw a path and its first pose."""
+    with house_style():
+        figure, axes = _plan()
+        axes.plot(*trajectory.pose_world_robot[:, :2].T, color=ESTIMATE, lw=1.0)
+        axes.plot(*trajectory.pose_world_robot[:1, :2].T, "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6)
+    return figure
+
+
+def plot_recording(recording: Recording) -> Figure:
+    """Draw range and landmark of every detection over time, odometry, and the true path where there is one."""
+    start_s = recording.frames.stamp_s[0] if len(recording.frames) else 0.0
+    seen_s = recording.frames.stamp_s[recording.detections.frame] - start_s
+    odometry = recording.odometry
+    panels = {
+        "range [m]": (seen_s, recording.detections.range_m),
+        "landmark": (seen_s, _rows_of_landmarks(recording.detections)),
+        "forward [m/s]": (odometry.stamp_s - start_s, odometry.forward_mps),
+        "turn [rad/s]": (odometry.stamp_s - start_s, odometry.angular_radps),
+    }
+    with house_style():
+        figure = new_figure(10.0 if recording.truth is not None else 7.2, 5.4)
+        grid = figure.add_gridspec(len(panels), 2 if recording.truth is not None else 1)
+        top: Axes | None = None
+        for k, (label, (time_s, values)) in enumerate(panels.items()):
+            axes = figure.add_subplot(grid[k, 0], sharex=top)
+            top = top or axes
+            axes.plot(time_s, values, "." if k < 2 else "-", color=LANDMARK if k < 2 else INK, ms=1.5, lw=0.6)
+            axes.set_ylabel(label)
+        axes.set_xlabel("time since the first frame [s]")
+        if recording.truth is not None:
+            plan = figure.add_subplot(grid[:, 1], aspect="equal", xlabel="x [m]", ylabel="y [m]")
+            plan.plot(*recording.truth.pose_world_robot[:, :2].T, color=INK, lw=0.8)
+            if recording.true_landmarks is not None:
+                plan.plot(*recording.true_landmarks.position_m.T, "s", mfc="none", mec=INK, ms=5, mew=0.8)
+    return figure
+
+
+def plot_lifetime(prior: LifetimePrior, **options: Any) -> Figure:
+    """Draw hazard, survival and density of a lifetime prior; options as of `plot_lifetimes`."""
+    return plot_lifetimes(prior, **options)
+
+
+def plot_estimate(estimate: Any, **options: Any) -> Figure:
+    """Draw the survival function of an estimate; options as of `plot_survival`."""
+    return plot_survival({type(estimate).__name__: estimate}, **options)
+
+
+def _plan() -> tuple[Figure, Axes]:
+    figure = new_figure(6.0, 5.0)
+    return figure, figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def _rows_of_landmarks(detections: Detections) -> np.ndarray:
+    """Return the rank (M,) of each detection's landmark among the ids; nan where it is unknown."""
+    _, rank = np.unique(detections.landmark_id, return_inverse=True)
+    return np.where(detections.landmark_id == UNKNOWN, np.nan, rank)
+
+
+def _nothing_but_frames(result: SlamResult) -> Recording:
+    nothing = np.zeros(0)
+    whole = nothing.astype(np.int64)
+    detections = Detections(whole, whole, nothing, nothing, whole, nothing, nothing, whole)
+    return Recording("", Odometry(nothing, nothing, nothing, nothing), Frames(result.online.stamp_s), detections)
