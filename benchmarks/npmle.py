@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.turnbull import npmle
+from evermap.survival.nonparametric import npmle
 from evermap.types import FloatArray
 
 N_LIFETIMES = 100_000

@@ -20,9 +20,8 @@ from evermap.show import LONGEST, Shown, ShownTable
 from evermap.survival import Exponential, PiecewiseConstantHazard, StepLifetime, Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
-from evermap.survival.kaplan_meier import kaplan_meier
+from evermap.survival.nonparametric import kaplan_meier, npmle
 from evermap.survival.parametric_fit import fit
-from evermap.survival.turnbull import npmle
 from evermap.types import (
     Alternative,
     ChangeKind,

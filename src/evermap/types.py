@@ -559,7 +559,7 @@ class MapChange(Shown):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """What its landmarks are called: their texts, or their ids."""
+        """Return what its landmarks are called: their texts, or their ids."""
         return self.names or tuple(map(str, self.landmark_ids))
 
 

@@ -10,7 +10,7 @@ from lifelines import KaplanMeierFitter
 
 from evermap.errors import ConfigError, DataError
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.kaplan_meier import kaplan_meier
+from evermap.survival.nonparametric import kaplan_meier
 
 
 @given(

@@ -15,8 +15,7 @@ from scipy.special import xlogy
 
 from evermap.errors import NumericalError
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.kaplan_meier import kaplan_meier
-from evermap.survival.turnbull import Npmle, npmle
+from evermap.survival.nonparametric import Npmle, kaplan_meier, npmle
 
 GOLDEN = Path(__file__).resolve().parents[3] / "shared" / "golden" / "npmle.json"
 CASES = json.loads(GOLDEN.read_text())["cases"] if GOLDEN.is_file() else []

@@ -12,9 +12,8 @@ from evermap.errors import ConfigError
 from evermap.survival import Exponential, Weibull, never_leaves
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
-from evermap.survival.kaplan_meier import kaplan_meier
+from evermap.survival.nonparametric import kaplan_meier, npmle
 from evermap.survival.parametric_fit import fit
-from evermap.survival.turnbull import npmle
 from evermap.viz.lifetime_figures import plot_chunks, plot_samples, plot_survival
 
 DAY_S = 86400.0

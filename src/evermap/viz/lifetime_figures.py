@@ -12,10 +12,9 @@ from evermap.errors import ConfigError, printable
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
-from evermap.survival.kaplan_meier import KaplanMeier
+from evermap.survival.nonparametric import KaplanMeier, Npmle
 from evermap.survival.parametric_fit import ParametricFit
 from evermap.survival.pooling import Chunk
-from evermap.survival.turnbull import Npmle
 from evermap.types import FloatArray
 from evermap.viz.style import (
     ALERT,

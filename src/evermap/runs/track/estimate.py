@@ -18,9 +18,8 @@ from evermap.types import FloatArray
 
 if TYPE_CHECKING:
     from evermap.survival.hazard_regression import HazardDraws
-    from evermap.survival.kaplan_meier import KaplanMeier
+    from evermap.survival.nonparametric import KaplanMeier, Npmle
     from evermap.survival.parametric_fit import ParametricFit
-    from evermap.survival.turnbull import Npmle
 
 NPMLE, KAPLAN_MEIER, BEST, GP = "npmle", "kaplan-meier", "best", "gp"
 
@@ -102,7 +101,7 @@ def estimate(name: str, data: CensoredLifetimes) -> Estimate:
 
 
 def _npmle(data: CensoredLifetimes) -> Estimate:
-    from evermap.survival.turnbull import npmle
+    from evermap.survival.nonparametric import npmle
 
     fitted = npmle(data)
     numbers = {
@@ -117,7 +116,7 @@ def _npmle(data: CensoredLifetimes) -> Estimate:
 
 
 def _kaplan_meier(data: CensoredLifetimes) -> Estimate:
-    from evermap.survival.kaplan_meier import kaplan_meier
+    from evermap.survival.nonparametric import kaplan_meier
 
     fitted = kaplan_meier(data)
     lower, upper = fitted.band(fitted.time_s) if fitted.time_s.size else (fitted.time_s, fitted.time_s)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from evermap.survival.nonparametric import Npmle
 from evermap.survival.parametric_fit import ParametricFit
-from evermap.survival.turnbull import Npmle
 from evermap.types import FloatArray
 from evermap.viz.style import (
     ALERT,

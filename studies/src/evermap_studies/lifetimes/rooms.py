@@ -17,8 +17,7 @@ from evermap.errors import InputError, NumericalError
 from evermap.io.columns import read_columns
 from evermap.survival import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
-from evermap.survival.kaplan_meier import KaplanMeier, kaplan_meier
-from evermap.survival.turnbull import Npmle, npmle
+from evermap.survival.nonparametric import KaplanMeier, Npmle, kaplan_meier, npmle
 from evermap.types import BoolArray, FloatArray
 from evermap.valid import STAMP_S
 from evermap_studies.lifetimes.truth import Value

@@ -16,7 +16,7 @@ from evermap.errors import NumericalError
 from evermap.survival import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
 from evermap.survival.gaussian_process import gp_fit
-from evermap.survival.kaplan_meier import kaplan_meier
+from evermap.survival.nonparametric import kaplan_meier
 from evermap.survival.parametric_fit import fit, fit_best, fit_sightings
 from evermap.types import FloatArray
 from evermap_studies.worlds.patrol_lifetimes import PatrolRun, PatrolWorld, simulate_patrols
