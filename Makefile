@@ -51,7 +51,7 @@ format: $(DEVELOPMENT)
 	$(VENV)/bin/ruff format .
 	$(VENV)/bin/ruff check --fix .
 
-# Open out/site/index.html; its search needs a server: python3 -m http.server --directory out/site
+# Nothing is loaded from elsewhere, neither here nor by a reader: open out/site/index.html from the file system.
 docs: $(RUNTIME) $(DOCUMENTATION)
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict --quiet
 
