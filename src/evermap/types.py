@@ -595,6 +595,7 @@ class SlamResult(Shown):
         interrupted: True where the run was stopped before the end of the recording.
         changes: how the world differs from the map that was given, or changed during the run.
         alternatives: other explanations nearly as probable as `changes`, the most probable first.
+        gone: landmarks that the map knows but does not believe to be there.
     """
 
     trajectory: Trajectory
@@ -609,6 +610,7 @@ class SlamResult(Shown):
     interrupted: bool = False
     changes: tuple[MapChange, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    gone: Landmarks = field(default_factory=lambda: Landmarks.at([], np.zeros((0, 2))))
 
     def _facts(self) -> dict[str, Any]:
         return {

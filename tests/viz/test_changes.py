@@ -12,9 +12,10 @@ from synthetic_run import with_changes
 
 from evermap.geometry import se2
 from evermap.metrics.summary import compare_with_truth
-from evermap.types import Alternative, ChangeKind, MapChange
+from evermap.types import Alternative, ChangeKind, Clock, Landmarks, MapChange
 from evermap.viz.change_words import describe, describe_all, explanations, near_alternatives, probability
 from evermap.viz.map_figure import GROUP_COLOURS, moves
+from evermap.viz.report import change_table
 from evermap.viz.rerun_scene import write_scene
 from evermap.viz.run_figures import draw_figures
 from evermap.viz.style import MUTED
@@ -157,3 +158,32 @@ def test_the_scene_shows_an_arrow_from_when_the_change_is_over(run, changed, eva
         origins, vectors = (np.array(batch.column(f"Arrows3D:{name}")[0].as_py()) for name in ("origins", "vectors"))
         assert origins[:, :2] == pytest.approx(move.before_m, abs=1e-5)
         assert (origins + vectors)[:, :2] == pytest.approx(move.after_m, abs=1e-5)
+
+
+def test_many_changes_share_a_line_of_the_legend_a_kind_and_what_vanished_is_crossed_out(run):
+    recording, result = run
+    ids = result.landmarks.landmark_id.tolist()
+    kinds = [ChangeKind.MOVED] * 6 + [ChangeKind.APPEARED] * 3
+    changes = [change(name, kind=kind, by=(1.0, 0.0) if kind is ChangeKind.MOVED else (NAN, NAN))
+               for name, kind in zip(ids, kinds, strict=False)]  # fmt: skip
+    gone = Landmarks.at([990, 991], [[0.0, 0.0], [1.0, 0.5]])
+    changes.append(change(991, kind=ChangeKind.VANISHED, by=(NAN, NAN)))
+    many = dataclasses.replace(result, changes=tuple(changes), gone=gone)
+    figure = next(f for f in draw_figures(recording, many, compare_with_truth(recording, many)) if f.name == "map")
+    axes = figure.figure.axes[0]
+    texts = [text.get_text() for text in figure.figure.legends[1].get_texts()]
+    assert texts == ["moved, 6 landmarks", "appeared, 3 landmarks", "vanished, 1 landmarks"]
+    crosses = {(line.get_alpha(), len(line.get_xdata())) for line in axes.lines if line.get_marker() == "x"}
+    assert {(0.8, 2), (None, 1)} <= crosses
+    assert "gone: P(exists) below 50 %" in [text.get_text() for text in figure.figure.legends[0].get_texts()]
+
+
+def test_numbers_of_a_change_are_dates_and_never_nan(run):
+    result = run[1]
+    dated = dataclasses.replace(result.landmarks, clock=Clock.UNIX)
+    seen = change(3, kind=ChangeKind.APPEARED, start=1704277600.0, stop=1704357870.0, by=(NAN, NAN))
+    html = change_table(dataclasses.replace(result, landmarks=dated, changes=(seen,)))
+    assert "nan" not in html
+    assert "1704" not in html
+    assert "2024-01-03 10:26:40" in html
+    assert "not before (UTC)" in html

@@ -103,8 +103,7 @@ def test_belief_curve_looks_and_truth_are_where_they_belong() -> None:
     figure: Any = plot_belief(
         TIME_S,
         BELIEF,
-        look_s=[60.0, 120.0, 420.0],
-        detected=[1, 1, 0],
+        looks=([60.0, 120.0, 420.0], [1, 1, 0]),
         truth_s=[(-5.0, 300.0), (900.0, 950.0)],
         forecast_from_s=480.0,
         threshold=0.25,
@@ -161,4 +160,4 @@ def test_samples_become_stretches() -> None:
 )
 def test_columns_that_do_not_fit_are_refused(time: Any, belief: Any, looks: Any, detected: Any, named: str) -> None:
     with pytest.raises(InputError, match=named):
-        plot_belief(time, belief, look_s=looks, detected=detected)
+        plot_belief(time, belief, looks=(looks, detected))

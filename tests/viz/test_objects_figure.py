@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.types import Clock
+from evermap.viz.style import ALERT, class_looks
 from evermap.viz.track_figures import MOST_SPELLS, Rests, plot_objects
 
 HOUR_S = 3600.0
@@ -26,19 +28,53 @@ def test_a_bar_for_each_spell_thin_where_it_can_have_come_and_gone() -> None:
     spans = sorted(
         (float(line.get_linewidth()), *(round(float(x), 6) for x in np.asarray(line.get_xdata()))) for line in lines
     )
+    spans = [span for span in spans if span[1:] != (8.0, 8.0)]  # the last frame
     # gone to last for the thin lines behind, elsewhere to first for those before
     assert spans == [(0.8, 0.5, 1.0), (0.8, 1.5, 1.0), (0.8, 1.5, 2.0), (0.8, 3.5, 3.0)] + [
         (3.0, 0.0, 1.0),
         (3.0, 1.0, 3.0),
         (3.0, 2.0, 5.0),
     ]
-    arrows = {str(line.get_marker()): float(np.asarray(line.get_xdata())[0]) for line in bars.lines}
+    drawn = [line for line in bars.lines if np.size(line.get_xdata())]
+    arrows = {str(line.get_marker()): float(np.asarray(line.get_xdata())[0]) for line in drawn}
     assert (arrows["<"], arrows[">"]) == pytest.approx((0.0, 5.0))
 
 
 def test_of_too_many_the_longest() -> None:
     figure = plot_objects(("a", "b"), [], rests(MOST_SPELLS + 5), start_s=0.0, end_s=400 * HOUR_S)
     _, bars = figure.axes
-    thick = [line for line in bars.lines if line.get_linewidth() == 3.0]
+    thick = [line for line in bars.lines if line.get_linewidth() == 3.0 and np.size(line.get_xdata())]
     assert len(thick) == MOST_SPELLS
     assert bars.get_title(loc="left") == f"the {MOST_SPELLS} longest of {MOST_SPELLS + 5} spells at rest"
+
+
+def test_classes_have_their_look_and_what_left_is_crossed_out() -> None:
+    figure = plot_objects(
+        ("b", "a"), [(0, np.array([[0.0, 0.0], [1.0, 1.0]]))], rests(3), start_s=0.0, end_s=8 * HOUR_S
+    )
+    above, bars = figure.axes
+    looks = class_looks(("a", "b"))
+    marks = {(str(line.get_marker()), str(line.get_mec()), str(line.get_mfc())): np.asarray(line.get_xydata()).tolist()
+             for line in above.lines if line.get_linestyle() == "None" and np.size(line.get_xdata())}  # fmt: skip
+    b, a = looks["b"], looks["a"]
+    assert marks[(b.marker, b.colour, "none")] == [[0.0, 0.0]]
+    assert marks[(b.marker, b.colour, b.colour)] == [[2.0, -2.0]]
+    assert marks[(a.marker, a.colour, "none")] == [[1.0, -1.0]]
+    assert marks[("x", ALERT, ALERT)] == [[0.0, 0.0], [1.0, -1.0]]
+    (path,) = [line for line in above.lines if np.size(line.get_xdata()) == 2 and line.get_linestyle() == "-"]
+    assert path.get_color() == b.colour
+    assert {str(line.get_color()) for line in bars.lines if line.get_linewidth() == 3.0} >= {a.colour, b.colour}
+    words = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {
+        "a",
+        "b",
+        "has left again",
+        "seen at rest",
+        "came or left in between",
+        "beginning or end not known",
+    } <= words
+
+
+def test_clocks_give_dates() -> None:
+    figure = plot_objects(("a", "b"), [], rests(2), start_s=1.7e9, end_s=1.7e9 + HOUR_S, clock=Clock.UNIX)
+    assert figure.axes[1].get_xlabel() == "time [UTC]"

@@ -133,7 +133,7 @@ def test_sections_of_the_caller_come_first_with_their_pictures(run, figures):
     )
     page, _ = page_of(*run, figures[1:], [section])
     check(page)
-    assert page.index("What a changing world does") < page.index("Where it was")
+    assert page.index("What a changing world does") < page.index("<h2>Accuracy")
     assert "<em>hurts</em>" in page
     assert "data:image/png;base64,iVBORw0KGgo" in page
     assert "one &lt; two" in page
@@ -174,6 +174,6 @@ def test_what_changed_is_told_in_words_and_numbers(run):
     assert "landmarks 3, 6, 9 moved by (-1.00, 0.00) m before the session, probability 97 %" in text
     assert "or: landmarks 12, 15, 18" in text
     assert "alternative_1.geojson" in text
-    assert page.index("What changed") < page.index("Where it was")
+    assert page.index("What changed") < page.index("<h2>Accuracy")
     assert "nan" not in text
     assert "What changed" not in page_of(recording, result)[0]

@@ -10,7 +10,7 @@ import pytest
 from evermap.errors import MissingExtraError
 from evermap.viz.rerun_scene import log_tracks
 from evermap.viz.style import house_style, new_figure
-from evermap.viz.track_figures import ARROW_S, DYNAMIC, STATIC, draw_tracks
+from evermap.viz.track_figures import ARROW_S, DYNAMIC, STATIC, TracksNow, draw_tracks
 
 POSITION = np.array([[0.0, 1.0, 0.0], [5.0, 2.0, 0.0], [9.0, -3.0, 1.0]])
 VELOCITY = np.array([[0.01, 0.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
@@ -25,12 +25,7 @@ def axes():
         axes = figure.add_subplot()
         draw_tracks(
             axes,
-            position_m=POSITION,
-            velocity_mps=VELOCITY,
-            static=REST,
-            resting_m=RESTING,
-            sensor_m=np.array([1.0, 2.0, 0.0]),
-            reach_m=7.0,
+            TracksNow(POSITION, VELOCITY, REST, RESTING, sensor_m=np.array([1.0, 2.0, 0.0]), reach_m=7.0),
             detected_m=POSITION[:2],
         )
     return axes

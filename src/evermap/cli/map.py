@@ -15,6 +15,7 @@ from evermap.errors import ConfigError
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.types import FloatArray
+    from evermap.viz.living_map_figures import MapView
 
 app = typer.Typer(
     name="map",
@@ -78,8 +79,8 @@ def show(
       evermap map show site.evermap --ahead 3d --figure map.png
     """
     from evermap.cli.map_content import landmark_dicts, landmark_row, prior_dicts
-    from evermap.maps.stamps import stamp_text
     from evermap.maps.store import open_store
+    from evermap.stamps import stamp_text
     from evermap.survival.durations import parse_duration_s
 
     ahead_s = parse_duration_s(ahead)
@@ -92,7 +93,7 @@ def show(
     if figure is not None:
         from evermap.viz.living_map_figures import plot_living_map
 
-        write_picture(figure, plot_living_map(**_picture(living), title=f"{Path(file).name}, revision {number}"))
+        write_picture(figure, plot_living_map(_picture(living), title=f"{Path(file).name}, revision {number}"))
     if as_json:
         about = {"map": file, "revision": number, "stamp_s": _finite(living.stamp_s), "clock": living.clock.value}
         print_json({**about, "ahead_s": ahead_s, "landmarks": content, "priors": prior_dicts(living)})
@@ -287,21 +288,25 @@ def _writer(out: Path) -> Any:
     )
 
 
-def _picture(living: LivingMap) -> dict[str, Any]:
-    """What the figure of a map needs."""
-    members, site = living.members, living.site_of()
-    place = living.place_row(members.landmark_id, site)
-    return {
-        "landmark_id": members.landmark_id,
-        "place": place,
-        "p_exists": living.p_exists(),
-        "class_id": members.class_id,
-        "class_names": living.class_names,
-        "pinned": members.pinned,
-        "deleted": members.deleted,
-        "position_m": living.places.position_m,
-        "place_landmark": living.places.landmark_id,
-    }
+def _picture(living: LivingMap) -> MapView:
+    """What the figure of a map shows."""
+    import numpy as np
+
+    from evermap.viz.living_map_figures import MapView
+
+    landmarks, places, views = living.landmarks(), living.places, living.views
+    row = living.place_row(living.members.landmark_id, living.site_of())
+    other = np.flatnonzero(np.isin(places.landmark_id, landmarks.landmark_id))
+    other = np.setdiff1d(other, row)
+    pinned = living.members.landmark_id[living.members.pinned]
+    return MapView(
+        landmarks,
+        np.isin(landmarks.landmark_id, pinned),
+        places.position_m[other],
+        np.searchsorted(landmarks.landmark_id, places.landmark_id[other]),
+        np.asarray(views.cell_m * (np.unique(views.cell, axis=0) + 0.5), dtype=np.float64),
+        views.cell_m,
+    )
 
 
 def _finite(value: float) -> float | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from evermap.maps.stamps import between_text, stamp_text
+from evermap.stamps import between_text, stamp_text
 from evermap.types import UNKNOWN, Clock, FloatArray, MapChange
 
 if TYPE_CHECKING:

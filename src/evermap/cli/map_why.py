@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 def print_why(answer: Answer) -> None:
     """The answer, what it rests on, and what every session saw."""
     from evermap.cli.map_content import change_line
-    from evermap.maps.stamps import stamp_text
     from evermap.maps.why import probability_text
+    from evermap.stamps import stamp_text
 
     echo(answer.headline)
     for reason in answer.reasons:
@@ -46,22 +46,21 @@ def draw_why(path: Path, answer: Answer) -> None:
     """The same as a figure."""
     import numpy as np
 
-    from evermap.viz.living_map_figures import plot_why
+    from evermap.viz.living_map_figures import LandmarkHistory, plot_why
 
     seen, stays = answer.evidence, answer.stays
     session = np.repeat([v.revision for v in answer.visits], [v.n_looks for v in answer.visits])
     names = {site: f"site {k + 1}" for k, site in enumerate(dict.fromkeys(stays.site_id.tolist()))}
     columns = zip(stays.site_id.tolist(), stays.elsewhere_s, stays.first_s, stays.last_s, stays.gone_s, strict=True)
-    drawn = plot_why(
+    history = LandmarkHistory(
         seen.stamp_s,
         seen.p_exists,
         seen.n_hits,
         seen.n_misses,
         seen.log_odds,
-        session=session.astype(np.int64),
-        stays=[(names[site], *map(float, stamps)) for site, *stamps in columns],  # type: ignore[misc]
-        now_s=answer.stamp_s,
-        title=answer.headline,
-        clock=answer.clock,
+        session.astype(np.int64),
+        [(names[site], *map(float, stamps)) for site, *stamps in columns],  # type: ignore[misc]
+        answer.stamp_s,
+        answer.clock,
     )
-    write_picture(path, drawn)
+    write_picture(path, plot_why(history, title=answer.headline))

@@ -9,8 +9,8 @@ import numpy as np
 from evermap.errors import InputError, similar
 from evermap.maps.diff import edits
 from evermap.maps.living import EXISTS, Evidence, LivingMap, Stays
-from evermap.maps.stamps import stamp_text
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
+from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
 from evermap.types import Clock, MapChange
 

@@ -25,21 +25,19 @@ def plot_belief(
     time_s: Any,
     p_exists: Any,
     *,
-    look_s: Any = (),
-    detected: Any = (),
+    looks: tuple[Any, Any] = ((), ()),
     truth_s: Any = None,
     forecast_from_s: float | None = None,
     threshold: float | None = None,
     title: str | None = None,
     clock: Clock = Clock.RECORDING,
 ) -> Figure:
-    """Figure of one feature: belief curve, detections above, misses below, truth shaded, forecast dashed.
+    """Draw one feature: belief curve, detections above, misses below, truth shaded, forecast dashed.
 
     Args:
         time_s: (N,) times of the curve, never decreasing; a time twice draws the jump of an observation.
         p_exists: (N,) probability that the feature exists then.
-        look_s: (M,) times of the looks at it.
-        detected: (M,) 1 for a detection, 0 for a miss.
+        looks: (M,) times of the looks at it, and (M,) 1 for a detection, 0 for a miss.
         truth_s: (K, 2) begin and end of the stretches in which it truly was there (`stretches` makes them from
             samples); None where the truth is not known.
         forecast_from_s: from here on the curve is a forecast.
@@ -57,8 +55,7 @@ def plot_belief(
             axes,
             time_s,
             p_exists,
-            look_s=look_s,
-            detected=detected,
+            looks=looks,
             truth_s=truth_s,
             forecast_from_s=forecast_from_s,
             threshold=threshold,
@@ -76,16 +73,15 @@ def draw_belief(
     time_s: Any,
     p_exists: Any,
     *,
-    look_s: Any = (),
-    detected: Any = (),
+    looks: tuple[Any, Any] = ((), ()),
     truth_s: Any = None,
     forecast_from_s: float | None = None,
     threshold: float | None = None,
     clock: Clock = Clock.RECORDING,
 ) -> None:
-    """As `plot_belief`, into given axes and without legend. Call within `house_style`."""
+    """Draw as `plot_belief` into given axes and without legend. Call within `house_style`."""
     time, belief = _columns(("time_s", time_s), ("p_exists", p_exists))
-    looks, hits = _columns(("look_s", look_s), ("detected", detected))
+    look_s, hits = _columns(("look_s", looks[0]), ("detected", looks[1]))
     if len(time) == 0 or np.any(np.diff(time) < 0.0):
         raise InputError("a curve needs at least one time, and times that never decrease", field="time_s")
     first, last = float(time[0]), float(time[-1])
@@ -106,8 +102,8 @@ def draw_belief(
             axes.fill_between(x([begin, end]), 0.0, 1.0, color=LANDMARK, alpha=0.16, lw=0, zorder=1, label=label)
     if threshold is not None:
         axes.axhline(threshold, color=MUTED, lw=0.9, ls=":", zorder=2, label=f"threshold {threshold:g}")
-    _ticks(axes, x(looks[hits > 0.5]), _HIT_ROW, LANDMARK, "detection")
-    _ticks(axes, x(looks[hits <= 0.5]), _MISS_ROW, ALERT, "miss")
+    _ticks(axes, x(look_s[hits > 0.5]), _HIT_ROW, LANDMARK, "detection")
+    _ticks(axes, x(look_s[hits <= 0.5]), _MISS_ROW, ALERT, "miss")
 
     axes.set(ylim=(-0.16, 1.16), ylabel="P(exists) [1]", yticks=np.linspace(0.0, 1.0, 5))
     if last > first:
@@ -116,7 +112,7 @@ def draw_belief(
 
 
 def stretches(stamp_s: Any, present: Any) -> FloatArray:
-    """(K, 2) begin and end of the runs of samples in which something was there; each sample holds until the next.
+    """Return (K, 2) begin and end of the runs of samples with something there; each holds until the next.
 
     Args:
         stamp_s: (N,) strictly increasing.

@@ -2,106 +2,88 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.errors import InputError, printable
-from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
+from evermap.types import BoolArray, Clock, FloatArray, IntArray, Landmarks, rows_of
+from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
-    GROUP,
     INK,
     LANDMARK,
     MUTED,
-    ODOMETRY,
-    ONLINE,
     PAPER,
+    SHADE,
+    class_looks,
     house_style,
+    label_points,
     legend_name,
+    legend_of,
     new_figure,
     settle,
 )
 from evermap.viz.time_axis import TimeAxis
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLOURS = (LANDMARK, ESTIMATE, ODOMETRY, GROUP, ONLINE)
-_MARKERS = ("o", "s", "^", "D")
-_MAX_LABELS = 60
+_EXISTS = 0.5
+_FAINTEST = 0.3
+"""Opacity of what exists with probability 0.5; what certainly exists is opaque."""
+_P_CLIP = 1e-3
+"""Beliefs beyond are drawn at the edge of the axis."""
+_NATS_CLIP = 20.0
+"""Evidence beyond is drawn at the edge of the axis: 20 nats are odds of 500 million to one."""
+_MAX_WORDS = 6
+"""More sessions than this have no room for words."""
 
 
-def plot_living_map(
-    landmark_id: IntArray,
-    place: IntArray,
-    p_exists: FloatArray,
-    class_id: IntArray,
-    class_names: tuple[str, ...],
-    pinned: BoolArray,
-    deleted: BoolArray,
-    position_m: FloatArray,
-    place_landmark: IntArray,
-    *,
-    title: str,
-) -> Figure:
-    """Landmarks at their most probable places, the fainter the less they exist; their other places as small dots.
+@dataclass(frozen=True, slots=True)
+class MapView:
+    """What the figure of a living map shows.
 
-    Args:
-        landmark_id: (L,) sorted.
-        place: (L,) row of the place of each, -1 for none.
-        p_exists: (L,) probability.
-        class_id: (L,) class, or `UNKNOWN`.
-        class_names: names of the classes, for the legend.
+    Attributes:
+        landmarks: L landmarks at their most probable places, also those that are believed gone.
         pinned: (L,) marked by a ring.
-        deleted: (L,) left out.
-        position_m: (P, 2) of all places.
-        place_landmark: (P,) whose place each is.
-        title: above the axes.
+        other_m: (K, 2) other places at which landmarks are known to have stood.
+        other_of: (K,) row of the landmark of each.
+        seen_from_m: (V, 2) middles of the floor's cells from which the robot looked.
+        cell_m: side of a cell.
+        walls_m: lines of (N, 2) points, where walls are known.
+    """
+
+    landmarks: Landmarks
+    pinned: BoolArray
+    other_m: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    other_of: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    seen_from_m: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    cell_m: float = 0.5
+    walls_m: tuple[FloatArray, ...] = ()
+
+
+def plot_living_map(view: MapView, *, title: str) -> Figure:
+    """Draw landmarks at their most probable places, the less probable the fainter; those believed gone are crossed out.
 
     Raises:
         InputError: there is nothing to draw.
     """
-    shown = np.flatnonzero((place >= 0) & ~deleted)
-    if not len(shown):
+    landmarks = view.landmarks
+    if not len(landmarks):
         raise InputError("nothing to draw: the map has no landmark")
-    at = position_m[place[shown]]
-    low, high = position_m.min(axis=0), position_m.max(axis=0)
+    everything = np.concatenate([landmarks.position_m, view.other_m, view.seen_from_m, *view.walls_m])
+    low, high = everything.min(axis=0), everything.max(axis=0)
     size = np.maximum(high - low, 1.0)
+    margin = 0.05 * float(size.max())
     with house_style():
-        figure = new_figure(7.2, float(np.clip(6.4 * size[1] / size[0], 2.4, 7.5)) + 1.0)
+        figure = new_figure(7.2, float(np.clip(6.4 * size[1] / size[0], 2.4, 7.5)) + 1.3)
         axes = figure.add_subplot()
-        earlier = ~np.isin(np.arange(len(position_m)), place[shown]) & np.isin(place_landmark, landmark_id[shown])
-        for row in np.flatnonzero(earlier):
-            now = at[np.searchsorted(landmark_id[shown], place_landmark[row])]
-            axes.plot(*np.stack([position_m[row], now]).T, color=MUTED, lw=0.5, alpha=0.5, zorder=1)
-        if earlier.any():
-            axes.plot(*position_m[earlier].T, ".", color=MUTED, ms=4, zorder=2, label="other known place")
-        there = p_exists[shown] >= 0.5
-        for k, name in enumerate(np.unique(class_id[shown])):
-            label = legend_name(class_names[name]) if 0 <= name < len(class_names) else "class not known"
-            colour = INK if name == UNKNOWN else _COLOURS[k % len(_COLOURS)]
-            mine = (class_id[shown] == name) & there
-            if mine.any():
-                alpha = np.clip(p_exists[shown][mine], 0.25, 1.0)
-                x, y = at[mine].T
-                shape = _MARKERS[k // len(_COLOURS) % len(_MARKERS)]
-                axes.scatter(x, y, s=34, color=colour, marker=shape, alpha=alpha, lw=0, zorder=4, label=label)
-        if not there.all():
-            axes.plot(*at[~there].T, "x", color=ALERT, ms=5, mew=1.1, zorder=3, label="believed gone")
-        if pinned[shown].any():
-            axes.plot(*at[pinned[shown]].T, "o", mfc="none", mec=INK, ms=10, mew=1.0, zorder=5, label="pinned")
-        if len(shown) <= _MAX_LABELS:
-            for point, name in zip(at, landmark_id[shown], strict=True):
-                axes.annotate(
-                    str(name), point, xytext=(5, 4), textcoords="offset points", fontsize=7.5, color=INK, zorder=6,
-                    bbox={"facecolor": PAPER, "alpha": 0.6, "edgecolor": "none", "pad": 0.5},
-                )  # fmt: skip
-        margin = 0.06 * float(size.max())
         axes.set(
             xlim=(low[0] - margin, high[0] + margin),
             ylim=(low[1] - margin, high[1] + margin),
@@ -110,33 +92,96 @@ def plot_living_map(
             ylabel="y [m]",
             title=printable(title),
         )
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+        handles = [*_draw_floor(axes, view), *_draw_landmarks(axes, view, size)]
+        if len(landmarks) <= LABELS_UP_TO:
+            names = [landmarks.names.get(name, str(name)) for name in landmarks.landmark_id.tolist()]
+            label_points(axes, landmarks.position_m, names)
+        _legend(figure, handles)
         settle(figure)
     return figure
 
 
-_WORDS = 10.0
-"""Room for words beyond the bars, as a factor on a logarithmic axis."""
-_MAX_WORDS = 6
-"""More sessions than this have no room for words."""
+def _draw_floor(axes: Axes, view: MapView) -> list[Any]:
+    """Walls, from where the robot looked, and other known places; returns what to put into a legend."""
+    from matplotlib.collections import PolyCollection
+
+    handles: list[Any] = []
+    if len(view.seen_from_m):
+        corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+        squares = view.seen_from_m[:, None, :] + corners
+        axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
+        handles.append(_mark("s", "the robot looked from here", color=SHADE, ms=7, mec="none"))
+    for wall in view.walls_m:
+        axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
+    if view.walls_m:
+        handles.append(_mark("", "wall", color=INK, ls="-", lw=1.6))
+    if len(view.other_m):
+        for place, now in zip(view.other_m, view.landmarks.position_m[view.other_of], strict=True):
+            axes.plot(*np.stack([place, now]).T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
+        axes.plot(*view.other_m.T, ".", color=MUTED, ms=4, zorder=2)
+        handles.append(_mark(".", "other known place, with a line to where it is now", color=MUTED, ms=4))
+    return handles
 
 
-def plot_why(
-    stamp_s: FloatArray,
-    p_exists: FloatArray,
-    n_hits: IntArray,
-    n_misses: IntArray,
-    log_odds: FloatArray,
-    *,
-    session: IntArray,
-    stays: Sequence[tuple[str, float, float, float, float]],
-    now_s: float,
-    title: str,
-    clock: Clock = Clock.RECORDING,
-) -> Figure:
-    """Three rows over one axis of time: belief, evidence of every session, stays.
+def _draw_landmarks(axes: Axes, view: MapView, size: FloatArray) -> list[Any]:
+    """Landmarks by class with their uncertainty; returns what to put into a legend."""
+    landmarks = view.landmarks
+    there = landmarks.p_exists >= _EXISTS
+    names = class_names_of(landmarks)
+    looks = class_looks(landmarks.class_names)
+    handles: list[Any] = []
+    for name in sorted(set(names)):
+        look, label = looks[name], legend_name(name) or "class not known"
+        mine = np.array([other == name for other in names])
+        here = np.flatnonzero(mine & there)
+        alpha: Any = _FAINTEST + (1.0 - _FAINTEST) * (landmarks.p_exists[here] - _EXISTS) / (1.0 - _EXISTS)
+        x, y = landmarks.position_m[here].T
+        axes.scatter(x, y, s=36, marker=look.marker, color=look.colour, alpha=alpha, edgecolors=PAPER, linewidths=0.5,
+                     zorder=4, label=label)  # fmt: skip
+        handles.append(_mark(look.marker, label, color=look.colour))
+    draw_gone(axes, rows_of(landmarks, ~there))
+    colours = np.array([looks[name].colour for name in names])[there]
+    handles.append(tuple(_mark("o", "", color=MUTED, alpha=a) for a in (_FAINTEST, 0.5 * (1.0 + _FAINTEST), 1.0)))
+    if not there.all():
+        hollow = _mark("o", "", mfc="none", mec=MUTED, alpha=0.6, ms=7, mew=1.1)
+        handles.append((hollow, _mark("x", GONE, color=ALERT, ms=6, mew=1.1, alpha=0.8)))
+    label = draw_ellipses(axes, landmarks.position_m[there], landmarks.covariance_m2[there], colours, size)
+    handles.append(_mark("o", label, mfc="none", mec=MUTED, ms=7))
+    if view.pinned.any():
+        axes.plot(*landmarks.position_m[view.pinned].T, "o", mfc="none", mec=INK, ms=11, mew=1.0, zorder=5)
+        handles.append(_mark("o", "pinned by an operator", mfc="none", mec=INK, ms=9))
+    return handles
 
-    Args:
+
+def _mark(marker: str, label: str, **style: Any) -> Artist:
+    from matplotlib.lines import Line2D
+
+    looks: dict[str, Any] = {"ls": "", "ms": 6.0, **style}
+    return Line2D([], [], marker=marker or None, label=label, **looks)
+
+
+_FAINT = "fainter: less probable, P(exists) from 50 % to 100 %"
+
+
+def _legend(figure: Figure, handles: Sequence[Any]) -> None:
+    """One legend for all marks; several marks side by side say what faint means."""
+    from matplotlib.legend_handler import HandlerTuple
+
+    faint = next(one for one in handles if isinstance(one, tuple) and not one[-1].get_label())
+    labels = [_FAINT if one is faint else (one[-1] if isinstance(one, tuple) else one).get_label() for one in handles]
+    short = [k for k, label in enumerate(labels) if len(label) <= 16]
+    order = short + [k for k in range(len(labels)) if k not in short]
+    figure.legend(
+        [handles[k] for k in order], [labels[k] for k in order], loc="outside lower center", ncols=3,
+        handler_map={faint: HandlerTuple(ndivide=None)}, handlelength=2.6,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class LandmarkHistory:
+    """What a map knows of one landmark over time.
+
+    Attributes:
         stamp_s: (N,) of the looks, never decreasing.
         p_exists: (N,) after each.
         n_hits: (N,) detections.
@@ -145,98 +190,94 @@ def plot_why(
         session: (N,) number of the session of each look.
         stays: name of the site, last look before, first and last sighting, first look after, as in `maps.Stays`.
         now_s: end of the axis.
-        title: above the axes.
         clock: of the stamps.
+    """
+
+    stamp_s: FloatArray
+    p_exists: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+    log_odds: FloatArray
+    session: IntArray
+    stays: Sequence[tuple[str, float, float, float, float]]
+    now_s: float
+    clock: Clock = Clock.RECORDING
+
+    def sessions(self) -> list[Any]:
+        """Return the rows of each session, in order."""
+        return [np.flatnonzero(self.session == number) for number in dict.fromkeys(self.session.tolist())]
+
+
+def plot_why(history: LandmarkHistory, *, title: str) -> Figure:
+    """Draw three rows over one axis of time: belief, evidence of every session, stays.
 
     Raises:
         InputError: nothing was looked at and it never stood anywhere.
     """
-    edges = [value for stay in stays for value in stay[1:] if np.isfinite(value)]
-    known = np.concatenate([stamp_s, edges, [now_s] if np.isfinite(now_s) else []])
+    edges = [value for stay in history.stays for value in (*stay[1:], history.now_s) if np.isfinite(value)]
+    known = np.concatenate([history.stamp_s, edges])
     if not len(known):
         raise InputError("nothing to draw: no session looked at it")
     first, last = float(known.min()), float(known.max())
     margin = 0.02 * max(last - first, 1.0)
-    axis = TimeAxis.over(first, last + margin, clock)
-    sites = list(dict.fromkeys(name for name, *_ in stays))
+    axis = TimeAxis.over(first, last + margin, history.clock)
+    sites = list(dict.fromkeys(name for name, *_ in history.stays))
     with house_style():
         figure = new_figure(7.2, 3.9 + 0.22 * len(sites))
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.6, 0.5 + 0.35 * max(len(sites), 1)])
-        _draw_belief(rows[0], axis, stamp_s, p_exists, session, now_s)
-        _draw_evidence(rows[1], axis, stamp_s, n_hits, n_misses, log_odds, session)
-        _draw_stays(rows[2], axis, stays, sites, last)
+        _draw_belief(rows[0], axis, history)
+        _draw_evidence(rows[1], axis, history)
+        _draw_stays(rows[2], axis, history.stays, sites, last)
         rows[0].set_title(printable(title))
         rows[2].set_xlim(axis.coordinates(first - margin), axis.coordinates(last + margin))
         axis.label(rows[2])
-        known_labels = {
-            label: handle for axes in rows for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(known_labels.values(), known_labels.keys(), loc="outside lower center", ncols=3)
+        figure.legend(*legend_of(*rows), loc="outside lower center", ncols=3)
         settle(figure)
     return figure
 
 
-def _draw_belief(
-    axes: Axes, axis: TimeAxis, stamp_s: FloatArray, p_exists: FloatArray, session: IntArray, now_s: float
-) -> None:
-    """A line within every session, a thin one between sessions, where nobody looked."""
-    for k, rows in enumerate(_sessions(session)):
-        label = "P(exists)" if k == 0 else None
-        axes.plot(axis.coordinates(stamp_s[rows]), p_exists[rows], color=ESTIMATE, lw=1.8, zorder=4, label=label)
-    if len(stamp_s):
-        axes.plot(axis.coordinates(stamp_s), p_exists, color=ESTIMATE, lw=0.7, alpha=0.6, zorder=3)
-        axes.plot(axis.coordinates(stamp_s[-1:]), p_exists[-1:], "o", color=ESTIMATE, ms=4.0, zorder=5)
+def _draw_belief(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
+    """A line within every session, a thin one between sessions, where nobody looked; log odds as probabilities."""
+    at, belief = axis.coordinates(history.stamp_s), np.clip(history.p_exists, _P_CLIP, 1.0 - _P_CLIP)
+    axes.set_yscale("logit")
+    edge = f", cut at {100 * _P_CLIP:g} % and {100 - 100 * _P_CLIP:g} %"
+    label = "P(exists)" + (edge if np.any(belief != history.p_exists) else "")
+    for k, rows in enumerate(history.sessions()):
+        axes.plot(at[rows], belief[rows], color=ESTIMATE, lw=1.8, zorder=4, label="" if k else label)
+    if len(at):
+        axes.plot(at, belief, color=ESTIMATE, lw=0.7, alpha=0.6, zorder=3, label="between sessions")
+        axes.plot(at[-1:], belief[-1:], "o", color=ESTIMATE, ms=4.0, zorder=5)
     axes.axhline(0.5, color=MUTED, lw=0.8, ls=(0, (3, 2)), zorder=2)
-    if np.isfinite(now_s):
-        axes.axvline(axis.coordinates(now_s), color=INK, lw=0.9, ls=(0, (4, 2)), zorder=2, label="now")
-    axes.set(ylim=(-0.05, 1.05), yticks=(0.0, 0.5, 1.0), ylabel="P(exists) [1]")
-
-
-def _draw_evidence(
-    axes: Axes,
-    axis: TimeAxis,
-    stamp_s: FloatArray,
-    n_hits: IntArray,
-    n_misses: IntArray,
-    log_odds: FloatArray,
-    session: IntArray,
-) -> None:
-    """What every session said, upwards for and downwards against, with its hits and misses written to it."""
-    for rows in _sessions(session):
-        said = float(log_odds[rows].sum())
-        at = axis.coordinates(stamp_s[rows].mean())
-        axes.vlines(at, 0.0, said, color=LANDMARK if said >= 0.0 else ALERT, lw=3.0, zorder=3)
-    for colour, label in ((LANDMARK, "a session speaks for it"), (ALERT, "a session speaks against it")):
-        axes.plot([], [], "-", color=colour, lw=3.0, label=label)
-    groups = _sessions(session)
-    if len(groups) <= _MAX_WORDS:
-        for k, rows in enumerate(groups):
-            said = float(log_odds[rows].sum())
-            axes.annotate(
-                f"{int(n_hits[rows].sum())} hits, {int(n_misses[rows].sum())} misses",
-                (axis.coordinates(stamp_s[rows].mean()), said),
-                xytext=(0, 3 if said >= 0.0 else -3),
-                textcoords="offset points",
-                ha="left" if k == 0 else "right" if k == len(groups) - 1 else "center",
-                va="bottom" if said >= 0.0 else "top",
-                fontsize=8,
-                color=MUTED,
-            )
-    axes.axhline(0.0, color=MUTED, lw=0.7, zorder=2)
-    said_all = [float(log_odds[rows].sum()) for rows in groups]
-    high, low = _decade(max([*said_all, 1.0])), 0.0 - _decade(-min([*said_all, 0.0]))
-    axes.set_yscale("symlog", linthresh=10.0)
-    ticks = sorted({low, 0.0, high})
-    axes.set_yticks(ticks)
-    axes.set_yticklabels([f"{value:,.0f}" for value in ticks])
+    if np.isfinite(history.now_s):
+        axes.axvline(axis.coordinates(history.now_s), color=INK, lw=0.9, ls=(0, (4, 2)), zorder=2, label="now")
     axes.minorticks_off()
-    axes.set_ylim(_WORDS * low if low else -3.0, _WORDS * high)
+    ticks = (0.01, 0.1, 0.5, 0.9, 0.99)
+    axes.set_yticks(ticks, [f"{100 * p:g} %" for p in ticks])
+    axes.set(ylim=(0.6 * _P_CLIP, 1.0 - 0.6 * _P_CLIP), ylabel="P(exists)")
+
+
+def _draw_evidence(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
+    """What every session said, upwards for and downwards against, with its hits and misses written to it."""
+    groups = history.sessions()
+    said = np.array([float(history.log_odds[rows].sum()) for rows in groups])
+    drawn = np.clip(said, -_NATS_CLIP, _NATS_CLIP)
+    at = axis.coordinates([history.stamp_s[rows].mean() for rows in groups])
+    for side, colour, label in ((said >= 0.0, LANDMARK, "for it"), (said < 0.0, ALERT, "against it")):
+        axes.vlines(at[side], 0.0, drawn[side], color=colour, lw=3.0, zorder=3)
+        axes.plot([], [], "-", color=colour, lw=3.0, label=f"a session speaks {label}")
+    beyond = np.abs(said) > _NATS_CLIP
+    for side, marker, colour in ((said > 0.0, "^", LANDMARK), (said < 0.0, "v", ALERT)):
+        axes.plot(at[beyond & side], drawn[beyond & side], marker, color=colour, ms=6.0, zorder=4)
+    if beyond.any():
+        axes.plot([], [], "^", color=MUTED, ms=6.0, label=f"more than {_NATS_CLIP:g} nats")
+    if len(groups) <= _MAX_WORDS:
+        hits, misses = ([int(column[rows].sum()) for rows in groups] for column in (history.n_hits, history.n_misses))
+        words = [f"{hit} hits, {miss} misses" for hit, miss in zip(hits, misses, strict=True)]
+        label_points(axes, list(zip(at, drawn, strict=True)), words)
+    axes.axhline(0.0, color=MUTED, lw=0.7, zorder=2)
+    low, high = (1.6 * _NATS_CLIP if side.any() else 0.3 * _NATS_CLIP for side in (said < 0.0, said >= 0.0))
+    axes.set(ylim=(-low, high), yticks=[y for y in (-_NATS_CLIP, 0.0, _NATS_CLIP) if -low < y < high])
     axes.set_ylabel("evidence [nats]")
-
-
-def _decade(nats: float) -> float:
-    """The power of ten from 10 on that holds so much; 0 for nothing."""
-    return 0.0 if nats <= 0.0 else max(10.0, 10.0 ** math.ceil(math.log10(nats)))
 
 
 def _draw_stays(
@@ -260,13 +301,14 @@ def _draw_stays(
         else:
             axes.hlines(y, axis.coordinates(until), axis.coordinates(last_s), color=LANDMARK, lw=1.0, zorder=2)
             axes.plot(axis.coordinates(last_s), y, ">", color=LANDMARK, ms=4.0, zorder=4)
-    if any(np.isfinite(stay[4]) for stay in stays):
-        axes.plot([], [], "x", color=ALERT, ms=5.0, mew=1.4, label="found gone")
+    for is_drawn, marker, style, label in (
+        (any(np.isfinite(stay[4]) for stay in stays), "x", {"color": ALERT, "ms": 5.0, "mew": 1.4}, "found gone"),
+        (any(not np.isfinite(stay[4]) for stay in stays), ">", {"color": LANDMARK, "ms": 4.0}, "the stay goes on"),
+        (any(np.isfinite(stay[[1, 4][k]]) for stay in stays for k in (0, 1)), "", {"color": MUTED, "lw": 1.0},
+         "came or left in between"),
+    ):  # fmt: skip
+        if is_drawn:
+            axes.plot([], [], marker=marker or None, ls="" if marker else "-", label=label, **style)  # type: ignore[arg-type]
     axes.set(ylim=(len(sites) - 0.4 if sites else 1.0, -0.6), yticks=range(len(sites)))
     axes.set_yticklabels(sites)
     axes.grid(visible=False, axis="y")
-
-
-def _sessions(session: IntArray) -> list[Any]:
-    """Rows of each session, in order."""
-    return [np.flatnonzero(session == number) for number in dict.fromkeys(session.tolist())]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,12 +19,14 @@ from evermap.viz.style import (
     ESTIMATE,
     GROUP,
     INK,
-    LANDMARK,
     MUTED,
     ODOMETRY,
     ONLINE,
     PAPER,
     NamedFigure,
+    class_looks,
+    label_points,
+    legend_name,
     new_figure,
 )
 
@@ -32,7 +35,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _MAX_POINTS = 6000
-_MAX_LABELS = 40
+LABELS_UP_TO = 60
+"""More landmarks than this have no room for their names."""
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 
 
@@ -40,18 +44,30 @@ def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -
     """Plan view in the frame of the truth where there is one, else in the map's own; what changed, with arrows."""
     pose_truth_map = _alignment(evaluation)
     poses = se2.compose(pose_truth_map, result.trajectory.pose_world_robot)
-    points = se2.transform(pose_truth_map, result.landmarks.position_m)
-    covariance = rotate_covariance(result.landmarks.covariance_m2, float(pose_truth_map[2]))
+    landmarks, gone = (
+        replace(
+            known,
+            position_m=se2.transform(pose_truth_map, known.position_m),
+            covariance_m2=rotate_covariance(known.covariance_m2, float(pose_truth_map[2])),
+        )
+        for known in (result.landmarks, result.gone)
+    )
     truth = None if recording.truth is None else recording.truth.pose_world_robot
     survey = None if recording.true_landmarks is None else recording.true_landmarks.position_m
     if evaluation.poses is None and evaluation.landmarks_own is None:
         truth = survey = None  # nothing ties the frames together
 
     changed = moves(result, pose_truth_map)
-    places = [poses[:, :2], points, *(part for move in changed for part in (move.before_m, move.after_m))]
+    places = [
+        poses[:, :2],
+        landmarks.position_m,
+        gone.position_m,
+        *(part for move in changed for part in (move.before_m, move.after_m)),
+    ]
     low, high = _frame([*places, *(part[:, :2] for part in (truth, survey) if part is not None)])
     size = high - low
-    height_in = float(np.clip(6.6 * size[1] / size[0], 2.6, 7.2)) + 0.9 + 0.17 * len(changed)
+    lines = 1 + (len(changed) if len(changed) <= _MOST_LINES else 1) + (len(set(class_names_of(landmarks))) + 6) // 4
+    height_in = float(np.clip(6.6 * size[1] / size[0], 2.6, 7.2)) + 0.65 + 0.18 * lines
     figure = new_figure(7.2, height_in)
     axes = figure.add_subplot()
 
@@ -66,17 +82,20 @@ def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -
         axes.plot(*_thin(truth[:, :2]).T, color=INK, lw=1.6, alpha=0.35 * faint, label="true path", zorder=2)
     axes.plot(*_thin(poses[:, :2]).T, color=ESTIMATE, lw=0.9, alpha=faint, label="estimated path", zorder=3)
     if survey is not None:
-        axes.plot(*survey.T, "s", mfc="none", mec=INK, ms=6.5, mew=0.9, label="surveyed landmark", zorder=4)
-    _draw_landmarks(axes, points, covariance, result.landmarks.landmark_id, size)
+        axes.plot(*survey.T, "s", mfc="none", mec=INK, ms=8.0, mew=0.7, label="surveyed landmark", zorder=4)
+    _draw_landmarks(axes, landmarks, size)
+    draw_gone(axes, gone)
     if len(poses):
         axes.plot(*poses[0, :2], "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6, label="start", zorder=7)
     moved = draw_moves(axes, changed)
 
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
     axes.spines[["top", "right"]].set_visible(True)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     if moved:
-        figure.legend(handles=moved, loc="outside lower left", ncols=1, handlelength=3.2)
+        figure.legend(
+            handles=moved, loc="outside lower left", ncols=1 if len(changed) <= _MOST_LINES else 3, handlelength=3.2
+        )
     return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, bool(changed)))
 
 
@@ -102,52 +121,79 @@ def _thin(points: FloatArray) -> FloatArray:
     return points[:: max(1, -(-len(points) // _MAX_POINTS))]
 
 
-def _draw_landmarks(
-    axes: Axes, points: FloatArray, covariance: FloatArray, ids: FloatArray | np.ndarray, size: FloatArray
-) -> None:
-    """Points, ids and 2-sigma ellipses; ellipses too small to see are magnified, and the legend says so."""
-    from matplotlib.collections import EllipseCollection
-    from matplotlib.patheffects import withStroke
+def class_names_of(landmarks: Landmarks) -> list[str]:
+    """Return the name of the class of each landmark, '' where it is not known."""
+    names = landmarks.class_names
+    return [names[k] if 0 <= k < len(names) else "" for k in landmarks.class_id.tolist()]
 
-    axes.plot(*points.T, "o", color=LANDMARK, ms=3.2, mec="none", label="mapped landmark", zorder=6)
-    if len(points) == 0:
+
+def _draw_landmarks(axes: Axes, landmarks: Landmarks, size: FloatArray) -> None:
+    """Landmarks by class with their names and 2-sigma ellipses."""
+    from matplotlib.lines import Line2D
+
+    names, looks = class_names_of(landmarks), class_looks(landmarks.class_names)
+    for name in sorted(set(names)):
+        look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
+        label = legend_name(name) or ("mapped landmark" if set(names) == {""} else "class not known")
+        axes.plot(*landmarks.position_m[mine].T, look.marker, color=look.colour, ms=4.5, mec=PAPER, mew=0.4,
+                  label=label, zorder=6)  # fmt: skip
+    if len(landmarks) == 0:
         return
+    colours = np.array([looks[name].colour for name in names])
+    label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, size)
+    axes.add_line(Line2D([], [], ls="", marker="o", mfc="none", mec=MUTED, ms=7, label=label))
+    if len(landmarks) <= LABELS_UP_TO:
+        ids = landmarks.landmark_id.tolist()
+        label_points(axes, landmarks.position_m, [landmarks.names.get(name, str(name)) for name in ids])
+
+
+def draw_gone(axes: Axes, gone: Landmarks) -> None:
+    """Draw landmarks that are believed gone: hollow, faint, and crossed out."""
+    from matplotlib.lines import Line2D
+
+    names, looks = class_names_of(gone), class_looks(gone.class_names)
+    for name in sorted(set(names)):
+        mine = [k for k, other in enumerate(names) if other == name]
+        look = looks[name]
+        axes.plot(*gone.position_m[mine].T, look.marker, mfc="none", mec=look.colour, mew=1.1, ms=7.0, alpha=0.6,
+                  zorder=3)  # fmt: skip
+    if len(gone):
+        axes.plot(*gone.position_m.T, "x", color=ALERT, ms=6, mew=1.1, alpha=0.8, zorder=3.5)
+        axes.add_line(Line2D([], [], marker="x", color=ALERT, ls="", ms=6, mew=1.1, alpha=0.8, label=GONE))
+
+
+def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colours: Any, size: FloatArray) -> str:
+    """Draw 2-sigma ellipses about points (K, 2) and return their label; those too small to see are magnified.
+
+    Args:
+        axes: a plan view.
+        points: (K, 2).
+        covariance: (K, 2, 2) [m²].
+        colours: (K,).
+        size: (2,) extent of the picture [m].
+    """
+    from matplotlib.collections import EllipseCollection
+
     variance, axis = np.linalg.eigh(covariance)
     sigma = np.sqrt(np.maximum(variance, 0.0))
     visible = 0.012 * float(np.max(size))
-    typical = 2.0 * float(np.median(sigma[:, 1]))
+    typical = 2.0 * float(np.median(sigma[:, 1])) if len(points) else 0.0
     factor = next((m for m in _MAGNIFICATIONS if m * typical >= visible), _MAGNIFICATIONS[-1]) if typical > 0 else 1
     angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
     full = 2.0 * 2.0 * factor * sigma
-    axes.add_collection(
-        EllipseCollection(
-            full[:, 1],
-            full[:, 0],
-            angle,
-            units="xy",
-            offsets=points,
-            offset_transform=axes.transData,
-            facecolors="none",
-            edgecolors=LANDMARK,
-            linewidths=1.0,
-            zorder=5,
-        )
-    )
-    label = "2σ of its position" + (f", drawn {factor} × larger" if factor > 1 else "")
-    axes.plot([], [], "o", mfc="none", mec=LANDMARK, ms=7, label=label)
-    if len(points) <= _MAX_LABELS:
-        halo = [withStroke(linewidth=2.2, foreground=PAPER)]
-        for name, point in zip(ids, points, strict=True):
-            axes.annotate(
-                str(name), point, (5, 5), textcoords="offset points", size=8, color=MUTED, path_effects=halo, zorder=8
-            )
+    ellipses = EllipseCollection(
+        full[:, 1], full[:, 0], angle, units="xy", offsets=points, offset_transform=axes.transData,
+        facecolors="none", edgecolors=colours, linewidths=0.9, zorder=5,
+    )  # fmt: skip
+    axes.add_collection(ellipses)
+    return "2σ of its position" + (f", drawn {factor} × larger" if factor > 1 else "")
 
 
 def _caption(recording: Recording, evaluation: Evaluation, changed: bool) -> str:
     if changed:
         arrows = (
-            " Arrows lead from where a landmark was (diamond) to where it is now; dashed: another explanation. The"
-            " displacements are in the map's own frame."
+            " Arrows lead from where a landmark was (diamond) to where it is now; a plus is what appeared, a cross what"
+            " vanished; dashed: another explanation. The displacements are in the map's own frame."
         )
         return _frame_caption(recording, evaluation) + arrows
     return _frame_caption(recording, evaluation)
@@ -175,8 +221,12 @@ def _duration(recording: Recording) -> float:
 
 
 GROUP_COLOURS = (ALERT, ONLINE, GROUP)
-"""One after the other; the legend tells groups of one colour apart."""
+"""Interleaved: groups of one colour are distinguished by the legend."""
 _MAX_ALTERNATIVES = 2
+_MOST_LINES = 8
+"""More changes than this have one line of the legend a kind; the report lists them all."""
+GONE = "gone: P(exists) below 50 %"
+_KIND_MARKS = {ChangeKind.APPEARED: "+", ChangeKind.VANISHED: "x"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,35 +256,42 @@ class Move:
 
 
 def moves(result: SlamResult, pose_truth_map: FloatArray) -> list[Move]:
-    """What to draw of a run: its changes by time, then those of the nearest alternatives.
+    """Return what to draw of a run: its changes by time, then those of the nearest alternatives.
 
     Args:
         result: what came out.
         pose_truth_map: (3,) from the map's frame to that of the picture.
     """
     found = []
-    for number, (change, before, after) in enumerate(_places(result.landmarks, result.changes, pose_truth_map)):
+    for number, (change, before, after) in enumerate(
+        _places((result.landmarks, result.gone), result.changes, pose_truth_map)
+    ):
         label = f"{what(change)}, {probability(change.probability)}"
         found.append(Move(change, before, after, label, GROUP_COLOURS[number % len(GROUP_COLOURS)], alternative=False))
     for other in near_alternatives(result)[:_MAX_ALTERNATIVES]:
-        for number, (change, before, after) in enumerate(_places(other.landmarks, other.changes, pose_truth_map)):
+        for number, (change, before, after) in enumerate(_places((other.landmarks,), other.changes, pose_truth_map)):
             label = f"and {what(change)}" if number else f"or: {what(change)}, {probability(other.probability)}"
             found.append(Move(change, before, after, label, MUTED, alternative=True))
     return found
 
 
 def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
-    """Diamonds where landmarks were, arrows to where they are. Returns what to put into a legend."""
+    """Draw diamonds where landmarks were, arrows to where they are, a plus for what appeared, a cross for what is gone.
+
+    Returns what to put into a legend: a line a change, or a line a kind where there are many.
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import FancyArrowPatch
 
+    few = len(drawn) <= _MOST_LINES
     handles: list[Artist] = []
+    kinds: Counter[str] = Counter()
     for move in drawn:
-        style = "--" if move.alternative else "-"
-        width = 1.0 if move.alternative else 1.5
-        mark: dict[str, Any] = {"marker": "D", "mfc": PAPER, "mec": move.colour, "mew": 1.1, "ms": 4.0}
+        colour = move.colour if few or move.alternative else ALERT
+        line: dict[str, Any] = {"ls": "--" if move.alternative else "-", "lw": 1.0 if move.alternative else 1.5}
+        mark = _change_mark(move.change.kind, colour)
         if not move.swapped:
-            axes.plot(*move.before_m.T, ls="", zorder=7, **mark)
+            axes.plot(*move.before_m.T, ls="", zorder=9, **mark)
         for start, end in zip(move.before_m, move.after_m, strict=True):
             if np.array_equal(start, end):
                 continue
@@ -246,21 +303,34 @@ def draw_moves(axes: Axes, drawn: Sequence[Move]) -> list[Artist]:
                 mutation_scale=8.0,
                 shrinkA=2.0,
                 shrinkB=2.0 if move.swapped else 0.0,
-                color=move.colour,
-                linestyle=style,
-                lw=width,
+                color=colour,
                 zorder=8 if move.alternative else 9,
+                **line,
             )
             axes.add_patch(arrow)
-        handles.append(Line2D([], [], color=move.colour, ls=style, lw=width, label=move.label, **mark))
+        if move.change.kind in _KIND_MARKS:
+            line["ls"] = ""
+        kind = "or: other explanations" if move.alternative else move.change.kind.value
+        kinds[kind] += len(move.before_m)
+        if few or kinds[kind] == len(move.before_m):
+            handles.append(Line2D([], [], color=colour, label=move.label if few else kind, **line, **mark))
+    for handle in handles if not few else []:
+        handle.set_label(f"{handle.get_label()}, {kinds[str(handle.get_label())]} landmarks")
     return handles
 
 
+def _change_mark(kind: ChangeKind, colour: str) -> dict[str, Any]:
+    """What a kind of change is marked with; what moved has a diamond where it was."""
+    if kind in _KIND_MARKS:
+        return {"marker": _KIND_MARKS[kind], "mec": colour, "mew": 1.6, "ms": 8.0}
+    return {"marker": "D", "mfc": PAPER, "mec": colour, "mew": 1.1, "ms": 4.0}
+
+
 def _places(
-    landmarks: Landmarks, changes: Sequence[MapChange], pose_truth_map: FloatArray
+    known: Sequence[Landmarks], changes: Sequence[MapChange], pose_truth_map: FloatArray
 ) -> list[tuple[MapChange, FloatArray, FloatArray]]:
     """(change, before, after) by time: undone one after the other from the last, for some landmarks move twice."""
-    place = dict(zip(landmarks.landmark_id.tolist(), landmarks.position_m, strict=True))
+    place = {name: at for some in known for name, at in zip(some.landmark_id.tolist(), some.position_m, strict=True)}
     found = []
     by_time = sorted(changes, key=lambda change: change.stamp_to_s)
     for change in by_time[::-1]:

@@ -1,10 +1,12 @@
-"""The page around a report: template and style sheet. Self-contained, light and dark, fit for printing."""
+"""The page of a report and its parts: cards, notes, tables, figures. Self-contained, light and dark, printable."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from html import escape
 from string import Template
 
-from evermap.viz.style import page_theme
+from evermap.viz.style import NamedFigure, inline_svg, page_theme
 
 # colours of figures are variables of the page, so that its theme decides what they look like
 STYLE = (
@@ -89,3 +91,46 @@ $body
 </html>
 """
 )
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int] = ()) -> str:
+    """Return a table of ready markup; `numbers` are the columns to align right."""
+
+    def row(tag: str, cells: Sequence[str]) -> str:
+        kind = [' class="n"' if column in numbers else "" for column in range(len(cells))]
+        return "<tr>" + "".join(f"<{tag}{k}>{cell}</{tag}>" for k, cell in zip(kind, cells, strict=True)) + "</tr>"
+
+    body = "".join(row("td", cells) for cells in rows)
+    return f'<div class="scroll"><table><thead>{row("th", head)}</thead><tbody>{body}</tbody></table></div>'
+
+
+def card(label: str, value: float | None, form: str, unit: str, meaning: str) -> str | None:
+    """Return a number with its unit and what it means; None where there is no number."""
+    if value is None:
+        return None
+    number = f'<dd class="number">{escape(form.format(value))} <small>{escape(unit)}</small></dd>'
+    return f'<div class="card"><dt>{escape(label)}</dt>{number}<dd><p>{escape(meaning)}</p></dd></div>'
+
+
+def cards_html(cards: Iterable[str | None]) -> str:
+    """Return the cards that there are as a definition list; '' for none."""
+    shown = [one for one in cards if one is not None]
+    return f'<dl class="cards">{"".join(shown)}</dl>' if shown else ""
+
+
+def warnings_note(warnings: Sequence[str]) -> str:
+    """Return a box with what a run warned of; '' for nothing."""
+    if not warnings:
+        return ""
+    items = "".join(f"<li>{escape(text)}</li>" for text in warnings)
+    return f'<div class="note"><strong>Warnings</strong><ul>{items}</ul></div>'
+
+
+def figure_html(named: NamedFigure) -> str:
+    """Return a figure as a drawing that follows the theme of the page, with its title and caption."""
+    label = escape(named.title, quote=True)
+    drawing = inline_svg(named.figure, named.name).replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+    return (
+        f'<figure id="{escape(named.name, quote=True)}">{drawing}'
+        f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"
+    )

@@ -6,7 +6,7 @@ import base64
 import io
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.metrics.summary import Evaluation
-from evermap.types import UNKNOWN, ParameterEstimate, Recording, SlamResult
+from evermap.stamps import stamp_text
+from evermap.types import UNKNOWN, Clock, ParameterEstimate, Recording, SlamResult
 from evermap.viz.change_words import explanations, grew, near_alternatives
-from evermap.viz.page import PAGE, STYLE
+from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
-from evermap.viz.style import NamedFigure, house_style, inline_svg
+from evermap.viz.style import NamedFigure, house_style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def render_report(
     figures: Sequence[NamedFigure],
     sections: Sequence[ReportSection] = (),
 ) -> str:
-    """The page as text. Contains no address outside of itself, and nothing in it is executed.
+    """Return the page as text. It contains no address outside of itself, and nothing in it is executed.
 
     Args:
         recording: what was processed.
@@ -64,11 +65,11 @@ def render_report(
         headline_cards(summary),
         _interrupted(summary),
         _changes(result, summary),
-        _warnings(summary),
-        _figures("Where it was", figures, ("map", "errors"), _frames(summary)),
-        _figures("What the sensors are like", figures, ("calibration",), _calibration(result)),
-        _figures("Does it know how wrong it is", figures, ("consistency",), _consistency(summary)),
-        _figures("Speed", figures, ("latency",), ""),
+        warnings_note(summary["warnings"]),
+        _figures("Accuracy", figures, ("map", "errors"), _frames(summary)),
+        _figures("Sensor calibration", figures, ("calibration",), _calibration(result)),
+        _figures("Calibration of the uncertainty", figures, ("consistency",), _consistency(summary)),
+        _figures("Cost", figures, ("latency",), ""),
         _landmarks(result, evaluation),
         _provenance(summary),
     ]
@@ -100,13 +101,6 @@ def _interrupted(summary: Mapping[str, Any]) -> str:
     return '<p class="note">Stopped before the end of the recording: everything here is about the part until then.</p>'
 
 
-def _warnings(summary: Mapping[str, Any]) -> str:
-    if not summary["warnings"]:
-        return ""
-    items = "".join(f"<li>{escape(text)}</li>" for text in summary["warnings"])
-    return f'<div class="note"><strong>Worth knowing</strong><ul>{items}</ul></div>'
-
-
 def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
     """What differs from the map, in words and numbers, and what else it may be; '' where nothing is in question."""
     lines = explanations(result) + grew(summary["counts"].get("landmarks_grown"))
@@ -116,7 +110,7 @@ def _changes(result: SlamResult, summary: Mapping[str, Any]) -> str:
     note = ""
     if near_alternatives(result):
         note = (
-            "<p>The recording cannot rule out what follows an 'or'. The maps as they would be then are in"
+            "<p>The recording cannot rule out what follows an 'or'. The maps that would follow are in"
             " <code>alternative_1.geojson</code> and so on, the most probable first.</p>"
         )
     return f"<h2>What changed</h2><ul>{items}</ul>{change_table(result)}{note}"
@@ -126,17 +120,7 @@ def _figures(title: str, figures: Sequence[NamedFigure], names: tuple[str, ...],
     shown = [figure for figure in figures if figure.name in names]
     if not shown and not html:
         return ""
-    return "\n".join([f"<h2>{escape(title)}</h2>", *map(_figure, shown), html])
-
-
-def _figure(named: NamedFigure) -> str:
-    drawing = inline_svg(named.figure, named.name)
-    label = escape(named.title, quote=True)
-    drawing = drawing.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
-    return (
-        f'<figure id="{named.name}">{drawing}'
-        f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"
-    )
+    return "\n".join([f"<h2>{escape(title)}</h2>", *map(figure_html, shown), html])
 
 
 def _section(section: ReportSection, number: int) -> str:
@@ -144,7 +128,7 @@ def _section(section: ReportSection, number: int) -> str:
     parts = [f"<h2>{escape(section.title)}</h2>" if number else "", section.html]
     for index, item in enumerate(section.figures):
         if isinstance(item, NamedFigure):
-            parts.append(_figure(item))
+            parts.append(figure_html(item))
             continue
         picture, caption = item
         data = base64.b64encode(picture if isinstance(picture, bytes) else _png(picture)).decode("ascii")
@@ -229,7 +213,7 @@ def _provenance(summary: Mapping[str, Any]) -> str:
     files = " ".join(f"<code>{escape(name)}</code>" for name in summary["outputs"])
     rows.append(("files beside this one", files))
     return (
-        f"<h2>How it was made</h2>{table(('what', ''), rows)}"
+        f"<h2>Source and settings</h2>{table(('what', ''), rows)}"
         f"<details><summary>Configuration</summary><pre>{config}</pre></details>"
     )
 
@@ -243,9 +227,8 @@ def _footer(summary: Mapping[str, Any]) -> str:
 
 
 def headline_cards(summary: Mapping[str, Any]) -> str:
-    """Cards for the numbers this run has, as a definition list."""
-    cards = [card for card in _cards(summary) if card is not None]
-    return f'<dl class="cards">{"".join(cards)}</dl>' if cards else ""
+    """Return cards for the numbers this run has, each with a sentence that says what it means."""
+    return cards_html(_cards(summary))
 
 
 def _cards(summary: Mapping[str, Any]) -> list[str | None]:
@@ -253,12 +236,12 @@ def _cards(summary: Mapping[str, Any]) -> list[str | None]:
     odometry, pose = metrics["dead_reckoning_rmse_m"], metrics["pose_rmse_m"]
     heading, odometry_heading = metrics["heading_rmse_deg"], metrics["dead_reckoning_heading_rmse_deg"]
     return [
-        _card("Position error", pose, "{:.3f}", "m RMSE", _gain(pose, odometry, "{:.2f} m")),
-        _card("Heading error", heading, "{:.2f}", "° RMSE", _gain(heading, odometry_heading, "{:.1f}°")),
+        card("Position error", pose, "{:.3f}", "m RMSE", _gain(pose, odometry, "{:.2f} m")),
+        card("Heading error", heading, "{:.2f}", "° RMSE", _gain(heading, odometry_heading, "{:.1f}°")),
         _landmark_card(metrics),
-        _card("Speed", timing["real_time_factor"], "{:.0f}", "× real time", _latency(timing)),
-        _card("Innovations", metrics["nis_mean"], "{:.2f}", "mean NIS", _nis(metrics)),
-        _card(
+        card("Speed", timing["real_time_factor"], "{:.0f}", "× real time", _latency(timing)),
+        card("Innovations", metrics["nis_mean"], "{:.2f}", "mean NIS", _nis(metrics)),
+        card(
             "Online position error",
             metrics["online_pose_rmse_m"],
             "{:.3f}",
@@ -266,13 +249,6 @@ def _cards(summary: Mapping[str, Any]) -> list[str | None]:
             "What the robot knew at the time, without hindsight, while it saw something.",
         ),
     ]
-
-
-def _card(label: str, value: float | None, form: str, unit: str, meaning: str) -> str | None:
-    if value is None:
-        return None
-    number = f'<dd class="number">{escape(form.format(value))} <small>{escape(unit)}</small></dd>'
-    return f'<div class="card"><dt>{escape(label)}</dt>{number}<dd><p>{escape(meaning)}</p></dd></div>'
 
 
 def _gain(value: float | None, odometry: float | None, form: str) -> str:
@@ -290,9 +266,9 @@ def _landmark_card(metrics: Mapping[str, Any]) -> str | None:
     scored, least = metrics["landmarks_scored"], metrics["landmark_min_sightings"]
     if after_path is not None:
         meaning = f"{scored} landmarks with at least {least} sightings, after the alignment of the path."
-        return _card("Landmark error", after_path, "{:.3f}", "m RMSE", meaning)
+        return card("Landmark error", after_path, "{:.3f}", "m RMSE", meaning)
     meaning = f"{scored} landmarks with at least {least} sightings, aligned among themselves: there is no true path."
-    return _card("Landmark error", own, "{:.3f}", "m RMSE", meaning)
+    return card("Landmark error", own, "{:.3f}", "m RMSE", meaning)
 
 
 def _latency(timing: Mapping[str, Any]) -> str:
@@ -314,17 +290,6 @@ def _nis(metrics: Mapping[str, Any]) -> str:
 
 
 _MAX_LANDMARK_ROWS = 500
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, numbers: Sequence[int] = ()) -> str:
-    """A table of ready markup; `numbers` are the columns to align right."""
-
-    def row(tag: str, cells: Sequence[str]) -> str:
-        kind = [' class="n"' if column in numbers else "" for column in range(len(cells))]
-        return "<tr>" + "".join(f"<{tag}{k}>{cell}</{tag}>" for k, cell in zip(kind, cells, strict=True)) + "</tr>"
-
-    body = "".join(row("td", cells) for cells in rows)
-    return f'<div class="scroll"><table><thead>{row("th", head)}</thead><tbody>{body}</tbody></table></div>'
 
 
 def is_noise(parameter: ParameterEstimate) -> bool:
@@ -367,28 +332,29 @@ def _learned(parameter: ParameterEstimate) -> str:
 
 
 def change_table(result: SlamResult) -> str:
-    """Every change with its numbers; stamps as in the recording. '' if there is none."""
+    """Return every change with its numbers, times as dates or since the start of the recording; '' if there is none."""
     if not result.changes:
         return ""
+    clock = result.landmarks.clock
+    start_s = float(result.trajectory.stamp_s[0]) if clock is Clock.RECORDING and len(result.trajectory) else 0.0
     rows = [
         (
             ", ".join(change.labels),
             change.kind.value,
-            _stamp(change.stamp_from_s),
-            _stamp(change.stamp_to_s),
-            f"{change.displacement_m[0]:.3f}",
-            f"{change.displacement_m[1]:.3f}",
-            f"{math.degrees(change.rotation_rad):.2f}",
+            *(stamp_text(stamp_s - start_s, clock) for stamp_s in (change.stamp_from_s, change.stamp_to_s)),
+            *(_number(metres, 3) for metres in change.displacement_m),
+            _number(math.degrees(change.rotation_rad), 2),
             f"{change.probability:.4f}",
         )
         for change in result.changes
     ]
-    head = ("landmarks", "kind", "not before [s]", "not after [s]", "Δx [m]", "Δy [m]", "turn [°]", "probability")
-    return table(head, rows, numbers=(2, 3, 4, 5, 6, 7))
+    zone = {Clock.RECORDING: "since the start", Clock.UNIX: "UTC"}.get(clock, "local clock")
+    head = ("landmarks", "kind", f"not before ({zone})", f"not after ({zone})")
+    return table((*head, "Δx [m]", "Δy [m]", "turn [°]", "probability"), rows, numbers=(2, 3, 4, 5, 6, 7))
 
 
-def _stamp(stamp_s: float) -> str:
-    return f"{stamp_s:.1f}" if math.isfinite(stamp_s) else "–"
+def _number(value: float, digits: int) -> str:
+    return f"{value:.{digits}f}" if math.isfinite(value) else "–"
 
 
 def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 
 from evermap.metrics.consistency import chi2_interval, running_mean
 from evermap.metrics.summary import Evaluation
-from evermap.types import FloatArray, ParameterEstimate, Recording, SlamResult
+from evermap.stamps import stamp_text
+from evermap.types import Clock, FloatArray, ParameterEstimate, Recording, SlamResult
 from evermap.viz.map_figure import draw_map
 from evermap.viz.style import (
     ALERT,
@@ -107,7 +108,7 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
         side = max(1.12 * float(np.max(np.abs(heading))), min(side, 3.0 * float(np.max(np.abs(heading)))))
     above.set(ylim=(0, top or None), ylabel="position error [m]" if poses else "2σ of position [m]")
     below.set(ylim=(-side, side) if side else None, ylabel="heading error [°]" if poses else "2σ of heading [°]")
-    below.set(xlabel="time since the first frame [s]")
+    below.set(xlabel=_since_start(recording))
     _span(below, recording)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     title = "Error over time" if poses else "Uncertainty over time"
@@ -192,7 +193,7 @@ def draw_latency(recording: Recording, result: SlamResult, real_time_factor: flo
         lines.append((budget, MUTED, f"frame interval {budget:.3g} ms"))
     for level, colour, label in lines:
         axes.axhline(level, color=colour, lw=1.1, ls="--" if colour == MUTED else "-", label=label)
-    axes.set(xlabel="time since the first frame [s]", ylabel="time a step [ms]")
+    axes.set(xlabel=_since_start(recording), ylabel="time per step [ms]")
     _span(axes, recording)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     caption = "Wall-clock time from a frame's arrival to its pose, on one core."
@@ -203,6 +204,14 @@ def draw_latency(recording: Recording, result: SlamResult, real_time_factor: flo
 
 def _start(recording: Recording) -> float:
     return float(recording.frames.stamp_s[0]) if len(recording.frames) else 0.0
+
+
+def _since_start(recording: Recording) -> str:
+    """Label of an axis of seconds, with the date of the first frame where it is known."""
+    if recording.clock is Clock.RECORDING or not len(recording.frames):
+        return "time since the first frame [s]"
+    zone = "UTC" if recording.clock is Clock.UNIX else "local clock"
+    return f"time since the first frame, {stamp_text(_start(recording), recording.clock)} {zone} [s]"
 
 
 def _span(axes: Axes, recording: Recording) -> None:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito (2008), distinguished with every common kind of colour blindness; wine and violet are darker additions
+# Okabe and Ito (2008), and wine and sand: distinguished with every common kind of colour blindness
 INK = "#1b1f24"
 MUTED = "#636c76"
 GRID = "#d8dde3"
@@ -37,9 +37,9 @@ ODOMETRY = "#e69f00"
 LANDMARK = "#009e73"
 ALERT = "#d55e00"
 ONLINE = "#cc79a7"
-GROUP = "#7a4fb5"
+GROUP = "#882255"
 SKY = "#56b4e9"
-WINE = "#882255"
+SAND = "#c8b560"
 
 ROLES = {
     INK: ("ink", "#e7ebef"),
@@ -53,14 +53,14 @@ ROLES = {
     LANDMARK: ("landmark", "#2fc39a"),
     ALERT: ("alert", "#ff8a4c"),
     ONLINE: ("online", "#dd97bd"),
-    GROUP: ("group", "#b794f0"),
+    GROUP: ("group", "#b5427f"),
     SKY: ("sky", "#2f74c0"),
-    WINE: ("wine", "#b5427f"),
+    SAND: ("sand", "#f3e6a0"),
 }
 """Colours by role: its name, which is a CSS variable of the report, and its colour on dark pages."""
 
-CLASS_COLOURS = (ESTIMATE, ODOMETRY, ONLINE, WINE, SKY, INK)
-CLASS_MARKERS = ("o", "s", "^", "D", "v", "P", "h")
+CLASS_COLOURS = (ESTIMATE, ODOMETRY, ONLINE, GROUP, SKY, INK, SAND)
+CLASS_MARKERS = ("o", "s", "^", "D", "v", "P", "<", ">")
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def class_looks(names: Iterable[str]) -> dict[str, ClassLook]:
 
     The order of the names decides, so that all figures of a run agree when they are given the same classes. Colours
     are distinguished by readers with every common kind of colour blindness; as their number and that of the markers
-    have no common divisor, 42 classes look different.
+    have no common divisor, 56 classes look different.
     """
     known = enumerate(sorted({name for name in names if name}))
     looks = {
@@ -160,6 +160,15 @@ def legend_name(name: str) -> str:
     return f"\N{ZERO WIDTH SPACE}{text}" if text.startswith("_") else text
 
 
+def legend_of(*panels: Axes) -> tuple[list[Any], list[str]]:
+    """Return handles and labels of several panels for one legend, each label once."""
+    found: dict[str, Any] = {}
+    for axes in panels:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    return list(found.values()), list(found)
+
+
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure with an Agg canvas and constrained layout. Call within `house_style`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -176,11 +185,11 @@ def settle(figure: Figure) -> None:
     figure.draw_without_rendering()
     figure.set_layout_engine("none")
     for axes in figure.axes:
-        _declutter(axes, [text for text in axes.texts if text.get_label() == _POINT_LABEL])
+        _declutter(axes, [text for text in axes.texts if text.get_gid() == _POINT_LABEL])
 
 
-def label_points(axes: Axes, points: FloatArray, texts: Iterable[str]) -> None:
-    """Write a text beside each point (K, 2); `settle` moves those that overlap, with a thin line to what is far off."""
+def label_points(axes: Axes, points: Any, texts: Iterable[str]) -> None:
+    """Write a text beside each of K points (x, y); `settle` moves them apart, with a thin line to what is far off."""
     from matplotlib.patheffects import withStroke
 
     line = {"arrowstyle": "-", "color": MUTED, "lw": 0.6, "shrinkA": 0.5, "shrinkB": 2.0}
@@ -190,10 +199,11 @@ def label_points(axes: Axes, points: FloatArray, texts: Iterable[str]) -> None:
             printable(text, 24), point, (0.0, 8.0), textcoords="offset points", ha="center", va="center", size=8,
             color=INK, path_effects=halo, arrowprops=line, zorder=10,
         )  # fmt: skip
-        label.set_label(_POINT_LABEL)
+        label.set_gid(_POINT_LABEL)
 
 
 _POINT_LABEL = "label of a point"
+"""Marks what `settle` still has to place; an id in files is none of its business."""
 _MARK_PT = 3.5
 """Half the side of the square about a point that no label should cover."""
 _NEAR_PT = 9.0
@@ -211,8 +221,9 @@ def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
     if not labels:
         return
     figure: Any = axes.figure
+    place: Any = axes
     renderer, pt = figure.canvas.get_renderer(), figure.dpi / 72.0
-    points = axes.transData.transform([label.xy for label in labels])
+    points = axes.transData.transform([(place.convert_xunits(x), y) for x, y in (label.xy for label in labels)])
     marks = np.concatenate([points - _MARK_PT * pt, points + _MARK_PT * pt], axis=1)
     frame = np.array(axes.bbox.extents)
     boxes = np.zeros((0, 4))
@@ -226,6 +237,7 @@ def _declutter(axes: Axes, labels: Sequence[Any]) -> None:
         here = np.concatenate([middle - half, middle + half], axis=1)
         outside = np.maximum(frame[:2] - here[:, :2], 0.0) + np.maximum(here[:, 2:] - frame[2:], 0.0)
         cost = _shared(here, boxes) + _shared(here, marks) + 1e3 * outside.sum(axis=1) + 1e-3 * ring
+        label.set_gid(None)
         best = int(np.argmin(cost))
         boxes = np.concatenate([boxes, here[best : best + 1]])
         label.set_position((middle[best] - point) / pt)

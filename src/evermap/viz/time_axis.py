@@ -34,6 +34,15 @@ DURATIONS = (
 """Where a logarithmic axis of durations may have its ticks."""
 
 
+_FIRST_UNIX_S = 6e8
+"""Stamps beyond this (1989) are dates."""
+
+
+def guess_clock(stamp_s: FloatArray) -> Clock:
+    """Return whether stamps count since 1970, or since some start."""
+    return Clock.UNIX if float(stamp_s.min()) > _FIRST_UNIX_S else Clock.RECORDING
+
+
 @dataclass(frozen=True, slots=True)
 class TimeUnit:
     """A unit to draw times in."""

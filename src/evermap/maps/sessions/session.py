@@ -383,9 +383,10 @@ def learned(
 def told(found: Judged, where: Laid | None, visit: Solved) -> Session:
     """Return the session that made a map of another; its landmarks have hits and misses of all sessions of the map."""
     frame, names = "first_pose" if where is None else "prior_map", visit.recording.landmark_names
-    landmarks = replace(found.living.landmarks(p_least=0.5), frame=frame, names=names)
+    known = replace(found.living.landmarks(), frame=frame, names=names)
+    landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in found.changes)
-    slam = replace(of_slam.result(visit, frame, landmarks, found.misses), changes=changes)
+    slam = replace(of_slam.result(visit, frame, landmarks, found.misses), changes=changes, gone=gone)
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 

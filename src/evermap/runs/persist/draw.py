@@ -12,30 +12,29 @@ from evermap.runs.persist.models import looks_at
 from evermap.runs.persist.run import PersistResult
 from evermap.types import Clock, FloatArray, IntArray
 from evermap.viz.style import NamedFigure
+from evermap.viz.time_axis import guess_clock
 
 RASTER_ROWS = 60
 _RASTER_COLUMNS = 480
 _CURVE_POINTS = 400
 _PIXELS = 1200
 """Columns of a figure: of more looks, each column shows the lowest and the highest belief, and one tick a kind."""
-_FIRST_UNIX_S = 6e8
-"""Stamps beyond this (1989) are dates."""
 
 
-def guess_clock(stamp_s: FloatArray) -> Clock:
-    """Whether stamps count since 1970, or since some start."""
-    return Clock.UNIX if float(stamp_s.min()) > _FIRST_UNIX_S else Clock.RECORDING
+def clock_of(result: PersistResult) -> Clock:
+    """Return the clock of the table's stamps; where the table does not say, guess."""
+    return result.table.clock or guess_clock(result.table.stamp_s)
 
 
 def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None) -> Iterator[NamedFigure]:
-    """The figures one by one, so that a progress bar can follow.
+    """Draw the figures one by one, so that a progress bar can follow.
 
     Args:
         result: of `run_persist`.
         figures: how many features get a figure of their own.
         clock: of the stamps; None guesses.
     """
-    clock = clock or result.table.clock or guess_clock(result.table.stamp_s)
+    clock = clock or clock_of(result)
     yield _overview(result, clock)
     if result.scores is not None and result.reliability is not None:
         yield _calibration(result)
@@ -45,7 +44,7 @@ def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None)
 
 
 def most_interesting(result: PersistResult, n: int) -> IntArray:
-    """The `n` features that changed most, of equals those looked at more often; in natural order."""
+    """Return the `n` features that changed most, of equals those looked at more often; in natural order."""
     changes = result.changes.per_feature(result.table.n_features)
     order = np.lexsort((-np.diff(result.looks.first), -changes))
     return np.sort(order[:n])
@@ -117,8 +116,7 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     figure = plot_belief(
         time_s,
         track.p_present,
-        look_s=looks.stamp_s[shown],
-        detected=looks.detected[shown],
+        looks=(looks.stamp_s[shown], looks.detected[shown]),
         truth_s=there,
         forecast_from_s=result.table.now_s,
         title=f"feature {name if len(name) <= 60 else name[:59] + '…'}",

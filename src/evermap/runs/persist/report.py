@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -12,36 +11,37 @@ from typing import Any
 import numpy as np
 
 from evermap.runs.persist.run import PersistResult
+from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
-from evermap.viz.page import PAGE, STYLE
-from evermap.viz.report import table
+from evermap.types import Clock
+from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.style import NamedFigure
 
 _MOST_ROWS = 100
 
 
 def render_report(
-    result: PersistResult, summary: Mapping[str, Any], figures: Sequence[NamedFigure], pictures: Sequence[bytes]
+    result: PersistResult, summary: Mapping[str, Any], figures: Sequence[NamedFigure], clock: Clock
 ) -> str:
     """The page as text. Contains no address outside of itself, and nothing in it is executed.
 
     Args:
         result: of `run_persist`.
         summary: the content of `summary.json`.
-        figures: their captions.
-        pictures: the same as PNG.
+        figures: as `draw_run` gives them.
+        clock: of the stamps.
     """
-    drawn = {figure.name: _figure(figure, picture) for figure, picture in zip(figures, pictures, strict=True)}
+    drawn = {figure.name: figure_html(figure) for figure in figures}
     alone = [html for name, html in drawn.items() if name.startswith("feature-")]
     parts = [
         _cards(summary),
-        _warnings(summary),
-        "<h2>At one glance</h2>" + drawn["overview"],
+        warnings_note(summary["warnings"]),
+        "<h2>Overview</h2>" + drawn["overview"],
         f"<h2>Calibration</h2>{drawn['calibration']}" if "calibration" in drawn else "",
-        _changes(result),
+        _changes(result, clock),
         _forecasts(result),
         "<h2>Single features</h2>" + "\n".join(alone) if alone else "",
-        f"<h2>Where this comes from</h2><pre>{escape(_provenance(summary))}</pre>",
+        f"<h2>Source and settings</h2><pre>{escape(_provenance(summary))}</pre>",
     ]
     counts, source = summary["counts"], escape(str(summary["source"]) or "a table in memory")
     lead = (
@@ -52,7 +52,7 @@ def render_report(
         version=escape(str(summary["evermap"])),
         title="evermap persist",
         style=STYLE,
-        heading="What is there, what changed, what is to come",
+        heading="Presence, changes and forecasts",
         lead=lead,
         body="\n".join(part for part in parts if part),
         footer=f"evermap {escape(str(summary['evermap']))}",
@@ -72,32 +72,10 @@ def _cards(summary: Mapping[str, Any]) -> str:
             ("Log loss", metrics["log_loss"], "{:.4f}", "nats", "Punishes being sure and wrong; 0 is perfect."),
             ("Calibration error", metrics["calibration_error"], "{:.4f}", "", "Mean distance from the dashed line."),
         ]
-    items = "".join(
-        f'<div class="card"><dt>{escape(label)}</dt><dd class="number">{escape(form.format(value))}'
-        f" <small>{escape(unit)}</small></dd><dd><p>{escape(meaning)}</p></dd></div>"
-        for label, value, form, unit, meaning in cards
-    )
-    return f'<dl class="cards">{items}</dl>'
+    return cards_html(card(*one) for one in cards)
 
 
-def _warnings(summary: Mapping[str, Any]) -> str:
-    if not summary["warnings"]:
-        return ""
-    items = "".join(f"<li>{escape(text)}</li>" for text in summary["warnings"])
-    return f'<div class="note"><strong>Worth knowing</strong><ul>{items}</ul></div>'
-
-
-def _figure(named: NamedFigure, picture: bytes) -> str:
-    data = base64.b64encode(picture).decode("ascii")
-    width = f"{7.5 * float(named.figure.get_size_inches()[0]):.0f}rem"  # one scale for all
-    return (
-        f'<figure><img style="max-width:{width}" alt="{escape(named.title, quote=True)}"'
-        f' src="data:image/png;base64,{data}">'
-        f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"
-    )
-
-
-def _changes(result: PersistResult) -> str:
+def _changes(result: PersistResult, clock: Clock) -> str:
     changes, names = result.changes, result.table.names
     if len(changes) == 0:
         return ""
@@ -105,12 +83,16 @@ def _changes(result: PersistResult) -> str:
         (
             escape(names[changes.feature[k]]),
             "returned" if changes.returned[k] else "vanished",
-            *(f"{getattr(changes, column)[k]:,.1f}" for column in ("stamp_s", "earliest_s", "latest_s", "decided_s")),
+            *(
+                stamp_text(getattr(changes, name)[k], clock)
+                for name in ("stamp_s", "earliest_s", "latest_s", "decided_s")
+            ),
             f"{changes.confidence[k]:.3f}",
         )
         for k in range(len(changes) - 1, max(-1, len(changes) - 1 - _MOST_ROWS), -1)
     ]
-    head = ("feature", "change", "when [s]", "not before [s]", "not after [s]", "clear since [s]", "confidence")
+    zone = "since the start" if clock is Clock.RECORDING else "UTC" if clock is Clock.UNIX else "local clock"
+    head = ("feature", "change", f"when ({zone})", "not before", "not after", "decided", "confidence")
     more = len(changes) - len(rows)
     note = f"<p>{more:,} earlier ones are in <code>changes.jsonl</code>.</p>" if more > 0 else ""
     return f"<h2>Changes, latest first</h2>{table(head, rows, numbers=(2, 3, 4, 5, 6))}{note}"
@@ -140,7 +122,7 @@ def _forecasts(result: PersistResult) -> str:
     head = ("feature", "P(exists) now", f"in {horizon}", *outlooks)
     more = believed.size - len(rows)
     note = f"<p>{more:,} more are in <code>forecasts.csv</code>.</p>" if more > 0 else ""
-    return f"<h2>Now and later</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
+    return f"<h2>Forecasts</h2>{table(head, rows, numbers=range(1, len(head)))}{note}"
 
 
 def _time(seconds: float) -> str:

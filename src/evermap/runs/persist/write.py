@@ -13,12 +13,12 @@ import numpy as np
 
 from evermap.io.columns import csv_bytes, named
 from evermap.runs.folder import RunFolder
-from evermap.runs.persist.draw import draw_run
+from evermap.runs.persist.draw import clock_of, draw_run
 from evermap.runs.persist.report import render_report
 from evermap.runs.persist.run import PersistResult
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
 from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
-from evermap.viz.style import NamedFigure, save_png
+from evermap.viz.style import NamedFigure, save_png, save_svg
 
 
 def write_persist(
@@ -59,6 +59,7 @@ def write_persist(
         total = min(result.config.figures, result.table.n_features) + 1 + (result.scores is not None)
         for figure in draw_run(result, figures=result.config.figures, clock=clock):
             save_png(figure.figure, folder.path(f"figures/{figure.name}.png"))
+            save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
             drawn.append(figure)
             if progress:
                 progress(len(drawn), total)
@@ -68,8 +69,8 @@ def write_persist(
             "draw_s": perf_counter() - written,
         }
         summary = folder.finish(persist_summary(result, info=info or RunInfo(), timing=timing), "report.html")
-        pages = [folder.path(f"figures/{figure.name}.png").read_bytes() for figure in drawn]
-        folder.path("report.html").write_text(render_report(result, summary, drawn, pages), encoding="utf-8")
+        page = render_report(result, summary, drawn, clock or clock_of(result))
+        folder.path("report.html").write_text(page, encoding="utf-8")
     return summary
 
 

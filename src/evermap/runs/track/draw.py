@@ -10,6 +10,7 @@ import numpy as np
 from evermap.runs.track.run import TrackResult
 from evermap.tracking.tracklets import EventKind
 from evermap.types import FloatArray
+from evermap.viz.time_axis import guess_clock
 from evermap.viz.track_figures import Rests, plot_objects
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def draw_run(result: TrackResult) -> Figure:
         start_s=float(table.stamp_s[0]),
         end_s=float(table.stamp_s[-1]),
         sensor_m=None if table.sensor_m is None else table.sensor_m[:, :2],
+        clock=guess_clock(table.stamp_s),
     )
 
 

@@ -69,14 +69,14 @@ def _what_happened(numbers: Mapping[str, Any]) -> str:
 
 
 def _who(numbers: Mapping[str, Any]) -> str:
-    from evermap.viz.report import table
+    from evermap.viz.page import table
 
     rows = [(escape(m["label"]), escape(m["says"])) for m in numbers["methods"].values()]
     return table(("method", "what it does about change"), rows)
 
 
 def _false_table(numbers: Mapping[str, Any]) -> str:
-    from evermap.viz.report import table
+    from evermap.viz.page import table
 
     head = ("method", "changes told", "false", "with p > .99", "of things that never changed", "'came'", "'vanished'",
             "'moved'", "Brier, told", "told of what could be known")  # fmt: skip
@@ -110,7 +110,7 @@ def _score(value: float | None) -> str:
 
 
 def _table(numbers: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
-    from evermap.viz.report import table
+    from evermap.viz.page import table
 
     head = ("method", "position error", "not found", "precision", "p ≥ .9", "recall", "Brier, existence",
             "forecast skill", "places", "time a minute")  # fmt: skip
@@ -161,7 +161,7 @@ def median_ms(cpu_s: Sequence[float]) -> float:
 
 
 def _expected(numbers: Mapping[str, Any], cost: Mapping[str, Any]) -> str:
-    from evermap.viz.report import table
+    from evermap.viz.page import table
 
     outcomes = [*numbers["expected"].values(), *cost["expected"].values()]
     return table(("what", "expected", "here", ""), [_row(outcome) for outcome in outcomes], numbers=(1, 2))

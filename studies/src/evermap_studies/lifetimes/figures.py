@@ -24,7 +24,7 @@ from evermap.viz.style import (
     new_figure,
     settle,
 )
-from evermap.viz.track_figures import draw_tracks
+from evermap.viz.track_figures import TracksNow, draw_tracks
 from evermap_studies.lifetimes.moving import TrackedRun
 from evermap_studies.lifetimes.rooms import RoomStays
 from evermap_studies.lifetimes.truth import ESTIMATORS, NAIVE, Stays, Value, groups
@@ -50,12 +50,14 @@ def draw_scene(tracked: TrackedRun) -> Figure:
         axes = figure.add_subplot()
         draw_tracks(
             axes,
-            position_m=now.position_m,
-            velocity_mps=now.velocity_mps,
-            static=now.static,
-            resting_m=tracked.resting_m[frame],
-            sensor_m=run.sensor_m[frame],
-            reach_m=run.world.reach_m,
+            TracksNow(
+                now.position_m,
+                now.velocity_mps,
+                now.static,
+                tracked.resting_m[frame],
+                run.sensor_m[frame],
+                run.world.reach_m,
+            ),
             path_m=run.sensor_m[: frame + 1],
             detected_m=run.detected_m[run.detections(frame)],
         )

@@ -55,8 +55,7 @@ def draw_belief_example(settings: Settings) -> Figure:
     return plot_belief(
         [*times_s, *after],
         [*curve, *(belief.predict(time_s) for time_s in after)],
-        look_s=looks_s,
-        detected=detected,
+        looks=(looks_s, detected),
         truth_s=[(0.0, GONE_S)],
         title=f"P_M = P_F = {P_ERROR:g}, general-purpose prior {settings.low_hz:g} to {settings.high_hz:g} per second",
     )
