@@ -23,6 +23,7 @@ RULES = {
     "types": "errors show",
     "config": "errors types",
     "geometry": "types",
+    "stamps": "types",
     "survival": "errors compiled show types",
     "valid": "errors types",
     "io": "errors interrupts types geometry valid",
@@ -31,12 +32,12 @@ RULES = {
     "sim": "errors types geometry",
     "existence": "errors compiled types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
-    "maps": "errors types config geometry survival sensing existence slam",
+    "maps": "errors types config geometry stamps survival sensing existence slam",
     "tracking": "errors compiled types config survival sensing existence",
-    "viz": "errors types geometry survival metrics existence",
+    "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",
-    "runs": "errors interrupts types config survival valid io metrics existence maps tracking viz pipeline",
-    "cli": "errors interrupts plugins types config survival io sim existence slam maps viz pipeline runs",
+    "runs": "errors interrupts types config stamps survival valid io metrics existence maps tracking viz pipeline",
+    "cli": "errors interrupts plugins types config stamps survival io sim existence slam maps viz pipeline runs",
 }
 
 # loaded by the functions that need them, never by starting up
