@@ -131,12 +131,12 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
         aged = believe.aged(living, config.living, alone.start_s)
         where = steps.laid(living, aged.p_here, alone, config.living)
         if where is None and len(living.places):
-            return steps.lost(alone, living, "too few of its landmarks were seen standing to each other as it says")
+            return steps.lost(alone, living, config.living, steps.NOT_FOUND)
         if where is not None:
             before = living
             living, where, visit = steps.refit(living, aged.p_here, where, alone, robust=config.slam.robust)
             if config.living.search == "joint" and not steps.fits(visit, alone):
-                return steps.lost(alone, before, "most sightings contradict it; it is bent, or of another place")
+                return steps.lost(alone, before, config.living, steps.CONTRADICTED)
         # judged twice: the second time by the lifetimes that the first has learned
         known = steps.judged(living, where, visit, config.living)
         return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)

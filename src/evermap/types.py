@@ -223,6 +223,12 @@ class Misses(ShownTable):
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), "landmarks": len(np.unique(self.landmark_id))}
 
+    @classmethod
+    def empty(cls) -> Misses:
+        """Return no misses."""
+        none = np.zeros(0, dtype=np.int64)
+        return cls(none, none, np.zeros(0))
+
 
 @dataclass(frozen=True, slots=True)
 class Sensor:

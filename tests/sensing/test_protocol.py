@@ -16,11 +16,9 @@ from evermap.sensing import learned
 from evermap.sensing.profile import Assumed
 from evermap.sensing.sightlines import LearnedField, SightLines
 from evermap.sensing.space import CAMERA, LIDAR, Fading, InField, SpatialModel, ViewingAngle
-from evermap.sensing.visibility import WORTH_A_LOOK, DetectionModel, NominalField, find_misses, looks_at
+from evermap.sensing.visibility import WORTH_A_LOOK, DetectionModel, NominalField, looks_at
 from evermap.tracking.views import View
-from evermap.types import FloatArray, IntArray, Landmarks, Sensor
-
-from .test_visibility import detections
+from evermap.types import FloatArray, IntArray, Sensor
 
 AHEAD = Sensor(range_min_m=0.5, range_max_m=8.0, bearing_min_rad=-1.0, bearing_max_rad=1.2, p_detect=0.8)
 ROUND = Sensor(range_max_m=6.0, p_detect=0.9, mount_robot_sensor=(0.2, 0.1, 0.3))
@@ -231,22 +229,3 @@ def test_looks_are_what_is_in_view_and_what_is_detected(seed: int, sensor: Senso
     missed = {pair for pair, hit in zip(told, looks.hit, strict=True) if not hit}
     assert missed == set(map(tuple, np.argwhere(p >= WORTH_A_LOOK * sensor.p_detect).tolist())) - hits
     np.testing.assert_array_equal(looks.p_detect, p[looks.pose, looks.landmark])
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
-def test_misses_of_the_same_scene_are_the_same_in_any_order(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    pose = np.column_stack([rng.uniform(-4.0, 4.0, (9, 2)), rng.uniform(-9.0, 9.0, 9)])
-    landmarks = Landmarks.at(np.sort(rng.choice(50, 8, replace=False)), rng.uniform(-8.0, 8.0, (8, 2)))
-    landmarks.first_seen_s[:] = rng.uniform(-3.0, 9.0, 8)
-    seen = np.column_stack([rng.integers(0, 9, 20), rng.integers(0, 60, 20)])
-    stamps = np.arange(9.0)
-    misses = find_misses(np.arange(9), pose, detections(seen), landmarks, stamps, ROUND)
-    told = set(zip(misses.frame.tolist(), misses.landmark_id.tolist(), strict=True))
-    assert not told & set(map(tuple, seen.tolist()))  # what is detected is not missed
-    first = dict(zip(landmarks.landmark_id.tolist(), landmarks.first_seen_s.tolist(), strict=True))
-    assert all(stamps[frame] > first[name] for frame, name in told)
-    again = find_misses(np.arange(9), pose, detections(rng.permutation(seen)), landmarks, stamps, ROUND)
-    for name in ("frame", "landmark_id", "p_detect"):
-        np.testing.assert_array_equal(getattr(misses, name), getattr(again, name))

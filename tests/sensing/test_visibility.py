@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from evermap.sensing import visibility
 from evermap.sensing.visibility import (
     BEARING_MARGIN_RAD,
     RANGE_MARGIN_M,
     WORTH_A_LOOK,
     NominalField,
-    find_misses,
+    looks_at,
 )
-from evermap.types import UNKNOWN, Detections, Landmarks, Sensor
+from evermap.types import Sensor
 
 CAMERA = Sensor(
     range_min_m=0.5,
@@ -69,64 +70,53 @@ def test_all_round_sensor_has_no_edge_behind():
     assert found[0] == pytest.approx(0.9)
 
 
-def detections(rows):
-    """From (frame, landmark id)."""
-    frame, identity = np.array(rows, dtype=np.int64).reshape(-1, 2).T
-    count = len(frame)
-    return Detections(
-        frame=frame,
-        landmark_id=identity,
-        range_m=np.ones(count),
-        bearing_rad=np.zeros(count),
-        class_id=np.full(count, UNKNOWN),
-        sigma_range_m=np.full(count, np.nan),
-        sigma_bearing_rad=np.full(count, np.nan),
-        source_line=np.zeros(count, dtype=np.int64),
-    )
-
-
 def tiny_scene():
-    """A robot on the x axis that looks ahead; landmarks 10 and 20 before it, 30 behind, 40 far away."""
-    landmarks = Landmarks.at([10, 20, 30, 40], [[3.0, 0.0], [4.0, 0.5], [-3.0, 0.0], [50.0, 0.0]])
-    landmarks.first_seen_s[:] = [100.0, 102.0, 100.0, 100.0]
+    """A robot on the x axis that looks ahead; landmarks 0 and 1 before it, 2 behind, 3 far away."""
+    position = np.array([[3.0, 0.0], [4.0, 0.5], [-3.0, 0.0], [50.0, 0.0]])
     sensor = Sensor(range_max_m=8.0, bearing_min_rad=-1.0, bearing_max_rad=1.0, p_detect=0.7)
-    stamps = 100.0 + np.arange(5.0)
     pose = np.column_stack([0.1 * np.arange(5), np.zeros(5), np.zeros(5)])
     pose[4, 2] = np.pi  # at last it turns around
-    return landmarks, sensor, stamps, pose
+    return sensor, pose, position
 
 
-def as_pairs(misses):
-    return list(zip(misses.frame.tolist(), misses.landmark_id.tolist(), strict=True))
+def looked_at(sensor, pose, position, seen):
+    """Hits and misses as pairs, of detections (frame, landmark)."""
+    looks = looks_at(sensor, pose, position, tuple(np.array(seen, dtype=np.int64).reshape(-1, 2).T))
+    pairs = list(zip(looks.pose.tolist(), looks.landmark.tolist(), strict=True))
+    hits, misses = ([pair for pair, hit in zip(pairs, looks.hit, strict=True) if hit == kind] for kind in (True, False))
+    return hits, misses, looks
 
 
-def test_misses_of_a_tiny_scene_are_those_counted_by_hand():
-    landmarks, sensor, stamps, pose = tiny_scene()
-    seen = detections([(0, 10), (2, 10), (2, 20), (2, 99), (3, UNKNOWN)])
-    misses = find_misses(np.arange(5), pose, seen, landmarks, stamps, sensor)
-    # frame 0: 10 seen, others not met yet or not in view; 1: 10 missed; 2: all seen; 3: both missed; 4: 30 missed
-    assert as_pairs(misses) == [(1, 10), (3, 10), (3, 20), (4, 30)]
-    assert misses.p_detect == pytest.approx(0.7, abs=1e-6)
+def test_looks_of_a_tiny_scene_are_those_counted_by_hand():
+    seen = [(0, 0), (2, 1), (2, 0), (3, 3)]
+    hits, misses, looks = looked_at(*tiny_scene(), seen)
+    assert hits == [(0, 0), (2, 0), (2, 1), (3, 3)]  # the last one is far out of view
+    # frame 0: 0 seen; 1: both missed; 2: both seen; 3: both missed; 4: turned around, what was behind is missed
+    assert misses == [(0, 1), (1, 0), (1, 1), (3, 0), (3, 1), (4, 2)]
+    assert looks.p_detect[~looks.hit] == pytest.approx(0.7, abs=1e-6)
+    assert looks.p_detect[-2] < 1e-12
+    some = looks.rows(looks.hit)
+    assert some.hit.all()
+    assert some.landmark.tolist() == [0, 0, 1, 3]
 
 
-def test_only_frames_with_a_pose_count():
-    landmarks, sensor, stamps, pose = tiny_scene()
-    seen = detections([(0, 10), (2, 10)])
-    misses = find_misses(np.array([1, 2]), pose[1:3], seen, landmarks, stamps, sensor)
-    assert as_pairs(misses) == [(1, 10)]
-
-
-def test_at_the_edge_of_the_view_nothing_is_missed():
-    landmarks, sensor, stamps, _ = tiny_scene()
+def test_beyond_the_edge_of_the_view_nothing_is_looked_at():
+    sensor, _, position = tiny_scene()
     # 0.3 of the best is half a standard deviation of the edge beyond the limit: 0.105 m
-    for x, expected in ((3.0 - 8.0 - 0.12, []), (3.0 - 8.0 - 0.09, [(1, 10)])):
-        pose = np.array([[x, 0.0, 0.0]])
-        misses = find_misses(np.array([1]), pose, detections([]), landmarks, stamps, sensor)
-        assert [pair for pair in as_pairs(misses) if pair[1] == 10] == expected
-        assert np.all(misses.p_detect >= WORTH_A_LOOK * sensor.p_detect)
+    for x, expected in ((3.0 - 8.0 - 0.12, []), (3.0 - 8.0 - 0.09, [(0, 0)])):
+        _, misses, looks = looked_at(sensor, np.array([[x, 0.0, 0.0]]), position[:1], [])
+        assert misses == expected
+        assert np.all(looks.p_detect >= WORTH_A_LOOK * sensor.p_detect)
 
 
-def test_no_frames_no_misses():
-    landmarks, sensor, stamps, _ = tiny_scene()
-    misses = find_misses(np.array([], dtype=np.int64), np.empty((0, 3)), detections([]), landmarks, stamps, sensor)
-    assert len(misses) == 0
+def test_no_frames_and_no_landmarks_no_looks():
+    sensor, pose, position = tiny_scene()
+    assert len(looked_at(sensor, pose[:0], position, [])[2].hit) == 0
+    assert len(looked_at(sensor, pose, position[:0], [])[2].hit) == 0
+
+
+def test_many_pairs_are_taken_in_parts(monkeypatch):
+    whole = looked_at(*tiny_scene(), [(0, 0), (3, 1)])
+    monkeypatch.setattr(visibility, "AT_ONCE", 5)
+    parts = looked_at(*tiny_scene(), [(0, 0), (3, 1)])
+    assert parts[:2] == whole[:2]

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from evermap.geometry import se2
-from evermap.types import BoolArray, Detections, FloatArray, IntArray, Landmarks, Misses, Sensor
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 RANGE_MARGIN_M = 0.2
 BEARING_MARGIN_RAD = 0.05
@@ -129,36 +129,6 @@ def log_in_view(
     if sensor.bearing_max_rad - sensor.bearing_min_rad < 2 * math.pi - 1e-6:
         inside += _log_within(bearing_rad, sensor.bearing_min_rad, sensor.bearing_max_rad, bearing_margin_rad)
     return inside
-
-
-def find_misses(
-    frame: IntArray,
-    pose_world_robot: FloatArray,
-    detections: Detections,
-    landmarks: Landmarks,
-    frame_stamp_s: FloatArray,
-    sensor: Sensor,
-) -> Misses:
-    """Find landmarks that were looked at and not detected, from the first time on that each was seen.
-
-    Args:
-        frame: (F,) rows of frames that have a pose, increasing.
-        pose_world_robot: (F, 3) poses at those frames.
-        detections: what was seen.
-        landmarks: what is there to be seen.
-        frame_stamp_s: stamps of all frames.
-        sensor: limits, mounting and detection probability.
-    """
-    order = np.argsort(landmarks.landmark_id, kind="stable")
-    at = np.searchsorted(landmarks.landmark_id, detections.landmark_id, sorter=order)
-    column = np.append(order, -1)[at]  # the last row for ids beyond the largest one
-    used = np.isin(detections.frame, frame) & np.isin(detections.landmark_id, landmarks.landmark_id)
-    seen = np.searchsorted(frame, detections.frame[used]), column[used]
-    looks = looks_at(sensor, pose_world_robot, landmarks.position_m, seen)
-    known = frame_stamp_s[frame[looks.pose]] > landmarks.first_seen_s[looks.landmark]
-    missed = ~looks.hit & known
-    row, of = looks.pose[missed], looks.landmark[missed]
-    return Misses(frame[row].astype(np.int64), landmarks.landmark_id[of].astype(np.int64), looks.p_detect[missed])
 
 
 def _log_within(value: FloatArray, low: float, high: float, margin: FloatArray | float) -> FloatArray:

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sensing.visibility import find_misses
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import SPECS, CalibrationPrior
 from evermap.slam.check import far_off
@@ -57,22 +56,16 @@ def concluded(solved: Solved) -> SlamResult:
 
 
 def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None = None) -> SlamResult:
-    """Return bridge the blind stretches, and count the misses where nobody has.
+    """Bridge the blind stretches, and put all of an estimate into plain arrays.
 
     Args:
         solved: the recording and its estimate.
         frame: in which the estimate is: 'first_pose' or 'prior_map'.
         in_map: landmarks that are told.
-        misses: what a living map, which counts misses itself, has missed in this recording; None for landmarks whose
-            misses are not counted yet: each line of sight in the field of view is then taken to be clear.
+        misses: of these landmarks in this recording; None where they are not known yet.
     """
     recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
     path = trajectory(prepared, outcome, recording, frame)
-    if misses is None:
-        rows = np.flatnonzero(recording.frames.stamp_s <= path.stamp_s[-1] + 1e-9).astype(np.int64)
-        poses = path.pose_world_robot[rows_at(path, recording, rows)]
-        misses = find_misses(rows, poses, recording.detections, in_map, recording.frames.stamp_s, recording.sensor)
-        in_map = with_misses(in_map, misses)
     states = described(outcome.estimate.states, outcome.states_covariance, outcome.noise, solved.prior)
     warnings = [*prepared.warnings, *far_off(states, solved.settings.check)]
     if solved.interrupted:
@@ -84,7 +77,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None 
         landmarks=in_map,
         parameters=states,
         innovations=innovations(prepared, solved.slam, outcome, recording),
-        misses=misses,
+        misses=Misses.empty() if misses is None else misses,
         step_s=solved.step_s,
         dead_reckoning=dead_reckoning(prepared, path),
         warnings=tuple(warnings),
@@ -187,12 +180,6 @@ def changes(prepared: Prepared, outcome: Outcome, moved: tuple[MapChange, ...]) 
         ).named(prepared.names)
         for change in moved
     )
-
-
-def with_misses(landmarks: Landmarks, misses: Misses) -> Landmarks:
-    """Return the map with its misses counted."""
-    columns = np.searchsorted(landmarks.landmark_id, misses.landmark_id)
-    return replace(landmarks, n_misses=np.bincount(columns, minlength=len(landmarks)).astype(np.int64))
 
 
 def online(prepared: Prepared, slam: StreamingSlam, recording: Recording, frame: str) -> Trajectory:

@@ -25,6 +25,9 @@ from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
 from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Misses, Recording, SlamResult, rows_of
 
+NOT_FOUND = "too few of its landmarks were seen standing to each other as it says"
+CONTRADICTED = "most sightings contradict it; the session is bent, or of another place"
+"""Why a session cannot be localised in a map."""
 INLIER = 0.5
 LEAST_FIT = 0.75
 """Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
@@ -390,22 +393,20 @@ def told(found: Judged, where: Laid | None, visit: Solved) -> Session:
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 
-def lost(alone: Solved, living: LivingMap, reason: str) -> Session:
+def lost(alone: Solved, living: LivingMap, config: LivingConfig, reason: str) -> Session:
     """Return a session that cannot be found in the map: it stands by itself, and the map as it was."""
     frame = "first_pose"
     landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, frame)
-    slam = of_slam.result(alone, frame, landmarks)
+    slam = existing(alone, of_slam.result(alone, frame, landmarks), config)
     slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason}"))
     return Session(living, False, alone.recording, slam, (), Evidence.empty())
 
 
 def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResult:
-    """Return the result of a recording by itself with the belief that each landmark still exists at its end.
+    """Return the result of a recording by itself with its misses, and with the belief that each landmark still exists.
 
-    The belief is that of a living map whose first session the recording is.
+    Both are those of a living map whose first session the recording is.
     """
-    if not config.existence:
-        return slam
     mapped = slam.landmarks
     count = len(mapped)
     covariance = np.zeros((count, 2, count, 2))
@@ -425,9 +426,12 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
     empty = LivingMap(clock=visit.recording.clock, class_names=visit.recording.class_names)
     entry = extended(empty, np.zeros(0), found, config, 0.0)
     seen, _ = looks(entry, visit, config)
-    believed_in = believed(entry, seen, visit, config).living.landmarks(p_least=0.0)
-    row = np.searchsorted(believed_in.landmark_id, mapped.landmark_id)
-    return replace(slam, landmarks=replace(mapped, p_exists=believed_in.p_exists[row]))
+    now = believed(entry, seen, visit, config).living
+    judged_now = now.landmarks(p_least=0.0)
+    row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)
+    p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists
+    mapped = replace(mapped, p_exists=p_exists, n_misses=judged_now.n_misses[row])
+    return replace(slam, landmarks=mapped, misses=missed(now, seen, visit))
 
 
 def _inliers(visit: Solved) -> tuple[IntArray, IntArray]:
