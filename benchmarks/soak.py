@@ -27,8 +27,8 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import align_points, interpolate, scored_stamps
 from evermap.pipeline import run_session
-from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.types import FloatArray, Landmarks, Recording
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, FaultConfig, with_faults
 
 SESSION_S = 180.0

@@ -29,7 +29,6 @@ RULES = {
     "io": "errors interrupts types geometry valid",
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types geometry",
-    "sim": "errors types geometry",
     "existence": "errors compiled types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors types config geometry stamps survival sensing existence slam",
@@ -37,7 +36,7 @@ RULES = {
     "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",
     "runs": "errors interrupts types config stamps survival valid io metrics existence maps tracking viz pipeline",
-    "cli": "errors interrupts plugins types config stamps survival io sim existence slam maps viz pipeline runs",
+    "cli": "errors interrupts plugins types config stamps survival io existence slam maps viz pipeline runs",
 }
 
 # loaded by the functions that need them, never by starting up
@@ -97,7 +96,7 @@ def test_the_library_knows_no_study() -> None:
 
 
 def test_the_core_knows_nothing_of_its_users() -> None:
-    outside = {"viz", "cli", "runs", "sim", "metrics"}
+    outside = {"viz", "cli", "runs", "metrics"}
     for part in ("survival", "sensing", "existence", "tracking", "slam", "maps", "pipeline"):
         assert not set(RULES[part].split()) & outside, part
 
@@ -125,7 +124,7 @@ def test_starting_up_loads_nothing_heavy(module: str) -> None:
 
 @pytest.mark.parametrize(
     "part",
-    ["types", "errors", "geometry.se2", "config", "io", "sim", "metrics", "viz", "pipeline", "runs.folder", "slam"],
+    ["types", "errors", "geometry.se2", "config", "io", "metrics", "viz", "pipeline", "runs.folder", "slam"],
 )
 def test_importing_a_part_loads_no_plot_backend_or_compiler(part: str) -> None:
     assert not loaded_after(f"import evermap.{part}") & set(LAZY_EVERYWHERE)

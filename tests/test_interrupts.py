@@ -16,7 +16,7 @@ import pytest
 
 from evermap.interrupts import held, sheltered, temporary, watched
 from evermap.pipeline import run_slam
-from evermap.sim import BuildingConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 INTERRUPT = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
 

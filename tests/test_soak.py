@@ -17,8 +17,8 @@ from evermap.errors import DataError
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session
-from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.types import Recording
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 
 LARGEST_FACTOR = 1.5

@@ -12,7 +12,7 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "check", "slam", "persist", "track", "convert", "simulate", "bench"]
+VERBS = ["demo", "simulate", "check", "slam", "persist", "track", "convert", "bench"]
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "verify", "revert", "pin", "unpin", "delete", "undelete"],
     "survival": ["plot", "fit", "learn"],

@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
 from evermap.io import read_recording
-from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
+from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, looked_at, simulate_building
 
 SIMULATION = ["--days", "2", "--sessions-per-day", "2", "--patrol-s", "20", "--seed", "3"]
 

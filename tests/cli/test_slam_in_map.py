@@ -19,7 +19,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.io import read_tum, write_native
 from evermap.maps.store import open_store
-from evermap.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
 
 # pictures have tests of their own, and take most of the time
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]

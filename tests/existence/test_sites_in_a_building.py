@@ -16,10 +16,10 @@ from evermap.existence.sites import SiteDynamics, SiteLooks, follow_sites
 from evermap.geometry import se2
 from evermap.sensing.sightlines import CLEAR, P_HIDDEN, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import NominalField
-from evermap.sim.config import BuildingConfig, Duration
-from evermap.sim.world import BuildingSimulation, simulate_building
 from evermap.survival import Exponential, LifetimePrior
 from evermap.types import BoolArray, Detections, FloatArray, IntArray, Recording, rows_of
+from evermap_studies.sim.config import BuildingConfig, Duration
+from evermap_studies.sim.world import BuildingSimulation, simulate_building
 
 P_FALSE = 1e-4
 NEAR_M = 0.35

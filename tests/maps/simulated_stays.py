@@ -9,8 +9,8 @@ import numpy as np
 
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
-from evermap.sim.config import DAY_S, ObjectClass
 from evermap.types import FloatArray
+from evermap_studies.sim.config import DAY_S, ObjectClass
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ def two_looks_a_day(days: int) -> FloatArray:
 def histories(
     classes: Sequence[ObjectClass], end_s: float, rng: np.random.Generator, warmup_s: float
 ) -> list[TrueStay]:
-    """True stays as of `evermap.sim.changes`, but without geometry: a new place is a new site, a door has two."""
+    """Draw true stays as `evermap_studies.sim.changes` does, without geometry: a new place is a new site."""
     stays: list[TrueStay] = []
     thing = 0
     for kind, law in enumerate(classes):

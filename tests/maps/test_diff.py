@@ -210,7 +210,7 @@ def part_of(recording: em.Recording, begin: float, end: float) -> em.Recording:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of five days of which three see only a part, each with its run folder beside it."""
     from evermap.io import write_native
-    from evermap.sim import BuildingConfig, SensorConfig, simulate_building
+    from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
 
     folder = tmp_path_factory.mktemp("site")
     config = BuildingConfig(days=5, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1, change_rate=2.0,

@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal
 
 from evermap.geometry import se2
 from evermap.maps.grouping import MOVE_SIGMA_M, Fate, group, log_evidence_of_motion, regrouped
-from evermap.sim import BuildingConfig, simulate_building
 from evermap.types import FloatArray, IntArray
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 REACH_M = 1.6
 SIGMA_M = 0.02

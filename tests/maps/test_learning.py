@@ -14,9 +14,9 @@ from evermap.maps.history import NEWEST
 from evermap.maps.learning import class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
-from evermap.sim.config import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.types import UNKNOWN
+from evermap_studies.sim.config import DAY_S, DEFAULT_CLASSES, Duration, ObjectClass
 
 LOOKS_S = two_looks_a_day(28)
 END_S = 28 * DAY_S

@@ -150,7 +150,7 @@ def run(*arguments: str | Path):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of two sessions, the first of them with what a user says of pallets and of all else."""
     from evermap.io import write_native
-    from evermap.sim import BuildingConfig, SensorConfig, simulate_building
+    from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
 
     folder = tmp_path_factory.mktemp("priors")
     priors = ["--prior", "pallet=weibull:scale=3d,shape=1.5", "--prior", "unknown:1d..1y"]

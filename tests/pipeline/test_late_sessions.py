@@ -16,8 +16,8 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
 from evermap.maps.store.recorded import pack_recording, unpack_recording
 from evermap.runs.sessions import at_time
-from evermap.sim import BuildingConfig, simulate_building
 from evermap.types import Recording
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 SESSIONS = simulate_building(BuildingConfig(days=4, patrol_s=35.0), 3).sessions
 

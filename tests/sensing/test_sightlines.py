@@ -27,9 +27,9 @@ from evermap.sensing.sightlines import (
     offsets,
 )
 from evermap.sensing.visibility import NominalField
-from evermap.sim.config import BuildingConfig
-from evermap.sim.world import simulate_building
 from evermap.types import BoolArray, FloatArray, IntArray, Recording
+from evermap_studies.sim.config import BuildingConfig
+from evermap_studies.sim.world import simulate_building
 
 PLACES = np.array([2, 2, 3, 7], dtype=np.int64), np.array([10, 11, 12, 10], dtype=np.int64)
 """Sites and landmarks of the places of a map."""

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from evermap.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
 from evermap.types import Frames, Recording
+from evermap_studies.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
 
 
 @cache

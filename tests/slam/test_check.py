@@ -14,9 +14,9 @@ import pytest
 from evermap import check_recording, run_session, run_slam
 from evermap.errors import DataError, InputError
 from evermap.io import list_robots, read_mrclam, read_recording, write_template
-from evermap.sim import BuildingConfig, simulate_building
 from evermap.slam.check import USUAL, far_off
 from evermap.types import ParameterEstimate, Recording
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 
 @cache

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from evermap.errors import DataError
 from evermap.io import read_recording, write_template
 from evermap.pipeline import run_slam
-from evermap.sim import BuildingConfig, SensorConfig, simulate_building
 from evermap.slam.cleaning import clean
 from evermap.types import Recording
+from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
 
 RATE_HZ = 5.0

@@ -14,12 +14,12 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.io.mrclam import read_mrclam
 from evermap.pipeline import run_slam
-from evermap.sim import BuildingConfig, simulate_building
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.localize_recording import localize
 from evermap.slam.noise import START
 from evermap.slam.problem import Noise
 from evermap.types import Landmarks, Recording, SlamResult, Trajectory
+from evermap_studies.sim import BuildingConfig, simulate_building
 
 SIGMA_M = 0.03
 

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__, interrupts, plugins
-from evermap.cli import bench, check, convert, persist, reproduce, simulate, slam, survival, track
+from evermap.cli import bench, check, convert, persist, reproduce, slam, survival, track
 from evermap.cli import map as living_map
 from evermap.cli.options import Verb
 from evermap.cli.terminal import fail, say, warn
@@ -98,7 +98,6 @@ app.command("track", help=track.HELP)(track.track)
 app.command("convert")(convert.convert)
 app.add_typer(living_map.app)
 app.add_typer(survival.app)
-app.command("simulate")(simulate.simulate)
 app.add_typer(reproduce.app)
 app.command("bench")(bench.bench)
 

@@ -12,9 +12,16 @@ from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session
-from evermap.sim import BuildingConfig, BuildingSimulation, Duration, ObjectClass, SensorConfig, simulate_building
-from evermap.sim.world import positions_at
 from evermap.types import FloatArray, IntArray, Recording
+from evermap_studies.sim import (
+    BuildingConfig,
+    BuildingSimulation,
+    Duration,
+    ObjectClass,
+    SensorConfig,
+    simulate_building,
+)
+from evermap_studies.sim.world import positions_at
 
 CLASSES = (
     ObjectClass("marker", "wall", count=6, landmarks=(1, 1)),

@@ -13,11 +13,11 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.own import own_landmarks
 from evermap.maps.sessions.refit import refitted
 from evermap.pipeline import solve_alone
-from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate
 from evermap.slam.streaming import Outcome
 from evermap.types import FloatArray, IntArray
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import predicted
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session
-from evermap.sim import BuildingSimulation, looked_at
-from evermap.sim.world import positions_at
 from evermap.types import ChangeKind, Clock, FloatArray, Recording
+from evermap_studies.sim import BuildingSimulation, looked_at
+from evermap_studies.sim.world import positions_at
 
 from .buildings import body_of, building, lived_through, p_exists, place_of, settings, truth_of, unseen
 

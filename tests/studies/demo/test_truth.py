@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.sim import BuildingSimulation, looked_at
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.truth import _observed_one, truth_of
+from evermap_studies.sim import BuildingSimulation, looked_at
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import binomtest, kstest, poisson
 
 from evermap.errors import ConfigError
-from evermap.sim import BuildingConfig, SensorConfig, simulate_building
 from evermap.types import Recording
+from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
 from evermap_studies.worlds.faults import (
     FAULTLESS,
     NOTHING,

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.maps.learning import class_survival
-from evermap.sim.config import DAY_S, ObjectClass
 from evermap.survival.gamma import Gamma
 from evermap.types import FloatArray
 from evermap_studies.demo.study import Study
+from evermap_studies.sim.config import DAY_S, ObjectClass
 
 QUARTILES = (0.75, 0.5, 0.25)
 """Where the learned curve is held against the truth: the ages up to which these shares truly stay."""

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from evermap.runs.folder import SUMMARY, RunFolder, RunInfo, summary_text, write_run
-from evermap.sim import ChangeEvent
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.study import Progress, run_study
+from evermap_studies.sim import ChangeEvent
 
 TRUE_EVENTS = "true_events.jsonl"
 MAP = "map.evermap"

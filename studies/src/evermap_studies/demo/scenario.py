@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from evermap.sim import (
+from evermap_studies.sim import (
     CLUTTER,
     ROOM_DOORS,
     BuildingConfig,

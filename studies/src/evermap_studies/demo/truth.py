@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.sim import BuildingSimulation, LookedAt, looked_at
-from evermap.sim.world import positions_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks
+from evermap_studies.sim import BuildingSimulation, LookedAt, looked_at
+from evermap_studies.sim.world import positions_at
 from evermap_studies.worlds.scores import NEAR_M
 
 

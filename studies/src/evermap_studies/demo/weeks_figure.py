@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sim import CLUTTER
-from evermap.sim.building import SceneObject
 from evermap.types import IntArray
 from evermap.viz.style import ALERT, ESTIMATE, INK, MUTED, SHADE, NamedFigure, house_style, new_figure, settle
 from evermap_studies.demo.claims import CERTAIN
@@ -16,6 +14,8 @@ from evermap_studies.demo.claims_figure import TELLING
 from evermap_studies.demo.looks import CLASS_LOOKS, METHOD_LOOKS
 from evermap_studies.demo.numbers import Line, week_of
 from evermap_studies.demo.study import Study
+from evermap_studies.sim import CLUTTER
+from evermap_studies.sim.building import SceneObject
 from evermap_studies.worlds.scores import NEAR_M
 
 if TYPE_CHECKING:

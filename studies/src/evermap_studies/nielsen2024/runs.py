@@ -129,7 +129,7 @@ class Reference:
 def recording_of(data: Path, dataset: int, robot: int) -> Recording:
     """A recording with its survey."""
     if dataset == BUILDING:
-        from evermap.sim import BuildingConfig, simulate_building
+        from evermap_studies.sim import BuildingConfig, simulate_building
 
         return simulate_building(BuildingConfig(days=1, change_rate=0.0), seed=robot).sessions[0]
     from evermap.io import read_recording

@@ -22,7 +22,10 @@ from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.sim import (
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap_studies.mrclam.study import machine
+from evermap_studies.partial_views.table import as_markdown
+from evermap_studies.sim import (
     CLUTTER,
     DEFAULT_CLASSES,
     ROOM_DOORS,
@@ -32,9 +35,6 @@ from evermap.sim import (
     looked_at,
     simulate_building,
 )
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
-from evermap_studies.mrclam.study import machine
-from evermap_studies.partial_views.table import as_markdown
 from evermap_studies.worlds.scores import stands_at
 
 __all__ = ["QUICK", "Settings", "as_markdown", "reproduce"]

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from evermap.sim.config import require_within
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
+from evermap_studies.sim.config import require_within
 
 Item = TypeVar("Item")
 

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sim.building import ROOM_INSET_M, FloorPlan
-from evermap.sim.config import DriveConfig, OdometryConfig
 from evermap.types import Clock, FloatArray, Odometry
+from evermap_studies.sim.building import ROOM_INSET_M, FloorPlan
+from evermap_studies.sim.config import DriveConfig, OdometryConfig
 
 LANE_M: float = 0.4
 """The robot keeps to the right of the corridor's middle by this much."""

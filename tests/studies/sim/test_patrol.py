@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import solve_ivp
 
-from evermap.sim import BuildingConfig, DriveConfig, OdometryConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, simulate_building
 
 ONE_LAP = BuildingConfig(days=2, patrol_s=170.0, change_rate=0.0)
 PERFECT = OdometryConfig(

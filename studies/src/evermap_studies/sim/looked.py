@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.sim.detect import Scene, in_view
-from evermap.sim.world import BuildingSimulation
 from evermap.types import BoolArray, FloatArray, IntArray
+from evermap_studies.sim.detect import Scene, in_view
+from evermap_studies.sim.world import BuildingSimulation
 
 LOOKED_AT: float = 0.95
 """A place was really looked at where a landmark would have been seen with at least this probability."""

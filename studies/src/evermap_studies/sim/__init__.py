@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from evermap.sim.building import FloorPlan, Room
-from evermap.sim.changes import ChangeEvent, EventKind, Stay
-from evermap.sim.config import (
+from evermap_studies.sim.building import FloorPlan, Room
+from evermap_studies.sim.changes import ChangeEvent, EventKind, Stay
+from evermap_studies.sim.config import (
     CLUTTER,
     DEFAULT_CLASSES,
     ROOM_DOORS,
@@ -15,8 +15,8 @@ from evermap.sim.config import (
     OdometryConfig,
     SensorConfig,
 )
-from evermap.sim.looked import LookedAt, looked_at
-from evermap.sim.world import BuildingSimulation, SessionTruth, simulate_building
+from evermap_studies.sim.looked import LookedAt, looked_at
+from evermap_studies.sim.world import BuildingSimulation, SessionTruth, simulate_building
 
 __all__ = [
     "CLUTTER",

@@ -15,8 +15,8 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.geometry import se2
-from evermap.sim.config import BuildingConfig, ObjectClass
 from evermap.types import BoolArray, FloatArray
+from evermap_studies.sim.config import BuildingConfig, ObjectClass
 
 DOORWAY_M: float = 1.5
 ROOM_INSET_M: float = 2.0

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evermap.sim import BuildingConfig, Duration, EventKind, ObjectClass, simulate_building
-from evermap.sim.building import ROUTE_CLEARANCE_M
-from evermap.sim.changes import Timeline
-from evermap.sim.config import DAY_S
-from evermap.sim.patrol import patrol_route
+from evermap_studies.sim import BuildingConfig, Duration, EventKind, ObjectClass, simulate_building
+from evermap_studies.sim.building import ROUTE_CLEARANCE_M
+from evermap_studies.sim.changes import Timeline
+from evermap_studies.sim.config import DAY_S
+from evermap_studies.sim.patrol import patrol_route
 
 SHORT = BuildingConfig(days=6, patrol_s=5.0)
 

@@ -15,9 +15,9 @@ from enum import StrEnum
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sim.building import Circles, Placer, SceneObject, attach_landmarks
-from evermap.sim.config import DAY_S, BuildingConfig
 from evermap.types import FloatArray
+from evermap_studies.sim.building import Circles, Placer, SceneObject, attach_landmarks
+from evermap_studies.sim.config import DAY_S, BuildingConfig
 
 Pose = tuple[float, float, float]
 

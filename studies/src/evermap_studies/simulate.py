@@ -12,7 +12,7 @@ import typer
 from evermap.cli.terminal import print_json, say
 
 if TYPE_CHECKING:
-    from evermap.sim import BuildingSimulation
+    from evermap_studies.sim import BuildingSimulation
 
 EVENTS_FILE = "changes_truth.jsonl"
 LOOKS_FILE = "looks_truth.csv"
@@ -60,7 +60,7 @@ def simulate(
     """
     from evermap.io import write_native
     from evermap.runs.folder import RunFolder
-    from evermap.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
+    from evermap_studies.sim import CLUTTER, DEFAULT_CLASSES, ROOM_DOORS, BuildingConfig, simulate_building
 
     folder = RunFolder(out, force=force, renew=False)
     config = BuildingConfig(
@@ -108,7 +108,7 @@ def _write_events(building: BuildingSimulation, path: Path) -> None:
 def _write_looks(building: BuildingSimulation, names: list[str], path: Path) -> None:
     """One row for every session and every place at which a landmark ever stood."""
     from evermap.io.atomic import write_atomic
-    from evermap.sim import looked_at
+    from evermap_studies.sim import looked_at
 
     looks = looked_at(building)
     lines = ["session,landmark_id,x_m,y_m,present,looked_at,p_seen\n"]

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.sim.building import FloorPlan
-from evermap.sim.config import SensorConfig
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray
+from evermap_studies.sim.building import FloorPlan
+from evermap_studies.sim.config import SensorConfig
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,12 @@ import numpy as np
 
 from evermap.errors import ConfigError
 from evermap.geometry import se2
-from evermap.sim.building import FloorPlan, Placer, SceneObject, draw_floor_plan, furnish
-from evermap.sim.changes import ChangeEvent, Stay, Timeline, events_of, live
-from evermap.sim.config import DAY_S, BuildingConfig
-from evermap.sim.detect import Scene, detect
-from evermap.sim.patrol import drive, patrol_route, report_odometry
 from evermap.types import Clock, FloatArray, Frames, IntArray, Landmarks, Recording, Trajectory
+from evermap_studies.sim.building import FloorPlan, Placer, SceneObject, draw_floor_plan, furnish
+from evermap_studies.sim.changes import ChangeEvent, Stay, Timeline, events_of, live
+from evermap_studies.sim.config import DAY_S, BuildingConfig
+from evermap_studies.sim.detect import Scene, detect
+from evermap_studies.sim.patrol import drive, patrol_route, report_odometry
 
 P_PASS_BY: float = 1.0 / 3.0
 """Probability that a patrol with a route of its own does not visit a room."""

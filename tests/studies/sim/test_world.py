@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError
-from evermap.sim import (
+from evermap.types import Clock
+from evermap_studies.sim import (
     DEFAULT_CLASSES,
     BuildingConfig,
     DriveConfig,
@@ -22,7 +23,6 @@ from evermap.sim import (
     SensorConfig,
     simulate_building,
 )
-from evermap.types import Clock
 
 SMALL = BuildingConfig(days=3, patrol_s=60.0)
 

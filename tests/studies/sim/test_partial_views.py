@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError
-from evermap.sim import (
+from evermap_studies.sim import (
     CLUTTER,
     DEFAULT_CLASSES,
     ROOM_DOORS,
@@ -25,7 +25,7 @@ from evermap.sim import (
     looked_at,
     simulate_building,
 )
-from evermap.sim.building import DOORWAY_M
+from evermap_studies.sim.building import DOORWAY_M
 
 LENGTHS_S = (20.0, 40.0, 60.0, 165.0)
 HARD = BuildingConfig(
