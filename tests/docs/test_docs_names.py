@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import re
 from pathlib import Path
@@ -22,6 +23,19 @@ def spans(page: Path) -> list[str]:
     """Code spans of a page outside of its blocks."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
     return SPANS.findall(text)
+
+
+def named_in_blocks(page: Path) -> list[str]:
+    """Names of ours that the Python blocks of a page import, and those that they take from `em`."""
+    text = page.read_text(encoding="utf-8")
+    names = []
+    for block in re.findall(r"^```python\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("evermap"):
+                names += [f"{node.module}.{alias.name}" for alias in node.names]
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "em":
+                names.append(f"evermap.{node.attr}")
+    return names
 
 
 def exists(name: str) -> bool:
@@ -51,6 +65,11 @@ def test_modules_and_files_that_a_page_names_exist(page: Path) -> None:
         elif dotted is not None:
             missing += [] if exists(dotted[1]) or span in OTHERS else [span]
     assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_what_the_examples_of_a_page_import_exists(page: Path) -> None:
+    assert [name for name in named_in_blocks(page) if not exists(name)] == []
 
 
 def test_the_page_on_calibration_has_every_state_with_its_prior() -> None:
