@@ -14,6 +14,7 @@ from random_maps import random_changes, random_evidence, random_map
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
+from evermap.errors import InputError
 from evermap.io import read_landmarks
 from evermap.maps.diff import diff
 from evermap.maps.store import Provenance, open_store
@@ -105,6 +106,22 @@ def test_show_foretells_less_the_longer_ahead(site: Path) -> None:
     for name in standing:
         assert soon[name]["p_ahead"] == pytest.approx(soon[name]["p_exists"], abs=0.05)
         assert late[name]["p_ahead"] < soon[name]["p_ahead"]
+
+
+def test_landmarks_at_a_time_and_within_a_box() -> None:
+    living = MAPS[2]
+    now, later = living.landmarks(), living.landmarks(at=living.stamp_s + 30 * 86400.0)
+    np.testing.assert_array_equal(now.landmark_id, later.landmark_id)
+    np.testing.assert_allclose(living.landmarks(at=living.stamp_s).p_exists, now.p_exists, atol=1e-9)
+    assert np.all(later.p_exists[now.p_exists > 0.7] < now.p_exists[now.p_exists > 0.7])
+    low, high = np.quantile(now.position_m, [0.2, 0.8], axis=0)
+    inside = ((now.position_m >= low) & (now.position_m <= high)).all(axis=1)
+    found = living.landmarks(within=(*low, *high), p_least=0.3)
+    assert found.landmark_id.tolist() == now.landmark_id[inside & (now.p_exists >= 0.3)].tolist()
+    with pytest.raises(InputError, match="before the map's newest look"):
+        living.landmarks(at=living.stamp_s - 1.0)
+    with pytest.raises(InputError, match="no box"):
+        living.landmarks(within=(1.0, 0.0, 0.0, 1.0))
 
 
 def test_diff_lists_changes_and_edits(site: Path) -> None:

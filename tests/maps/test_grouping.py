@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
 from evermap.geometry import se2
-from evermap.maps.grouping import MOVE_SIGMA_M, Fate, group, log_evidence_of_motion, regrouped
+from evermap.maps.bodies import MOVE_SIGMA_M, Fate, group, log_evidence_of_motion, regrouped
 from evermap.types import FloatArray, IntArray
 from evermap_studies.sim import BuildingConfig, simulate_building
 

@@ -10,8 +10,7 @@ import pytest
 from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
-from evermap.maps.history import NEWEST
-from evermap.maps.learning import class_survival, learned_lives
+from evermap.maps.learning import NEWEST, class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
 from evermap.survival.general_purpose import GeneralPurpose

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap.maps.bodies import without_missed
 from evermap.maps.living import LivingMap, Members, Places, Sites
-from evermap.maps.missed import without_missed
 
 LANDMARKS = 10 + np.arange(4)
 OFF = np.zeros(4, np.bool_)

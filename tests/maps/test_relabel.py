@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from evermap.maps.bodies import relabelled
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
-from evermap.maps.relabel import relabelled
 from evermap.types import FloatArray
 
 

@@ -14,7 +14,8 @@ from random_maps import assert_same, random_changes, random_evidence, random_map
 from sqlalchemy import create_engine, inspect
 
 from evermap.errors import InputError
-from evermap.maps.store import Provenance, migrations, open_store, schema
+from evermap.maps.store import Provenance, open_store, schema
+from evermap.maps.store import schema as migrations
 
 # as a database told of itself when schema 1 was that of the day
 CHANGE_OF_SCHEMA_1 = """

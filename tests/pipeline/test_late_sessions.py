@@ -14,7 +14,7 @@ from evermap.config import Config, parse_config, to_toml
 from evermap.errors import DataError, InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
-from evermap.maps.store.recorded import pack_recording, unpack_recording
+from evermap.maps.store.measured import pack_recording, unpack_recording
 from evermap.runs.sessions import at_time
 from evermap.types import Recording
 from evermap_studies.sim import BuildingConfig, simulate_building

@@ -14,7 +14,6 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
-    from evermap.types import FloatArray
     from evermap.viz.living_map_figures import MapView
 
 app = typer.Typer(
@@ -89,7 +88,7 @@ def show(
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         living = store.load(number)
-    content = landmark_dicts(living, _p_ahead(living, ahead_s))
+    content = landmark_dicts(living, living.p_exists(living.stamp_s + ahead_s))
     if figure is not None:
         from evermap.viz.living_map_figures import plot_living_map
 
@@ -223,8 +222,7 @@ def why(
     Example:
       evermap map why site.evermap 17 --figure why.png
     """
-    from evermap.cli.map_content import answer_dict
-    from evermap.cli.map_why import draw_why, print_why
+    from evermap.cli.map_content import answer_dict, draw_why, print_why
     from evermap.maps.store import open_store
     from evermap.maps.why import why as of_landmark
 
@@ -238,21 +236,6 @@ def why(
         print_json({"map": file, **answer_dict(answer)})
         return
     print_why(answer)
-
-
-def _p_ahead(living: LivingMap, ahead_s: float) -> FloatArray:
-    """(L,) probability that each landmark stands at one of its sites a while after the map was last seen."""
-    import numpy as np
-
-    from evermap.config import LivingConfig
-    from evermap.maps.sessions.believe import predicted
-
-    if not (np.isfinite(living.stamp_s) and len(living.sites)):
-        return np.full(len(living.members), np.nan)
-    from dataclasses import replace
-
-    later = replace(living.sites, p_here=predicted(living, LivingConfig(), living.stamp_s + ahead_s))
-    return replace(living, sites=later).p_exists()
 
 
 def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:

@@ -89,10 +89,9 @@ def slam(
             show_default=False,
         ),
     ] = None,
-    priors: Annotated[
+    prior: Annotated[
         list[str] | None,
         typer.Option(
-            "--prior",
             metavar="[CLASS=]PRIOR|FILE.json",
             help="With --map: how long things stay, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
             "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
@@ -156,7 +155,7 @@ def slam(
     if shifts and prior_map is None:
         raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
-    if priors and (map_file is None or localize):
+    if prior and (map_file is None or localize):
         raise ConfigError("is for a session of a map", field="--prior", hint="--map FILE, without --localize")
     inputs = [recording_path, config_file, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
@@ -173,7 +172,7 @@ def slam(
             config,
             map_file,
             out,
-            priors=priors or [],
+            priors=prior or [],
             localize=localize,
             realtime=realtime,
             as_json=as_json,
@@ -181,8 +180,8 @@ def slam(
             inputs=inputs,
         )
         return
-    prior = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-    run_and_write(recording, config, out, prior=prior, realtime=realtime, as_json=as_json, force=force, inputs=inputs)
+    start = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
+    run_and_write(recording, config, out, prior=start, realtime=realtime, as_json=as_json, force=force, inputs=inputs)
 
 
 def run_and_write(

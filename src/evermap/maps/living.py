@@ -18,6 +18,7 @@ from typing import Self
 
 import numpy as np
 
+from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
@@ -244,13 +245,29 @@ class LivingMap:
             return landmark_id_of(name)
         return int(name) if name.isdecimal() and len(name) <= MOST_DIGITS else -1
 
-    def p_exists(self) -> FloatArray:
-        """(L,) probability that each landmark stands at one of its known places."""
+    def p_exists(self, at: float | None = None) -> FloatArray:
+        """Return the (L,) probability that each landmark stands at one of its known places.
+
+        Args:
+            at: stamp at which it is asked for, by what is learned of lifetimes; None for `stamp_s`.
+
+        Raises:
+            InputError: an earlier stamp than `stamp_s`; what was believed then is in an older revision.
+        """
+        if at is not None and not at >= self.stamp_s:
+            problem = f"{at:g} s is before the map's newest look, {self.stamp_s:g} s"
+            raise InputError(problem, field="at", hint="an older revision: store.load(number)")
+        p_here = self.sites.p_here
+        if at is not None and np.isfinite(self.stamp_s):
+            from evermap.config import LivingConfig
+            from evermap.maps.sessions.believe import predicted
+
+            p_here = predicted(self, LivingConfig(), at)
         cliques, row = np.unique(self.sites.clique_id, return_inverse=True)
-        total = np.bincount(row, self.sites.p_here, minlength=len(cliques))
-        at = np.minimum(np.searchsorted(cliques, self.members.clique_id), max(len(cliques) - 1, 0))
-        found = cliques[at] == self.members.clique_id if len(cliques) else np.zeros(len(self.members), np.bool_)
-        return np.where(found, total[at] if len(total) else 0.0, 0.0)
+        total = np.bincount(row, p_here, minlength=len(cliques))
+        mine = np.minimum(np.searchsorted(cliques, self.members.clique_id), max(len(cliques) - 1, 0))
+        found = cliques[mine] == self.members.clique_id if len(cliques) else np.zeros(len(self.members), np.bool_)
+        return np.where(found, total[mine] if len(total) else 0.0, 0.0)
 
     def site_of(self) -> IntArray:
         """(L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
@@ -290,15 +307,32 @@ class LivingMap:
             [known.get((int(s), int(n)), -1) for s, n in zip(site_id, landmark_id, strict=True)], dtype=np.int64
         )
 
-    def landmarks(self, *, p_least: float = 0.0) -> Landmarks:
-        """The map as plain records: every landmark at its most probable place, deleted ones left out.
+    def landmarks(
+        self,
+        *,
+        at: float | None = None,
+        within: tuple[float, float, float, float] | None = None,
+        p_least: float = 0.0,
+    ) -> Landmarks:
+        """Return the map as plain records: every landmark at its most probable place, deleted ones left out.
 
         Args:
+            at: stamp for which `p_exists` is asked, see there; None for `stamp_s`.
+            within: leave out what lies outside of this box `(x_min, y_min, x_max, y_max)`, in metres of the map.
             p_least: leave out what exists with a smaller probability.
+
+        Raises:
+            InputError: `at` is earlier than the map's newest look, or the box is not of four numbers in this order.
         """
         row = self.place_row(self.members.landmark_id, self.site_of())
-        p_exists = self.p_exists()
+        p_exists = self.p_exists(at)
         kept = np.flatnonzero((row >= 0) & ~self.members.deleted & (p_exists >= p_least))
+        if within is not None:
+            box = np.asarray(within, dtype=np.float64)
+            if box.shape != (4,) or not (box[:2] <= box[2:]).all():
+                raise InputError(f"{within!r} is no box", field="within", hint="(x_min, y_min, x_max, y_max) in metres")
+            position = self.places.position_m[row[kept]]
+            kept = kept[((position >= box[:2]) & (position <= box[2:])).all(axis=1)]
         row = row[kept]
         site = np.searchsorted(self.sites.site_id, self.places.site_id[row])
         return Landmarks(
@@ -379,3 +413,24 @@ class LivingMap:
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
             covariance_m2=self.covariance_m2[np.ix_(corner, corner)],
         )
+
+
+def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
+    """Ids of the cliques that have sites, and for every site the row of its own."""
+    cliques, row = np.unique(sites.clique_id, return_inverse=True)
+    return cliques, row.ravel().astype(np.int64)
+
+
+def class_of(living: LivingMap, cliques: IntArray) -> IntArray:
+    """(C,) class of every clique: that of its members."""
+    order = np.argsort(living.members.clique_id, kind="stable")
+    first = np.searchsorted(living.members.clique_id[order], cliques)
+    return np.asarray(living.members.class_id[order[first]])
+
+
+def site_middles(living: LivingMap) -> FloatArray:
+    """(S, 2) mean position of the places of every site."""
+    row = np.searchsorted(living.sites.site_id, living.places.site_id)
+    count = np.maximum(np.bincount(row, minlength=len(living.sites)), 1)
+    columns = [np.bincount(row, living.places.position_m[:, k], minlength=len(living.sites)) / count for k in (0, 1)]
+    return np.column_stack(columns)

@@ -129,7 +129,7 @@ def enter_session(
     from evermap.config import Config
     from evermap.maps.diff import net
     from evermap.maps.learning import with_priors
-    from evermap.maps.store.recorded import RECORDING, pack_recording
+    from evermap.maps.store.measured import RECORDING, pack_recording
     from evermap.pipeline import run_session
     from evermap.valid import check_type
 
@@ -268,7 +268,7 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
                 living = living.edited(landmark, **words[word])
         return living, ()
     from evermap.config import parse_config
-    from evermap.maps.store.recorded import unpack_recording
+    from evermap.maps.store.measured import unpack_recording
     from evermap.pipeline import run_session
 
     recording = unpack_recording(store.attached(step.recording))

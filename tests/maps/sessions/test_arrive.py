@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.arrive import LEAST_EXPECTED, STICKY, Arrivals, arrivals
-from evermap.maps.sessions.believe import Looks
+from evermap.maps.sessions.looks import LEAST_EXPECTED, STICKY, Arrivals, PlaceLooks, arrivals
 from evermap.sensing.sightlines import HEADINGS, SightLines, Views, nominal_lines
 from evermap.survival import Exponential
 from evermap.types import UNKNOWN, FloatArray, Sensor
@@ -58,7 +57,7 @@ def come(before: LivingMap, *, stamp_s: float = 21_000.0, seen_from_m: FloatArra
     one = np.ones(1, dtype=np.bool_)
     rows = SiteLooks(np.array([stamp_s]), np.array([clique]), np.array([site]), np.zeros(1, np.int64), one)
     sight = np.zeros(len(np.unique(after.sites.clique_id)), dtype=np.int64)
-    looks = Looks(rows, np.array([row]), cell, nominal_lines(np.ones(1)), one, one, sight, np.zeros(2))
+    looks = PlaceLooks(rows, np.array([row]), cell, nominal_lines(np.ones(1)), one, one, sight, np.zeros(2))
     told = arrivals(before, after, looks, SENSOR)
     assert told.site.tolist() == [site]
     return told

@@ -8,8 +8,7 @@ from scipy.optimize import least_squares
 
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.geometry import anchored
-from evermap.maps.sessions.own import own_landmarks
+from evermap.maps.sessions.gaussian import anchored, own_landmarks
 from evermap.maps.sessions.session import laid
 from evermap.pipeline import bring_in, solve_alone
 from evermap.slam.estimate import Solved

@@ -13,9 +13,8 @@ from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import Life, Lives
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.sessions import decide
-from evermap.maps.sessions.arrive import Arrivals
-from evermap.maps.sessions.believe import Looks
 from evermap.maps.sessions.extend import Extended
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.sensing.sightlines import nominal_lines
 from evermap.survival import Exponential, Mixture
 from evermap.survival.step import never_leaves
@@ -152,7 +151,7 @@ class Story:
                 p_here[np.searchsorted(after.sites.site_id, after.places.site_id[row])] = 0.98
         return replace(after, sites=replace(after.sites, p_here=p_here))
 
-    def _looks(self, after: LivingMap, looks: list[Look]) -> Looks:
+    def _looks(self, after: LivingMap, looks: list[Look]) -> PlaceLooks:
         """Looks are at the newest place of the landmark, unless they say at which."""
         rows = []
         for look in looks:
@@ -172,7 +171,7 @@ class Story:
         counts = np.array([look.counts for look in looks], dtype=np.bool_)
         lines = nominal_lines(np.ones(1))
         sight = np.zeros(len(cliques), dtype=np.int64)
-        return Looks(table, place[order], key, lines, (hit | counts)[order], hit[order], sight, np.zeros(2))
+        return PlaceLooks(table, place[order], key, lines, (hit | counts)[order], hit[order], sight, np.zeros(2))
 
 
 def told() -> Story:
@@ -429,7 +428,7 @@ def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
         stamp = np.sort(start_s + rng.uniform(0.0, 99.0, n))
         order = np.lexsort((stamp, row[site]))
         rows = rows_of(SiteLooks(stamp, row[site], site, np.zeros(n, np.int64), hit), order)
-        looks = Looks(
+        looks = PlaceLooks(
             rows, place[order], np.zeros(n, np.int64), nominal_lines(np.ones(1)), (hit | counts)[order], hit[order],
             rng.integers(0, 3, len(cliques)), np.zeros(2),
         )  # fmt: skip

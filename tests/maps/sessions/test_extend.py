@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evermap.config import LivingConfig
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.extend import Extended, Found, extended
-from evermap.maps.sessions.geometry import with_session
+from evermap.maps.sessions.gaussian import with_session
 from evermap.types import FloatArray
 
 from .scenes import assert_consistent, begun, found, next_map

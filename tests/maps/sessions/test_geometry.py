@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evermap.geometry import se2
-from evermap.maps.sessions.geometry import anchored, drifted, of_places, with_session
+from evermap.maps.sessions.gaussian import anchored, drifted, of_places, with_session
 from evermap.types import FloatArray, IntArray
 
 seeds = st.integers(0, 2**32 - 1)

@@ -9,9 +9,10 @@ import pytest
 
 from evermap.config import LivingConfig
 from evermap.existence.sites import SiteLooks
-from evermap.maps.living import LivingMap
-from evermap.maps.sessions.believe import Looks, Sighting, believed, clique_rows, looked_at, said
+from evermap.maps.living import LivingMap, clique_rows
+from evermap.maps.sessions.believe import believed, said
 from evermap.maps.sessions.decide import LEAST_EVIDENCE
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, looked_at
 from evermap.sensing.sightlines import P_HIDDEN, SightLines
 from evermap.types import FloatArray, Sensor
 
@@ -36,7 +37,7 @@ def a_map(place_m: dict[int, tuple[float, float]], clear: tuple[int, ...], p_her
     return replace(living, sites=sites, sightlines=lines, stamp_s=100.0)
 
 
-def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> Looks:
+def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> PlaceLooks:
     """All from `EYE`, with some landmarks in every frame."""
     place = np.flatnonzero(np.isin(living.places.landmark_id, seen))
     frame = np.repeat(np.arange(frames), len(place))
@@ -44,7 +45,7 @@ def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> Look
     return looked_at(living, living.sites.p_here, sighting, SENSOR, learn_sight=True)
 
 
-def evidence(living: LivingMap, looks: Looks) -> dict[int, float]:
+def evidence(living: LivingMap, looks: PlaceLooks) -> dict[int, float]:
     """By landmark: what looks say for 'it stands there'."""
     after = believed(living, living.sites.p_here, looks, SENSOR, ALONE, 1000.0, 1020.0)
     cliques, _ = clique_rows(living.sites)
@@ -52,7 +53,7 @@ def evidence(living: LivingMap, looks: Looks) -> dict[int, float]:
     return dict(zip(living.members.landmark_id.tolist(), said(living, after)[row].tolist(), strict=True))
 
 
-def rows_of_landmark(living: LivingMap, looks: Looks, landmark: int) -> np.ndarray:
+def rows_of_landmark(living: LivingMap, looks: PlaceLooks, landmark: int) -> np.ndarray:
     return living.places.landmark_id[looks.place] == landmark
 
 
@@ -90,7 +91,7 @@ def test_a_witness_makes_a_miss_say_more() -> None:
     assert looks_of(living, (3,)).sight[0] == 0
 
 
-def p_hidden_of(living: LivingMap, looks: Looks) -> FloatArray:
+def p_hidden_of(living: LivingMap, looks: PlaceLooks) -> FloatArray:
     """By line, as the chain takes it."""
     return 1.0 - looks.lines.p_free
 

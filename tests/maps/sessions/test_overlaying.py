@@ -14,7 +14,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.overlay import ELSEWHERE
-from evermap.maps.sessions.overlaying import BENT_CLIQUES, BENT_M, Laid, unbent, with_glimpsed
+from evermap.maps.sessions.placing import BENT_CLIQUES, BENT_M, Laid, unbent, with_glimpsed
 from evermap.types import FloatArray, IntArray
 
 from .scenes import begun, found

@@ -10,8 +10,8 @@ import pytest
 from evermap.config import Config
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.own import own_landmarks
-from evermap.maps.sessions.refit import refitted
+from evermap.maps.sessions.gaussian import own_landmarks
+from evermap.maps.sessions.placing import refitted
 from evermap.pipeline import solve_alone
 from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from evermap.geometry import se2
-from evermap.maps.sessions.size import WALK, log_ratio, settled
+from evermap.maps.sessions.gaussian import WALK, log_ratio, settled
 from evermap.types import FloatArray
 
 

@@ -9,10 +9,9 @@ import numpy as np
 
 from evermap.maps.diff import SAME_SPOT_M, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, LivingMap, Stays
-from evermap.maps.sessions.arrive import Arrivals
-from evermap.maps.sessions.believe import Looks, class_of, clique_rows, site_middles
-from evermap.maps.sessions.geometry import of_places
+from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
+from evermap.maps.sessions.gaussian import of_places
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
 LEAST_EVIDENCE = 1.5
@@ -52,7 +51,7 @@ def standing(living: LivingMap) -> Standing:
 def decided(
     before: LivingMap,
     after: LivingMap,
-    looks: Looks,
+    looks: PlaceLooks,
     log_evidence: FloatArray,
     arrivals: Arrivals,
     start_s: float,
@@ -103,14 +102,14 @@ class _Session:
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
-        hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `Looks.sight`.
+        hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
         begun: clique, site, not there before, first and last sighting of new stays.
         found: changes.
     """
 
     before: LivingMap
     after: LivingMap
-    looks: Looks
+    looks: PlaceLooks
     arrivals: Arrivals
     start_s: float
     cliques: IntArray
@@ -136,7 +135,7 @@ class _Session:
         cls,
         before: LivingMap,
         after: LivingMap,
-        looks: Looks,
+        looks: PlaceLooks,
         log_evidence: FloatArray,
         arrivals: Arrivals,
         start_s: float,
@@ -430,13 +429,13 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     return motion_of(was, now) if len(i) else (now.mean(axis=0) - was.mean(axis=0), 0.0)
 
 
-def _first_miss(looks: Looks, site: int, last_s: float, start_s: float) -> float:
+def _first_miss(looks: PlaceLooks, site: int, last_s: float, start_s: float) -> float:
     """The first look of a session at which a clique was missed at its site after its last sighting there."""
     rows = (looks.rows.site == site) & ~looks.rows.hit & looks.counts & (looks.rows.stamp_s > last_s)
     return float(looks.rows.stamp_s[rows].min()) if rows.any() else max(start_s, float(np.nextafter(last_s, np.inf)))
 
 
-def _counted(looks: Looks, count: int) -> tuple[IntArray, IntArray]:
+def _counted(looks: PlaceLooks, count: int) -> tuple[IntArray, IntArray]:
     hit: BoolArray = looks.rows.hit
     hits = np.bincount(looks.rows.site[hit], minlength=count)
     return hits, np.bincount(looks.rows.site[~hit & looks.counts], minlength=count)

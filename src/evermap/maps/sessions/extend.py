@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.maps.grouping import Fate, group, regrouped
+from evermap.maps.bodies import Fate, group, regrouped, relabelled
 from evermap.maps.living import LivingMap, Members, Places, Sites
-from evermap.maps.relabel import relabelled
-from evermap.maps.sessions.geometry import blocks, of_places, with_session
+from evermap.maps.sessions.gaussian import blocks, of_places, with_session
 from evermap.types import BoolArray, FloatArray, IntArray
 
 

@@ -9,17 +9,23 @@ import numpy as np
 from evermap.config import LivingConfig
 from evermap.errors import DataError
 from evermap.geometry.rigid import rigid
+from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
-from evermap.maps.living import EXISTS, Evidence, LivingMap
-from evermap.maps.missed import without_missed
-from evermap.maps.sessions import arrive, believe, decide
-from evermap.maps.sessions.believe import Looks, Sighting
+from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
+from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.extend import Extended, Found, extended
-from evermap.maps.sessions.geometry import anchored, drifted, of_places, resized
-from evermap.maps.sessions.overlaying import Laid, all_at_home, laid_over, unbent, with_glimpsed
-from evermap.maps.sessions.own import of_unknown_size, own_landmarks
-from evermap.maps.sessions.refit import MOST_LOST, refitted
-from evermap.maps.sessions.size import log_ratio, settled
+from evermap.maps.sessions.gaussian import (
+    anchored,
+    drifted,
+    log_ratio,
+    of_places,
+    of_unknown_size,
+    own_landmarks,
+    resized,
+    settled,
+)
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, arrivals, looked_at, sensor_poses
+from evermap.maps.sessions.placing import MOST_LOST, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
@@ -64,7 +70,7 @@ class Believed:
     Attributes:
         living: all but stays and what is learned.
         log_evidence: (C,) what the session's looks say for 'it stands at one of its sites' against 'it is away', as a
-            log likelihood ratio, by clique, in the order of `believe.clique_rows`.
+            log likelihood ratio, by clique, in the order of `living.clique_rows`.
         evidence: of every clique and frame.
     """
 
@@ -262,7 +268,7 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: So
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
-def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[Looks, FloatArray]:
+def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:
     """Which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor poses."""
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = of_slam.trajectory(prepared, outcome, recording, "")
@@ -277,8 +283,8 @@ def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[Looks, 
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-    seen = believe.looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
-    return seen, believe.sensor_poses(sighting, recording.sensor)
+    seen = looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
+    return seen, sensor_poses(sighting, recording.sensor)
 
 
 def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
@@ -294,7 +300,7 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
     place_of[row[near]] = place[near]
 
 
-def believed(entry: Extended, seen: Looks, visit: Solved, config: LivingConfig) -> Believed:
+def believed(entry: Extended, seen: PlaceLooks, visit: Solved, config: LivingConfig) -> Believed:
     """The map with the beliefs and the counts of the session."""
     living, rows = entry.living, seen.rows
     hit, missed = rows.hit, seen.counts & ~rows.hit
@@ -329,7 +335,7 @@ def believed(entry: Extended, seen: Looks, visit: Solved, config: LivingConfig) 
     return Believed(living, log_evidence, evidence)
 
 
-def missed(living: LivingMap, seen: Looks, visit: Solved) -> Misses:
+def missed(living: LivingMap, seen: PlaceLooks, visit: Solved) -> Misses:
     """Return the looks that the map counts as misses of landmarks where they most probably stand after the session.
 
     These are looks in the field of view, without a detection, along lines of sight that are known to be clear.
@@ -345,7 +351,7 @@ def missed(living: LivingMap, seen: Looks, visit: Solved) -> Misses:
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: Looks, visit: Solved, config: LivingConfig, classes: ClassLives | None
+    before: LivingMap, now: Believed, seen: PlaceLooks, visit: Solved, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date and without what is forgotten, and what changed since the session before.
 
@@ -357,8 +363,8 @@ def decided(
         config: which parts of the engine are on.
         classes: how long things stay, as the session teaches; None for nothing.
     """
-    arrivals = arrive.arrivals(before, now.living, seen, visit.recording.sensor)
-    after, changes = decide.decided(before, now.living, seen, now.log_evidence, arrivals, visit.start_s, classes)
+    came = arrivals(before, now.living, seen, visit.recording.sensor)
+    after, changes = decide.decided(before, now.living, seen, now.log_evidence, came, visit.start_s, classes)
     changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)
@@ -368,7 +374,7 @@ def decided(
 
 
 def learned(
-    after: LivingMap, seen: Looks, entry: Extended, eye: FloatArray, config: LivingConfig
+    after: LivingMap, seen: PlaceLooks, entry: Extended, eye: FloatArray, config: LivingConfig
 ) -> tuple[LivingMap, ClassLives | None]:
     """The map with what the session taught of lifetimes, and of from where places are seen."""
     if config.learn_sight and config.existence:
@@ -443,7 +449,7 @@ def _inliers(visit: Solved) -> tuple[IntArray, IntArray]:
 def _as_seen(living: LivingMap, hit_site: IntArray, last_s: FloatArray) -> FloatArray:
     """Beliefs of a map that never doubts: a clique stands where it was seen last."""
     p_here = living.sites.p_here.copy()
-    _, clique = believe.clique_rows(living.sites)
+    _, clique = clique_rows(living.sites)
     seen = np.unique(hit_site)
     for row in np.unique(clique[seen]):
         mine = np.flatnonzero(clique == row)

@@ -22,7 +22,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import content
 from evermap.maps.store.content import DTYPES, NAME_BYTES, Chunk, DamagedError
 from evermap.maps.store.history import Record
-from evermap.maps.store.looks import looks_of, read_index
+from evermap.maps.store.measured import looks_of, read_index
 from evermap.maps.store.protocol import DamagedMapError, Provenance
 
 _PAGE = 4096

@@ -19,8 +19,7 @@ from evermap.maps.living import Evidence, LivingMap
 from evermap.maps.store import content, schema
 from evermap.maps.store.content import Chunk, DamagedError
 from evermap.maps.store.history import Record, about, lineage
-from evermap.maps.store.looks import evidence_to_chunks, looks_of, read_index
-from evermap.maps.store.migrations import migrate
+from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
@@ -29,6 +28,7 @@ from evermap.maps.store.protocol import (
     RevisionKind,
     StaleRevisionError,
 )
+from evermap.maps.store.schema import migrate
 from evermap.types import MapChange
 
 _AT_ONCE = 500

@@ -1,15 +1,83 @@
-"""Evidence of a session as chunks: one a clique, some ten bytes a look, and an index of them."""
+"""What sessions measured and saw, as bytes: recordings to bring in once more, and the evidence of every clique.
+
+Of a recording is kept what the estimate may see: odometry, frames, detections, sensor and objects, bit by bit, and no
+truth. Evidence is one chunk a clique, some ten bytes a look, and an index of them.
+"""
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import zipfile
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.maps.living import Evidence
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
+from evermap.types import Clock, Detections, Frames, Odometry, Recording, Sensor, landmark_id_of
+
+RECORDING = "recording"
+"""Name of the attachment."""
+_TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
+_PLAIN = ("name", "source", "class_names", "clock")
+
+
+def pack_recording(recording: Recording) -> bytes:
+    """The bytes of a recording; equal recordings have equal bytes."""
+    arrays: dict[str, Any] = {"objects": recording.objects}
+    values: dict[str, Any] = {name: getattr(recording, name) for name in _PLAIN}
+    values["landmark_texts"] = sorted(recording.landmark_names.values())
+    for table in _TABLES:
+        part = getattr(recording, table)
+        for item in fields(part):
+            value = getattr(part, item.name)
+            (arrays if isinstance(value, np.ndarray) else values)[f"{table}.{item.name}"] = value
+    arrays["values"] = np.frombuffer(json.dumps(values).encode(), np.uint8)
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)
+    return buffer.getvalue()
+
+
+def unpack_recording(data: bytes) -> Recording:
+    """What `pack_recording` wrote.
+
+    Raises:
+        DamagedError: anything else.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        values = json.loads(arrays.pop("values").tobytes())
+        tables: dict[str, Any] = {
+            table: kind(
+                **{item.name: _part(f"{table}.{item.name}", item.name, arrays, values) for item in fields(kind)}
+            )
+            for table, kind in _TABLES.items()
+        }
+        return Recording(
+            name=values["name"],
+            source=values["source"],
+            objects=arrays["objects"],
+            class_names=tuple(values["class_names"]),
+            clock=Clock(values["clock"]),
+            landmark_names={landmark_id_of(text): text for text in values["landmark_texts"]},
+            **tables,
+        )
+    except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
+        raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
+
+
+def _part(column: str, name: str, arrays: dict[str, Any], values: dict[str, Any]) -> Any:
+    if column in arrays:
+        return arrays[column]
+    value = values[column]
+    if name == "clock":
+        return Clock(value)
+    return tuple(value) if isinstance(value, list) else value
+
 
 _COLUMNS = {
     "stamp_s": "<f8",
@@ -22,7 +90,7 @@ _COLUMNS = {
 """Evidence explains what was decided and decides nothing: 7 digits of it are enough."""
 
 
-class Looks(NamedTuple):
+class CliqueLooks(NamedTuple):
     """Where the looks at one clique are.
 
     Attributes:
@@ -47,11 +115,11 @@ def evidence_to_chunks(evidence: Evidence) -> tuple[Chunk, list[Chunk]]:
     return text_chunk(json.dumps(listed)), parts
 
 
-def read_index(text: str) -> list[Looks]:
+def read_index(text: str) -> list[CliqueLooks]:
     """Read the index that `evidence_to_chunks` made; `DamagedError` if it is anything else."""
     try:
         listed = json.loads(text)
-        looks = [Looks(clique, float(first), float(last), name_of(name)) for clique, first, last, name in listed]
+        looks = [CliqueLooks(clique, float(first), float(last), name_of(name)) for clique, first, last, name in listed]
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DamagedError(f"the index of the evidence is not valid: {error}") from None
     if not all(type(item.clique_id) is int and abs(item.clique_id) < 2**63 for item in looks):

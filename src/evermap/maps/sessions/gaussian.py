@@ -1,0 +1,238 @@
+"""Joint Gaussians of a session and of a map: what a session says of its landmarks, the scale, and the places after it.
+
+The poses of a session are marginalised, so nothing of it remains but the places: the cost of a map is that of its size.
+
+Every session knows the length of a metre a little, by the priors of its range slope and wheel size. A graph whose scale
+is free shrinks: smaller worlds have smaller residuals. So the scale is held inside every graph and settled outside, where
+it is a one-dimensional Gaussian: with `e` the log of the map's metre over the true one and `g` that of the true metre
+over the session's, how much longer the map is than the session shows `g + e`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
+from evermap.maps.living import LivingMap
+from evermap.slam.streaming import Outcome
+from evermap.types import FloatArray, IntArray
+
+
+def with_session(
+    position_m: FloatArray,
+    covariance_m2: FloatArray,
+    seen: IntArray,
+    session_m: FloatArray,
+    session_covariance_m2: FloatArray,
+    drift_m: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Positions and joint covariance of the old places, then of the new ones.
+
+    What the session says of the places it saw moves those that it did not see, by their correlation.
+
+    Args:
+        position_m: (P, 2) as the map had them.
+        covariance_m2: (2 P, 2 P).
+        seen: (K,) rows of those that the session saw.
+        session_m: (K + N, 2) posterior of these, then of N new ones.
+        session_covariance_m2: (2 (K + N), 2 (K + N)) joint posterior.
+        drift_m: as in `drifted`, when the session was solved.
+
+    Returns:
+        (P + N, 2) and (2 (P + N), 2 (P + N)).
+    """
+    count, new = len(position_m), len(session_m) - len(seen)
+    s = se2.xy_rows(seen)
+    k = len(s)
+    u = np.setdiff1d(np.arange(2 * count), s)
+    before = drifted(covariance_m2[np.ix_(s, s)], drift_m)
+    gain = np.linalg.solve(before, covariance_m2[np.ix_(s, u)]).T if k else np.zeros((len(u), 0))
+    mean = np.zeros(2 * (count + new))
+    mean[s] = session_m[: len(seen)].ravel()
+    mean[u] = position_m.ravel()[u] + gain @ (session_m[: len(seen)] - position_m[seen]).ravel()
+    mean[2 * count :] = session_m[len(seen) :].ravel()
+    joint = np.zeros((len(mean), len(mean)))
+    place = np.concatenate([s, np.arange(2 * count, 2 * (count + new))])
+    joint[np.ix_(place, place)] = session_covariance_m2
+    joint[np.ix_(u, u)] = covariance_m2[np.ix_(u, u)] + gain @ (session_covariance_m2[:k, :k] - before) @ gain.T
+    across = gain @ session_covariance_m2[:k]
+    joint[np.ix_(u, place)] = across
+    joint[np.ix_(place, u)] = across.T
+    return mean.reshape(-1, 2), 0.5 * (joint + joint.T)
+
+
+def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
+    """The joint covariance of a new map in the frame that its places define: as a whole they neither move nor turn.
+
+    A session knows its landmarks in the frame of its first pose, whose heading is no better known than the robot saw.
+    Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
+    This is the S-transformation of geodesy (Baarda 1973) to inner constraints.
+    """
+    motion = se2.rigid_directions(position_m - position_m.mean(axis=0))
+    onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
+    return np.asarray(onto @ covariance_m2 @ onto.T)
+
+
+def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
+    """Joint covariance (2 K, 2 K) of places of which each may be off by `drift_m` since the map was made."""
+    return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
+
+
+def resized(living: LivingMap, factor: float, log_size_variance: float, log_size_information: float) -> LivingMap:
+    """The map longer by a factor, about its middle; how well its metre is known goes with it."""
+    position = living.places.position_m
+    middle = position.mean(axis=0)
+    return replace(
+        living,
+        places=replace(living.places, position_m=middle + factor * (position - middle)),
+        covariance_m2=factor**2 * living.covariance_m2,
+        log_size_variance=log_size_variance,
+        log_size_information=log_size_information,
+    )
+
+
+def blocks(covariance_m2: FloatArray) -> FloatArray:
+    """(P, 2, 2) covariance of every place by itself, of the joint one (2 P, 2 P)."""
+    count = len(covariance_m2) // 2
+    rows = np.arange(count)
+    return np.asarray(covariance_m2.reshape(count, 2, count, 2)[rows, :, rows, :])
+
+
+def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
+    """(2 K, 2 K) joint covariance of some places, in their order."""
+    at = se2.xy_rows(rows)
+    return np.asarray(covariance_m2[np.ix_(at, at)])
+
+
+SIGHTINGS = 1.5
+"""Inliers that a landmark needs to be believed: one sighting may carry a wrong identity."""
+SIGHTINGS_IN_PLACE = 0.5
+"""The same, of one that stands where the map has it: a wrong identity is hardly ever the right one there."""
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLandmarks:
+    """Landmarks of a session.
+
+    Attributes:
+        row: (K,) rows of the problem's landmarks: those that were seen often enough to be believed.
+        position_m: (K, 2) in the frame of the first pose.
+        covariance_m2: (2 K, 2 K), as if its size were known.
+    """
+
+    row: IntArray
+    position_m: FloatArray
+    covariance_m2: FloatArray
+
+
+def own_landmarks(outcome: Outcome, in_place: IntArray | None = None) -> OwnLandmarks:
+    """What a session says of its landmarks, in its own metres: those of the map where it was solved with one.
+
+    Args:
+        outcome: of the session.
+        in_place: rows of landmarks that were laid at places of the map.
+    """
+    estimate = outcome.graph_estimate
+    landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
+    least = np.full(len(estimate.known), SIGHTINGS)
+    least[[] if in_place is None else in_place] = SIGHTINGS_IN_PLACE
+    row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
+    at = se2.xy_rows(row)
+    position = estimate.landmark[row] * outcome.scale
+    return OwnLandmarks(row, position, outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2)
+
+
+def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
+    """(2 K, 2 K) covariance with a size that is known to `log_sigma`: a longer world moves all away from the origin."""
+    longer = own.position_m.ravel() * log_sigma
+    return np.asarray(own.covariance_m2 + np.outer(longer, longer))
+
+
+ITERATIONS = 5
+WALK = 0.002
+"""Standard deviation by which the log of a map's metre wanders in a session, as its landmarks are replaced."""
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """What a session and a map say of the size of the world, together.
+
+    Attributes:
+        map_factor: by which the map should be longer.
+        session_factor: metres of that map for one of the session's own.
+        variance: of the log of the map's metre, after the session.
+        information: sum of the inverse variances of all sessions that the map's metre is the mean of.
+    """
+
+    map_factor: float
+    session_factor: float
+    variance: float
+    information: float
+
+
+def settled(
+    log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float
+) -> Size:
+    """Both sizes after they were compared.
+
+    The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
+    every session, so errors are taken as fully correlated: more sessions do not make the metre surer.
+
+    Args:
+        log_ratio: of the map's size over that of the session, as its landmarks show it.
+        ratio_variance: of it.
+        session: log of the true metre over the session's, by its own priors, and the standard deviation of that.
+        map_variance: of the log of the map's metre over the true one.
+        information: of the map so far, see `Size`.
+    """
+    own, sigma = session
+    before = 1.0 / (1.0 / information + WALK**2)
+    after = 1.0 / (sigma**2 + ratio_variance)
+    gain = after / (before + after)
+    innovation = log_ratio - own
+    return Size(
+        map_factor=float(np.exp(-gain * innovation)),
+        session_factor=float(np.exp(own + innovation * sigma**2 / (1.0 / before + sigma**2 + ratio_variance))),
+        variance=((1.0 - gain) * np.sqrt(map_variance) + gain * sigma) ** 2 + gain**2 * min(ratio_variance, 1.0),
+        information=before + after,
+    )
+
+
+def log_ratio(
+    session_m: FloatArray, session_m2: FloatArray, map_m: FloatArray, map_m2: FloatArray
+) -> tuple[float, float]:
+    """Log of the map's size over the session's, and its variance: a similarity by generalised least squares.
+
+    Where residuals are larger than the covariances allow, as in a session that is bent, the variance grows with them.
+
+    Args:
+        session_m: (K, 2) landmarks in the session's frame and metres.
+        session_m2: (2 K, 2 K) their covariance, the scale held.
+        map_m: (K, 2) the same in the map.
+        map_m2: (2 K, 2 K) covariance of these.
+    """
+    if len(session_m) < 2:  # a point has no size
+        return 0.0, np.inf
+    size = float(
+        np.sqrt(((map_m - map_m.mean(0)) ** 2).sum() / max(((session_m - session_m.mean(0)) ** 2).sum(), 1e-12))
+    )
+    motion, log_size, variance = np.zeros(3), np.log(size), np.inf
+    motion = rigid(size * session_m, map_m)
+    for _ in range(ITERATIONS):
+        factor = np.exp(log_size)
+        turned = se2.transform(np.array([0.0, 0.0, motion[2]]), session_m) * factor
+        turn = factor * np.kron(np.eye(len(session_m)), se2.rotation(motion[2]))
+        columns = np.column_stack([se2.rigid_directions(turned), turned.ravel()])
+        rest = (map_m - turned - motion[:2]).ravel()
+        weighed = np.linalg.solve(turn @ session_m2 @ turn.T + map_m2, np.column_stack([columns, rest]))
+        information = columns.T @ weighed[:, :4]
+        step = np.linalg.solve(information, columns.T @ weighed[:, 4])
+        motion, log_size = motion + step[:3], log_size + step[3]
+        squared = float(rest @ weighed[:, 4] - step @ information @ step)
+        variance = float(np.linalg.inv(information)[3, 3]) * max(1.0, squared / max(len(rest) - 4, 1))
+        if np.abs(step).max() < 1e-9:
+            break
+    return float(log_size), variance

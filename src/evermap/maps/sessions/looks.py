@@ -1,0 +1,358 @@
+"""What a session looked at, and what looks say of new landmarks.
+
+A hit is a look anywhere. A miss is a look only along a line of sight that is known to be clear.
+
+A landmark that the map did not know has appeared if its place was seen empty: an earlier session looked at it from
+where it is seen now, or past it at something behind. With `t` the time since that look and `S` the survival of its
+class in this place,
+
+    odds(appeared) = (1 - S(t)) / S(t) / P(all looks missed it | it was there)
+
+since the age of what one comes upon is distributed as a stay is, if hazards are constant (which of them is what is not
+known of a class). Without a look the map grew, and nothing has changed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.existence.sites import SiteLooks
+from evermap.geometry import se2
+from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
+from evermap.sensing.sightlines import BLOCKED_P, CLEAR, HEADINGS, Lines, SightLines, Views, nominal_lines, offsets
+from evermap.sensing.visibility import NominalField, looks_at
+from evermap.types import BoolArray, FloatArray, IntArray, Sensor
+
+SETTLED_S = 300.0
+"""What is seen within this time of a look was there at that look."""
+BESIDE_M, BESIDE_RAD = 1.0, 0.15
+"""What is seen this close to a place, or behind it at this angle, is seen along its line of sight."""
+ALONG_M = 0.3
+"""What is seen farther away, and at this distance from a line of sight, tells that this line is clear."""
+WITNESSES = 3
+"""Frames in which something else must be seen along the lines to a clique to know that they are clear."""
+SIDES, MOST_SIDES = 6, 3
+"""Sectors around a place that are sides of it, and how many of them count for being seen all around."""
+TOGETHER_M = 2.0
+"""Cliques that are missed from places this close to each other may be hidden by the same thing."""
+ROUNDS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What a session saw of the places of a map.
+
+    Attributes:
+        stamp_s: (F,) of the frames.
+        pose_map_robot: (F, 3).
+        frame, place: (H,) detections: in which frame, and of which row of the map's places.
+    """
+
+    stamp_s: FloatArray
+    pose_map_robot: FloatArray
+    frame: IntArray
+    place: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceLooks:
+    """Places in the nominal field of view: rows by clique, then by time.
+
+    Attributes:
+        rows: as the chain wants them; `rows.key` are rows of `lines`.
+        place: (N,) row of the map's places.
+        cell: (N,) cell of the sensor, see `SightLines.cells`.
+        lines: (K,) what is known of the different lines of sight.
+        counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
+        settled: (N,) whether the place was seen shortly before or after.
+        sight: (C,) what is known of the lines to each clique, as a row of `sightlines.P_HIDDEN`.
+        unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
+    """
+
+    rows: SiteLooks
+    place: IntArray
+    cell: IntArray
+    lines: Lines
+    counts: BoolArray
+    settled: BoolArray
+    sight: IntArray
+    unwitnessed: FloatArray
+
+
+def looked_at(
+    living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, *, learn_sight: bool
+) -> PlaceLooks:
+    """Which places of a map were looked at, frame by frame, and which of them were seen.
+
+    Args:
+        living: the map, with the sites that the session found.
+        p_start: (S,) beliefs in these when it began.
+        sighting: what the session saw of it.
+        sensor: its nominal field of view.
+        learn_sight: False takes that for the truth, whatever is in the way.
+    """
+    places = living.places
+    used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
+    listed = looks_at(sensor, sighting.pose_map_robot, places.position_m, (sighting.frame, sighting.place))
+    listed = listed.rows(used[listed.landmark])
+    site = np.searchsorted(living.sites.site_id, places.site_id[listed.landmark])
+    order = np.lexsort((listed.landmark, site, listed.pose, clique_rows(living.sites)[1][site]))
+    (frame, place, nominal, hit), site = listed.rows(order), site[order]
+    clique = clique_rows(living.sites)[1][site]
+    eye = sensor_poses(sighting, sensor)
+    cell = living.sightlines.cells(eye[frame, :2], places.position_m[place])
+    line, key = np.unique(np.column_stack([place, cell]), axis=0, return_inverse=True)
+    key = key.ravel().astype(np.int64)
+    p_nominal = np.bincount(key, np.maximum(nominal, 1e-3), minlength=len(line)) / np.maximum(
+        np.bincount(key, minlength=len(line)), 1
+    )
+    rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, hit)
+    settled = surely_there(rows)
+    if not learn_sight:
+        everything = np.ones(len(rows), dtype=np.bool_)
+        sight = np.zeros(len(np.unique(living.sites.clique_id)), dtype=np.int64)
+        return PlaceLooks(rows, place, cell, nominal_lines(p_nominal), everything, settled, sight, np.zeros(2))
+    names = places.site_id, places.landmark_id
+    now = living.sightlines.learned(
+        names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum()))
+    )
+    lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
+    _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
+    clear = ((p_clear >= CLEAR) & seen)[key]
+    beside, behind = _beside(rows, frame, places.position_m[place], eye[frame])
+    unknown = behind & ~clear & (p_clear > BLOCKED_P)[key]
+    was_unknown = behind & ~((p_before >= CLEAR) & seen_before)[key] & (p_before > BLOCKED_P)[key]
+    tried, found = (np.bincount(rows.clique[was_unknown & some], minlength=len(np.unique(living.sites.clique_id)))
+                    for some in (np.ones(len(rows), dtype=np.bool_), rows.hit))  # fmt: skip
+    there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= WITNESSES)
+    unwitnessed = np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
+    counts, sight, p_hidden = _hidden(
+        living, p_start, rows, clear, beside & clear, unknown, eye[frame], eye[frame, :2] - places.position_m[place]
+    )
+    lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
+        np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
+    return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
+
+
+def _beside(rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray) -> tuple[BoolArray, BoolArray]:
+    """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
+    beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
+    hit = np.flatnonzero(rows.hit)
+    order = hit[np.argsort(frame[hit], kind="stable")]
+    mine = np.arange(len(rows))
+    low, high = (np.searchsorted(frame[order], frame[mine], side=side) for side in ("left", "right"))
+    one = np.repeat(mine, high - low)
+    other = order[np.repeat(low - np.append(0, np.cumsum(high - low)[:-1]), high - low) + np.arange(len(one))]
+    away, there = place_m[one] - eye[one, :2], place_m[other] - eye[other, :2]
+    range_m, beyond_m = np.hypot(*away.T), np.hypot(*there.T)
+    angle = np.abs(se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(there[:, 1], there[:, 0])))
+    near = np.hypot(*(place_m[one] - place_m[other]).T) < BESIDE_M
+    behind = (angle < BESIDE_RAD) & (beyond_m > range_m - 0.5 * BESIDE_M)
+    others = rows.clique[one] != rows.clique[other]
+    beside[one[(near | behind) & others]] = True
+    close = (angle * range_m < ALONG_M) & (angle < np.pi / 4.0) & (beyond_m > range_m + ALONG_M)
+    along[one[close & others]] = True
+    return beside, along
+
+
+def _hidden(
+    living: LivingMap,
+    p_start: FloatArray,
+    rows: SiteLooks,
+    clear: BoolArray,
+    beside: BoolArray,
+    unknown: BoolArray,
+    eye: FloatArray,
+    away: FloatArray,
+) -> tuple[BoolArray, IntArray, FloatArray]:
+    """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
+
+    A miss with a witness counts for what it is: something else was seen along the line. Without one the line may be
+    closed in this session, the more probably the more cliques are missed from there together: one door hides them all,
+    while they would leave one by one.
+    """
+    cliques, row = clique_rows(living.sites)
+    n = len(cliques)
+    hits, n_clear, n_beside, n_unknown = (
+        np.bincount(rows.clique[some], minlength=n) for some in (rows.hit, clear, beside, unknown)
+    )
+    sight = np.select([n_beside >= WITNESSES, n_unknown >= WITNESSES], [1, 2], 0).astype(np.int64)
+    known = np.bincount(row, p_start, minlength=n) >= 0.5
+    p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
+    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= WITNESSES), hits > 0, p_gone)
+    counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
+    of_clique = p_hidden[sight] ** _sides(rows, counts & ~rows.hit, away, n)
+    alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
+    looks = clear & np.isin(rows.clique, alone)
+    middle = np.column_stack(
+        [np.bincount(rows.clique[looks], eye[looks, k], minlength=n) for k in (0, 1)]
+    ) / np.maximum(np.bincount(rows.clique[looks], minlength=n), 1)[:, None]  # fmt: skip
+    for clique in alone:
+        others = alone[(alone != clique) & known[alone]]
+        others = others[np.hypot(*(middle[others] - middle[clique]).T) < TOGETHER_M]
+        together = float(np.prod(p_gone[others]))
+        of_clique[clique] /= of_clique[clique] + (1.0 - of_clique[clique]) * together
+    return counts, sight, of_clique
+
+
+def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int) -> IntArray:
+    """(C,) from how many sides each clique was looked at, one at least: what hides it from one need not from others.
+
+    Args:
+        rows: (N,) looks.
+        missed: (N,) those that count, and missed.
+        away: (N, 2) from the places to the sensor.
+        n: number of cliques.
+    """
+    side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (SIDES / (2.0 * np.pi))).astype(np.int64)
+    count = np.bincount(rows.clique[missed] * SIDES + side[missed] % SIDES, minlength=n * SIDES).reshape(n, SIDES)
+    sides: IntArray = np.sum(count >= WITNESSES, axis=1)
+    return np.asarray(np.clip(sides, 1, MOST_SIDES))
+
+
+def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
+    """(3,) probability of being hidden, with what this session says: more is missed than should be gone."""
+    p_hidden = lines.p_hidden
+    for _ in range(ROUNDS):
+        missed = looked & ~seen
+        by_sight = p_hidden[sight]
+        share = by_sight * (1.0 - p_gone) / (by_sight * (1.0 - p_gone) + p_gone)
+        hidden, shown = (np.bincount(sight, w, minlength=3) for w in (missed * share, looked & seen))
+        known = np.array([1.0, 1.0, 0.0])  # lines that were unknown are counted where a clique is known to stand
+        p_hidden = lines.after_session(known * hidden, known * shown).p_hidden
+    return p_hidden
+
+
+def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
+    """(F, 3) poses of the sensor in the map."""
+    return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
+
+
+def surely_there(rows: SiteLooks) -> BoolArray:
+    """(N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
+
+    They teach lines of sight before anything is judged by these, so that a robot on a way that it never took does not
+    take what stands behind a wall for gone.
+    """
+    order = np.lexsort((rows.stamp_s, rows.site))
+    site, stamp = rows.site[order], np.where(rows.hit, rows.stamp_s, np.nan)[order]
+    near = np.zeros(len(rows), dtype=np.bool_)
+    for step, sign in ((order, 1.0), (order[::-1], -1.0)):
+        along, times = (site, stamp) if sign > 0 else (site[::-1], stamp[::-1])
+        last = np.maximum.accumulate(np.where(np.isfinite(times), np.arange(len(times)), -1))
+        seen = (last >= 0) & (along[last] == along)
+        gap = np.abs(rows.stamp_s[step] - times[last])
+        near[step[seen]] |= gap[seen] <= SETTLED_S
+    return near
+
+
+NEAR_M = 0.6
+"""Positions this close to one from which a place was seen have a clear line to it, too [m]."""
+LEAST_EXPECTED = 2.0
+"""Detections that earlier looks must have been expected to give to count as looks."""
+STICKY = 2.0
+"""Frames in a row that say as much as one that is independent of all others."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrivals:
+    """Where cliques were seen that had no site there before: (A,) rows.
+
+    Attributes:
+        site: (A,) row of the new site.
+        looked_s: (A,) last time before this session at which its place was looked at; -inf for never.
+        p_appeared: (A,) probability that it came after that; 0 without a look.
+    """
+
+    site: IntArray
+    looked_s: FloatArray
+    p_appeared: FloatArray
+
+
+def arrivals(before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor) -> Arrivals:
+    """What earlier sessions saw of the places of new sites.
+
+    Args:
+        before: the map as the session found it.
+        after: with the sites that it found.
+        looks: of the session, at places of `after`.
+        sensor: of the session.
+    """
+    new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
+    looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
+    if not len(before.views) or not len(new):
+        return Arrivals(new, looked, p_appeared)
+    at_eye = replace(sensor, mount_robot_sensor=(0.0, 0.0, 0.0))
+    cliques, row = clique_rows(after.sites)
+    kinds, middle = class_of(after, cliques), site_middles(after)
+    site_of_place = np.searchsorted(after.sites.site_id, after.places.site_id)
+    cells, p_hidden = after.sightlines.cell_m, float(before.sightlines.p_hidden[2])
+    rays = _Rays.of(before)
+    for k, site in enumerate(new.tolist()):
+        expected: dict[float, float] = {}
+        log_missed: dict[float, float] = {}
+        for place in np.flatnonzero(site_of_place == site).tolist():
+            mine = looks.rows.hit & (looks.place == place)
+            place_m = after.places.position_m[place]
+            seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
+            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye)
+            for stamp in np.unique(stamps):
+                then = stamps == stamp
+                expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
+                log_missed[stamp] = log_missed.get(stamp, 0.0) + float(frames[then] @ np.log1p(-rate[then])) / STICKY
+        enough = [stamp for stamp, number in expected.items() if number >= LEAST_EXPECTED]
+        if not enough:
+            continue
+        looked[k] = max(enough)
+        missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
+        stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
+        young = -float(np.expm1(stay.log_survival(after.stamp_s - looked[k])))
+        p_appeared[k] = young / (young + (1.0 - young) * missed)
+    return Arrivals(new, looked, p_appeared)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rays:
+    """Lines along which a place was seen: (K, 2) from, (K, 2) to."""
+
+    from_m: FloatArray
+    to_m: FloatArray
+
+    @classmethod
+    def of(cls, living: LivingMap) -> _Rays:
+        lines = living.sightlines
+        row = living.place_row(lines.landmark_id, lines.site_id)
+        used = (row >= 0) & (lines.hits >= 0.5)
+        to_m = living.places.position_m[row[used]]
+        return cls(to_m + offsets(lines.cell[used], lines.cell_m), to_m)
+
+    def pass_by(self, eye_m: FloatArray, place_m: FloatArray) -> BoolArray:
+        """(V,) whether something behind a place (2,) was seen from eyes (V, 2), past the place."""
+        away = place_m - self.from_m
+        ahead = self.to_m - self.from_m
+        length = np.maximum(np.hypot(*ahead.T), 1e-9)
+        along = (away * ahead).sum(axis=1) / length
+        across = np.abs(away[:, 0] * ahead[:, 1] - away[:, 1] * ahead[:, 0]) / length
+        past = self.from_m[(across < ALONG_M) & (along > 0.0) & (length > along + ALONG_M)]
+        gap = np.linalg.norm(eye_m[:, None] - past[None], axis=2).min(axis=1, initial=np.inf)
+        return np.asarray(gap <= NEAR_M)
+
+
+def _empty_looks(
+    views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
+    pose = views.pose
+    near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf) <= NEAR_M
+    near |= rays.pass_by(pose[:, :2], place_m)
+    pose = pose[near]
+    half, field = np.pi / HEADINGS, NominalField(sensor)
+    rate = np.min(
+        [field.p_detect(pose + np.array([0, 0, turn]), place_m[None])[:, 0] for turn in (-half, half)],
+        axis=0,
+        initial=1.0,
+    )
+    good = field.worth_a_look(rate)
+    return views.frames[near][good], rate[good], views.stamp_s[near][good]
