@@ -1,11 +1,11 @@
 """How long things stay, learned from the history of this very map, after every session (MATH.md sections 5 and 6).
 
 Classes learn from each other (`survival.class_lifetimes`), places lean on their class, and what a user says of a class
-counts as a number of stays. `History` is what a map knows of the comings and goings of its cliques. What happened between
-two looks is not seen. The likelihood of lifetimes takes care of arrivals. Departures can be missed, too: a clique that
-leaves a site and is back at it by the next look has one long stay instead of two, like a door that was opened and closed
-again. With a rate `l` of leaving, and `n` of coming back to this very site, a clique that is there is there again at the
-next look, after `dt`, with probability
+counts as a number of stays. `History` is what a map knows of the comings and goings of its cliques. What happened
+between two looks is not seen. The likelihood of lifetimes takes care of arrivals. Departures can be missed, too: a
+clique that leaves a site and is back at it by the next look has one long stay instead of two, like a door that was
+opened and closed again. With a rate `l` of leaving, and `n` of coming back to this very site, a clique that is there is
+there again at the next look, after `dt`, with probability
 
     P(dt) = (n + l exp(-(l + n) dt)) / (l + n)          instead of exp(-l dt)
 

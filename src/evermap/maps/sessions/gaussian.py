@@ -3,9 +3,9 @@
 The poses of a session are marginalised, so nothing of it remains but the places: the cost of a map is that of its size.
 
 Every session knows the length of a metre a little, by the priors of its range slope and wheel size. A graph whose scale
-is free shrinks: smaller worlds have smaller residuals. So the scale is held inside every graph and settled outside, where
-it is a one-dimensional Gaussian: with `e` the log of the map's metre over the true one and `g` that of the true metre
-over the session's, how much longer the map is than the session shows `g + e`.
+is free shrinks: smaller worlds have smaller residuals. So the scale is held inside every graph and settled outside,
+where it is a one-dimensional Gaussian: with `e` the log of the map's metre over the true one and `g` that of the true
+metre over the session's, how much longer the map is than the session shows `g + e`.
 """
 
 from __future__ import annotations

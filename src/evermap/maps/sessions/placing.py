@@ -1,4 +1,4 @@
-"""Where a session lies in the map: which places its landmarks stand at, and the session solved again with these as prior."""
+"""Where a session lies in the map: its landmarks at places of the map, and solved again with these as a prior."""
 
 from __future__ import annotations
 
