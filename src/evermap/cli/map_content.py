@@ -220,7 +220,7 @@ def _or_nan(value: float | None) -> float:
 def print_why(answer: Answer) -> None:
     """The answer, what it rests on, and what every session saw."""
     from evermap.cli.map_content import change_line
-    from evermap.maps.why import probability_text, stamp_text
+    from evermap.maps.why import probability_text
 
     echo(answer.headline)
     for reason in answer.reasons:
