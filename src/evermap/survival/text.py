@@ -226,7 +226,7 @@ FORMS: Mapping[str, Form] = {
     ),
     "gamma": Form(
         "gamma:scale=2d,shape=2",
-        "two exponential stages of 2 days each, in sequence",
+        "two exponential stages of 2 days one after the other",
         lambda v: Gamma(v["scale"], v["shape"]),
         needed={"scale": parse_duration_s, "shape": parse_positive},
     ),
