@@ -18,7 +18,6 @@ USED_FOR_SEVERAL = {
     "Estimate",
     "Frames",
     "Learned",
-    "Looks",
     "Method",
     "Sight",
     "Stamps",
