@@ -31,7 +31,7 @@ RULES = {
     "sensing": "errors compiled types geometry",
     "existence": "errors compiled types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
-    "maps": "errors types config geometry stamps survival sensing existence slam",
+    "maps": "errors show types config geometry stamps survival sensing existence slam",
     "tracking": "errors compiled types config survival sensing existence",
     "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",

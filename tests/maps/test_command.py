@@ -124,6 +124,28 @@ def test_landmarks_at_a_time_and_within_a_box() -> None:
         living.landmarks(within=(1.0, 0.0, 0.0, 1.0))
 
 
+def test_maps_stores_differences_and_answers_show_themselves(site: Path) -> None:
+    import evermap as em
+
+    with em.open_store(site) as store:
+        living, found = store.load(), em.diff(store, 1)
+        answer = em.why(store, int(living.members.landmark_id[0]))
+        for shown in (store, living, living.sites, found, answer):
+            assert len(repr(shown)) < 1000
+            assert "\n" not in repr(shown)
+            assert shown._repr_html_().startswith("<table>")
+        assert "revisions=3" in repr(store)
+        assert f"landmarks={len(living.members)}" in repr(living)
+        assert len(living.to_pandas()) == len(living.landmarks())
+        assert living.sites.to_pandas()["p_here"].tolist() == living.sites.p_here.tolist()
+        assert len(found.to_pandas()) == len(found.changes)
+        log = store.to_pandas()
+        assert log["number"].tolist() == [1, 2, 3]
+        assert log["moved"].tolist() == [1, 1, 1]
+        assert living.plot(title="here").axes
+        assert store.plot().axes
+
+
 def test_diff_lists_changes_and_edits(site: Path) -> None:
     run("pin", site, int(MAPS[2].members.landmark_id[0]))
     content = said("diff", site, 1)

@@ -14,7 +14,6 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
-    from evermap.viz.living_map_figures import MapView
 
 app = typer.Typer(
     name="map",
@@ -90,9 +89,7 @@ def show(
         living = store.load(number)
     content = landmark_dicts(living, living.p_exists(living.stamp_s + ahead_s))
     if figure is not None:
-        from evermap.viz.living_map_figures import plot_living_map
-
-        write_picture(figure, plot_living_map(_picture(living), title=f"{Path(file).name}, revision {number}"))
+        write_picture(figure, living.plot(title=f"{Path(file).name}, revision {number}"))
     if as_json:
         about = {"map": file, "revision": number, "stamp_s": _finite(living.stamp_s), "clock": living.clock.value}
         print_json({**about, "ahead_s": ahead_s, "landmarks": content, "priors": prior_dicts(living)})
@@ -268,27 +265,6 @@ def _writer(out: Path) -> Any:
         return writers[out.suffix.lower()]
     raise ConfigError(
         f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson or .csv"
-    )
-
-
-def _picture(living: LivingMap) -> MapView:
-    """What the figure of a map shows."""
-    import numpy as np
-
-    from evermap.viz.living_map_figures import MapView
-
-    landmarks, places, views = living.landmarks(), living.places, living.views
-    row = living.place_row(living.members.landmark_id, living.site_of())
-    other = np.flatnonzero(np.isin(places.landmark_id, landmarks.landmark_id))
-    other = np.setdiff1d(other, row)
-    pinned = living.members.landmark_id[living.members.pinned]
-    return MapView(
-        landmarks,
-        np.isin(landmarks.landmark_id, pinned),
-        places.position_m[other],
-        np.searchsorted(landmarks.landmark_id, places.landmark_id[other]),
-        np.asarray(views.cell_m * (np.unique(views.cell, axis=0) + 0.5), dtype=np.float64),
-        views.cell_m,
     )
 
 

@@ -10,14 +10,17 @@ A landmark that the earlier map did not know, and that nobody saw appear, has no
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.store.protocol import MapStore
+from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
 SAME_PLACE_M = 0.3
@@ -55,7 +58,7 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class Difference(Shown):
     """How one revision of a map differs from another.
 
     Attributes:
@@ -70,6 +73,19 @@ class Difference:
     changes: tuple[MapChange, ...]
     grown: IntArray
     edits: tuple[tuple[int, str], ...]
+
+    def _facts(self) -> dict[str, Any]:
+        kinds = Counter(change.kind.value for change in self.changes)
+        return {"a": self.a, "b": self.b, **kinds, "grown": len(self.grown), "edits": len(self.edits)}
+
+    def to_pandas(self) -> Any:
+        """Return a data frame with a row a change, with the fields of `MapChange`.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        names = [item.name for item in fields(MapChange)]
+        return data_frame({name: [getattr(change, name) for change in self.changes] for name in names})
 
 
 def diff(store: MapStore, a: int, b: int | None = None) -> Difference:

@@ -14,7 +14,7 @@ All arrays are sorted by their id. Ids are never used twice, so that revisions o
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -22,7 +22,11 @@ from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views
+from evermap.show import Shown, ShownTable, draw
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
@@ -31,18 +35,18 @@ MOST_DIGITS = 18
 """Of ids of landmarks, which are 64 bits wide."""
 
 
-class _Rows:
+class _Rows(ShownTable):
     """Columns of equal length that are taken and joined together."""
 
     __slots__ = ()
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
         """Some of the rows, by number or by a mask."""
-        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))  # type: ignore[arg-type]
+        return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
 
     def joined(self, other: Self) -> Self:
         """These rows, then those of another."""
-        columns = [(getattr(self, item.name), getattr(other, item.name)) for item in fields(self)]  # type: ignore[arg-type]
+        columns = [(getattr(self, item.name), getattr(other, item.name)) for item in fields(self)]
         return type(self)(*(np.concatenate(both) for both in columns))
 
 
@@ -193,7 +197,7 @@ class Evidence(_Rows):
 
 
 @dataclass(frozen=True, slots=True)
-class LivingMap:
+class LivingMap(Shown):
     """All that is known of a place at one instant; what one session hands to the next.
 
     Attributes:
@@ -229,6 +233,36 @@ class LivingMap:
     clock: Clock = Clock.RECORDING
     n_cliques_ever: int = 0
     n_sites_ever: int = 0
+
+    def _facts(self) -> dict[str, Any]:
+        exists = (self.p_exists() >= EXISTS) & ~self.members.deleted
+        return {
+            "landmarks": len(self.members),
+            "existing": int(exists.sum()),
+            "bodies": len(np.unique(self.members.clique_id)),
+            "sites": len(self.sites),
+            "stays": len(self.stays),
+            "classes": self.class_names,
+            "seen_until_s": self.stamp_s,
+            "clock": str(self.clock),
+        }
+
+    def to_pandas(self) -> Any:
+        """Return a data frame with a row a landmark, as `landmarks` has them.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        return self.landmarks().to_pandas()
+
+    def plot(self, *, title: str = "") -> Figure:
+        """Draw the map, what is gone and from where the robot looked; returns a matplotlib figure.
+
+        Raises:
+            InputError: there is nothing to draw.
+        """
+        figure: Figure = draw("plot_map", self, title=title)
+        return figure
 
     @property
     def landmark_names(self) -> dict[int, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from evermap.errors import InputError, similar
 from evermap.maps.diff import edits
 from evermap.maps.living import EXISTS, Evidence, LivingMap, Stays
 from evermap.maps.store.protocol import MapStore, Revision, RevisionKind
+from evermap.show import Shown
 from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
 from evermap.types import Clock, MapChange
@@ -41,7 +43,7 @@ class Visit:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(Shown):
     """All that a map knows of why it believes what it believes of one landmark.
 
     Attributes:
@@ -76,6 +78,10 @@ class Answer:
     evidence: Evidence
     headline: str
     reasons: tuple[str, ...]
+
+    def _facts(self) -> dict[str, Any]:
+        reasons = {f"reason {k}": reason for k, reason in enumerate(self.reasons, start=1)}
+        return {"landmark": self.label, "p_exists": self.p_exists, "headline": self.headline, **reasons}
 
 
 def why(store: MapStore, landmark: int | str, revision: int | None = None) -> Answer:

@@ -136,8 +136,9 @@ def _draw_landmarks(axes: Axes, view: MapView, size: FloatArray) -> list[Any]:
         here = np.flatnonzero(mine & there)
         alpha: Any = _FAINTEST + (1.0 - _FAINTEST) * (landmarks.p_exists[here] - _EXISTS) / (1.0 - _EXISTS)
         x, y = landmarks.position_m[here].T
-        axes.scatter(x, y, s=36, marker=look.marker, color=look.colour, alpha=alpha, edgecolors=PAPER, linewidths=0.5,
-                     zorder=4, label=label)  # fmt: skip
+        if len(here):
+            axes.scatter(x, y, s=36, marker=look.marker, color=look.colour, alpha=alpha, edgecolors=PAPER,
+                         linewidths=0.5, zorder=4, label=label)  # fmt: skip
         handles.append(_mark(look.marker, label, color=look.colour))
     draw_gone(axes, rows_of(landmarks, ~there))
     colours = np.array([looks[name].colour for name in names])[there]

@@ -10,6 +10,7 @@ from evermap.metrics.summary import compare_with_truth
 from evermap.survival.base import LifetimePrior
 from evermap.types import UNKNOWN, Detections, Frames, Landmarks, Odometry, Recording, SlamResult, Trajectory
 from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
+from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import draw_map
 from evermap.viz.style import (
     ESTIMATE,
@@ -37,6 +38,22 @@ def plot_result(result: SlamResult, recording: Recording | None = None) -> Figur
     whole = recording or _nothing_but_frames(result)
     with house_style():
         return draw_map(whole, result, compare_with_truth(whole, result)).figure
+
+
+def plot_map(living: Any, *, title: str = "") -> Figure:
+    """Draw a `LivingMap`: landmarks, their other places, what is gone, and from where the robot looked."""
+    landmarks, places, views = living.landmarks(), living.places, living.views
+    here = living.place_row(living.members.landmark_id, living.site_of())
+    other = np.setdiff1d(np.flatnonzero(np.isin(places.landmark_id, landmarks.landmark_id)), here)
+    view = MapView(
+        landmarks,
+        np.isin(landmarks.landmark_id, living.members.landmark_id[living.members.pinned]),
+        places.position_m[other],
+        np.searchsorted(landmarks.landmark_id, places.landmark_id[other]),
+        np.asarray(views.cell_m * (np.unique(views.cell, axis=0) + 0.5), dtype=np.float64),
+        views.cell_m,
+    )
+    return plot_living_map(view, title=title)
 
 
 def plot_landmarks(landmarks: Landmarks) -> Figure:

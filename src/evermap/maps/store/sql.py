@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from sqlalchemy import Connection, Engine, bindparam, func, insert, inspect, select, update
@@ -29,7 +29,11 @@ from evermap.maps.store.protocol import (
     StaleRevisionError,
 )
 from evermap.maps.store.schema import migrate
-from evermap.types import MapChange
+from evermap.show import Shown, data_frame
+from evermap.types import ChangeKind, MapChange
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _AT_ONCE = 500
 """Names in one question to the database."""
@@ -37,7 +41,7 @@ _LONGEST = 900_000_000
 """Bytes of an attachment; a database takes no more in one piece."""
 
 
-class SqlStore:
+class SqlStore(Shown):
     """`MapStore` over an engine of SQLAlchemy, see there. Made by `opened`."""
 
     def __init__(
@@ -92,6 +96,32 @@ class SqlStore:
     def where(self) -> str:
         """Path or address."""
         return self._where
+
+    def _facts(self) -> dict[str, Any]:
+        try:
+            log = self.log()
+        except InputError as error:  # a damaged file shows itself, too
+            return {"where": self._where, "damaged": error.problem}
+        newest = log[-1] if log else None
+        about = {"recording": newest.provenance.recording, "existing": newest.n_existing} if newest else {}
+        return {"where": self._where, "revisions": len(log), "head": newest.number if newest else 0, **about}
+
+    def to_pandas(self) -> Any:
+        """Return the history as a data frame, a row a revision.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        log = self.log()
+        names = ("number", "parent", "created_at", "n_landmarks", "n_existing", "n_grown")
+        columns: dict[str, Any] = {name: [getattr(item, name) for item in log] for name in names}
+        columns |= {name: [getattr(item.provenance, name) for item in log] for name in ("kind", "recording", "note")}
+        told = [{kind.value: count for kind, count in item.n_changes.items()} for item in log]
+        return data_frame({**columns, **{kind: [one.get(kind, 0) for one in told] for kind in map(str, ChangeKind)}})
+
+    def plot(self) -> Figure:
+        """Draw the newest map; returns a matplotlib figure."""
+        return self.load().plot(title=f"{self._where}, revision {self.head()}")
 
     def close(self) -> None:
         """Let go of all connections."""
