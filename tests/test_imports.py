@@ -32,10 +32,10 @@ RULES = {
     "existence": "errors compiled types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors show types config geometry stamps survival sensing existence slam",
-    "tracking": "errors compiled types config survival sensing existence",
+    "tracking": "errors compiled show types config survival sensing existence",
     "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",
-    "runs": "errors interrupts types config stamps survival valid io metrics existence maps tracking viz pipeline",
+    "runs": "errors interrupts show types config stamps survival valid io metrics existence maps tracking viz pipeline",
     "cli": "errors interrupts plugins types config stamps survival io existence slam maps viz pipeline runs",
 }
 

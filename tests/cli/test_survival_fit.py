@@ -13,7 +13,7 @@ from scipy import stats
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.runs.track.estimate import estimators
+from evermap.runs.track.lifetimes import estimators
 from evermap.survival import Weibull, parse_prior
 
 GOLDEN = Path(__file__).resolve().parents[3] / "shared" / "golden" / "npmle.json"

@@ -17,8 +17,7 @@ from evermap.errors import ConfigError
 if TYPE_CHECKING:
     from evermap.existence.choose import Choice
     from evermap.runs.persist.learning import LearnedModels
-    from evermap.runs.track.estimate import Estimate
-    from evermap.runs.track.lifetimes import Group, LifetimeTable
+    from evermap.runs.track.lifetimes import LifetimeEstimate, LifetimeGroup, LifetimeTable
     from evermap.survival import LifetimePrior
 
 PLOT = """\
@@ -156,8 +155,7 @@ def fit(
     values = {"survival.by": by, "survival.estimator": estimator, "survival.chunk_m": chunk_m}
     chosen = configured(config, settings, values, within="survival", show=show_config).survival
     from evermap.runs.folder import check_output_file
-    from evermap.runs.track.estimate import check_estimator, estimates
-    from evermap.runs.track.lifetimes import BY_CHUNK, groups_of, parse_by, read_lifetimes
+    from evermap.runs.track.lifetimes import BY_CHUNK, check_estimator, estimates, groups_of, parse_by, read_lifetimes
 
     check_estimator(chosen.estimator)
     words = parse_by(chosen.by)
@@ -169,7 +167,7 @@ def fit(
         raise ConfigError("a model file knows no places", field="out", hint="--by class, or the texts of --json")
     table = read_lifetimes(input)
     groups = groups_of(table, words, chosen.chunk_m)
-    found: list[Estimate] = []
+    found: list[LifetimeEstimate] = []
     with progress_bar(f"{input.name}: estimating", speed=False) as progress:
         for one in estimates(chosen.estimator, table, groups):
             found.append(one)
@@ -244,7 +242,7 @@ def learn(
     say(f"written to {out}; use it with: evermap persist INPUT --model {out}")
 
 
-def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
+def _keep(out: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[LifetimeEstimate]) -> None:
     """The priors as models of one stay."""
     import numpy as np
 
@@ -258,13 +256,13 @@ def _keep(out: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> 
     save_models(ModelOfEach(models, names, np.zeros(0, dtype=np.int64)), per, out)
 
 
-def _draw(path: Path, groups: Sequence[Group], estimates: Sequence[Estimate]) -> None:
+def _draw(path: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[LifetimeEstimate]) -> None:
     from evermap.viz.lifetime_figures import plot_survival
 
     write_picture(path, plot_survival({g.label: found.fitted for g, found in zip(groups, estimates, strict=True)}))
 
 
-def _remarks(table: LifetimeTable, groups: Sequence[Group]) -> list[str]:
+def _remarks(table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> list[str]:
     """What a reader of the result must know."""
     import numpy as np
 
@@ -272,7 +270,7 @@ def _remarks(table: LifetimeTable, groups: Sequence[Group]) -> list[str]:
     return [f"{label}: nothing was seen to leave, so the estimate says that nothing ever does" for label in endless]
 
 
-def _counts(table: LifetimeTable, group: Group) -> dict[str, Any]:
+def _counts(table: LifetimeTable, group: LifetimeGroup) -> dict[str, Any]:
     """How many lifetimes there are of each sort."""
     import numpy as np
 
@@ -288,7 +286,7 @@ def _counts(table: LifetimeTable, group: Group) -> dict[str, Any]:
     }
 
 
-def _content(table: LifetimeTable, group: Group, found: Estimate) -> dict[str, Any]:
+def _content(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> dict[str, Any]:
     """For `--json`."""
     who: dict[str, Any] = {}
     if group.class_id is not None:
@@ -305,7 +303,7 @@ def _content(table: LifetimeTable, group: Group, found: Estimate) -> dict[str, A
     }
 
 
-def _lines(table: LifetimeTable, group: Group, found: Estimate) -> list[tuple[str, str]]:
+def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) -> list[tuple[str, str]]:
     """What a person wants to know."""
     counts = _counts(table, group)
     ends = f"{counts['exact']:,} watched, {counts['intervals']:,} between two looks"

@@ -164,8 +164,7 @@ def _run(
     """Read, run, write; return the summary."""
     from evermap.runs.folder import check_replaceable
     from evermap.runs.summary import RunInfo
-    from evermap.runs.track.confusion import read_confusion
-    from evermap.runs.track.detections import read_detections
+    from evermap.runs.track.detections import read_confusion, read_detections
     from evermap.runs.track.run import run_track
     from evermap.runs.track.run import warm_up as compile_kernels
     from evermap.runs.track.write import write_track

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.existence.kernels import aged, observed
 from evermap.tracking.association import NEVER_SURE, NOBODY, Likelihood, Targets, assign, candidates
 from evermap.tracking.frame import Frame
 from evermap.tracking.kalman import kernel, update
@@ -103,12 +104,13 @@ def live(
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
     n_events, n_spells, n_gone = 0, 0, 0
     for i in range(n):
-        predicted = t.inverse_odds[i] + (1.0 + t.inverse_odds[i]) * death_odds
+        predicted = aged(t.inverse_odds[i], death_odds)
         if chosen[i] != NOBODY:
             j = pairs.column[chosen[i]]
             track_of_detection[j] = t.track_id[i]
-            gain = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0)) / max(p_detect[i], NEVER_SURE)
-            t.inverse_odds[i] = max(predicted * gain, LEAST)
+            gone = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0))
+            after, _ = observed(predicted, max(p_detect[i], NEVER_SURE), gone)
+            t.inverse_odds[i] = max(after, LEAST)
             update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
             recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
             t.n_hits[i] += 1
@@ -124,7 +126,8 @@ def live(
                 n_events += 1
             continue
         if view_known or t.state[i] == BIRTH:
-            t.inverse_odds[i] = min(predicted / max(1.0 - p_detect[i], 1e-12), MOST)
+            after, _ = observed(predicted, max(1.0 - p_detect[i], 1e-12), 1.0)
+            t.inverse_odds[i] = min(after, MOST)
         t.n_missed[i] += 1
         what = NOTHING
         if t.inverse_odds[i] > rules.odds_dead:

@@ -8,14 +8,43 @@ found moved or gone at `gone_s`. What that says of lifetimes is in `survival.cen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from evermap.errors import DataError
+from evermap.show import ShownTable
 from evermap.tracking.tracklets import EventKind, SpellTable, Tracklets, TrackState
 from evermap.tracking.working_set import Stored, WorkingSet
 from evermap.types import BoolArray, FloatArray, IntArray
+
+
+class InSpace(ShownTable):
+    """Mixin of tables of objects: positions and velocities are three columns each, states are words."""
+
+    __slots__ = ()
+
+    def _columns(self) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for name in self.__dataclass_fields__:
+            values: Any = getattr(self, name)
+            if not isinstance(values, np.ndarray) or values.ndim > 2:
+                continue  # covariances are for programs
+            if name == "state":
+                words = np.array([state.name.lower() for state in TrackState])
+                found[name] = words[values]
+            elif name == "class_p":
+                found["class_id"] = values.argmax(axis=1)
+            elif values.ndim == 2:
+                prefix, unit = {"position_m": ("", "m"), "velocity_mps": ("v", "mps")}[name]
+                found |= {f"{prefix}{axis}_{unit}": values[:, k] for k, axis in enumerate("xyz")}
+            else:
+                found[name] = values
+        return found
+
+    def _facts(self) -> dict[str, Any]:
+        rows: Any = self
+        return {"rows": len(rows), "objects": len(np.unique(rows.track_id))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +56,8 @@ class Event:
     track_id: int
 
 
-@dataclass(frozen=True, slots=True)
-class Followed:
+@dataclass(frozen=True, slots=True, repr=False)
+class Followed(InSpace):
     """The active tracklets at one instant, one row each, in no order. Copies.
 
     Attributes:
@@ -59,8 +88,8 @@ class Followed:
         return len(self.track_id)
 
 
-@dataclass(frozen=True, slots=True)
-class Tracks:
+@dataclass(frozen=True, slots=True, repr=False)
+class Tracks(InSpace):
     """Objects over time, one row an object and frame, sorted by track and time.
 
     Attributes:
@@ -138,8 +167,8 @@ def _given_up_after(ids: IntArray, frame: IntArray, n_missed: IntArray, n_frames
     return guess
 
 
-@dataclass(frozen=True, slots=True)
-class StaticSpells:
+@dataclass(frozen=True, slots=True, repr=False)
+class StaticSpells(InSpace):
     """Times at which objects stayed where they were, one row a spell, sorted by track and time.
 
     Attributes:

@@ -7,12 +7,13 @@ detection that then remains; and let those die that should have been seen and we
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
+from evermap.show import Shown, draw
 from evermap.survival import GeneralPurpose, LifetimePrior
 from evermap.tracking.frame import Frame, appearances, classes, covariances, positions
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
@@ -21,12 +22,15 @@ from evermap.tracking.views import View, ViewMemory
 from evermap.tracking.working_set import WorkingSet
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 ROOM = 64
 FROM_MINUTES_TO_YEARS = (1e-8, 1e-2)
 """Rates [1/s] of leaving a place, for objects of which nothing is known."""
 
 
-class Tracker:
+class Tracker(Shown):
     """Follows objects in space, and finds them again where they were left.
 
     Args:
@@ -154,6 +158,27 @@ class Tracker:
             n_missed=t.n_missed[:n].copy(),
             static=t.static[:n] == 1,
         )
+
+    def to_pandas(self) -> Any:
+        """Return a data frame with a row an active tracklet, after the last frame.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        return self.followed().to_pandas()
+
+    def plot(self) -> Figure:
+        """Draw what is followed, and what rests out of view, from above."""
+        resting = self.working_set.stored.position[self.working_set.rows]
+        figure: Figure = draw("plot_followed", self.followed(), resting)
+        return figure
+
+    def _facts(self) -> dict[str, Any]:
+        states = self._tracklets.state[: self._n]
+        counts = {state.name.lower(): int((states == state).sum()) for state in TrackState}
+        out_of_view = {"working_set": len(self.working_set), "objects_ever": self._next_id}
+        last = {} if np.isneginf(self._stamp_s) else {"stamp_s": round(self._stamp_s, 6)}
+        return last | {name: counts[name] for name in ("birth", "alive", "lost")} | out_of_view
 
     def static_spells(self) -> StaticSpells:
         """Return all static spells so far: those that have ended, and those that go on, whose end is open."""

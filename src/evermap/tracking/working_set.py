@@ -177,12 +177,15 @@ class WorkingSet:
 
     def inverse_odds(self, rows: IntArray, stamp_s: float) -> FloatArray:
         """Return (K,) inverse odds that objects are there still at `stamp_s`: less what lifetimes took."""
+        from evermap.existence.kernels import predict_rows
+
         s = self._stored
         prior = s.class_id[rows].astype(np.int64) if len(self._priors) > 1 else np.zeros(len(rows), dtype=np.int64)
         since = s.rest_since_s[rows]
         log_odds = log_death_odds(self._priors, prior, s.judged_s[rows] - since, stamp_s - since)
-        before = s.inverse_odds[rows]
-        return np.asarray(before + (1.0 + before) * np.exp(np.minimum(log_odds, 690.0)), dtype=np.float64)
+        predicted = np.empty(len(rows))
+        predict_rows(s.inverse_odds[rows], log_odds, predicted)
+        return predicted
 
     def missed(self, rows: IntArray, stamp_s: float, p_detect: FloatArray) -> FloatArray:
         """Return (K,) inverse odds after the places of these objects were looked at, and nothing was seen there."""

@@ -8,7 +8,17 @@ import numpy as np
 
 from evermap.metrics.summary import compare_with_truth
 from evermap.survival.base import LifetimePrior
-from evermap.types import UNKNOWN, Detections, Frames, Landmarks, Odometry, Recording, SlamResult, Trajectory
+from evermap.types import (
+    UNKNOWN,
+    Detections,
+    FloatArray,
+    Frames,
+    Landmarks,
+    Odometry,
+    Recording,
+    SlamResult,
+    Trajectory,
+)
 from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import draw_map
@@ -54,6 +64,30 @@ def plot_map(living: Any, *, title: str = "") -> Figure:
         views.cell_m,
     )
     return plot_living_map(view, title=title)
+
+
+def plot_followed(followed: Any, resting_m: FloatArray) -> Figure:
+    """Draw objects of a tracker from above, with where they go in a second; those out of view that rest as crosses.
+
+    Args:
+        followed: `Tracker.followed()`.
+        resting_m: (K, 3) places of the objects of its working set.
+    """
+    with house_style():
+        figure, axes = _plan()
+        if len(resting_m):
+            axes.plot(*resting_m[:, :2].T, "x", color=MUTED, ms=5, lw=0, label="at rest, out of view")
+        for static, marker, label in ((True, "s", "at rest"), (False, "o", "moving")):
+            rows = followed.static == static
+            if rows.any():
+                axes.plot(*followed.position_m[rows, :2].T, marker, color=LANDMARK, ms=5, lw=0, label=label)
+        moving = ~followed.static
+        start, way = followed.position_m[moving, :2], followed.velocity_mps[moving, :2]
+        for (x, y), (dx, dy) in zip(start, way, strict=True):
+            axes.plot([x, x + dx], [y, y + dy], color=ESTIMATE, lw=1.0)
+        if axes.get_legend_handles_labels()[1]:
+            axes.legend()
+        return figure
 
 
 def plot_landmarks(landmarks: Landmarks) -> Figure:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import EvermapError
-from evermap.runs.track.confusion import read_confusion
-from evermap.runs.track.detections import read_detections
+from evermap.runs.track.detections import read_confusion, read_detections
 from evermap.runs.track.run import run_track
 
 CLASSES = ("bus", "car")

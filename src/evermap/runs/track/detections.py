@@ -1,4 +1,4 @@
-"""The table of object detections that `evermap track` reads, put together into frames."""
+"""The tables that `evermap track` reads: detections, put together into frames, and how often classes are confused."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
-from evermap.io.text import counted
+from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 from evermap.valid import STAMP_S, X_M, Quantity
 
@@ -200,3 +200,41 @@ def said_of(table: DetectionTable) -> list[str]:
     """Remarks on what was read: its own, and what was left out."""
     weak = [f"{counted(table.n_weak, 'detection')} of low score left out"] if table.n_weak else []
     return [*table.warnings, *weak]
+
+
+def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:
+    """A table with a row a true class: its name in `class_id`, and a column for each class that it is detected as.
+
+    Args:
+        path: a `.csv`, `.csv.gz` or `.parquet` file.
+        class_names: the C classes of the detections.
+
+    Returns:
+        (C, C) `P(detected class | true class)`, a row a true class.
+
+    Raises:
+        InputError: a class is missing or there twice, or a row is no distribution; by line and column.
+    """
+    table = read_columns(path, [])
+    table.expect(("class_id", *class_names))
+    names, of_row = table.labels("class_id")
+    columns = [table.numbers(Quantity(name, 0.0, 1.0, hint="a probability")) for name in class_names]
+    p_detected = np.stack(columns, axis=1)
+    confusion = np.full((len(class_names), len(class_names)), np.nan)
+    for row, code in enumerate(of_row.tolist()):
+        name = names[code] if code != UNKNOWN else ""
+        if name not in class_names:
+            hint = f"one of {', '.join(class_names)}"
+            raise table.error(f"no detection is of class {quote(name)}", row=row, field="class_id", hint=hint)
+        true = class_names.index(name)
+        if not np.isnan(confusion[true, 0]):
+            raise table.error(f"class {quote(name)} appears twice", row=row, field="class_id", hint="one row a class")
+        total = float(p_detected[row].sum())
+        if abs(total - 1.0) > 1e-6:
+            raise table.error(f"the row sums to {total:g}", row=row, hint="probabilities that sum to 1")
+        confusion[true] = p_detected[row]
+    missing = np.flatnonzero(np.isnan(confusion[:, 0]))
+    if missing.size:
+        problem = f"has no row for class {quote(class_names[missing[0]])}"
+        raise InputError(problem, path=path, field="class_id", hint="one row a class")
+    return confusion

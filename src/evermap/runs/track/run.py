@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.config import TrackConfig
+from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, DataError
+from evermap.existence.lifetimes import Lifetimes
+from evermap.existence.storage import lifetimes_of
 from evermap.io.text import counted, quote
 from evermap.runs.track.detections import DetectionTable, said_of
+from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
@@ -20,12 +25,15 @@ from evermap.tracking.tracker import Tracker
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 _SLOW_STEP_S = 2.0
 """Frames that are farther apart than this say little about motion."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackResult:
+@dataclass(frozen=True, slots=True, repr=False)
+class TrackResult(Shown):
     """What came out of a run.
 
     Attributes:
@@ -54,6 +62,33 @@ class TrackResult:
     n_gaps: int
     seconds: float
     warnings: tuple[str, ...]
+
+    def to_pandas(self) -> Any:
+        """Return a data frame with a row an object and frame.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        frame = self.tracks.to_pandas()
+        frame["class_id"] = np.array(self.table.class_names, dtype=object)[frame["class_id"]]
+        return frame
+
+    def plot(self) -> Figure:
+        """Draw paths and places of rest from above, and when objects rested."""
+        from evermap.runs.track.write import draw_run
+
+        return draw_run(self)
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "source": self.table.source,
+            "frames": self.table.n_frames,
+            "detections": len(self.table),
+            "objects": len(self.first_rows()),
+            "classes": self.table.class_names,
+            "spells": len(self.spells),
+            "warnings": self.warnings,
+        }
 
     def first_rows(self) -> IntArray:
         """(T,) row of `tracks` at which each object begins."""
@@ -123,12 +158,28 @@ def run_track(
 
 
 def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePrior, ...]:
-    """Return the prior of every class; ConfigError for text that is no prior, or a class that no detection has."""
+    """Return how long objects of every class rest, from texts or files of models.
+
+    Raises:
+        ConfigError: text that is no prior, or a class that no detection has.
+        InputError: a file that cannot be read.
+    """
     _check_classes(config.class_priors, class_names, "class_priors")
     try:
-        return tuple(parse_prior(config.class_priors.get(name, config.prior)) for name in class_names)
+        common = {name: found.stay for name, found in lifetimes_of(config.prior).items()}
+        own = {name: _for_class(lifetimes_of(text), name) for name, text in config.class_priors.items()}
+        rest = common.get("") or parse_prior(DEFAULT_PRIOR)  # a file may name some of the classes only
+        return tuple(own.get(name) or common.get(name) or rest for name in class_names)
     except ConfigError as error:
         raise ConfigError(error.problem, field="prior", hint=error.hint) from error
+
+
+def _for_class(found: Mapping[str, Lifetimes], name: str) -> LifetimePrior:
+    """Return the lifetime of a class from a text or file of its own."""
+    if name not in found and "" not in found:
+        hint = f"one of {', '.join(found)}, without CLASS=: the file names its classes"
+        raise ConfigError(f"the file has no lifetime of class {quote(name)}", field="prior", hint=hint)
+    return found[name if name in found else ""].stay
 
 
 def _speeds(config: TrackConfig, class_names: Sequence[str]) -> tuple[float, ...]:
