@@ -34,6 +34,7 @@ def test_raster_has_a_row_a_feature_with_its_changes() -> None:
     np.testing.assert_allclose(line(axes, "vanished").get_xydata(), [[1.5, 0.0]])  # in hours
     np.testing.assert_allclose(line(axes, "returned").get_xydata(), [[2.5, 1.0]])
     assert axes.yaxis_inverted()
+    assert {"vanished", "returned", "not yet seen"} == {text.get_text() for text in figure.legends[0].get_texts()}
 
 
 def test_many_rows_are_labelled_sparsely() -> None:

@@ -8,8 +8,9 @@ import pytest
 
 from evermap.errors import MissingExtraError
 from evermap.geometry import se2
-from evermap.types import Landmarks, Trajectory
+from evermap.types import Clock, Landmarks, Trajectory
 from evermap.viz.rerun_scene import write_scene
+from evermap.viz.style import class_looks
 
 NANOSECONDS = 1e-9
 
@@ -108,3 +109,27 @@ def test_missing_rerun_is_said_in_one_line(run, tmp_path, monkeypatch):
     with pytest.raises(MissingExtraError, match=r"evermap\[rerun\]"):
         write_scene(*run, tmp_path / "scene.rrd")
     assert not (tmp_path / "scene.rrd").exists()
+
+
+def test_landmarks_have_the_colour_of_their_class_and_unix_stamps_are_dates(run, tmp_path):
+    reader = pytest.importorskip("rerun.chunk")
+    recording, result = run
+    count = len(result.landmarks)
+    classed = dataclasses.replace(
+        result.landmarks,
+        class_names=("post", "door"),
+        class_id=np.arange(count) % 2,
+        first_seen_s=np.full(count, 1.7e9),
+    )
+    path = write_scene(
+        dataclasses.replace(recording, clock=Clock.UNIX), dataclasses.replace(result, landmarks=classed),
+        tmp_path / "scene.rrd",
+    )  # fmt: skip
+    looks = class_looks(("post", "door"))
+    entity = f"/world/landmarks/{int(classed.landmark_id[1])}"
+    (chunk,) = [chunk for chunk in reader.RrdReader(str(path)).stream() if chunk.entity_path == entity]
+    batch = chunk.to_record_batch()
+    assert batch.column("Points3D:colors")[0].as_py() == [int(looks["door"].colour[1:] + "ff", 16)]
+    assert batch.column("Points3D:labels")[0].as_py() == [f"{int(classed.landmark_id[1])} (door)"]
+    assert "timestamp" in str(batch.schema.field("stamp_s").type)
+    assert batch.column("stamp_s").cast("int64")[0].as_py() * NANOSECONDS == pytest.approx(1.7e9)

@@ -126,10 +126,16 @@ def warnings_note(warnings: Sequence[str]) -> str:
     return f'<div class="note"><strong>Warnings</strong><ul>{items}</ul></div>'
 
 
+_REM_PER_INCH = 7.5
+"""One scale for the text of all figures."""
+
+
 def figure_html(named: NamedFigure) -> str:
     """Return a figure as a drawing that follows the theme of the page, with its title and caption."""
     label = escape(named.title, quote=True)
-    drawing = inline_svg(named.figure, named.name).replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
+    width_rem = _REM_PER_INCH * float(named.figure.get_size_inches()[0])
+    start = f'<svg role="img" aria-label="{label}" style="max-width:{width_rem:.0f}rem"'
+    drawing = inline_svg(named.figure, named.name).replace("<svg", start, 1)
     return (
         f'<figure id="{escape(named.name, quote=True)}">{drawing}'
         f"<figcaption><strong>{escape(named.title)}.</strong> {escape(named.caption)}</figcaption></figure>"

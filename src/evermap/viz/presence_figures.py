@@ -101,7 +101,10 @@ def _paint(figure: Figure, axes: Axes, edges: Any, belief: Any) -> None:
     mesh = axes.pcolormesh(edges, rows, shown, cmap=colours, vmin=0.0, vmax=1.0, rasterized=True, zorder=1)
     axes.grid(visible=False)
     axes.set_facecolor(SHADE)
-    axes.patch.set(hatch="/////", edgecolor=GRID, linewidth=0.0)
+    unknown: Any = {"hatch": "/////", "edgecolor": GRID, "linewidth": 0.0}
+    axes.patch.set(**unknown)
+    if np.isnan(belief).any():
+        axes.fill_between([], [], facecolor=SHADE, label="not yet seen", **unknown)
     bar = figure.colorbar(mesh, ax=axes, pad=0.015, fraction=0.03, aspect=12, ticks=[0.0, 0.5, 1.0])
     bar.set_label("P(exists) [1]")
     bar.outline.set_visible(False)

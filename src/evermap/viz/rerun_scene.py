@@ -13,14 +13,14 @@ from evermap.errors import MissingExtraError
 from evermap.geometry import se2
 from evermap.metrics.consistency import chi2_interval
 from evermap.metrics.summary import Evaluation, compare_with_truth
-from evermap.types import BoolArray, FloatArray, IntArray, Recording, SlamResult, Trajectory
-from evermap.viz.map_figure import moves
-from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY
+from evermap.types import BoolArray, Clock, FloatArray, IntArray, Recording, SlamResult, Trajectory
+from evermap.viz.map_figure import class_names_of, moves
+from evermap.viz.style import ALERT, ESTIMATE, INK, MUTED, ODOMETRY, class_looks
 from evermap.viz.track_figures import DYNAMIC, STATIC
 
 
 def require_rerun() -> None:
-    """Makes sure that rerun-sdk (extra `evermap[rerun]`) can be imported.
+    """Make sure that rerun-sdk (extra `evermap[rerun]`) can be imported.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -33,7 +33,7 @@ def require_rerun() -> None:
 
 
 def rgb(colour: str) -> tuple[int, int, int]:
-    """Red, green and blue in [0, 255] of a colour of `style`, `#rrggbb`."""
+    """Return red, green and blue in [0, 255] of a colour of `style`, `#rrggbb`."""
     red, green, blue = bytes.fromhex(colour[1:])
     return red, green, blue
 
@@ -49,10 +49,10 @@ Float32Array = NDArray[np.float32]
 def write_scene(
     recording: Recording, result: SlamResult, path: str | Path, *, evaluation: Evaluation | None = None
 ) -> Path:
-    """Writes `path` (.rrd): robot, path so far, landmarks as they appear, what changed, rays of detections, truth, NIS.
+    """Write `path` (.rrd): robot, path so far, landmarks as they appear, what changed, rays of detections, truth, NIS.
 
     Everything is in the frame of the truth where there is one, else in the map's. Time is the recording's own,
-    in seconds on the timeline `stamp_s`.
+    on the timeline `stamp_s`: dates, or seconds where its clock has an arbitrary start.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.
@@ -69,9 +69,9 @@ def write_scene(
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _send_truth(stream, recording, evaluation)
     _send_odometry(stream, result, evaluation)
-    _send_robot(stream, result.trajectory, pose_truth_map)
-    _send_landmarks(stream, result, pose_truth_map)
-    _send_changes(stream, result, pose_truth_map)
+    _send_robot(stream, result.trajectory, pose_truth_map, recording.clock)
+    _send_landmarks(stream, result, pose_truth_map, recording.clock)
+    _send_changes(stream, result, pose_truth_map, recording.clock)
     _send_rays(stream, recording, result, pose_truth_map)
     _send_numbers(stream, recording, result, evaluation)
     stream.flush()
@@ -115,10 +115,15 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
     )
 
 
-def _time(stamp_s: FloatArray) -> Any:
+def _kind(clock: Clock) -> str:
+    """What rerun takes stamps for: dates, or seconds since some start."""
+    return "duration" if clock is Clock.RECORDING else "timestamp"
+
+
+def _time(stamp_s: FloatArray, clock: Clock) -> Any:
     import rerun as rr
 
-    return rr.TimeColumn(TIMELINE, duration=stamp_s)
+    return rr.TimeColumn(TIMELINE, **{_kind(clock): stamp_s})
 
 
 def _thin(count: int, limit: int = _MAX_STEPS) -> IntArray:
@@ -160,7 +165,7 @@ def _send_odometry(stream: Any, result: SlamResult, evaluation: Evaluation) -> N
     stream.log("world/odometry_alone", strip, static=True)
 
 
-def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray) -> None:
+def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray, clock: Clock) -> None:
     """The robot's pose, and the path as one short piece a step that stays visible afterwards."""
     import rerun as rr
 
@@ -171,7 +176,7 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray)
     stamps, half = trajectory.stamp_s[rows], 0.5 * poses[:, 2]
     quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
     places = rr.Transform3D.columns(translation=_flat(poses[:, :2]), quaternion=quaternion)
-    stream.send_columns("world/robot", [_time(stamps)], places)
+    stream.send_columns("world/robot", [_time(stamps, clock)], places)
     body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=rgb(ESTIMATE), fill_mode="solid")
     heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=rgb(ESTIMATE), radii=0.02)
     stream.log("world/robot/body", body, static=True)
@@ -180,12 +185,12 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray)
         points = _flat(poses[:, :2], 0.01)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
         columns = rr.LineStrips3D.columns(strips=pieces)
-        stream.send_columns("world/path", [_time(stamps[1:])], columns)
+        stream.send_columns("world/path", [_time(stamps[1:], clock)], columns)
         stream.log("world/path", rr.LineStrips3D.from_fields(colors=rgb(ESTIMATE), radii=0.012), static=True)
 
 
-def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -> None:
-    """Final positions with 2-sigma ellipses, each from when it was first seen; large maps in groups by that time."""
+def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray, clock: Clock) -> None:
+    """Send final positions with 2-sigma ellipses by class, each from its first sighting on; large maps in groups."""
     import rerun as rr
 
     landmarks = result.landmarks
@@ -195,18 +200,32 @@ def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray)
     first_s = np.where(np.isfinite(landmarks.first_seen_s), landmarks.first_seen_s, start_s)
     points = _flat(se2.transform(pose_truth_map, landmarks.position_m))
     ellipses = _ellipses(points, landmarks.covariance_m2, float(pose_truth_map[2]))
+    looks, classes = class_looks(landmarks.class_names), class_names_of(landmarks)
+    colours = np.array([rgb(looks[name].colour) for name in classes], dtype=np.uint8)
+    called = np.array(
+        [
+            landmarks.names.get(name, str(name)) + (f" ({of})" if of else "")
+            for name, of in zip(landmarks.landmark_id.tolist(), classes, strict=True)
+        ]
+    )
     order = np.argsort(first_s, kind="stable")
     for group in np.array_split(order, min(len(order), _MAX_LANDMARK_ENTITIES)):
         names = landmarks.landmark_id[group].astype(str).tolist()
         entity = f"world/landmarks/{names[0]}" + (f"_and_{len(names) - 1}_more" if len(names) > 1 else "")
-        stream.set_time(TIMELINE, duration=float(first_s[group].max()))
-        marks = rr.Points3D(points[group], colors=rgb(LANDMARK), radii=0.05, labels=names, show_labels=len(order) <= 60)
+        stream.set_time(TIMELINE, **{_kind(clock): float(first_s[group].max())})
+        marks = rr.Points3D(
+            points[group],
+            colors=colours[group],
+            radii=0.05,
+            labels=called[group].tolist(),
+            show_labels=len(order) <= 60,
+        )
         stream.log(entity, marks)
-        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=rgb(LANDMARK), radii=0.008))
+        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=colours[group], radii=0.008))
     stream.reset_time()
 
 
-def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -> None:
+def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray, clock: Clock) -> None:
     """Arrows from where landmarks were to where they are, from the time on at which the change is over."""
     import rerun as rr
 
@@ -219,7 +238,7 @@ def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray) -
             labels=[move.label] * len(move.before_m),
             show_labels=False,
         )
-        stream.set_time(TIMELINE, duration=move.change.stamp_to_s)
+        stream.set_time(TIMELINE, **{_kind(clock): move.change.stamp_to_s})
         stream.log(f"world/changes/{number}", arrows)
     stream.reset_time()
 
@@ -261,7 +280,7 @@ def _send_rays(stream: Any, recording: Recording, result: SlamResult, pose_truth
     rays = np.stack([_flat(sensor[row, :2], 0.1), _flat(se2.transform(sensor[row], ends), 0.05)], axis=1)
     counts = np.bincount(row, minlength=len(kept))
     columns = rr.LineStrips3D.columns(strips=rays).partition(lengths=counts)
-    stream.send_columns("world/detections", [_time(frames.stamp_s[kept])], columns)
+    stream.send_columns("world/detections", [_time(frames.stamp_s[kept], recording.clock)], columns)
     stream.log("world/detections", rr.LineStrips3D.from_fields(colors=rgb(ALERT), radii=0.006), static=True)
 
 
@@ -269,31 +288,37 @@ def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluat
     """NIS with its band, latency and, with truth, the position error with its 2-sigma band."""
     import rerun as rr
 
+    def at(stamp_s: FloatArray) -> Any:
+        return _time(stamp_s, recording.clock)
+
     innovations = result.innovations
     finite = np.flatnonzero(np.isfinite(innovations.nis) & (innovations.nis > 0))
     if len(finite):
         rows = finite[_thin(len(finite))]
         _plot(
-            stream, "nis/detection", innovations.stamp_s[rows], np.log10(innovations.nis[rows]), ESTIMATE, points=True
+            stream,
+            "nis/detection",
+            at(innovations.stamp_s[rows]),
+            np.log10(innovations.nis[rows]),
+            ESTIMATE,
+            points=True,
         )
         ends = innovations.stamp_s[rows[[0, -1]]]
         for name, level in zip(("low", "high"), chi2_interval(2), strict=True):
-            _plot(stream, f"nis/{name}", ends, np.full(2, np.log10(level)), MUTED)
+            _plot(stream, f"nis/{name}", at(ends), np.full(2, np.log10(level)), MUTED)
     if len(result.step_s):
         rows = _thin(len(result.step_s))
-        _plot(stream, "latency/step_ms", result.online.stamp_s[rows], 1e3 * result.step_s[rows], ESTIMATE)
+        _plot(stream, "latency/step_ms", at(result.online.stamp_s[rows]), 1e3 * result.step_s[rows], ESTIMATE)
     poses = evaluation.poses
     if poses is not None:
         rows = _thin(len(poses.stamp_s))
         band = 2.0 * np.sqrt(np.trace(poses.covariance[rows, :2, :2], axis1=1, axis2=2))
-        _plot(stream, "error/position_m", poses.stamp_s[rows], poses.position_error_m[rows], ESTIMATE)
-        _plot(stream, "error/two_sigma_m", poses.stamp_s[rows], band, MUTED)
+        _plot(stream, "error/position_m", at(poses.stamp_s[rows]), poses.position_error_m[rows], ESTIMATE)
+        _plot(stream, "error/two_sigma_m", at(poses.stamp_s[rows]), band, MUTED)
     stream.log("about", rr.TextDocument(f"{recording.name}\n\nsource: {recording.source}"), static=True)
 
 
-def _plot(
-    stream: Any, entity: str, stamp_s: FloatArray, values: FloatArray, colour: str, *, points: bool = False
-) -> None:
+def _plot(stream: Any, entity: str, times: Any, values: FloatArray, colour: str, *, points: bool = False) -> None:
     import rerun as rr
 
     look = (
@@ -302,7 +327,7 @@ def _plot(
         else rr.SeriesLines(colors=rgb(colour), widths=1.5)
     )
     stream.log(entity, look, static=True)
-    stream.send_columns(entity, [_time(stamp_s)], rr.Scalars.columns(scalars=values))
+    stream.send_columns(entity, [times], rr.Scalars.columns(scalars=values))
 
 
 TRACKS_TIMELINE = "time"
@@ -322,7 +347,7 @@ def log_tracks(
     sensor_m: FloatArray | None = None,
     reach_m: float | None = None,
 ) -> Path:
-    """Writes `path` (.rrd): tracklets with their ids, static ones blue and dynamic ones purple, and who rests, smaller.
+    """Write `path` (.rrd): tracklets with their ids, static ones blue and dynamic ones purple, and who rests, smaller.
 
     Args:
         path: of the file.

@@ -8,9 +8,9 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
-from evermap.viz.style import ALERT, INK, MUTED, PAPER, NamedFigure, house_style, new_figure, settle
+from evermap.viz.style import ALERT, GRID, INK, MUTED, PAPER, NamedFigure, class_looks, house_style, new_figure, settle
 from evermap_studies.demo.claims import Claims
-from evermap_studies.demo.looks import CLASS_LOOKS, METHOD_LOOKS
+from evermap_studies.demo.looks import METHOD_LOOKS
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.numbers import Line, ratios
 from evermap_studies.demo.study import Study
@@ -31,7 +31,7 @@ FAINTEST = 0.12
 
 
 def draw_hero(study: Study, lines: dict[str, Line]) -> NamedFigure:
-    """The hero figure, 1600 x 800 pixels at 160 dpi."""
+    """Draw the hero figure, 1600 x 800 pixels at 160 dpi."""
     import matplotlib as mpl
 
     with house_style(), mpl.rc_context(_RC):
@@ -73,7 +73,7 @@ def _draw_map(axes: Axes, study: Study, pose_truth_map: FloatArray) -> None:
         axes.plot(*wall.T, color=INK, lw=2.2, solid_capstyle="round", zorder=2)
     path = study.building.sessions[-1].truth
     assert path is not None
-    axes.plot(*path.pose_world_robot[::25, :2].T, color="#cfd5db", lw=1.4, zorder=1)
+    axes.plot(*path.pose_world_robot[::25, :2].T, color=GRID, lw=1.4, zorder=1)
 
     living = study.living
     best = living.landmarks()
@@ -81,8 +81,9 @@ def _draw_map(axes: Axes, study: Study, pose_truth_map: FloatArray) -> None:
     here = se2.transform(pose_truth_map, best.position_m)
     remembered = _remembered(study)
     places = se2.transform(pose_truth_map, living.places.position_m)
+    looks = class_looks(study.building.class_names)
     for row, name in enumerate(study.building.class_names):
-        colour, shape = CLASS_LOOKS[row % len(CLASS_LOOKS)]
+        colour, shape = looks[name].colour, looks[name].marker
         old = [k for k in remembered if classes[int(living.places.landmark_id[k])] == row]
         axes.plot(*places[old].T, shape, ms=4.2, mfc="none", mec=colour, mew=0.8, alpha=0.4, ls="none", zorder=3)
         axes.plot([], [], shape, color=colour, ms=6, ls="none", label=name)
@@ -171,7 +172,7 @@ def _dress(errors: Axes, false: Axes, day: FloatArray) -> None:
     errors.yaxis.set_minor_formatter(FuncFormatter(lambda _value, _: ""))
     errors.set_title("Position error [cm]")
     errors.set_xticklabels([])
-    false.set_title("Changes told falsely, in all")
+    false.set_title("False changes, cumulative")
     false.set_ylim(bottom=0.0)
     false.set_xlabel("day")
     for axes in (errors, false):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from evermap.viz.style import INK, NamedFigure, house_style, new_figure, settle
+from evermap.viz.style import INK, NamedFigure, class_looks, house_style, new_figure, settle
 from evermap_studies.demo.lifetimes import LearnedLife
-from evermap_studies.demo.looks import CLASS_LOOKS
 
 
 def draw_lifetimes(lives: Sequence[LearnedLife]) -> NamedFigure:
@@ -16,8 +15,9 @@ def draw_lifetimes(lives: Sequence[LearnedLife]) -> NamedFigure:
         rows = -(-len(lives) // columns)
         figure = new_figure(7.2, 1.9 * rows + 0.3)
         panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
-        for row, (axes, life) in enumerate(zip(panels, lives, strict=False)):
-            colour, _ = CLASS_LOOKS[row % len(CLASS_LOOKS)]
+        looks = class_looks(life.name for life in lives)
+        for axes, life in zip(panels, lives, strict=False):
+            colour = looks[life.name].colour
             axes.fill_between(life.age_days, life.low, life.high, color=colour, alpha=0.18, lw=0)
             axes.plot(life.age_days, life.mean, color=colour, lw=1.8, label="learned")
             axes.plot(life.age_days, life.truth, color=INK, lw=1.2, ls="--", label="truth")

@@ -1,22 +1,11 @@
-"""What classes and methods look like in the demonstration's figures: Okabe and Ito's colours, shapes and dashes."""
+"""What methods look like in the demonstration's figures; classes look as in all figures (`style.class_looks`)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from evermap.viz.style import ALERT, ESTIMATE, INK, MUTED, ODOMETRY, ONLINE
+from evermap.viz.style import ALERT, ESTIMATE, LANDMARK, MUTED, ODOMETRY, ONLINE
 from evermap_studies.demo.methods import METHODS
-
-CLASS_LOOKS = (
-    (INK, "s"),
-    ("#e69f00", "D"),
-    ("#009e73", "^"),
-    ("#0072b2", "o"),
-    ("#cc79a7", "v"),
-    ("#56b4e9", "P"),
-    ("#882255", "h"),
-)
-"""Colour and marker by class; shapes tell them apart where colours don't."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +24,7 @@ METHOD_LOOKS = {
     "static": Look(_LABELS["static"], ALERT, width=2.2),
     "rosen2016": Look(_LABELS["rosen2016"], ODOMETRY, "--"),
     "bateman2020": Look(_LABELS["bateman2020"], ONLINE, "-."),
-    "nielsen2024": Look(_LABELS["nielsen2024"], "#009e73", (0, (5, 1, 1, 1, 1, 1))),
+    "nielsen2024": Look(_LABELS["nielsen2024"], LANDMARK, (0, (5, 1, 1, 1, 1, 1))),
     "evermap": Look(_LABELS["evermap"], ESTIMATE, width=2.6, order=5.0),
     "oracle": Look(_LABELS["oracle"], MUTED, ":", width=2.2, order=6.0),
 }

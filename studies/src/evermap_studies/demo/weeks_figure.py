@@ -8,10 +8,21 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.types import IntArray
-from evermap.viz.style import ALERT, ESTIMATE, INK, MUTED, SHADE, NamedFigure, house_style, new_figure, settle
+from evermap.viz.style import (
+    ALERT,
+    ESTIMATE,
+    INK,
+    MUTED,
+    SHADE,
+    NamedFigure,
+    class_looks,
+    house_style,
+    new_figure,
+    settle,
+)
 from evermap_studies.demo.claims import CERTAIN
 from evermap_studies.demo.claims_figure import TELLING
-from evermap_studies.demo.looks import CLASS_LOOKS, METHOD_LOOKS
+from evermap_studies.demo.looks import METHOD_LOOKS
 from evermap_studies.demo.numbers import Line, week_of
 from evermap_studies.demo.study import Study
 from evermap_studies.sim import CLUTTER
@@ -107,6 +118,7 @@ def _draw_plan(axes: Axes, study: Study, line: Line, sessions: IntArray) -> None
 def _draw_objects(axes: Axes, study: Study, before: int, after: int) -> None:
     """What stands there after a week, and what happened to everything but clutter since the session `before`."""
     drawn: set[str] = set()
+    looks = class_looks(study.building.class_names)
 
     def named(label: str) -> str | None:
         new = label not in drawn
@@ -115,21 +127,21 @@ def _draw_objects(axes: Axes, study: Study, before: int, after: int) -> None:
 
     for item in study.building.objects:
         then, now = (_middle(study, item, k) for k in (before, after))
-        colour, shape = CLASS_LOOKS[item.class_id % len(CLASS_LOOKS)]
+        look = looks[study.building.class_names[item.class_id]]
         is_clutter = item.kind.name == CLUTTER.name
         if now is not None:
             size = 3.0 if is_clutter else 4.5
-            axes.plot(*now, shape, color=colour, ms=size, mew=0.0, zorder=4, label=named(item.kind.name))
+            axes.plot(*now, look.marker, color=look.colour, ms=size, mew=0.0, zorder=4, label=named(item.kind.name))
         if is_clutter or after == before:
             continue
         if then is None and now is not None:
-            axes.plot(*now, "+", color="k", ms=10, mew=1.6, zorder=5, label=named("came"))
+            axes.plot(*now, "+", color=INK, ms=10, mew=1.6, zorder=5, label=named("came"))
         elif then is not None and now is None:
-            axes.plot(*then, "x", color="k", ms=7, mew=1.6, zorder=5, label=named("left"))
+            axes.plot(*then, "x", color=INK, ms=7, mew=1.6, zorder=5, label=named("left"))
         elif then is not None and now is not None and np.hypot(*np.subtract(now, then)) > NEAR_M:
-            arrow: Any = {"arrowstyle": "-|>", "color": "k", "lw": 1.0, "shrinkA": 0.0, "shrinkB": 2.0}
+            arrow: Any = {"arrowstyle": "-|>", "color": INK, "lw": 1.0, "shrinkA": 0.0, "shrinkB": 2.0}
             axes.annotate("", now, then, arrowprops=arrow, zorder=5)
-            axes.plot([], [], color="k", lw=1.0, marker=">", ms=4, label=named("moved"))
+            axes.plot([], [], color=INK, lw=1.0, marker=">", ms=4, label=named("moved"))
 
 
 def _middle(study: Study, item: SceneObject, session: int) -> tuple[float, float] | None:
