@@ -18,7 +18,7 @@ from benchmarks import persistence, rosen
 from evermap.existence import joint, single
 from evermap.existence.single import Belief
 from evermap.sensing import learned
-from evermap.sensing.learned import CliqueLook, Learned
+from evermap.sensing.learned import CliqueLook, LearnedDetection
 from evermap.sensing.profile import Assumed
 from evermap.sensing.space import LIDAR
 from evermap.survival import Exponential
@@ -79,7 +79,7 @@ class WithLearning:
     """Cliques whose detection model learns as it goes."""
 
     def __init__(self, scene: World) -> None:
-        self.model: Learned = learned.init(scene.landmark_m, scene.clique, Assumed(LIDAR))
+        self.model: LearnedDetection = learned.init(scene.landmark_m, scene.clique, Assumed(LIDAR))
         self.belief: Belief = single.init(len(self.model), Exponential(RATE_HZ))
         self._frames = _frames(scene)
         self._seen: CliqueLook

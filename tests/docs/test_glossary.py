@@ -17,9 +17,7 @@ USED_FOR_SEVERAL = {
     "Candidate",
     "Estimate",
     "Frames",
-    "Learned",
     "Method",
-    "Sight",
     "Stamps",
 }
 """Names of classes that two modules define, for different things. The list may only become shorter."""

@@ -13,7 +13,7 @@ from scipy.special import log_softmax
 from evermap.errors import DataError, InputError
 from evermap.existence import joint, single
 from evermap.sensing import learned
-from evermap.sensing.learned import Learned
+from evermap.sensing.learned import LearnedDetection
 from evermap.sensing.profile import Assumed, Profile
 from evermap.sensing.space import CAMERA, LIDAR, Field, Projection, sight
 from evermap.survival import Exponential
@@ -39,7 +39,7 @@ def frames(rng, n, landmarks, *, p_detect=0.35):
         yield float(stamp), rng.normal(0.0, 4.0, 3) * [1.0, 1.0, 0.2], turn, rng.random(landmarks) < p_detect
 
 
-def same(one: Learned, other: Learned, rows=slice(None), landmarks=slice(None)) -> None:
+def same(one: LearnedDetection, other: LearnedDetection, rows=slice(None), landmarks=slice(None)) -> None:
     """Bit for bit, in these cliques and landmarks."""
     for name in ("stamp_s", "occluded", "log_chain", "pending"):
         np.testing.assert_array_equal(getattr(one, name)[rows], getattr(other, name)[rows], err_msg=name)
@@ -174,7 +174,7 @@ def test_looking_and_confirming_leave_the_model_before_them_alone():
     landmark, clique = cliques(rng)
     looks = list(frames(rng, 6, len(clique)))
     model, _ = run_frames(learned.init(landmark, clique, Assumed(LIDAR)), looks[:5])
-    before = {f.name: np.array(getattr(model, f.name)) for f in fields(Learned) if f.name != "profile"}
+    before = {f.name: np.array(getattr(model, f.name)) for f in fields(LearnedDetection) if f.name != "profile"}
     shared = {name: np.array(getattr(model.profile, name)) for name in (*SHARED, "log_weight")}
     run_frames(model, looks[5:], probability=1.0)
     for name, was in before.items():

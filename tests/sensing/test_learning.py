@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap.existence import single
 from evermap.sensing import learned
-from evermap.sensing.learned import Learned
+from evermap.sensing.learned import LearnedDetection
 from evermap.sensing.profile import Assumed, Profile, facing_middles, range_middles
 from evermap.sensing.space import LIDAR, sight
 from evermap.survival import Exponential
@@ -32,7 +32,7 @@ class Truth:
     come_hz: FloatArray | float = 0.0
     go_hz: FloatArray | float = 1.0
 
-    def chances(self, model: Learned, position: FloatArray, turn: FloatArray, own: FloatArray | float = 1.0):
+    def chances(self, model: LearnedDetection, position: FloatArray, turn: FloatArray, own: FloatArray | float = 1.0):
         """(K,) probability of a detection if there and free, and of a false alarm."""
         view = sight(model.landmark_m, model.outward, position, turn)
         assumed = model.profile.assumed
@@ -73,13 +73,15 @@ def scene(rng: np.random.Generator, cliques: int, each: int):
     return middle[clique] + rng.normal(0.0, 0.7, (len(clique), 3)), clique
 
 
-def all_the_same(model: Learned) -> Learned:
+def all_the_same(model: LearnedDetection) -> LearnedDetection:
     """Landmarks without a detectability of their own."""
     firm = np.full_like(model.hits, FIRM)
     return replace(model, hits=firm, expected=firm.copy())
 
 
-def watch(model: Learned, truth: Truth, rng: np.random.Generator, steps: int, own=1.0, sure=1.0) -> Learned:
+def watch(
+    model: LearnedDetection, truth: Truth, rng: np.random.Generator, steps: int, own=1.0, sure=1.0
+) -> LearnedDetection:
     """Look once a second from everywhere at cliques that are there all the time."""
     clique = np.repeat(np.arange(len(model)), np.diff(model.first))
     hidden = truth.occlusions(rng, steps, len(model), 1.0)

@@ -180,7 +180,7 @@ def test_all_of_the_scene_may_be_turned_and_moved(case: Case) -> None:
     """Only what lies between sensor and landmark matters; models of single landmarks know them by place."""
     pose, position, name = scene(case, 6)
     model = case.model(position, name)
-    if isinstance(model, InOrder | learned.Learned):
+    if isinstance(model, InOrder | learned.LearnedDetection):
         return
     if case.dimensions == 2:
         turn, shift = 0.7, np.array([30.0, -4.0])

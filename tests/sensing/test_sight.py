@@ -17,8 +17,8 @@ from evermap.sensing.space import (
     Field,
     InField,
     Projection,
-    Sight,
     SpatialModel,
+    ViewGeometry,
     ViewingAngle,
     sight,
 )
@@ -33,7 +33,7 @@ FIELDS = {
 }
 
 
-def seen_from(point_sensor_m) -> Sight:
+def seen_from(point_sensor_m) -> ViewGeometry:
     """Points (K, 3) that face a sensor which stands at the origin and looks along x."""
     point = np.atleast_2d(np.asarray(point_sensor_m, dtype=float))
     outward = -point / np.linalg.norm(point, axis=1, keepdims=True)

@@ -115,7 +115,7 @@ class SensorLaw(NamedTuple):
 
 
 class CliqueRows(NamedTuple):
-    """Landmarks and cliques, names as in `learned.Learned`; all but the first three are changed in place."""
+    """Landmarks and cliques, names as in `learned.LearnedDetection`; all but the first three are changed in place."""
 
     first: IntArray
     landmark_m: FloatArray

@@ -40,7 +40,7 @@ MOSTLY_FREE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class LearnedDetection:
     """What is known of the sensor, and of K landmarks on C cliques.
 
     Attributes:
@@ -119,7 +119,7 @@ class CliqueLook:
     expected: IntArray
 
 
-def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -> Learned:
+def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -> LearnedDetection:
     """Return a model of landmarks of which nothing is known but their positions.
 
     Args:
@@ -153,7 +153,7 @@ def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -
     start = profile if isinstance(profile, Profile) else Profile.of(profile)
     chain = start.occlusion
     c, prior = len(count), start.assumed.hits
-    return Learned(
+    return LearnedDetection(
         profile=start,
         first=first,
         landmark_m=point,
@@ -168,14 +168,14 @@ def init(landmark_m: FloatArray, clique: IntArray, profile: Profile | Assumed) -
 
 
 def look(
-    model: Learned,
+    model: LearnedDetection,
     stamp_s: float,
     position_m: FloatArray,
     rotation: FloatArray,
     detected: BoolArray,
     *,
     active: BoolArray | None = None,
-) -> tuple[Learned, CliqueLook]:
+) -> tuple[LearnedDetection, CliqueLook]:
     """Process one frame: what it says of each clique, and what it teaches.
 
     Args:
@@ -205,14 +205,8 @@ def look(
         problem = f"time {stamp_s} s lies before the last look at clique {late[0]} at {model.stamp_s[late[0]]} s"
         raise InputError(problem, field="stamp_s", hint="sort by time")
 
-    after = replace(
-        model,
-        hits=model.hits.copy(),
-        expected=model.expected.copy(),
-        occluded=model.occluded.copy(),
-        log_chain=model.log_chain.copy(),
-        pending=model.pending.copy(),
-    )
+    changed = ("hits", "expected", "occluded", "log_chain", "pending")
+    after = replace(model, **{name: getattr(model, name).copy() for name in changed})
     profile, chain = model.profile, model.profile.occlusion
     seen = CliqueLook(np.empty(c), np.empty(c), np.empty(c), np.empty(c), np.empty(c, dtype=np.int64))
     rates = profile.range_rate, profile.facing_rate, profile.p_false
@@ -230,7 +224,7 @@ def look(
     )
 
 
-def confirm(model: Learned, seen: CliqueLook, probability: FloatArray) -> Learned:
+def confirm(model: LearnedDetection, seen: CliqueLook, probability: FloatArray) -> LearnedDetection:
     """Learn the profile from the cliques whose presence the last look has made certain.
 
     Args:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.sensing.space import Fading, Field, InField, Sight, ViewingAngle
+from evermap.sensing.space import Fading, Field, InField, ViewGeometry, ViewingAngle
 from evermap.types import FloatArray
 
 RANGE_BINS = 16
@@ -200,7 +200,7 @@ def facing_middles() -> FloatArray:
     return np.asarray((np.arange(FACING_BINS) + 0.5) * (2.0 / FACING_BINS) - 1.0)
 
 
-def _sight(range_m: FloatArray, facing: FloatArray) -> Sight:
+def _sight(range_m: FloatArray, facing: FloatArray) -> ViewGeometry:
     """Landmarks of which nothing matters but how far they are, and how they face."""
     nowhere = np.zeros((len(range_m), 3))
-    return Sight(nowhere, range_m, facing, nowhere)
+    return ViewGeometry(nowhere, range_m, facing, nowhere)

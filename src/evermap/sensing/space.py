@@ -1,8 +1,8 @@
 """Sensors in space: how far, how wide and how high they look, and what decides whether a landmark is detected.
 
 Causes multiply: `P_D = P_0 P(range) P(incidence) P(in the field)` (MATH.md section 3). Each is a function of a
-`Sight`, that is of how landmarks stand to the sensor; together they are a `SpatialModel`. This is what is assumed
-before anything was seen; `learned` finds out what is so.
+`ViewGeometry`, that is of how landmarks stand to the sensor; together they are a `SpatialModel`. This is what is
+assumed before anything was seen; `learned` finds out what is so.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ CAMERA = Field(16.0, math.radians(45.0), math.radians(45.0), Projection.PINHOLE)
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class ViewGeometry:
     """K landmarks seen from one pose.
 
     Attributes:
@@ -111,15 +111,15 @@ class Sight:
     direction: FloatArray
 
 
-def sight(landmark_m: FloatArray, outward: FloatArray, position_m: FloatArray, rotation: FloatArray) -> Sight:
+def sight(landmark_m: FloatArray, outward: FloatArray, position_m: FloatArray, rotation: FloatArray) -> ViewGeometry:
     """Look at landmarks (K, 3) with outward unit vectors (K, 3) from (3,) with rotation (3, 3) to the world."""
     offset = position_m - landmark_m
     range_m = np.linalg.norm(offset, axis=1)
     direction = offset / np.maximum(range_m, 1e-9)[:, None]
-    return Sight(-offset @ rotation, range_m, np.sum(direction * outward, axis=1), direction)
+    return ViewGeometry(-offset @ rotation, range_m, np.sum(direction * outward, axis=1), direction)
 
 
-def sights(pose: FloatArray, position_m: FloatArray, outward: FloatArray | None = None) -> list[Sight]:
+def sights(pose: FloatArray, position_m: FloatArray, outward: FloatArray | None = None) -> list[ViewGeometry]:
     """Look at landmarks (L, 3) from each of F poses; arguments as in `SpatialModel.p_detect`.
 
     Raises:
@@ -137,7 +137,7 @@ def sights(pose: FloatArray, position_m: FloatArray, outward: FloatArray | None 
 class Cause(Protocol):
     """One of the reasons for which a landmark is detected or not."""
 
-    def probability(self, sight: Sight) -> FloatArray:
+    def probability(self, sight: ViewGeometry) -> FloatArray:
         """Return (K,) probabilities that it does not prevent a detection."""
         ...
 
@@ -152,7 +152,7 @@ class Fading:
         if not 0.0 < self.length_m <= math.inf:
             raise ConfigError(f"must be positive, not {self.length_m!r}", field="length_m", hint="0.7 of the range")
 
-    def probability(self, sight: Sight) -> FloatArray:
+    def probability(self, sight: ViewGeometry) -> FloatArray:
         """Return (K,) probabilities that it does not prevent a detection."""
         return np.exp(-sight.range_m / self.length_m)
 
@@ -175,7 +175,7 @@ class ViewingAngle:
         if not 0.0 < self.edge < math.inf:
             raise ConfigError(f"must be positive and finite, not {self.edge!r}", field="edge")
 
-    def probability(self, sight: Sight) -> FloatArray:
+    def probability(self, sight: ViewGeometry) -> FloatArray:
         """Return (K,) probabilities that it does not prevent a detection."""
         return 1.0 / (1.0 + np.exp(-(sight.facing - math.cos(self.largest_rad)) / self.edge))
 
@@ -207,7 +207,7 @@ class InField:
         if self.sigma_position_m == 0.0:
             raise ConfigError("must be positive: no edge is infinitely sharp", field="sigma_position_m", hint="0.001")
 
-    def probability(self, sight: Sight) -> FloatArray:
+    def probability(self, sight: ViewGeometry) -> FloatArray:
         """Return (K,) probabilities that it does not prevent a detection."""
         from scipy.special import ndtr
 
@@ -238,7 +238,7 @@ class SpatialModel:
         if not 0.0 <= self.p_0 <= 1.0:
             raise ConfigError(f"must be a probability, not {self.p_0!r}", field="p_0", hint="a number between 0 and 1")
 
-    def probability(self, sight: Sight) -> FloatArray:
+    def probability(self, sight: ViewGeometry) -> FloatArray:
         """Return (K,) probabilities of detection."""
         product = np.full(len(sight.range_m), self.p_0)
         for cause in self.causes:
