@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
 from evermap.geometry import se2
-from evermap.maps.bodies import MOVE_SIGMA_M, Fate, group, log_evidence_of_motion, regrouped
+from evermap.maps.bodies import MOVE_SIGMA_M, Displacements, Fate, group, log_evidence_of_motion, regrouped
 from evermap.types import FloatArray, IntArray
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -22,8 +22,8 @@ def after_session(
 ) -> IntArray:
     """Of one class, seen to 2 cm at either time."""
     return regrouped(
-        np.array(clique), np.zeros(len(clique), dtype=np.int64), np.array(fate), before, after,
-        np.tile(2.0 * SIGMA_M**2 * np.eye(2), (len(clique), 1, 1)),
+        np.array(clique), np.zeros(len(clique), dtype=np.int64), np.array(fate),
+        Displacements(before, after, np.tile(2.0 * SIGMA_M**2 * np.eye(2), (len(clique), 1, 1))),
         reach_m=REACH_M, next_id=100, **options,
     )  # fmt: skip
 
@@ -169,7 +169,12 @@ def pairs_in_building(seed: int, *, moves: bool = True, classes: bool = True) ->
         if moves and len(old):
             covariance = np.tile(2.0 * SIGMA_M**2 * np.eye(2), (len(old), 1, 1))
             label[old] = regrouped(
-                label[old], kind[old], fate[old], last[old], seen[old], covariance, reach_m=REACH_M, next_id=next_id
+                label[old],
+                kind[old],
+                fate[old],
+                Displacements(last[old], seen[old], covariance),
+                reach_m=REACH_M,
+                next_id=next_id,
             )
         next_id = int(label.max()) + 1
         label[new] = next_id + group(seen[new], kind[new], reach_m=REACH_M)

@@ -165,20 +165,10 @@ def slam(
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)
     if map_file is not None:
-        from evermap.cli.slam_in_map import run_in_map
+        from evermap.cli.slam_in_map import MapOptions, run_in_map
 
-        run_in_map(
-            recording,
-            config,
-            map_file,
-            out,
-            priors=prior or [],
-            localize=localize,
-            realtime=realtime,
-            as_json=as_json,
-            force=force,
-            inputs=inputs,
-        )
+        options = MapOptions(map_file, prior or [], localize, realtime)
+        run_in_map(recording, config, options, out, as_json=as_json, force=force, inputs=inputs)
         return
     start = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
     run_and_write(recording, config, out, prior=start, realtime=realtime, as_json=as_json, force=force, inputs=inputs)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from evermap.cli.options import priors_by_class
 from evermap.cli.summary import show_run
@@ -19,15 +19,28 @@ if TYPE_CHECKING:
     from evermap.types import Recording
 
 
+class MapOptions(NamedTuple):
+    """What the command line says of a living map.
+
+    Attributes:
+        map_file: the map.
+        priors: how long things stay, `[CLASS=]PRIOR`.
+        localize: only localise; the map stays.
+        realtime: at the recording's pace.
+    """
+
+    map_file: Path
+    priors: Sequence[str]
+    localize: bool
+    realtime: bool
+
+
 def run_in_map(
     recording: Recording,
     config: Config,
-    map_file: Path,
+    options: MapOptions,
     out: Path,
     *,
-    priors: Sequence[str],
-    localize: bool,
-    realtime: bool,
     as_json: bool,
     force: bool,
     inputs: Sequence[str | Path | None],
@@ -39,6 +52,7 @@ def run_in_map(
     from evermap.runs.sessions import at_time, enter_session, priors_of
     from evermap.viz.change_words import explanations, grew
 
+    map_file, priors, localize, realtime = options
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
     if config.slam.unknown_ids:

@@ -19,6 +19,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -73,13 +74,24 @@ def group(position_m: FloatArray, class_id: IntArray, *, reach_m: float) -> IntA
     return np.asarray(np.unique(label, return_inverse=True)[1].ravel(), dtype=np.int64)
 
 
+class Displacements(NamedTuple):
+    """L landmarks before and after a session.
+
+    Attributes:
+        before_m, after_m: (L, 2) last and new places.
+        covariance_m2: (L, 2, 2) of the differences of the two.
+    """
+
+    before_m: FloatArray
+    after_m: FloatArray
+    covariance_m2: FloatArray
+
+
 def regrouped(
     clique_id: IntArray,
     class_id: IntArray,
     fate: IntArray,
-    before_m: FloatArray,
-    after_m: FloatArray,
-    covariance_m2: FloatArray,
+    displaced: Displacements,
     *,
     reach_m: float,
     next_id: int,
@@ -91,9 +103,7 @@ def regrouped(
         clique_id: (L,) cliques as they were.
         class_id: (L,) classes, negative for none.
         fate: (L,) of each landmark, as of `Fate`.
-        before_m: (L, 2) its last place.
-        after_m: (L, 2) its new place; looked at only where it moved.
-        covariance_m2: (L, 2, 2) of the difference of the two.
+        displaced: from where to where each of them moved; looked at only where it did.
         reach_m: largest extent of a body.
         next_id: first free id.
         p_wrong: probability that a fate is wrong, of all or (L,) of each.
@@ -102,7 +112,7 @@ def regrouped(
         (L,) cliques. Of one that is split the largest part keeps the id, with those that were not seen.
     """
     log_wrong = np.log(np.broadcast_to(np.asarray(p_wrong, dtype=np.float64), clique_id.shape))
-    moves = _Moves(before_m, after_m, covariance_m2)
+    moves = _Moves(*displaced)
     label, moved = clique_id.copy(), []
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
         of_fate = {one: np.flatnonzero((clique_id == name) & (fate == one)) for one in Fate}
@@ -119,7 +129,7 @@ def regrouped(
 
     def log_prior(a: IntArray, b: IntArray) -> float:
         both = np.concatenate([a, b])
-        if max(_extent(before_m[both]), _extent(after_m[both])) > reach_m:
+        if max(_extent(displaced.before_m[both]), _extent(displaced.after_m[both])) > reach_m:
             return -math.inf
         one_class = len(np.unique(class_id[both][class_id[both] >= 0])) <= 1
         return _logit(P_SPLIT_BEFORE if one_class else P_OTHER_CLASS)
@@ -341,9 +351,7 @@ def without_missed(before: LivingMap, after: LivingMap) -> LivingMap:
         members.clique_id,
         members.class_id,
         fate,
-        nowhere,
-        nowhere,
-        np.zeros((len(members), 2, 2)),
+        Displacements(nowhere, nowhere, np.zeros((len(members), 2, 2))),
         reach_m=0.0,
         next_id=after.n_cliques_ever,
         p_wrong=np.where(fate == Fate.GONE, p_missed, P_WRONG),

@@ -127,7 +127,6 @@ def enter_session(
         DataError, NumericalError: as `pipeline.run_session`.
     """
     from evermap.config import Config
-    from evermap.maps.diff import net
     from evermap.maps.learning import with_priors
     from evermap.maps.store.measured import RECORDING, pack_recording
     from evermap.pipeline import run_session
@@ -146,14 +145,31 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    steps = _history(store, kept)
+    return _enter_late(store, recording, said, config, _history(store, kept), data, progress)
+
+
+def _enter_late(
+    store: MapStore,
+    recording: Recording,
+    newest: LivingMap,
+    config: Config | None,
+    steps: list[_Step],
+    data: bytes,
+    progress: Progress | None,
+) -> Entered:
+    """A session that belongs before some of the steps of the history: these are taken once more, after it."""
+    from evermap.maps.diff import net
+    from evermap.maps.store.measured import RECORDING
+    from evermap.pipeline import run_session
+
+    head, start_s = store.head(), float(recording.frames.stamp_s[0])
     first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
     base = store.load(steps[first].revision.parent)
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
     # what users said of lifetimes is of no time
-    names, lives = said.class_names, said.lives
+    names, lives = newest.class_names, newest.lives
     lives = replace(base.lives, prior_class_id=lives.prior_class_id, prior=lives.prior)
     living = replace(living, class_names=names, lives=lives) if len(lives.prior) else living
     if not len(living.places):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.maps.bodies import Fate, group, regrouped, relabelled
+from evermap.maps.bodies import Displacements, Fate, group, regrouped, relabelled
 from evermap.maps.living import LivingMap, Members, Places, Sites
 from evermap.maps.sessions.gaussian import blocks, of_places, with_session
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -74,16 +74,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         config: how far landmarks of one body may be apart.
         drift_m: by which places may have been off when the session was solved.
     """
-    expected = replace(living, sites=replace(living.sites, p_here=p_site))
-    clique_id = _bodies(expected, found, config, drift_m)
-    if not np.array_equal(clique_id, living.members.clique_id):
-        before, (living, moved_to) = relabelled(living, clique_id)[0], relabelled(expected, clique_id)
-        if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
-            before = living
-        p_site = living.sites.p_here
-        found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
-    else:
-        before = living
+    before, living, p_site, found = _with_bodies(living, p_site, found, config, drift_m)
     members, cliques_ever = _with_members(living, found, config)
     clique = members.clique_id[np.searchsorted(members.landmark_id, found.landmark_id)]
     site_of = _standing_at(living, found, clique)
@@ -129,6 +120,21 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         p_start,
         is_new,
     )
+
+
+def _with_bodies(
+    living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float
+) -> tuple[LivingMap, LivingMap, FloatArray, Found]:
+    """The map as it was and as it is believed, beliefs in its sites, and what was found, with the bodies of now."""
+    expected = replace(living, sites=replace(living.sites, p_here=p_site))
+    clique_id = _bodies(expected, found, config, drift_m)
+    if np.array_equal(clique_id, living.members.clique_id):
+        return living, living, p_site, found
+    before, (living, moved_to) = relabelled(living, clique_id)[0], relabelled(expected, clique_id)
+    if not np.array_equal(before.sites.site_id, living.sites.site_id):  # united under another of their sites
+        before = living
+    found = replace(found, place=np.where(found.place >= 0, moved_to[found.place], -1))
+    return before, living, living.sites.p_here, found
 
 
 def _with_members(living: LivingMap, found: Found, config: LivingConfig) -> tuple[Members, int]:
@@ -203,9 +209,7 @@ def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: floa
         members.clique_id,
         members.class_id,
         fate,
-        before,
-        after,
-        spread,
+        Displacements(before, after, spread),
         reach_m=config.clique_reach_m,
         next_id=living.n_cliques_ever,
     )

@@ -227,6 +227,41 @@ def refitted(
     Raises:
         NumericalError: no finite optimum.
     """
+    problem, start = _in_map(outcome, prior, pose_map_session, size, row, mean_m, covariance_m2)
+    noise = outcome.noise.noise
+    smoother, estimate = _solved(problem, noise, start, robust=robust)
+    straightened = False
+    if smoother.inlier_probability(estimate).mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
+        # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
+        other, straight = _solved(problem, noise, _placed(problem, start, row), robust=robust)
+        if other.cost(straight) < smoother.cost(estimate):
+            smoother, estimate, straightened = other, straight, True
+    marginals = smoother.marginals(estimate)
+    outcome = replace(
+        outcome,
+        estimate=estimate,
+        states_covariance=marginals.states.copy(),
+        problem=problem,
+        graph_estimate=estimate,
+        graph_marginals=marginals,
+        inlier=smoother.inlier_probability(estimate),
+        scale=1.0,
+        log_scale_sigma=0.0,
+        aligned=True,
+    )
+    return outcome, straightened
+
+
+def _in_map(
+    outcome: Outcome,
+    prior: CalibrationPrior,
+    pose_map_session: FloatArray,
+    size: float,
+    row: IntArray,
+    mean_m: FloatArray,
+    covariance_m2: FloatArray,
+) -> tuple[Problem, Estimate]:
+    """The problem of a session with the map as its prior, and where to start; arguments as of `refitted`."""
     count = len(outcome.problem.landmark_mean)
     mean, information = np.zeros((count, 2)), np.zeros((2 * count, 2 * count))
     at = se2.xy_rows(row)
@@ -250,28 +285,7 @@ def refitted(
         landmark_mean=mean,
         landmark_information=information,
     )
-    noise = outcome.noise.noise
-    smoother, estimate = _solved(problem, noise, start, robust=robust)
-    straightened = False
-    if smoother.inlier_probability(estimate).mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
-        # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
-        other, straight = _solved(problem, noise, _placed(problem, start, row), robust=robust)
-        if other.cost(straight) < smoother.cost(estimate):
-            smoother, estimate, straightened = other, straight, True
-    marginals = smoother.marginals(estimate)
-    outcome = replace(
-        outcome,
-        estimate=estimate,
-        states_covariance=marginals.states.copy(),
-        problem=problem,
-        graph_estimate=estimate,
-        graph_marginals=marginals,
-        inlier=smoother.inlier_probability(estimate),
-        scale=1.0,
-        log_scale_sigma=0.0,
-        aligned=True,
-    )
-    return outcome, straightened
+    return problem, start
 
 
 def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) -> tuple[Smoother, Estimate]:

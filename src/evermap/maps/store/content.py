@@ -201,6 +201,11 @@ def flaw(living: LivingMap) -> str:
     The rules are those that the rest of the package relies on: columns of equal length, sorted unique ids, references
     that lead somewhere, finite positions, probabilities in [0, 1].
     """
+    return _flaw_of_shapes(living) or _flaw_of_ids(living) or _flaw_of_values(living) or _flaw_of_signs(living)
+
+
+def _flaw_of_shapes(living: LivingMap) -> str:
+    """Columns of one length."""
     members, sites, places, stays = living.members, living.sites, living.places, living.stays
     lives, lines = living.lives, living.sightlines
     for table, rows in (("members", members), ("sites", sites), ("places", places), ("stays", stays)):
@@ -218,6 +223,12 @@ def flaw(living: LivingMap) -> str:
         return "'sightlines.hidden' of another length"
     if living.covariance_m2.shape != (2 * len(places), 2 * len(places)):
         return f"a covariance of shape {living.covariance_m2.shape} for {len(places)} places"
+    return ""
+
+
+def _flaw_of_ids(living: LivingMap) -> str:
+    """Sorted unique ids, references that lead somewhere."""
+    members, sites, places, stays, lives = living.members, living.sites, living.places, living.stays, living.lives
     for column, ids in (("members.landmark_id", members.landmark_id), ("sites.site_id", sites.site_id)):
         if np.any(ids[1:] <= ids[:-1]):
             return f"'{column}' is not sorted, or not unique"
@@ -245,6 +256,21 @@ def flaw(living: LivingMap) -> str:
     ):
         if np.any(numbers < least):
             return f"'{column}' has a number below {least}"
+    for column, ids, ever in (
+        ("sites.site_id", sites.site_id, living.n_sites_ever),
+        ("stays.site_id", stays.site_id, living.n_sites_ever),
+        ("sites.clique_id", sites.clique_id, living.n_cliques_ever),
+        ("stays.clique_id", stays.clique_id, living.n_cliques_ever),
+        ("members.clique_id", members.clique_id, living.n_cliques_ever),
+    ):
+        if len(ids) and ids.max() >= ever:
+            return f"'{column}' has {ids.max()}, but the next free one is {ever}"
+    return ""
+
+
+def _flaw_of_values(living: LivingMap) -> str:
+    """Finite numbers."""
+    sites, places, stays, lives, lines = living.sites, living.places, living.stays, living.lives, living.sightlines
     for column, values in (
         ("places.position_m", places.position_m),
         ("stays.position_m", stays.position_m),
@@ -275,6 +301,12 @@ def flaw(living: LivingMap) -> str:
     ):
         if np.isnan(values).any():
             return f"'{column}' is not a number"
+    return ""
+
+
+def _flaw_of_signs(living: LivingMap) -> str:
+    """Sizes and variances that are positive, probabilities in [0, 1]."""
+    sites, stays, lives, lines = living.sites, living.stays, living.lives, living.sightlines
     if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
         return "a cell without size"
     if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):
@@ -291,15 +323,6 @@ def flaw(living: LivingMap) -> str:
     counts = (lines.hits, lines.looks, lines.hidden, lines.shown, living.views.frames)
     if any(np.any(values < 0.0) for values in counts):
         return "a negative count in 'sightlines' or 'views'"
-    for column, ids, ever in (
-        ("sites.site_id", sites.site_id, living.n_sites_ever),
-        ("stays.site_id", stays.site_id, living.n_sites_ever),
-        ("sites.clique_id", sites.clique_id, living.n_cliques_ever),
-        ("stays.clique_id", stays.clique_id, living.n_cliques_ever),
-        ("members.clique_id", members.clique_id, living.n_cliques_ever),
-    ):
-        if len(ids) and ids.max() >= ever:
-            return f"'{column}' has {ids.max()}, but the next free one is {ever}"
     return ""
 
 

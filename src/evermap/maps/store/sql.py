@@ -298,11 +298,7 @@ class SqlStore(Shown):
         name, chunks = content.pack(living)
         config = content.text_chunk(provenance.config)
         chunks[config.name] = config
-        index = None
-        if evidence is not None and len(evidence):
-            listed, looks = evidence_to_chunks(evidence)
-            index = listed.name
-            chunks.update((part.name, part) for part in (listed, *looks))
+        index = self._with_evidence(evidence, chunks)
         attached = self._attach(attachments or {}, chunks)
         number = parent + 1
         told = about(
@@ -340,6 +336,14 @@ class SqlStore(Shown):
             self._move_anchor(connection, number, record.name)
         self._checked |= chunks.keys()
         return number
+
+    def _with_evidence(self, evidence: Evidence | None, chunks: dict[bytes, Chunk]) -> bytes | None:
+        """The name of the index of what a session saw, None for nothing; its chunks are added to `chunks`."""
+        if evidence is None or not len(evidence):
+            return None
+        listed, looks = evidence_to_chunks(evidence)
+        chunks.update((part.name, part) for part in (listed, *looks))
+        return listed.name
 
     def _n_grown(
         self, connection: Connection, parent: int, living: LivingMap, changes: Sequence[MapChange]
