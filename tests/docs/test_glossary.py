@@ -15,7 +15,6 @@ ROW = re.compile(r"^\| (?P<noun>[a-z ]+) \| (?P<meaning>[^|]+) \| `(?P<path>[\w.
 TERMS = list(ROW.finditer((REPOSITORY / "docs" / "glossary.md").read_text(encoding="utf-8")))
 USED_FOR_SEVERAL = {
     "Candidate",
-    "Estimate",
     "Frames",
     "Method",
     "Stamps",
