@@ -141,16 +141,24 @@ def test_uncertainty_walls_floor_and_other_places_are_drawn() -> None:
 
 def test_the_legend_explains_every_mark() -> None:
     assert set(legend_texts(plot_living_map(view(), title="site"))) == {
-        "chair", "door", "class not known", "the robot looked from here", "wall", "2σ of its position",
-        "other known place, with a line to where it is now", "gone: P(exists) below 50 %", "pinned by an operator",
-        "fainter: less probable, P(exists) from 50 % to 100 %",
+        "chair", "door", "class not known", "looked from here", "wall", "2σ of its position",
+        "other known place", "gone: P(exists) below 50 %", "pinned",
+        "faint: P(exists) from 50 % upwards",
     }  # fmt: skip
     bare = dataclasses.replace(view().landmarks, p_exists=np.ones(4))
     few = plot_living_map(MapView(bare, np.zeros(4, dtype=bool)), title="site")
     assert set(legend_texts(few)) == {
         "chair", "door", "class not known", "2σ of its position",
-        "fainter: less probable, P(exists) from 50 % to 100 %",
+        "faint: P(exists) from 50 % upwards",
     }  # fmt: skip
+
+
+def test_the_legend_fits_the_width_of_the_figure() -> None:
+    names = tuple(f"fixture number {k}" for k in range(8))
+    many = dataclasses.replace(view().landmarks, class_names=names, class_id=np.array([0, 3, 5, 7]))
+    figure: Any = plot_living_map(view(landmarks=many), title="site")
+    extent = figure.legends[0].get_window_extent(figure.canvas.get_renderer())
+    assert 0.0 <= extent.x0 < extent.x1 <= figure.bbox.x1
 
 
 def test_landmarks_are_called_by_their_names_and_labels_do_not_overlap() -> None:

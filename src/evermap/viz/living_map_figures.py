@@ -110,7 +110,7 @@ def _draw_floor(axes: Axes, view: MapView) -> list[Any]:
         corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         squares = view.seen_from_m[:, None, :] + corners
         axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
-        handles.append(_mark("s", "the robot looked from here", color=SHADE, ms=7, mec="none"))
+        handles.append(_mark("s", "looked from here", color=SHADE, ms=7, mec="none"))
     for wall in view.walls_m:
         axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
     if view.walls_m:
@@ -119,7 +119,7 @@ def _draw_floor(axes: Axes, view: MapView) -> list[Any]:
         for place, now in zip(view.other_m, view.landmarks.position_m[view.other_of], strict=True):
             axes.plot(*np.stack([place, now]).T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
         axes.plot(*view.other_m.T, ".", color=MUTED, ms=4, zorder=2)
-        handles.append(_mark(".", "other known place, with a line to where it is now", color=MUTED, ms=4))
+        handles.append(_mark(".", "other known place", color=MUTED, ms=4))
     return handles
 
 
@@ -150,7 +150,7 @@ def _draw_landmarks(axes: Axes, view: MapView, size: FloatArray) -> list[Any]:
     handles.append(_mark("o", label, mfc="none", mec=MUTED, ms=7))
     if view.pinned.any():
         axes.plot(*landmarks.position_m[view.pinned].T, "o", mfc="none", mec=INK, ms=11, mew=1.0, zorder=5)
-        handles.append(_mark("o", "pinned by an operator", mfc="none", mec=INK, ms=9))
+        handles.append(_mark("o", "pinned", mfc="none", mec=INK, ms=9))
     return handles
 
 
@@ -161,7 +161,7 @@ def _mark(marker: str, label: str, **style: Any) -> Artist:
     return Line2D([], [], marker=marker or None, label=label, **looks)
 
 
-_FAINT = "fainter: less probable, P(exists) from 50 % to 100 %"
+_FAINT = "faint: P(exists) from 50 % upwards"
 
 
 def _legend(figure: Figure, handles: Sequence[Any]) -> None:
