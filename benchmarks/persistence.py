@@ -18,8 +18,8 @@ import numpy as np
 from benchmarks import rosen
 from evermap.existence import run_length as run_length_filter
 from evermap.existence import single
-from evermap.existence.batch import Look, Sight, State, look_exponential, look_general_purpose, look_two_state
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.batch import Looked, RowLooks, RowState, look_exponential, look_general_purpose, look_two_state
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LogNormal
 from evermap.types import FloatArray
 
@@ -154,8 +154,8 @@ def two_state(n: int) -> Case:
     features = fleet(n, exponential=True)
     random = np.random.default_rng(2)
     parameters = (features.low_hz, 10 ** random.uniform(-6, -4, n))
-    before, sight = State(features.inverse_odds, features.before.stamp_s), Sight(*features.looks)
-    out = Look(np.empty(n), np.empty(n))
+    before, sight = RowState(features.inverse_odds, features.before.stamp_s), RowLooks(*features.looks)
+    out = Looked(np.empty(n), np.empty(n))
 
     def ours(threads: bool) -> FloatArray:
         return look_two_state(before, *parameters, sight, horizon_s=HORIZON_S, out=out, threads=threads).probability
@@ -257,8 +257,8 @@ def _batch_case(
     horizon_s: float = HORIZON_S,
 ) -> Case:
     n = len(features.low_hz)
-    state, looks, out = features.before, features.looks, Look(np.empty(n), np.empty(n))
-    before, sight = State(features.inverse_odds, state.stamp_s), Sight(*looks)
+    state, looks, out = features.before, features.looks, Looked(np.empty(n), np.empty(n))
+    before, sight = RowState(features.inverse_odds, state.stamp_s), RowLooks(*looks)
     after, belief = rosen.State(*(np.empty(n) for _ in range(3)), looks.time_s), np.empty(n)
 
     def by_numba() -> FloatArray:
@@ -361,7 +361,7 @@ def _torch(n: int, seconds: float) -> dict[str, dict[str, float]]:
             ]
 
             def work(look: Callable[..., Any] = look, columns: list[Any] = columns) -> None:
-                look(State(*columns[:2]), *columns[2:-4], Sight(*columns[-4:]), horizon_s=HORIZON_S)
+                look(RowState(*columns[:2]), *columns[2:-4], RowLooks(*columns[-4:]), horizon_s=HORIZON_S)
                 torch.cuda.synchronize()
 
             name = f"{look.__name__.removeprefix('look_')}_{str(kind).removeprefix('torch.')}"

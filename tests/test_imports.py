@@ -29,7 +29,7 @@ RULES = {
     "io": "errors interrupts types geometry valid",
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types geometry",
-    "existence": "errors compiled types survival io sensing",
+    "existence": "errors compiled show types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors show types config geometry stamps survival sensing existence slam",
     "tracking": "errors compiled show types config survival sensing existence",

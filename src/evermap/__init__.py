@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from evermap.config import Config, PersistConfig, load_config
     from evermap.errors import EvermapError
-    from evermap.existence.one import PersistenceFilter
+    from evermap.existence.one_stay import PersistenceFilter
     from evermap.io import read_recording, write_native
     from evermap.maps.diff import diff
     from evermap.maps.living import LivingMap
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _HOME = {
     "evermap.config": ("Config", "PersistConfig", "load_config"),
     "evermap.errors": ("EvermapError",),
-    "evermap.existence.one": ("PersistenceFilter",),
+    "evermap.existence.one_stay": ("PersistenceFilter",),
     "evermap.io": ("read_recording", "write_native"),
     "evermap.maps.diff": ("diff",),
     "evermap.maps.living": ("LivingMap",),

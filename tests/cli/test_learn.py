@@ -10,9 +10,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.existence.choose import KINDS
+from evermap.existence.models import KINDS, model_of
 from evermap.existence.protocol import Looks
-from evermap.existence.storage import model_of
 
 P_ERROR = 0.05
 STEP_S = 10.0

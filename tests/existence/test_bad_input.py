@@ -7,8 +7,8 @@ import pytest
 
 from evermap.errors import ConfigError, DataError, EvermapError, InputError, NumericalError
 from evermap.existence import single
-from evermap.existence.batch import Look
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.batch import Looked
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import Exponential, Uniform
 
 from .rows import look_exponential, look_general_purpose
@@ -107,7 +107,7 @@ def test_kernel_parameters() -> None:
     with pytest.raises(InputError, match="'low_hz': row 0"):
         look_general_purpose(one, 0 * one, one, one, one, seen, 0.1 * one, 0.1 * one)
     with pytest.raises(InputError, match="shares memory"):
-        look_exponential(one, 0 * one, one, one, seen, 0.1 * one, 0.1 * one, out=Look(one, np.empty(1)))
+        look_exponential(one, 0 * one, one, one, seen, 0.1 * one, 0.1 * one, out=Looked(one, np.empty(1)))
     with pytest.raises(InputError, match="'inverse_odds': row 0"):
         look_exponential(-one, 0 * one, one, one, seen, 0.1 * one, 0.1 * one)
 

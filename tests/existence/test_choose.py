@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
-from evermap.existence.choose import KINDS, _until, choose
+from evermap.existence.models import KINDS, _until, choose
 from evermap.existence.protocol import Looks
 
 P_ERROR = 0.1

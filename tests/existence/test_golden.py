@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evermap.existence import single
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Uniform
 
 from .rows import look_exponential, look_general_purpose

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from evermap.existence.hazard_table import DOUBLINGS_BELOW, PER_DOUBLING, bins_of, edges, tabulate
+from evermap.existence.lifetimes import DOUBLINGS_BELOW, PER_DOUBLING, bins_of, edges, tabulate
 from evermap.survival import (
     Exponential,
     Gamma,

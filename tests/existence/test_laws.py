@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.existence import single
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Uniform, Weibull
 
 from .priors import PRIORS, Stream, streams

@@ -13,7 +13,8 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.learn_phases import AUTO, Limits, learn
-from evermap.existence.phase_em_kernels import expect_feature, piece_integral
+from evermap.existence.phase_em_kernels import Expectations, Forgetting, Generator, expect_feature, piece_integral
+from evermap.existence.phase_kernels import PhaseLooks
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BIN_S, BINS, WEEK_S
@@ -90,8 +91,9 @@ def test_expectations_are_sums_over_all_paths(bins: int) -> None:
     there, gone, begin = rng.random(4), rng.random(4), rng.dirichlet(np.ones(n))
     integrals, smoothed, last = np.zeros_like(rates), np.empty(n), np.empty(n)
     evidence, bad = expect_feature(
-        rates, exits, present, 0.0, begin, look_s, there, gone, 2600.0, np.inf, integrals, smoothed, last
-    )
+        Generator(rates, exits, present), 0.0, begin, PhaseLooks(look_s, there, gone), Forgetting(2600.0, np.inf),
+        Expectations(integrals, smoothed, last),
+    )  # fmt: skip
     assert bad == -1
 
     monday = (3 * BINS // 7) if bins > 1 else 0  # 1970-01-01 was a Thursday

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
-from evermap.existence.learn_sojourns import Learned, learn
+from evermap.existence.learn_sojourns import Data, LearnedSojourns, learn, with_lifetimes
 from evermap.existence.protocol import Looks
 from evermap.existence.run_length import RunLength
-from evermap.existence.sojourn_em import Data, with_lifetimes
 from evermap.existence.sojourns import FAMILIES
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.types import BoolArray, FloatArray
@@ -38,7 +37,7 @@ def looks_at(time: FloatArray, there: BoolArray, error: float = ERROR, seed: int
 
 
 def standard_errors(
-    learned: Learned, prior: LifetimePrior, expected: LifetimePrior, name: str, which: int
+    learned: LearnedSojourns, prior: LifetimePrior, expected: LifetimePrior, name: str, which: int
 ) -> FloatArray:
     """By how many standard errors of fully observed durations the parameters are off."""
     n = learned.expected.counts[which].n_events

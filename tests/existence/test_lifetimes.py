@@ -10,11 +10,11 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError, EvermapError, InputError
 from evermap.existence.lifetimes import Lifetimes
+from evermap.existence.models import NamedModels, lifetimes_of, load_models, save_models
 from evermap.existence.one_stay import OneStay
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.rhythm import BINS, Rhythm
 from evermap.existence.run_length import RunLength
-from evermap.existence.storage import NamedModels, lifetimes_of, load_models, save_models
 from evermap.survival import (
     CallableHazard,
     Exponential,

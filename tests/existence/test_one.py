@@ -7,7 +7,7 @@ import pickle
 
 import pytest
 
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import LifetimePrior
 
 from .priors import PRIORS

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, NumericalError
-from evermap.existence.one import PersistenceFilter
-from evermap.existence.one_stay import OneStay, births
-from evermap.existence.protocol import Instants, Looks, PresenceModel
+from evermap.existence.one_stay import OneStay, PersistenceFilter, births
+from evermap.existence.protocol import Instants, Looks
 from evermap.survival import (
     CallableHazard,
     Exponential,
@@ -85,14 +84,6 @@ def test_without_instants_it_answers_at_the_looks() -> None:
     assert len(at_looks) == len(looks.stamp_s)
 
 
-def test_asking_more_changes_no_answer() -> None:
-    model, looks = OneStay(GeneralPurpose(1e-3, 1.0)), random_looks(6)
-    few, many = np.array([1010.0, 1050.0, 1300.0]), np.linspace(1000.0, 1300.0, 301)
-    coarse = model.track(looks, Instants.same_for_all(looks.n_features, few)).p_present.reshape(-1, 3)
-    fine = model.track(looks, Instants.same_for_all(looks.n_features, many)).p_present.reshape(-1, 301)
-    np.testing.assert_allclose(fine[:, [10, 50, 300]], coarse, rtol=1e-9)
-
-
 def test_a_feature_is_born_at_its_first_detection() -> None:
     looks = Looks.from_rows([0, 0, 0, 1], [5.0, 7.0, 7.0, 1.0], [0, 1, 0, 0], 0.1, 0.1)
     np.testing.assert_array_equal(births(looks), [7.0, np.nan])
@@ -121,10 +112,6 @@ def test_the_median_of_what_remains() -> None:
     found = OneStay(half_stay).median_remaining_s(np.array([0.0, 500.0]))
     assert found[0] == pytest.approx(-np.log((0.5 - 0.4) / 0.6) / 0.1, rel=1e-9)
     assert found[1] == np.inf
-
-
-def test_it_is_a_model_of_presence() -> None:
-    assert isinstance(OneStay(Exponential(1.0)), PresenceModel)
 
 
 def test_it_is_stored_as_it_was_written() -> None:

@@ -12,11 +12,11 @@ from scipy.linalg import expm
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.existence import phase_belief
 from evermap.existence.lifetimes import exponential_mixture_of
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
+from evermap.existence.phase_belief import time_to_leave, time_to_return
 from evermap.existence.phase_kernels import leap, transition
-from evermap.existence.phase_times import time_to_leave, time_to_return
 from evermap.existence.phase_type import PhaseType
-from evermap.existence.protocol import Instants, Looks, PresenceModel
+from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, Rhythm
 from evermap.survival import Exponential, GeneralPurpose, Mixture, Weibull
 
@@ -288,7 +288,3 @@ def test_refusals() -> None:
     looks = Looks.from_rows([0, 1, 1], [0.0, 0.0, 5.0], [0, 0, 1], 0.1, 0.0)
     with pytest.raises(NumericalError, match=r"feature 1 at 5\.0 s: this observation is impossible"):
         gone.track(looks)
-
-
-def test_it_is_a_model_of_presence() -> None:
-    assert isinstance(random_chain(0), PresenceModel)

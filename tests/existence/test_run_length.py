@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError, InputError, NumericalError
-from evermap.existence.hazard_table import edges
-from evermap.existence.lattice import Lattice, lattice
+from evermap.existence.lifetimes import edges
 from evermap.existence.protocol import Instants, Looks, PresenceModel
 from evermap.existence.rhythm import BINS, Rhythm, bin_of_week
 from evermap.existence.run_length import RunLength, init, predict, update
+from evermap.existence.run_length_smoothing import Lattice, lattice
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Uniform, never_leaves
 from evermap.types import FloatArray
 
@@ -210,7 +210,7 @@ def test_smooth_lifetimes_are_those_of_their_tables() -> None:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", MODELS)
 def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
-    from evermap.existence.run_length_smoothing import Counts, expectations
+    from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
 
     model, looks = beginning(MODELS[name]), looks_at(stamps(seed, 3.0), seed)
     grid = lattice(looks, STEP_S)
@@ -221,7 +221,7 @@ def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
 
     n_bins = model.law.hazard_hz.shape[1]
     shape = (2, n_bins, BINS)
-    counts = Counts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 3)), np.zeros((2, 3)))
+    counts = SojournCounts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 3)), np.zeros((2, 3)))
     smoothed = np.empty(steps + 1)
     law = model.law
     if law.factor.shape[1] == 1:  # so that columns are counted here too
@@ -229,7 +229,9 @@ def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
         first = for_all_week(model.first)
     else:
         first = model.first
-    evidence, at_first = expectations(*grid, np.ones(steps), period, level, model.slots, law, first, counts, smoothed)
+    evidence, at_first = expectations(
+        grid, Calendar(np.ones(steps), period, level), model.slots, law, first, counts, smoothed
+    )
     assert evidence == pytest.approx(expected.log_evidence, abs=1e-10)
     np.testing.assert_allclose(smoothed, expected.smoothed, rtol=1e-10, atol=1e-12)
     assert at_first == smoothed[0]
@@ -244,18 +246,18 @@ def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
 
 
 def test_smoothing_weighs_steps_by_their_importance() -> None:
-    from evermap.existence.run_length_smoothing import Counts, expectations
+    from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
 
     model, looks = beginning(MODELS["no rhythm"]), looks_at(stamps(3), 3)
     grid = lattice(looks, STEP_S)
     steps = len(grid.stamp_s) - 1
 
-    def count(importance: FloatArray) -> Counts:
+    def count(importance: FloatArray) -> SojournCounts:
         shape = (2, model.law.hazard_hz.shape[1], 1)
-        zeros = Counts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 1)), np.zeros((2, 1)))
+        zeros = SojournCounts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 1)), np.zeros((2, 1)))
         expectations(
-            *grid, importance, np.zeros(steps, dtype=np.int64), np.ones((2, 1)), model.slots, model.law, model.first,
-            zeros, np.empty(steps + 1),
+            grid, Calendar(importance, np.zeros(steps, dtype=np.int64), np.ones((2, 1))), model.slots, model.law,
+            model.first, zeros, np.empty(steps + 1),
         )  # fmt: skip
         return zeros
 
@@ -273,8 +275,8 @@ def test_smoothing_weighs_steps_by_their_importance() -> None:
 @pytest.mark.parametrize("name", ["no rhythm", "both rhythms"])
 def test_a_long_recording_is_smoothed_as_a_hidden_markov_chain(name: str) -> None:
     """Exponential lifetimes forget their age: two states, and merging does no harm. Several stretches of steps."""
+    from evermap.existence.learn_sojourns import Data
     from evermap.existence.run_length_smoothing import STRETCH
-    from evermap.existence.sojourn_em import Data
 
     n = 2 * STRETCH + 500
     rng = np.random.default_rng(4)

@@ -7,17 +7,21 @@ import pytest
 from scipy import integrate
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence.hazard_table import tabulate
+from evermap.existence.lifetimes import tabulate
 from evermap.existence.protocol import Looks
 from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, Rhythm
-from evermap.existence.run_length import RunLength, RunLengthBelief, init, predict, update
-from evermap.existence.run_length_forecast import (
+from evermap.existence.run_length import (
+    RunLength,
+    RunLengthBelief,
     after,
+    init,
     p_stays,
     p_stays_away,
+    predict,
     residual_life,
     time_to_leave,
     time_to_return,
+    update,
 )
 from evermap.survival import (
     Exponential,

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BINS, WEEK_S, Rhythm
-from evermap.existence.run_length import RunLength, RunLengthBelief, init, predict, update
-from evermap.existence.run_length_forecast import after
+from evermap.existence.run_length import RunLength, RunLengthBelief, after, init, predict, update
 from evermap.survival import (
     Exponential,
     Gamma,

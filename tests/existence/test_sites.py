@@ -14,10 +14,12 @@ from scipy.special import betaln
 
 from evermap.errors import InputError
 from evermap.existence import joint, single
-from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
+from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks
 from evermap.sensing.sightlines import Lines
 from evermap.survival import Exponential, GeneralPurpose, Weibull
 from evermap.types import FloatArray
+
+from .rows import follow_sites
 
 SURE = 1e15
 """Pseudo counts of a rate that is known: no look changes it."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from evermap.existence.sites import SiteDynamics, SiteLooks, follow_sites
+from evermap.existence.sites import SiteDynamics, SiteLooks
 from evermap.geometry import se2
 from evermap.sensing.sightlines import CLEAR, P_HIDDEN, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import NominalField
@@ -20,6 +20,8 @@ from evermap.survival import Exponential, LifetimePrior
 from evermap.types import BoolArray, Detections, FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim.config import BuildingConfig, Duration
 from evermap_studies.sim.world import BuildingSimulation, simulate_building
+
+from .rows import follow_sites
 
 P_FALSE = 1e-4
 NEAR_M = 0.35

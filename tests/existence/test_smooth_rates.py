@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from evermap.existence.rhythm import BINS
-from evermap.existence.smooth_rates import (
+from evermap.existence.rhythm import (
+    BINS,
     HALF_AN_EVENT,
     Basis,
     _newton,

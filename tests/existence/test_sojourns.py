@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evermap.existence.hazard_table import edges
-from evermap.existence.rhythm import BINS
-from evermap.existence.smooth_rates import HALF_AN_EVENT
-from evermap.existence.sojourn_em import ranked_fits
+from evermap.existence.learn_sojourns import ranked_fits
+from evermap.existence.lifetimes import edges
+from evermap.existence.rhythm import BINS, HALF_AN_EVENT
 from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns, hazards
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
 from evermap.types import FloatArray

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError
+from evermap.existence.models import load_model, model_of, save_model
 from evermap.existence.one_stay import OneStay
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks, PresenceModel
 from evermap.existence.rhythm import BINS, Rhythm
-from evermap.existence.storage import load_model, model_of, save_model
 from evermap.survival import Exponential, Mixture
 
 RHYTHM = Rhythm(np.round(np.sin(np.arange(BINS) / 23.0), 5))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence.batch import Look
+from evermap.existence.batch import Looked
 from evermap.types import FloatArray
 
 from .rows import look_exponential, look_general_purpose, look_two_state
@@ -47,7 +47,7 @@ def test_tensors_give_what_arrays_give(
 
     parameters = tuple(rounded(p) for p in parameters_of(look, random))
     stamp = np.zeros(N)
-    arrays, tensors = Look(np.zeros(N), np.ones(N)), Look(tensor(np.zeros(N)), tensor(np.ones(N)))
+    arrays, tensors = Looked(np.zeros(N), np.ones(N)), Looked(tensor(np.zeros(N)), tensor(np.ones(N)))
     for _ in range(60):
         time = rounded(stamp + random.choice([0.0, 1e-3, 1.0, 100.0, 1e4], N))
         seen, miss, false = random.random(N) < 0.5, rounded(random.random(N)), rounded(random.random(N))
@@ -104,4 +104,4 @@ def test_what_is_refused() -> None:
     with pytest.raises(InputError, match=r"'time_s'.*shape \(2,\) instead of \(3,\)"):
         look_exponential(ones, ones, ones, ones[:2], seen, 0.5 * ones, 0.5 * ones)
     with pytest.raises(InputError, match="'out'"):
-        look_exponential(ones, ones, ones, ones, seen, 0.5 * ones, 0.5 * ones, out=Look(ones, ones))
+        look_exponential(ones, ones, ones, ones, seen, 0.5 * ones, 0.5 * ones, out=Looked(ones, ones))

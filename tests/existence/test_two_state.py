@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence.batch import Look
+from evermap.existence.batch import Looked
 
 from .rows import look_exponential, look_two_state
 
@@ -41,7 +41,7 @@ def test_without_return_it_is_the_persistence_filter(horizon_s: float) -> None:
     random = np.random.default_rng(2)
     rate = 10 ** random.uniform(-6, 0, N)
     stamp = np.zeros(N)
-    recurrent, once = Look(np.zeros(N), np.ones(N)), Look(np.zeros(N), np.ones(N))
+    recurrent, once = Looked(np.zeros(N), np.ones(N)), Looked(np.zeros(N), np.ones(N))
     for _ in range(30):
         time = stamp + random.choice([0.0, 1e-3, 1.0, 100.0], N)
         look = (time, random.random(N) < 0.5, random.uniform(0.01, 0.99, N), random.uniform(0.01, 0.99, N))

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from evermap.cli.main import app
 from evermap.errors import ConfigError, InputError
 from evermap.existence.lifetimes import Lifetimes
+from evermap.existence.models import NamedModels, lifetimes_of, save_models
 from evermap.existence.run_length import RunLength
-from evermap.existence.storage import NamedModels, lifetimes_of, save_models
 from evermap.maps.learning import absence_said, learned_lives, lifetimes_by_class, stay_said, with_priors
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Stays

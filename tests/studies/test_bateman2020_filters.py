@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import Exponential
 from evermap_studies.bateman2020.filters import beliefs
 from evermap_studies.bateman2020.runs import TUNING, Stack, miss_rate, simulate, stack

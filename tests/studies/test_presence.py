@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from evermap.cli.main import app
 from evermap.errors import InputError
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.existence.protocol import Instants, Looks
 from evermap.survival import Exponential
 from evermap.types import FloatArray

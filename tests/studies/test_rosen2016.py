@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
 from evermap.errors import ConfigError, InputError
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.runs.folder import MANIFEST
 from evermap.survival import GeneralPurpose, LifetimePrior, Uniform, never_leaves
 from evermap_studies.rosen2016 import study as rosen2016

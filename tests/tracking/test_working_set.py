@@ -66,7 +66,7 @@ def test_a_million_objects_are_small() -> None:
 
 
 def test_misses_and_lifetimes_are_the_persistence_filters() -> None:
-    from evermap.existence.one import PersistenceFilter
+    from evermap.existence.one_stay import PersistenceFilter
 
     rate = 0.01
     kept = WorkingSet(10.0, (Exponential(rate),), 1, 0)

@@ -237,8 +237,8 @@ def why(
 
 def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:
     """The lifetimes of a map as a file of models; returns the classes in it."""
+    from evermap.existence.models import NamedModels, save_models
     from evermap.existence.run_length import RunLength
-    from evermap.existence.storage import NamedModels, save_models
     from evermap.maps.learning import lifetimes_by_class
 
     models = {name: RunLength.from_lifetimes(found) for name, found in lifetimes_by_class(living).items()}

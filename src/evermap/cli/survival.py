@@ -15,7 +15,7 @@ from evermap.cli.terminal import check_picture, print_json, print_table, progres
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
-    from evermap.existence.choose import Choice
+    from evermap.existence.models import Choice
     from evermap.runs.persist.learning import LearnedModels
     from evermap.runs.track.lifetimes import LifetimeEstimate, LifetimeGroup, LifetimeTable
     from evermap.survival import LifetimePrior

@@ -7,28 +7,37 @@ nothing is allocated at a million rows.
 Columns are numpy arrays, or torch tensors of float32 or float64 on any one device; tensors give tensors, of the type of
 `inverse_odds`, and stay on their device. Probabilities from float32 are within 1e-6 of those from the same numbers in
 double precision. Mind that float32 keeps seven digits of a time: a week to a twentieth of a second.
+
+Tensors go through the formulas of `recursion` too: each conditional expression `a if c else b` is read as a selection
+between whole tensors, each name as torch's function. Exponential lifetimes are computed in the tensors' own type.
+Lifetimes of unknown rate are computed in double precision whatever comes in, for their odds of dying are differences of
+nearly equal numbers, of which single precision would leave three or four digits.
 """
 
 from __future__ import annotations
 
+import ast
+import math
 import os
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence import checks
+from evermap.existence import protocol as checks
+from evermap.existence import recursion
 from evermap.types import FloatArray
 
 CHUNK_ROWS = 65536
 """Most rows that a thread takes at a time: much longer than handing them out, short enough for busy cores to help."""
 
 
-class State(NamedTuple):
+class RowState(NamedTuple):
     """Features before a look.
 
     Attributes:
@@ -40,7 +49,7 @@ class State(NamedTuple):
     stamp_s: Any
 
 
-class Sight(NamedTuple):
+class RowLooks(NamedTuple):
     """One look at each of N features.
 
     Attributes:
@@ -56,7 +65,7 @@ class Sight(NamedTuple):
     p_false: Any
 
 
-class Look(NamedTuple):
+class Looked(NamedTuple):
     """Answers of one look at N features.
 
     Attributes:
@@ -69,8 +78,14 @@ class Look(NamedTuple):
 
 
 def look_exponential(
-    before: State, rate_hz: Any, sight: Sight, *, horizon_s: float = 0.0, out: Look | None = None, threads: bool = False
-) -> Look:
+    before: RowState,
+    rate_hz: Any,
+    sight: RowLooks,
+    *,
+    horizon_s: float = 0.0,
+    out: Looked | None = None,
+    threads: bool = False,
+) -> Looked:
     """Predict to the look, take it in, predict `horizon_s` further: exponential lifetimes (MATH.md section 2).
 
     Args:
@@ -89,30 +104,30 @@ def look_exponential(
 
 
 def look_general_purpose(
-    before: State,
+    before: RowState,
     low_hz: Any,
     high_hz: Any,
-    sight: Sight,
+    sight: RowLooks,
     *,
     horizon_s: float = 0.0,
-    out: Look | None = None,
+    out: Looked | None = None,
     threads: bool = False,
-) -> Look:
+) -> Looked:
     """As `look_exponential`, for lifetimes of unknown rate between `low_hz` and `high_hz` (Rosen 2016 eqs. 26-29)."""
     rates = {"low_hz": low_hz, "high_hz": high_hz}
     return _look(_Columns("general_purpose", before, rates, sight), horizon_s, out, threads)
 
 
 def look_two_state(
-    before: State,
+    before: RowState,
     leave_hz: Any,
     return_hz: Any,
-    sight: Sight,
+    sight: RowLooks,
     *,
     horizon_s: float = 0.0,
-    out: Look | None = None,
+    out: Looked | None = None,
     threads: bool = False,
-) -> Look:
+) -> Looked:
     """As `look_exponential`, for features that leave and return: exponential stays and absences (MATH.md section 4).
 
     At birth the inverse odds are 0; of a feature that may have come and gone for long they are
@@ -126,34 +141,32 @@ class _Columns(NamedTuple):
     """All columns of a look, and the kind of lifetimes."""
 
     kind: str
-    before: State
+    before: RowState
     rates: dict[str, Any]
-    sight: Sight
+    sight: RowLooks
 
     def by_name(self) -> dict[str, Any]:
         return {**self.before._asdict(), **self.rates, **self.sight._asdict()}
 
     def of(self, columns: dict[str, Any]) -> _Columns:
         """The same with other columns."""
-        before, sight = ([columns[name] for name in kind._fields] for kind in (State, Sight))
-        return _Columns(self.kind, State(*before), {name: columns[name] for name in self.rates}, Sight(*sight))
+        before, sight = ([columns[name] for name in kind._fields] for kind in (RowState, RowLooks))
+        return _Columns(self.kind, RowState(*before), {name: columns[name] for name in self.rates}, RowLooks(*sight))
 
 
-def _look(given: _Columns, horizon_s: float, out: Look | None, threads: bool) -> Look:
+def _look(given: _Columns, horizon_s: float, out: Looked | None, threads: bool) -> Looked:
     """The look under the lifetimes of this kind, by the kernels or by torch, whichever the columns are of."""
     if not 0.0 <= horizon_s < np.inf:
         raise InputError(f"{horizon_s} s is not a time after the look", field="horizon_s", hint="a finite number >= 0")
     columns, torch = given.by_name(), sys.modules.get("torch")  # who has tensors has loaded it
     if torch is not None and isinstance(given.before.inverse_odds, torch.Tensor):
-        from evermap.existence import tensors
-
         if out is not None:
             raise InputError("is for arrays only", field="out", hint="leave it out: torch keeps memory for reuse")
         _check_tensors(columns, torch)
-        *found, refused = tensors.look(given.kind, given.before, given.rates.values(), given.sight, float(horizon_s))
+        *found, refused = _look_at_tensors(given, float(horizon_s))
         if refused:
             _refuse({name: column.cpu().numpy() for name, column in columns.items()}, found[0].cpu().numpy())
-        return Look(*found)
+        return Looked(*found)
 
     from evermap.existence import kernels
 
@@ -164,7 +177,7 @@ def _look(given: _Columns, horizon_s: float, out: Look | None, threads: bool) ->
     return answer
 
 
-def _apply(kernel: Callable[..., bool], given: _Columns, horizon_s: float, answer: Look, threads: bool) -> bool:
+def _apply(kernel: Callable[..., bool], given: _Columns, horizon_s: float, answer: Looked, threads: bool) -> bool:
     """Run a kernel over all rows, at once or chunk by chunk on all cores; True if it refused a row."""
     n = len(answer.probability)
 
@@ -172,7 +185,7 @@ def _apply(kernel: Callable[..., bool], given: _Columns, horizon_s: float, answe
         before, rates, sight, after = (
             [column[rows] for column in part] for part in (given.before, given.rates.values(), given.sight, answer)
         )
-        return kernel(State(*before), tuple(rates), Sight(*sight), horizon_s, Look(*after))
+        return kernel(RowState(*before), tuple(rates), RowLooks(*sight), horizon_s, Looked(*after))
 
     if not threads or n <= CHUNK_ROWS:
         return chunk(slice(None))
@@ -203,11 +216,11 @@ def _contiguous(columns: dict[str, Any]) -> dict[str, Any]:
     return arrays
 
 
-def _space(columns: dict[str, Any], out: Look | None) -> Look:
+def _space(columns: dict[str, Any], out: Looked | None) -> Looked:
     """The arrays to fill."""
     n = len(columns["time_s"])
     if out is None:
-        return Look(np.empty(n), np.empty(n))
+        return Looked(np.empty(n), np.empty(n))
     if any(a.shape != (n,) or a.dtype != np.float64 or not a.flags.c_contiguous for a in out):
         raise InputError(f"not contiguous float64 arrays of shape ({n},)", field="out")
     if any(np.may_share_memory(a, b) for a in out for b in columns.values()):
@@ -248,3 +261,80 @@ def _refuse(columns: dict[str, Any], after: FloatArray) -> None:
         raise InputError(f"row {row}: {odds[row]} are no inverse odds", field="inverse_odds", hint="a number >= 0")
     checks.check_possible(after)
     raise NumericalError("a row was refused for no reason that can be found")
+
+
+Tensor = Any
+"""A `torch.Tensor`; torch need not be installed where types are checked."""
+
+
+def _look_at_tensors(given: _Columns, horizon_s: float) -> tuple[Tensor, Tensor, bool]:
+    """Inverse odds, probability, and whether a row was refused."""
+    kind, sight, rates, like = given.kind, given.sight, given.rates.values(), given.before.inverse_odds
+    columns = [*given.before, *rates, *sight]
+    if kind == "general_purpose":
+        columns = [column if column.dtype == sight.detected.dtype else column.double() for column in columns]
+    formulas = _formulas(columns[0].element_size() == 8)
+    odds, start, *rest = columns
+    own, (stop, *looked) = rest[: len(rates)], rest[len(rates) :]
+    new, *middle, fine = formulas[f"look_{kind}"](odds, start, *own, stop, *looked)
+    if kind == "general_purpose" and horizon_s > 0.0:
+        probability = formulas[f"later_{kind}"](new, *own, stop, horizon_s, *middle)
+    else:
+        probability = 1.0 / (1.0 + new) if middle else formulas[f"later_{kind}"](new, *own, horizon_s)
+    smallest, largest, _ = _bounds(like.element_size() == 8)
+    kept = new.clamp(smallest, largest).where((new > 0.0) & new.isfinite(), new)
+    return kept.to(like.dtype), probability.to(like.dtype), not bool(fine.all())
+
+
+def _bounds(double: bool) -> tuple[float, float, float]:
+    """Smallest and largest finite inverse odds of a type of tensors, and the logarithm of the largest."""
+    return (recursion.SMALLEST, recursion.LARGEST, recursion.LOG_LARGEST) if double else (1e-37, 1e37, 85.0)
+
+
+class _Selections(ast.NodeTransformer):
+    """`a if c else b` becomes `where(c, a, b)`."""
+
+    def visit_IfExp(self, node: ast.IfExp) -> ast.Call:
+        self.generic_visit(node)
+        return ast.Call(ast.Name("where", ast.Load()), [node.test, node.body, node.orelse], [])
+
+
+@cache
+def _formulas(double: bool) -> dict[str, Any]:
+    """The formulas, compiled once for each type of tensors."""
+    torch: Any = sys.modules["torch"]  # who has tensors has loaded it
+
+    def where(condition: Any, a: Any, b: Any) -> Any:
+        if not isinstance(condition, torch.Tensor):
+            return a if condition else b
+        sides = (x if isinstance(x, torch.Tensor) else condition.new_full((), x, dtype=torch.float64) for x in (a, b))
+        return torch.where(condition, *sides)
+
+    def pick(scalar: Any, tensor: Any) -> Any:
+        """`min` or `max` of two, either of which may be a number."""
+
+        def of(a: Any, b: Any) -> Any:
+            if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+                return tensor(a, b)
+            x, bound = (a, b) if isinstance(a, torch.Tensor) else (b, a)
+            return x.clamp(**{scalar: bound})
+
+        return of
+
+    def split(x: Tensor) -> tuple[Tensor, Tensor]:
+        fraction, exponent = torch.frexp(x)
+        low = (fraction < math.sqrt(0.5)).to(x.dtype)
+        return exponent - low, fraction * (1.0 + low) - 1.0
+
+    tree = _Selections().visit(ast.parse(Path(recursion.__file__).read_text(encoding="utf-8")))
+    space: dict[str, Any] = {"__name__": recursion.__name__}
+    exec(compile(ast.fix_missing_locations(tree), recursion.__file__, "exec"), space)
+    smallest, largest, log_largest = _bounds(double)
+    space.update(
+        SMALLEST=smallest, LARGEST=largest, LOG_LARGEST=log_largest, where=where, split=split,
+        exp=lambda x: x.exp() if isinstance(x, torch.Tensor) else math.exp(x),
+        expm1=lambda x: x.expm1() if isinstance(x, torch.Tensor) else math.expm1(x),
+        log_of_split=lambda exponent, s: exponent * math.log(2.0) + 2.0 * s.atanh(),
+        min=pick("max", torch.minimum), max=pick("min", torch.maximum),
+    )  # fmt: skip
+    return space

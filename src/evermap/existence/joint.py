@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.existence import checks, single
+from evermap.existence import protocol as checks
+from evermap.existence import single
 from evermap.existence.single import Belief
 from evermap.types import BoolArray, FloatArray, IntArray
 

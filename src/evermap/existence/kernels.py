@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.existence import elementary, recursion
-from evermap.existence.batch import Sight, State
+from evermap.existence.batch import RowLooks, RowState
 from evermap.existence.elementary import aligned_stack, inlined, kernel
 from evermap.types import FloatArray, IntArray
 
@@ -119,7 +119,7 @@ def general_purpose_gaps(low: float, high: float, start_s: FloatArray, stop_s: F
 
 
 @kernel
-def exponential(before: State, rates: Any, sight: Sight, horizon_s: float, after: Any) -> bool:
+def exponential(before: RowState, rates: Any, sight: RowLooks, horizon_s: float, after: Any) -> bool:
     """Look at each row of an exponential lifetime, and fill in its belief `horizon_s` later; True if refused."""
     inverse_odds, stamp_s = before
     (rate_hz,) = rates
@@ -137,7 +137,7 @@ def exponential(before: State, rates: Any, sight: Sight, horizon_s: float, after
 
 
 @kernel
-def two_state(before: State, rates: Any, sight: Sight, horizon_s: float, after: Any) -> bool:
+def two_state(before: RowState, rates: Any, sight: RowLooks, horizon_s: float, after: Any) -> bool:
     """Look at each row of a feature that comes and goes; as `exponential`."""
     inverse_odds, stamp_s = before
     leave_hz, return_hz = rates
@@ -156,7 +156,7 @@ def two_state(before: State, rates: Any, sight: Sight, horizon_s: float, after: 
 
 
 @kernel
-def general_purpose(before: State, rates: Any, sight: Sight, horizon_s: float, after: Any) -> bool:
+def general_purpose(before: RowState, rates: Any, sight: RowLooks, horizon_s: float, after: Any) -> bool:
     """Look at each row of an unknown-rate lifetime; as `exponential`."""
     aligned_stack()
     inverse_odds, stamp_s = before

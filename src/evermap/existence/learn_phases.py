@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.errors import ConfigError, DataError
-from evermap.existence.phase_type import PhaseType
+from evermap.existence.phase_type import PhaseType, Structure, structure_of
 from evermap.existence.protocol import Looks
 from evermap.existence.rhythm import BINS, Rhythm
-from evermap.existence.structures import Structure, structure_of
+from evermap.show import Shown
 from evermap.types import FloatArray
 
 AUTO = ("two-state", "three-phase")
@@ -72,7 +72,6 @@ class Limits(NamedTuple):
             DataError: no feature has looks at two instants.
         """
         feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
-        feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
         gaps = np.diff(looks.stamp_s)[np.diff(feature) == 0]
         gaps = gaps[gaps > 0.0]
         if not gaps.size:
@@ -81,7 +80,7 @@ class Limits(NamedTuple):
         return cls(FASTEST / gap, 0.5 * float(np.sqrt(gap * span)))
 
 
-class Candidate(NamedTuple):
+class PhaseCandidate(NamedTuple):
     """One structure that was tried.
 
     Attributes:
@@ -100,7 +99,7 @@ class Candidate(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedPhases:
+class LearnedPhases(Shown):
     """A model learned from looks, and what is needed to go on learning.
 
     Attributes:
@@ -117,7 +116,7 @@ class LearnedPhases:
 
     model: PhaseType
     log_evidence: float
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[PhaseCandidate, ...]
     structure: Structure
     statistics: Statistics
     belief: FloatArray
@@ -191,9 +190,7 @@ def learn(
         DataError: fewer than two looks at every feature.
         NumericalError: a look that is impossible, whether the feature is there or not.
     """
-    names = AUTO if isinstance(phases, str) and phases == "auto" else phases
-    several = [names] if isinstance(names, (str, Structure)) else list(names)
-    structures = [structure_of(s) if isinstance(s, str) else s for s in several]
+    structures = _structures(phases)
     if not structures or restarts < 1:
         raise ConfigError("nothing to try", field="phases" if restarts >= 1 else "restarts", hint="at least one")
     if half_life_s is not None and not half_life_s > 0.0:
@@ -205,19 +202,18 @@ def learn(
     data = _Data.of(looks, end_s, np.inf if half_life_s is None else half_life_s)
     span_s, limits = end_s - float(looks.stamp_s.min()), Limits.of(looks)
     with_rhythm = rhythm is True or (rhythm == "auto" and span_s >= SHORTEST_RHYTHM_S)
+    found: list[tuple[PhaseCandidate, _Fit, Structure]] = []
     random = np.random.default_rng(seed)
-    found: list[tuple[Candidate, _Fit, Structure]] = []
     for structure in structures:
         if progress:
             progress(structure.name)
         fit = _best_of(data, structure, restarts, random, span_s, limits)
-        if rhythm is not True:
-            found.append((_candidate(looks, structure, fit), fit, structure))
+        fits = [] if rhythm is True else [fit]
         if with_rhythm:
             if progress:
                 progress(f"{structure.name} + rhythm")
-            fit = _with_rhythm(data, structure, fit, limits)
-            found.append((_candidate(looks, structure, fit), fit, structure))
+            fits.append(_with_rhythm(data, structure, fit, limits))
+        found += [(_candidate(looks, structure, fit), fit, structure) for fit in fits]
     found.sort(key=lambda one: -one[0].score)
     best, fit, structure = found[0]
     final = _expect(data, fit.model, fit.start[None])
@@ -232,6 +228,13 @@ def learn(
         half_life_s=data.half_life_s,
         limits=limits,
     )
+
+
+def _structures(phases: str | Structure | Sequence[str | Structure]) -> list[Structure]:
+    """What to choose from."""
+    names = AUTO if isinstance(phases, str) and phases == "auto" else phases
+    several = [names] if isinstance(names, (str, Structure)) else list(names)
+    return [structure_of(s) if isinstance(s, str) else s for s in several]
 
 
 class _Data(NamedTuple):
@@ -271,17 +274,23 @@ class _Fit(NamedTuple):
 
 def _expect(data: _Data, model: PhaseType, start: FloatArray) -> _Expected:
     """Expected changes and times under a model; `start` is (n,) rows, one a feature or one for all."""
-    from evermap.existence.phase_em_kernels import expect_all
+    from evermap.existence import phase_em_kernels as kernels
+    from evermap.existence.phase_kernels import PhaseLooks
 
     rates = model.rates_by_bin
     features, n = data.looks.n_features, model.n_phases
     begin = np.array(np.broadcast_to(start, (features, n)))
     integrals = np.zeros_like(rates)
     smoothed, last = np.empty((features, n)), np.empty((features, n))
-    evidence, bad = expect_all(
-        rates, rates.sum(2), model.present.astype(np.float64), data.begin_s, begin, data.looks.first,
-        data.looks.stamp_s, data.there, data.gone, data.end_s, data.half_life_s, integrals, smoothed, last,
-    )  # fmt: skip
+    evidence, bad = kernels.expect_all(
+        kernels.Generator(rates, rates.sum(2), model.present.astype(np.float64)),
+        data.begin_s,
+        begin,
+        data.looks.first,
+        PhaseLooks(data.looks.stamp_s, data.there, data.gone),
+        kernels.Forgetting(float(data.end_s), float(data.half_life_s)),
+        kernels.Expectations(integrals, smoothed, last),
+    )
     if bad >= 0:
         raise data.looks.impossible(bad)
     exposure = np.einsum("bii->bi", integrals).copy()
@@ -290,7 +299,7 @@ def _expect(data: _Data, model: PhaseType, start: FloatArray) -> _Expected:
 
 def _maximise(structure: Structure, statistics: Statistics, rhythm: bool, limits: Limits) -> tuple[PhaseType, float]:
     """Rates of greatest posterior density given expected changes and times, and how many parameters they are."""
-    from evermap.existence.smooth_rates import constant, fit, week_basis
+    from evermap.existence.rhythm import constant, fit, week_basis
 
     rates = np.zeros(structure.changes.shape)
     edges = np.argwhere(structure.changes)
@@ -396,9 +405,9 @@ def _with_rhythm(data: _Data, structure: Structure, flat: _Fit, limits: Limits) 
     return _Fit(model, start, parameters, ())
 
 
-def _candidate(looks: Looks, structure: Structure, fit: _Fit) -> Candidate:
+def _candidate(looks: Looks, structure: Structure, fit: _Fit) -> PhaseCandidate:
     """How well a fit does, its parameters counted against it."""
     evidence = float(fit.model.track(looks).log_evidence.sum())
     penalty = 0.5 * fit.parameters * float(np.log(max(len(looks.stamp_s), 2)))
     name = f"{structure.name} + rhythm" if fit.model.rhythms else structure.name
-    return Candidate(name, evidence, fit.parameters, evidence - penalty, fit.history)
+    return PhaseCandidate(name, evidence, fit.parameters, evidence - penalty, fit.history)

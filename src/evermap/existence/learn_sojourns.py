@@ -1,7 +1,10 @@
 """How long things stay and stay away, learned from uncertain looks by expectation maximisation.
 
-No truth is needed and no list of changes: the expectation step runs the run-length filter forward and backward, and
+No truth is needed and no list of changes: the expectation step runs the run-length filter forward and backward and
 counts, with probabilities, at which ages stays and absences ended; the maximisation step fits lifetimes to the counts.
+Where there is a rhythm of the week the calendar matters too: from week to week the level of each hazard may drift. It
+is a random walk whose steps are as large as the counts want them (smoothness by marginal likelihood, `smooth_rates`);
+the model that comes out has the level of the last week.
 """
 
 from __future__ import annotations
@@ -12,11 +15,214 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.errors import ConfigError, DataError
+from evermap.existence.lifetimes import edges
 from evermap.existence.protocol import Looks
+from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, fit, steady_level
 from evermap.existence.run_length import RunLength
-from evermap.existence.sojourn_em import Ascent, Data, Expected, climb, ranked_fits, with_lifetimes
-from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Sojourns
+from evermap.existence.run_length_smoothing import Lattice, lattice
+from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Fitted, Sojourns
+from evermap.show import Shown
 from evermap.survival import Exponential
+from evermap.types import FloatArray, IntArray
+
+AGE_GROUP = 4
+"""Bins of age that count as one where there is a rhythm."""
+CHOOSING_ROUNDS = 4
+"""Rounds in which the families are chosen anew."""
+HOPELESS = 20.0
+"""A family whose score is this much below the best is not tried again."""
+SETTLED = 0.02
+"""Gain of log evidence below which EM stops."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected(Shown):
+    """What an expectation step finds.
+
+    Attributes:
+        counts: of absences and of stays, exposures times the level of their week.
+        log_evidence: `log p(looks)`.
+        presence: of each feature, at every step, given all its looks.
+        of_period: (2, P) how many absences and stays ended in each week, the last week last.
+        expected_of_period: (2, P) how many would have at the level of the model.
+    """
+
+    counts: tuple[Sojourns, Sojourns]
+    log_evidence: float
+    presence: list[FloatArray]
+    of_period: FloatArray
+    expected_of_period: FloatArray
+
+    def levels(self) -> FloatArray:
+        """(2, P) by what the hazards of each week differ from those of the last."""
+        n = self.of_period.shape[1]
+        if n == 1:
+            return np.ones((2, 1))
+        basis = steady_level(n)
+        logs = np.array(
+            [
+                fit(events[:, None], expected[:, None], basis, None).log_age
+                for events, expected in zip(self.of_period, self.expected_of_period, strict=True)
+            ]
+        )
+        return np.asarray(np.exp(logs - logs[:, -1:]), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Data(Shown):
+    """Looks laid out on the filter's steps.
+
+    Attributes:
+        lattices: one of each feature that was looked at twice.
+        importance: weight of every step.
+        period: week of every step, counted back from the last look; one for all where there is no rhythm.
+        n_periods: P.
+        step_s: longest step.
+        rhythm: whether the time of the week is counted.
+        span_s: longest time that a feature was looked at.
+        last_s: end of the last look.
+    """
+
+    lattices: tuple[Lattice, ...]
+    importance: tuple[FloatArray, ...]
+    period: tuple[IntArray, ...]
+    n_periods: int
+    step_s: float
+    rhythm: bool
+    span_s: float
+    last_s: float
+
+    @classmethod
+    def of(cls, looks: Looks, step_s: float, half_life_s: float, *, rhythm: bool) -> Data:
+        """Lay out looks.
+
+        Raises:
+            DataError: no feature with two looks at different times.
+        """
+        # as the filter's: never longer than a rhythm is constant
+        step = min(step_s, BIN_S) if rhythm else step_s
+        pieces = [lattice(one, step) for one in map(looks.of, range(looks.n_features)) if len(one.stamp_s)]
+        pieces = [piece for piece in pieces if len(piece.stamp_s) > 1]
+        if not pieces:
+            raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
+        last = max(float(piece.stamp_s[-1]) for piece in pieces)
+        weights = tuple(2.0 ** (-(last - piece.stamp_s[1:]) / half_life_s) for piece in pieces)
+        span = max(float(np.ptp(piece.stamp_s)) for piece in pieces)
+        ago = [((last - piece.stamp_s[1:]) // WEEK_S).astype(np.int64) * rhythm for piece in pieces]
+        n = 1 + max(int(weeks.max()) for weeks in ago)
+        return cls(tuple(pieces), weights, tuple(n - 1 - weeks for weeks in ago), n, step_s, rhythm, span, last)
+
+    def expect(self, model: RunLength, level: FloatArray | None = None) -> Expected:
+        """Run the filter forward and backward and count.
+
+        Args:
+            model: how features come and go.
+            level: (2, P) by what the hazards of absences and stays are multiplied in each week.
+        """
+        from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
+
+        _, edge = edges(self.step_s)
+        group = AGE_GROUP if self.rhythm else 1
+        shape = (2, -(-len(edge) // group), BINS if self.rhythm else 1)
+        calendar = (2, self.n_periods)
+        total = SojournCounts(
+            np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros(calendar), np.zeros(calendar)
+        )
+        levels = np.ones(calendar) if level is None else level
+        evidence, presence = 0.0, []
+        for piece, importance, period in zip(self.lattices, self.importance, self.period, strict=True):
+            smoothed = np.empty(len(piece.stamp_s))
+            gain, _ = expectations(
+                piece, Calendar(importance, period, levels), model.slots, model.law, model.first, total, smoothed
+            )
+            evidence += gain
+            presence.append(smoothed)
+        coarse = np.append(edge[::group], 2.0 * edge[-1])
+        absences, stays = (Sojourns(coarse, total.events[s], total.exposure_s[s], total.open_ended[s]) for s in (0, 1))
+        return Expected((absences, stays), evidence, presence, total.of_period, total.expected_of_period)
+
+
+@dataclass(frozen=True, slots=True)
+class Ascent(Shown):
+    """Where expectation maximisation has arrived.
+
+    Attributes:
+        model: the best model.
+        fitted: its absences and stays.
+        expected: what it finds in the looks.
+        level: (2, P) drift of the hazards over the weeks.
+    """
+
+    model: RunLength
+    fitted: tuple[Fitted, Fitted]
+    expected: Expected
+    level: FloatArray
+
+    @property
+    def name(self) -> str:
+        """Families of stay and absence."""
+        absence, stay = self.fitted
+        return f"{stay.family} stays, {absence.family} absences" + (", rhythm of the week" if stay.rhythm else "")
+
+    @property
+    def freedom(self) -> float:
+        """Effective number of parameters."""
+        return sum(one.freedom for one in self.fitted)
+
+    @property
+    def score(self) -> float:
+        """Log evidence less the price of the parameters (Schwarz 1978)."""
+        events = sum(counts.n_events for counts in self.expected.counts)
+        return self.expected.log_evidence - 0.5 * self.freedom * float(np.log(max(events, 2.0)))
+
+
+def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) -> Ascent:
+    """Expectation and maximisation in turn until the evidence settles; families are chosen in the first rounds."""
+    allowed: list[Sequence[str]] = [families, families]
+    level = np.ones((2, data.n_periods))
+    expected = data.expect(model, level)
+    best: Ascent | None = None
+    fitted: tuple[Fitted, Fitted] | None = None
+    for number in range(rounds):
+        ranked = [
+            ranked_fits(expected.counts[s], allowed[s], fitted[s] if fitted else None, rhythm=data.rhythm)
+            for s in (0, 1)
+        ]
+        fitted = (ranked[0][0], ranked[1][0])
+        allowed = [_promising(fits, expected.counts[s]) for s, fits in enumerate(ranked)]
+        if number >= CHOOSING_ROUNDS - 1:
+            allowed = [[one.family] for one in fitted]
+        before = expected.log_evidence
+        model, level = with_lifetimes(model, fitted), expected.levels()
+        expected = data.expect(model, level)
+        if best is None or expected.log_evidence > best.expected.log_evidence:
+            best = Ascent(model, fitted, expected, level)
+        if number >= CHOOSING_ROUNDS and expected.log_evidence - before < SETTLED:
+            break
+    assert best is not None
+    return best
+
+
+def ranked_fits(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> list[Fitted]:
+    """Lifetimes of some families, the highest score first."""
+    known = WITH_RHYTHM if rhythm else FAMILIES
+    fits = [known[name](counts, start if start and start.family == name else None) for name in families]
+    return sorted(fits, key=lambda one: -one.score(counts)) if len(fits) > 1 else fits
+
+
+def _promising(ranked: Sequence[Fitted], counts: Sojourns) -> list[str]:
+    """The families that are worth another round."""
+    best = ranked[0].score(counts)
+    return list(dict.fromkeys(one.family for one in ranked if one.score(counts) > best - HOPELESS))
+
+
+def with_lifetimes(model: RunLength, fitted: tuple[Fitted, Fitted]) -> RunLength:
+    """A model like `model` with other lifetimes."""
+    absence, stay = fitted
+    return RunLength(
+        stay.prior, absence.prior, model.step_s, stay.rhythm, absence.rhythm, model.newborn, model.hypotheses
+    )
+
 
 _WARM_UP_ROUNDS = 4
 _TRIAL_ROUNDS = 8
@@ -26,7 +232,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class SojournCandidate:
     """A kind of model that was considered.
 
     Attributes:
@@ -43,7 +249,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class LearnedSojourns(Shown):
     """What was learned.
 
     Attributes:
@@ -58,13 +264,13 @@ class Learned:
 
     model: RunLength
     log_evidence: float
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[SojournCandidate, ...]
     families: tuple[str, ...]
     half_life_s: float
     last_s: float
     expected: Expected
 
-    def updated(self, looks: Looks) -> Learned:
+    def updated(self, looks: Looks) -> LearnedSojourns:
         """Learn from further looks: one expectation step on them, added to what is remembered of the earlier ones.
 
         Args:
@@ -101,7 +307,7 @@ def learn(
     hypotheses: int = 64,
     restarts: int = 4,
     progress: Progress | None = None,
-) -> Learned:
+) -> LearnedSojourns:
     """One model of the comings and goings of all features in `looks`.
 
     Args:
@@ -128,14 +334,7 @@ def learn(
     data = Data.of(looks, step, half_life_s, rhythm=False)
     tell = progress or (lambda _: None)
 
-    starts = []
-    durations = np.geomspace(10.0 * step, max(data.span_s / 4.0, 20.0 * step), restarts)
-    for number, duration in enumerate(durations):
-        model = RunLength(Exponential(1.0 / duration), Exponential(1.0 / duration), step, hypotheses=hypotheses)
-        starts.append(climb(data, model, ("exponential",), _WARM_UP_ROUNDS))
-        tell(0.3 * (number + 1) / restarts)
-    simple = max(starts, key=lambda ascent: ascent.expected.log_evidence)
-    ascents = [climb(data, simple.model, ("exponential",), _MOST_ROUNDS)]
+    ascents = [_exponential(data, hypotheses, restarts, tell)]
     tell(0.5)
     if rhythm or allowed != ("exponential",):
         # what a model of one family counts looks like that family: each has to be tried from its own counts
@@ -151,10 +350,10 @@ def learn(
     tell(1.0)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
     best = ranked[0]
-    candidates: dict[str, Candidate] = {}
+    candidates: dict[str, SojournCandidate] = {}
     for ascent in ranked:  # the best of each kind
         candidates.setdefault(ascent.name, _candidate(ascent))
-    return Learned(
+    return LearnedSojourns(
         best.model,
         best.expected.log_evidence,
         tuple(candidates.values()),
@@ -165,9 +364,20 @@ def learn(
     )
 
 
-def _candidate(ascent: Ascent) -> Candidate:
+def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> Ascent:
+    """The best exponential lifetimes, from several typical durations on."""
+    starts, step = [], data.step_s
+    for number, duration in enumerate(np.geomspace(10.0 * step, max(data.span_s / 4.0, 20.0 * step), restarts)):
+        model = RunLength(Exponential(1.0 / duration), Exponential(1.0 / duration), step, hypotheses=hypotheses)
+        starts.append(climb(data, model, ("exponential",), _WARM_UP_ROUNDS))
+        tell(0.3 * (number + 1) / restarts)
+    simple = max(starts, key=lambda ascent: ascent.expected.log_evidence)
+    return climb(data, simple.model, ("exponential",), _MOST_ROUNDS)
+
+
+def _candidate(ascent: Ascent) -> SojournCandidate:
     """An ascent in numbers."""
-    return Candidate(ascent.name, ascent.expected.log_evidence, ascent.freedom, ascent.score)
+    return SojournCandidate(ascent.name, ascent.expected.log_evidence, ascent.freedom, ascent.score)
 
 
 def _added(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:

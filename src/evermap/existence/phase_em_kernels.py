@@ -8,12 +8,12 @@ the double sum over jumps before and after would need its square.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from evermap.existence.elementary import kernel
-from evermap.existence.phase_kernels import NEGLIGIBLE, advance, observe
+from evermap.existence.phase_kernels import NEGLIGIBLE, PhaseLooks, advance, observe
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -21,6 +21,46 @@ PIECE = 16.0
 """Most expected jumps in one piece."""
 _TERMS = 128
 """More than a Poisson variable of mean `PIECE` has with a chance of 1e-17."""
+
+
+class Generator(NamedTuple):
+    """A chain of n phases.
+
+    Attributes:
+        rates: (B, n, n) rates of changes of phase at each time of the week (B is 1008 or 1).
+        exits: (B, n) sums of their rows.
+        present: (n,) 1.0 where a phase is 'there'.
+    """
+
+    rates: FloatArray
+    exits: FloatArray
+    present: FloatArray
+
+
+class Forgetting(NamedTuple):
+    """How expectations are weighed.
+
+    Attributes:
+        end_s: instant at which they weigh 1.
+        half_life_s: by how much earlier they weigh half; inf: all the same.
+    """
+
+    end_s: float
+    half_life_s: float
+
+
+class Expectations(NamedTuple):
+    """What is expected of F features; of one where a dimension is less.
+
+    Attributes:
+        integrals: (B, n, n) added to: as in `piece_integral`.
+        smoothed: (F, n) filled in: belief at the beginning given all looks.
+        last: (F, n) filled in: belief after the last look.
+    """
+
+    integrals: FloatArray
+    smoothed: FloatArray
+    last: FloatArray
 
 
 @kernel
@@ -141,37 +181,22 @@ def _cut(from_s: float, to_s: float, exits: FloatArray, spans: FloatArray, bins:
 
 @kernel
 def expect_feature(
-    rates: FloatArray,
-    exits: FloatArray,
-    present: FloatArray,
-    begin_s: float,
-    begin: FloatArray,
-    look_s: FloatArray,
-    there: FloatArray,
-    gone: FloatArray,
-    end_s: float,
-    half_life_s: float,
-    integrals: FloatArray,
-    smoothed: FloatArray,
-    last: FloatArray,
+    chain: Generator, begin_s: float, begin: FloatArray, looks: PhaseLooks, fading: Forgetting, out: Expectations
 ) -> tuple[float, int]:
-    """Add one feature's expectations to `integrals`; evidence, and the look that is impossible or -1.
+    """Add one feature's expectations to `out`; evidence, and the look that is impossible or -1.
 
     Args:
-        rates: (B, n, n) rates of changes of phase at each time of the week (B is 1008 or 1).
-        exits: (B, n) sums of their rows.
-        present: (n,) 1.0 where a phase is 'there'.
+        chain: of the feature.
         begin_s: where the belief starts, not after the first look.
         begin: (n,) that belief.
-        look_s: (M,) looks.
-        there: (M,) likelihood of each if the feature is there.
-        gone: (M,) if it is not.
-        end_s: instant at which expectations weigh 1.
-        half_life_s: by how much earlier they weigh half; inf: all the same.
-        integrals: (B, n, n) added to: as in `piece_integral`.
-        smoothed: (n,) filled in: belief at `begin_s` given all looks.
-        last: (n,) filled in: belief after the last look.
+        looks: at the feature.
+        fading: of older events.
+        out: filled in, integrals added to.
     """
+    rates, exits, present = chain
+    look_s, there, gone = looks
+    end_s, half_life_s = fading
+    integrals, smoothed, last = out
     m, n = look_s.size, present.size
     forward = np.empty((m + 1, n))
     forward[0] = begin
@@ -234,29 +259,22 @@ def expect_feature(
 
 @kernel
 def expect_all(
-    rates: FloatArray,
-    exits: FloatArray,
-    present: FloatArray,
+    chain: Generator,
     begin_s: FloatArray,
     begin: FloatArray,
     first: IntArray,
-    look_s: FloatArray,
-    there: FloatArray,
-    gone: FloatArray,
-    end_s: float,
-    half_life_s: float,
-    integrals: FloatArray,
-    smoothed: FloatArray,
-    last: FloatArray,
+    looks: PhaseLooks,
+    fading: Forgetting,
+    out: Expectations,
 ) -> tuple[float, int]:
     """`expect_feature` of all features; the sum of their evidence, and the first look that is impossible or -1."""
     evidence = 0.0
     for f in range(begin_s.size):
         a, b = first[f], first[f + 1]
+        own = PhaseLooks(looks.stamp_s[a:b], looks.there[a:b], looks.gone[a:b])
         gained, bad = expect_feature(
-            rates, exits, present, begin_s[f], begin[f], look_s[a:b], there[a:b], gone[a:b], end_s, half_life_s,
-            integrals, smoothed[f], last[f],
-        )  # fmt: skip
+            chain, begin_s[f], begin[f], own, fading, Expectations(out.integrals, out.smoothed[f], out.last[f])
+        )
         if bad >= 0:
             return evidence, int(a + bad)
         evidence += gained

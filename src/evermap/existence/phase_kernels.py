@@ -22,7 +22,7 @@ LONG = 16.0
 NEGLIGIBLE = 1e-17
 
 
-class Chain(NamedTuple):
+class PhaseChain(NamedTuple):
     """All that the kernels know of a model; B is 1, or 1008 where there is a rhythm.
 
     Attributes:
@@ -38,6 +38,26 @@ class Chain(NamedTuple):
     whole: FloatArray
     week: FloatArray
     present: FloatArray
+
+
+class Beginning(NamedTuple):
+    """What is believed before anything was seen.
+
+    Attributes:
+        start: (1, n) phases, or (1008, n) at the begin of each ten minutes of the week.
+        fixed: whether they hold at the first look, even where presence is asked for before it.
+    """
+
+    start: FloatArray
+    fixed: bool
+
+
+class PhaseLooks(NamedTuple):
+    """M looks in order of time, and their likelihoods if the feature is there and if it is not."""
+
+    stamp_s: FloatArray
+    there: FloatArray
+    gone: FloatArray
 
 
 @inlined
@@ -212,20 +232,14 @@ def first_belief(start: FloatArray, chain: Any, at_s: float, belief: FloatArray,
 
 @kernel
 def track_feature(
-    chain: Any,
-    start: FloatArray,
-    fixed: bool,
-    look_s: FloatArray,
-    there: FloatArray,
-    gone: FloatArray,
-    asked_s: FloatArray,
-    p_present: FloatArray,
-    belief: FloatArray,
+    chain: Any, beginning: Beginning, seen: PhaseLooks, asked_s: FloatArray, p_present: FloatArray, belief: FloatArray
 ) -> tuple[float, int]:
     """One feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
 
     `belief`, (n,), is filled in with what is believed at the last of them all.
     """
+    look_s, there, gone = seen
+    start, fixed = beginning
     looks, asks = look_s.size, asked_s.size
     if looks + asks == 0:
         return 0.0, -1
@@ -259,56 +273,51 @@ def track_feature(
 @kernel
 def track_all(
     chain: Any,
-    start: FloatArray,
-    fixed: bool,
+    beginning: Beginning,
     first_look: IntArray,
-    look_s: FloatArray,
-    there: FloatArray,
-    gone: FloatArray,
+    looks: PhaseLooks,
     first_asked: IntArray,
     asked_s: FloatArray,
-    p_present: FloatArray,
-    evidence: FloatArray,
-    beliefs: FloatArray,
-) -> int:
-    """Every feature in turn; the first look that is impossible, or -1."""
-    for f in range(evidence.size):
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """Filter every feature in turn.
+
+    Returns:
+        (Q,) presence at the instants asked for, (F,) log evidence, (F, n) phases at the last look or instant, and (F,)
+        the look that is impossible, counted over all, or -1.
+    """
+    stamp_s, there, gone = looks
+    features = len(first_look) - 1
+    p_present, evidence, bads = np.empty(len(asked_s)), np.zeros(features), np.full(features, -1)
+    beliefs = np.empty((features, chain.present.size))
+    for f in range(features):
         a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
-        evidence[f], bad = track_feature(
-            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
-        )
-        if bad >= 0:
-            return int(a + bad)
-    return -1
+        own = PhaseLooks(stamp_s[a:b], there[a:b], gone[a:b])
+        evidence[f], bad = track_feature(chain, beginning, own, asked_s[c:d], p_present[c:d], beliefs[f])
+        bads[f] = a + bad if bad >= 0 else -1
+    return p_present, evidence, beliefs, bads
 
 
 @parallel_kernel
 def track_all_parallel(
     chain: Any,
-    start: FloatArray,
-    fixed: bool,
+    beginning: Beginning,
     first_look: IntArray,
-    look_s: FloatArray,
-    there: FloatArray,
-    gone: FloatArray,
+    looks: PhaseLooks,
     first_asked: IntArray,
     asked_s: FloatArray,
-    p_present: FloatArray,
-    evidence: FloatArray,
-    beliefs: FloatArray,
-) -> int:
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
     """`track_all`, the features spread over all threads."""
-    bads = np.full(evidence.size, -1)
-    for f in prange(evidence.size):
+    # arrays of its own, taken out of tuples: what is written to others, a parallel loop takes for dead
+    stamp_s, there, gone = looks
+    features = len(first_look) - 1
+    p_present, evidence, bads = np.empty(len(asked_s)), np.zeros(features), np.full(features, -1)
+    beliefs = np.empty((features, chain.present.size))
+    for f in prange(features):
         a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
-        evidence[f], bad = track_feature(
-            chain, start, fixed, look_s[a:b], there[a:b], gone[a:b], asked_s[c:d], p_present[c:d], beliefs[f]
-        )
+        own = PhaseLooks(stamp_s[a:b], there[a:b], gone[a:b])
+        evidence[f], bad = track_feature(chain, beginning, own, asked_s[c:d], p_present[c:d], beliefs[f])
         bads[f] = a + bad if bad >= 0 else -1
-    for f in range(evidence.size):
-        if bads[f] >= 0:
-            return int(bads[f])
-    return -1
+    return p_present, evidence, beliefs, bads
 
 
 @kernel

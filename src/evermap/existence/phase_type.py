@@ -2,11 +2,13 @@
 
 Some phases are 'there', the others 'not there'; a feature changes from phase to phase at constant rates, or at rates
 that follow the hours of the week. Two phases are exponential stays and absences; more make mixtures (a door that is
-closed briefly or for the night). The filter is exact, and its cost does not grow with the past.
+closed briefly or for the night). The filter is exact, and its cost does not grow with the past. A `Structure` is a
+chain without its rates, which learning chooses from.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
@@ -17,11 +19,50 @@ from evermap.errors import ConfigError
 from evermap.existence.lifetimes import Lifetimes, exponential_mixture_of, lifetime_of_phases
 from evermap.existence.protocol import Instants, Looks, Track
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
+from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from evermap.existence.phase_kernels import Chain
+    from evermap.existence.phase_kernels import PhaseChain
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """A chain without its rates.
+
+    Attributes:
+        name: what it is called on the command line and in reports.
+        present: (n,) bool, whether a feature in this phase is there.
+        changes: (n, n) bool, which changes of phase there are.
+    """
+
+    name: str
+    present: BoolArray
+    changes: BoolArray
+
+
+def hyperexponential(stays: int, absences: int, name: str = "") -> Structure:
+    """Several kinds of stays and of absences; each change is between one of these and one of those."""
+    present = np.arange(absences + stays) >= absences
+    return Structure(name or f"{stays}+{absences}", present, present[:, None] != present[None, :])
+
+
+def structure_of(name: str) -> Structure:
+    """The structure of a name: 'two-state', 'three-phase' (away, briefly away, there), or '2+3' for two kinds of stays
+    and three of absences.
+
+    Raises:
+        ConfigError: another name.
+    """
+    if name == "two-state":
+        return hyperexponential(1, 1, name)
+    if name == "three-phase":
+        return hyperexponential(1, 2, name)
+    if parts := re.fullmatch(r"([1-6])\+([1-6])", name):
+        return hyperexponential(int(parts[1]), int(parts[2]))
+    raise ConfigError(f"'{name}' is no structure", field="phases", hint="auto, two-state, three-phase, or 2+2 to 6+6")
+
 
 _ENDLESS = 100
 """Doublings of a time after which nothing of its beginning is left: 2^100 ten-minute steps."""
@@ -29,7 +70,7 @@ _UNIQUE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class PhaseType:
+class PhaseType(Shown):
     """Presence as a Markov chain of `n` phases.
 
     Attributes:
@@ -151,16 +192,12 @@ class PhaseType:
         from evermap.existence import phase_kernels
 
         there, gone = looks.likelihoods()
-        p_present, evidence = np.empty(len(asked.stamp_s)), np.zeros(looks.n_features)
-        last = np.empty((looks.n_features, self.n_phases))
         run = phase_kernels.track_all_parallel if threads else phase_kernels.track_all
-        start, fixed = self._starts, self.start is not None
-        bad = run(
-            self.chain, start, fixed, looks.first, looks.stamp_s, there, gone, asked.first, asked.stamp_s,
-            p_present, evidence, last,
-        )  # fmt: skip
-        if bad >= 0:
-            raise looks.impossible(bad)
+        beginning = phase_kernels.Beginning(self._starts, self.start is not None)
+        columns = phase_kernels.PhaseLooks(looks.stamp_s, there, gone)
+        p_present, evidence, last, bad = run(self.chain, beginning, looks.first, columns, asked.first, asked.stamp_s)
+        for row in bad[bad >= 0][:1]:
+            raise looks.impossible(int(row))
         return p_present, evidence, last
 
     def stationary(self, stamp_s: float | None = None) -> FloatArray:
@@ -202,20 +239,20 @@ class PhaseType:
         )
 
     @cached_property
-    def chain(self) -> Chain:
+    def chain(self) -> PhaseChain:
         """Rates and transitions for the kernels, made once."""
-        from evermap.existence.phase_kernels import Chain, transitions
+        from evermap.existence.phase_kernels import PhaseChain, transitions
 
         rates = self.rates_by_bin
         exits = rates.sum(2)
         if len(rates) == 1:
             nothing = np.zeros((1, self.n_phases, self.n_phases))
-            return Chain(rates, exits, nothing, nothing[0], self.present.astype(np.float64))
+            return PhaseChain(rates, exits, nothing, nothing[0], self.present.astype(np.float64))
         whole = transitions(rates, exits, BIN_S)
         week = np.eye(self.n_phases)
         for matrix in whole:
             week = week @ matrix
-        return Chain(rates, exits, whole, week, self.present.astype(np.float64))
+        return PhaseChain(rates, exits, whole, week, self.present.astype(np.float64))
 
     @property
     def rates_by_bin(self) -> FloatArray:

@@ -1,14 +1,21 @@
-"""Daily and weekly rhythms: by what a hazard is multiplied at each local time of the week."""
+"""Daily and weekly rhythms: by what a hazard is multiplied at each local time of the week, and how that is learned.
+
+Learning is penalised Poisson regression on a table of events and exposure. The logarithm of the rate is a smooth
+function of age plus a smooth function of the time of the week; how smooth is learned with it (Wood and Fasiolo 2017,
+the generalised Fellner-Schall update of the smoothing parameters, which climbs the marginal likelihood). A stay or an
+absence is a sequence of survived moments, so its hazard is such a rate.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
+from evermap.show import Shown
 from evermap.types import FloatArray, IntArray
 
 DAY_S = 86400.0
@@ -22,7 +29,7 @@ MONDAY_S = 4.0 * DAY_S
 
 
 @dataclass(frozen=True, slots=True)
-class Rhythm:
+class Rhythm(Shown):
     """A factor on a hazard for every ten minutes of the week, Monday 00:00 first.
 
     Stamps are seconds since 1970-01-01 as the clocks on the wall show them (`Clock.LOCAL_WALL`).
@@ -63,3 +70,199 @@ def bin_of_week(stamp_s: ArrayLike) -> IntArray:
     """Which ten minutes of the week an instant lies in, 0 from Monday 00:00, stamps in local wall time."""
     phase = np.mod(np.asarray(stamp_s, dtype=np.float64) - MONDAY_S, WEEK_S)
     return np.minimum((phase / BIN_S).astype(np.int64), BINS - 1)
+
+
+HALF_AN_EVENT = 0.5
+"""Added to every table where the exposure is, so that no rate is zero (Jeffreys' prior of a Poisson rate)."""
+DAY_KNOTS = 72
+DEVIATION_KNOTS = 12
+_WEAK = 1e-5
+"""Precision of the prior of directions that no penalty reaches."""
+_WEEKEND = 0.03
+"""Precision of the prior of the weekend's log factor: a factor of e^6 is one standard deviation."""
+_SMOOTHEST, _ROUGHEST = 1e6, 1e-4
+_SETTLED = 0.01
+"""Change of the effective number of parameters below which the smoothness is found."""
+_MAX_ROUNDS = 60
+_MAX_NEWTON = 25
+_MAX_STEP = 4.0
+_LOWEST, _HIGHEST = -60.0, 20.0
+
+
+class Basis(NamedTuple):
+    """Columns that a smooth function is made of, and what its roughness costs.
+
+    Attributes:
+        columns: (n, p) value of each column at each of n points.
+        penalties: (p, p) matrices, each with a weight that is learned.
+        fixed: (p, p) penalty that always holds.
+    """
+
+    columns: FloatArray
+    penalties: tuple[FloatArray, ...]
+    fixed: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SmoothRates(Shown):
+    """Log rate at age `i` and time of the week `j`: `log_age[i] + log_week[j]`.
+
+    Attributes:
+        log_age: (I,) log of events per unit of exposure.
+        log_week: (J,) log factor, of mean 0 over the events.
+        freedom: effective number of parameters.
+        coefficients: of the columns of both bases.
+        weights: of the penalties.
+    """
+
+    log_age: FloatArray
+    log_week: FloatArray
+    freedom: float
+    coefficients: FloatArray
+    weights: FloatArray
+
+
+def constant(n: int) -> Basis:
+    """One level for all of n points."""
+    return Basis(np.ones((n, 1)), (), np.zeros((1, 1)))
+
+
+def age_basis(log_age: FloatArray, knots: int) -> Basis:
+    """A cubic spline in the logarithm of age, its second differences penalised (Eilers and Marx 1996)."""
+    low, high = float(log_age[0]), float(log_age[-1])
+    columns = _spline(log_age, low, max(high - low, 1e-6) / knots, knots)
+    difference = np.diff(np.eye(columns.shape[1]), 2, axis=0)
+    return Basis(columns, (difference.T @ difference,), np.zeros((columns.shape[1],) * 2))
+
+
+def week_basis() -> Basis:
+    """A daily curve shared by all days, a weekend, and a level and a smoother curve of each day of the week."""
+    time = (np.arange(BINS_OF_DAY) + 0.5) / BINS_OF_DAY
+    shared, own = _cyclic_spline(time, DAY_KNOTS), _cyclic_spline(time, DEVIATION_KNOTS)
+    weekend = np.repeat(np.arange(7) >= 5, BINS_OF_DAY)[:, None].astype(np.float64)
+    levels = np.repeat(np.eye(7), BINS_OF_DAY, axis=0)
+    columns = np.hstack([np.tile(shared, (7, 1)), weekend, levels, np.kron(np.eye(7), own)])
+    starts = np.cumsum([0, DAY_KNOTS, 1, 7])
+    size = columns.shape[1]
+
+    rough = _cyclic_difference(DEVIATION_KNOTS) + 0.05 * np.eye(DEVIATION_KNOTS)
+    penalties = (
+        _padded(_cyclic_difference(DAY_KNOTS), int(starts[0]), size),
+        _padded(np.eye(7), int(starts[2]), size),
+        _padded(np.asarray(np.kron(np.eye(7), rough), dtype=np.float64), int(starts[3]), size),
+    )
+    return Basis(columns, penalties, _padded(np.array([[_WEEKEND]]), int(starts[1]), size))
+
+
+def steady_level(n: int) -> Basis:
+    """A level for each of n periods, from one to the next changed as little as the events allow: a random walk."""
+    difference = np.diff(np.eye(n), axis=0)
+    return Basis(np.eye(n), (difference.T @ difference,) if n > 1 else (), np.zeros((n, n)))
+
+
+def fit(
+    events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None = None
+) -> SmoothRates:
+    """Log rates of greatest penalised likelihood, the penalties' weights by marginal likelihood.
+
+    Args:
+        events: (I, J) expected numbers of events by age and time of the week.
+        exposure: (I, J) time spent there.
+        age: basis of the I ages.
+        week: basis of the J times of the week; None where there is no rhythm (then J may be 1).
+        start: where to begin: an earlier fit of the same bases.
+    """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1, user_api="blas"):  # for matrices this small, threads only get in each other's way
+        return _fit(events, exposure, age, week, start)
+
+
+def _fit(
+    events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None
+) -> SmoothRates:
+    total = exposure.sum()
+    if total <= 0.0:
+        none = np.zeros(0)
+        return SmoothRates(np.full(len(exposure), _LOWEST), np.zeros(exposure.shape[1]), 0.0, none, none)
+    counted = events + HALF_AN_EVENT * exposure / total
+    columns_week = week.columns if week else np.zeros((exposure.shape[1], 0))
+    p, q = age.columns.shape[1], columns_week.shape[1]
+    penalties = [_padded(penalty, 0, p + q) for penalty in age.penalties]
+    fixed = _WEAK * np.eye(p + q) + _padded(age.fixed, 0, p + q)
+    if week:
+        penalties += [_padded(penalty, p, p + q) for penalty in week.penalties]
+        fixed += _padded(week.fixed, p, p + q)
+    weights = np.ones(len(penalties))
+    beta = np.concatenate([np.full(p, np.log(counted.sum() / total)), np.zeros(q)])
+    if start is not None and len(start.coefficients) == p + q:
+        beta, weights = start.coefficients, start.weights
+    freedom = 0.0
+    for _ in range(_MAX_ROUNDS):
+        penalty = fixed + sum((w * m for w, m in zip(weights, penalties, strict=True)), np.zeros_like(fixed))
+        beta, covariance = _newton(beta, counted, exposure, age.columns, columns_week, penalty)
+        prior = np.linalg.inv(penalty)
+        updated = np.array(
+            [
+                w * max(float(np.sum(prior * m) - np.sum(covariance * m)), 1e-3) / max(float(beta @ m @ beta), 1e-8)
+                for w, m in zip(weights, penalties, strict=True)
+            ]
+        )
+        weights = np.clip(updated, _ROUGHEST, _SMOOTHEST)
+        before, freedom = freedom, p + q - float(np.sum(covariance * penalty))
+        if abs(freedom - before) < _SETTLED:
+            break
+    log_age, log_week = age.columns @ beta[:p], columns_week @ beta[p:]
+    level = float(counted.sum(0) @ log_week / counted.sum())
+    return SmoothRates(log_age + level, log_week - level, freedom, beta, weights)
+
+
+def _newton(
+    beta: FloatArray, events: FloatArray, exposure: FloatArray, a: FloatArray, w: FloatArray, penalty: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Maximum of the penalised likelihood by damped Newton steps, and the covariance there."""
+    p = a.shape[1]
+    gradient_events = np.concatenate([a.T @ events.sum(1), w.T @ events.sum(0)])
+    information = penalty
+    for _ in range(_MAX_NEWTON):
+        log_rate = (a @ beta[:p])[:, None] + (w @ beta[p:])[None, :]
+        expected = exposure * np.exp(np.clip(log_rate, _LOWEST, _HIGHEST))
+        rows, columns = expected.sum(1), expected.sum(0)
+        gradient = gradient_events - np.concatenate([a.T @ rows, w.T @ columns]) - penalty @ beta
+        cross = a.T @ expected @ w
+        information = np.block([[(a.T * rows) @ a, cross], [cross.T, (w.T * columns) @ w]]) + penalty
+        step = np.linalg.solve(information, gradient)
+        largest = float(np.abs(step).max())
+        beta = beta + step * min(1.0, _MAX_STEP / max(largest, 1e-300))
+        if largest < 1e-5:
+            break
+    return beta, np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+def _padded(matrix: FloatArray, start: int, size: int) -> FloatArray:
+    """`matrix` on the diagonal of a larger matrix of zeros."""
+    whole = np.zeros((size, size))
+    whole[start : start + len(matrix), start : start + len(matrix)] = matrix
+    return whole
+
+
+def _spline(points: FloatArray, low: float, spacing: float, knots: int) -> FloatArray:
+    """Cubic B-splines on equally spaced knots."""
+    from scipy.interpolate import BSpline
+
+    places = low + spacing * np.arange(-3, knots + 4)
+    inside = np.clip(points, low, low + spacing * knots * (1.0 - 1e-12))
+    return np.asarray(BSpline.design_matrix(inside, places, 3).toarray(), dtype=np.float64)
+
+
+def _cyclic_spline(points: FloatArray, knots: int) -> FloatArray:
+    """Cubic B-splines on the unit circle."""
+    columns = _spline(points, 0.0, 1.0 / knots, knots)
+    columns[:, :3] += columns[:, knots:]
+    return columns[:, :knots]
+
+
+def _cyclic_difference(n: int) -> FloatArray:
+    """Sum of squared second differences around a circle of n coefficients."""
+    difference = np.eye(n) - 2.0 * np.roll(np.eye(n), 1, axis=1) + np.roll(np.eye(n), 2, axis=1)
+    return np.asarray(difference.T @ difference)

@@ -12,25 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import ConfigError, NumericalError
-from evermap.existence import checks
-from evermap.existence.checks import impossible
-from evermap.existence.hazard_table import HazardTable, edges, tabulate
-from evermap.existence.lifetimes import Lifetimes, proportional
-from evermap.existence.protocol import Instants, Looks, Track
+from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.existence import protocol as checks
+from evermap.existence.lifetimes import HazardTable, Lifetimes, bins_of, edges, proportional, tabulate
+from evermap.existence.protocol import Instants, Looks, Track, impossible
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
+from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from evermap.existence.run_length_kernels import First, Law
+    from evermap.existence.run_length_kernels import BeliefRows, First, Law
 
 ABSENT, PRESENT = 0, 1
 _MOST_HYPOTHESES = 10_000
 
 
 @dataclass(frozen=True)
-class RunLength:
+class RunLength(Shown):
     """How features come and go: an alternating renewal process (MATH.md section 4).
 
     A hazard at local time `t` of a stay of age `a` is that of its lifetime at `a` times its rhythm at `t`. Within one
@@ -95,14 +94,11 @@ class RunLength:
         from evermap.existence import run_length_kernels as kernels
 
         asked = instants or Instants.of_looks(looks)
-        n = looks.n_features
-        answer, evidence, moved = np.empty(len(asked.stamp_s)), np.empty(n), np.empty(n)
-        bad = np.empty(n, dtype=np.int64)
         there, gone = looks.likelihoods()
-        kernels.track(
-            looks.first, looks.stamp_s, gone, there, asked.first, asked.stamp_s, self.slots, self.law,
-            self.first, answer, evidence, moved, bad,
-        )  # fmt: skip
+        columns = kernels.LookColumns(looks.stamp_s, gone, there)
+        answer, evidence, moved, bad = kernels.track(
+            looks.first, columns, asked.first, asked.stamp_s, self.slots, self.law, self.first
+        )
         for feature in np.flatnonzero(bad >= 0)[:1]:
             raise looks.impossible(int(looks.first[feature] + bad[feature]))
         return Track(answer, evidence, moved)
@@ -138,7 +134,7 @@ class RunLength:
     @cached_property
     def first(self) -> First:
         """What is believed before the first look."""
-        from evermap.existence.run_length_kernels import First, week_of_beliefs
+        from evermap.existence.run_length_kernels import First, RunHypotheses, week_of_beliefs
 
         age, weight = np.zeros((1, 2, self.slots)), np.zeros((1, 2, self.slots))
         if self.newborn:
@@ -154,8 +150,9 @@ class RunLength:
 
         ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, 2, self.slots))
         counts = np.zeros((BINS, 2), dtype=np.int64)
-        week_of_beliefs(MONDAY_S - age[0], weight[0], count[0], self.law, ages, weights, counts)
-        return First(ages, weights, counts)
+        week = First(ages, weights, counts)
+        week_of_beliefs(RunHypotheses(MONDAY_S - age[0], weight[0], count[0]), self.law, week)
+        return week
 
     def to_dict(self) -> dict[str, Any]:
         """The model as plain numbers and words, for JSON."""
@@ -208,7 +205,7 @@ def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class RunLengthBelief:
+class RunLengthBelief(Shown):
     """Beliefs about N features, one row each; state `s` is 0 absent, 1 present.
 
     Attributes:
@@ -233,6 +230,14 @@ class RunLengthBelief:
         return len(self.stamp_s)
 
     @property
+    def rows(self) -> BeliefRows:
+        """The same as the kernels want it."""
+        from evermap.existence.run_length_kernels import BeliefRows, RunHypotheses
+
+        held = RunHypotheses(self.start_s, self.weight, self.count)
+        return BeliefRows(held, self.stamp_s, self.log_evidence, self.merged_mass)
+
+    @property
     def probability(self) -> FloatArray:
         """(N,) probability of presence at `stamp_s`."""
         held = np.arange(self.weight.shape[2]) < self.count[:, PRESENT, None]
@@ -249,14 +254,14 @@ def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
     Raises:
         InputError: an instant that is not finite.
     """
-    from evermap.existence.run_length_kernels import begin_rows
+    from evermap.existence.run_length_kernels import RunHypotheses, begin_rows
 
     time = np.array(stamp_s, dtype=np.float64).reshape(-1)
     n = len(time)
     checks.check_times(time, np.full(n, -np.inf))
     start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, 2, model.slots))
     count = np.zeros((n, 2), dtype=np.int64)
-    begin_rows(start, weight, count, time, model.first)
+    begin_rows(RunHypotheses(start, weight, count), time, model.first)
     return RunLengthBelief(model, start, weight, count, time, np.zeros(n), np.zeros(n))
 
 
@@ -277,7 +282,7 @@ def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatA
     time = checks.as_rows(stamp_s, len(index), "stamp_s")
     checks.check_times(time, state.stamp_s[index], index)
     belief = np.empty(len(index))
-    predict_rows(index, state.start_s, state.weight, state.count, state.stamp_s, time, state.model.law, belief)
+    predict_rows(index, state.rows, time, state.model.law, belief)
     return belief
 
 
@@ -299,7 +304,7 @@ def update(
         DataError: a row twice.
         NumericalError: a look that is impossible under both states.
     """
-    from evermap.existence.run_length_kernels import look_rows
+    from evermap.existence.run_length_kernels import LookColumns, look_rows
 
     index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
     time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[index], index)
@@ -312,10 +317,153 @@ def update(
         log_evidence=state.log_evidence.copy(),
         merged_mass=state.merged_mass.copy(),
     )
-    bad = look_rows(
-        index, after.start_s, after.weight, after.count, after.stamp_s, time, gone, there, state.model.law,
-        after.log_evidence, after.merged_mass, np.empty(len(index)),
-    )  # fmt: skip
+    bad = look_rows(index, after.rows, LookColumns(time, gone, there), state.model.law, np.empty(len(index)))
     if bad >= 0:
         raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
     return after
+
+
+WEEKS = 8
+"""How far ahead a rhythm is followed; what lasts longer goes on as in the last of these weeks."""
+
+
+def after(model: RunLength, looks: Looks) -> RunLengthBelief:
+    """Beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
+
+    Args:
+        model: how features come and go.
+        looks: at F features.
+
+    Raises:
+        InputError: no look at all.
+        NumericalError: a look that is impossible under both states.
+    """
+    from evermap.existence.run_length_kernels import LookColumns, look_rows
+
+    if not len(looks.stamp_s):
+        raise InputError("there is no look", field="looks", hint="init(), which needs none")
+    number = np.diff(looks.first)
+    looked = number > 0
+    began = np.full(looks.n_features, looks.stamp_s.max())
+    began[looked] = looks.stamp_s[looks.first[:-1][looked]]
+    state = init(model, began)
+    rows = np.repeat(np.arange(looks.n_features), number)
+    there, gone = looks.likelihoods()
+    bad = look_rows(rows, state.rows, LookColumns(looks.stamp_s, gone, there), model.law, np.empty(len(rows)))
+    if bad >= 0:
+        raise looks.impossible(bad)
+    return state
+
+
+def time_to_leave(state: RunLengthBelief) -> FloatArray:
+    """Expected time until each feature leaves, if it is there.
+
+    Returns:
+        (N,) seconds from `state.stamp_s` on: the mean residual life `int S(a + t) dt / S(a)` over what is believed of
+        the age `a`; `inf` where some stay for ever, NaN where the feature is certainly away. With a rhythm, a numerical
+        integral over the coming weeks.
+    """
+    return _time_to_change(state, PRESENT)
+
+
+def time_to_return(state: RunLengthBelief) -> FloatArray:
+    """Expected time until each feature returns, if it is away; as `time_to_leave`.
+
+    Returns:
+        (N,) seconds from `state.stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.
+    """
+    return _time_to_change(state, ABSENT)
+
+
+def p_stays(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
+    """Probability that a feature which is there now is still there, without a break, at instants ahead.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: (T,) instants in order, none before any row's last.
+
+    Returns:
+        (N, T) probabilities; NaN where the feature is certainly away.
+
+    Raises:
+        InputError: an instant that is not finite, out of order, or before a row's last.
+    """
+    return _lasts(state, stamp_s, PRESENT)
+
+
+def p_stays_away(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
+    """Probability that a feature which is away now has not returned at instants ahead; as `p_stays`.
+
+    Args:
+        state: beliefs about N features.
+        stamp_s: (T,) instants in order, none before any row's last.
+
+    Returns:
+        (N, T) probabilities; NaN where the feature is certainly there.
+
+    Raises:
+        InputError: an instant that is not finite, out of order, or before a row's last.
+    """
+    return _lasts(state, stamp_s, ABSENT)
+
+
+def residual_life(table: HazardTable, age_s: FloatArray) -> FloatArray:
+    """Expected time that is left at an age: closed in every bin of the table, an exponential tail after the last.
+
+    Args:
+        table: a lifetime.
+        age_s: ages of any shape.
+
+    Returns:
+        Seconds, of the same shape; `inf` where the last hazard is 0 and can be reached.
+    """
+    hazard, edge = table.hazard_hz, table.edge_s
+    left = np.empty(len(edge) + 1)
+    endless = hazard[-1] == 0.0
+    left[-2:] = 0.0 if endless else 1.0 / hazard[-1]
+    for k in range(len(edge) - 2, -1, -1):
+        left[k] = _through_bin(hazard[k], edge[k + 1] - edge[k], left[k + 1])
+    i = bins_of(age_s, table.offset, len(edge))
+    width = np.append(edge[1:], np.inf)[i] - age_s
+    last = i == len(edge) - 1
+    inside = np.where(last, left[-1], _through_bin(hazard[i], np.where(last, 0.0, width), left[i + 1]))
+    to_go = table.cumulative[-1] - (table.cumulative[i] + hazard[i] * np.where(last, 0.0, age_s - edge[i]))
+    return np.asarray(np.where(endless & (np.exp(-to_go) > 0.0), np.inf, inside), dtype=np.float64)
+
+
+def _through_bin(hazard: Any, width: Any, beyond: Any) -> Any:
+    """Expected time left, from inside a bin of constant hazard with `width` to go to one where `beyond` is left."""
+    x = hazard * width
+    spent = width * np.where(x > 1e-9, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
+    return spent + np.exp(-x) * beyond
+
+
+def _time_to_change(state: RunLengthBelief, which: int) -> FloatArray:
+    """Expected time that the present state lasts, given that it is `which`."""
+    law = state.model.law
+    if law.factor.shape[1] > 1:
+        from evermap.existence.run_length_kernels import remaining_rows
+
+        left = np.empty(len(state))
+        remaining_rows(state.rows, which, law, WEEKS, left)
+        return left
+    held = np.arange(state.weight.shape[2]) < state.count[:, which, None]
+    weight = np.where(held, state.weight[:, which], 0.0)
+    age = np.where(held, state.stamp_s[:, None] - state.start_s[:, which], 0.0)
+    life = residual_life(state.model.tables[which], age)
+    total = weight.sum(axis=1)
+    mean = (weight * np.where(weight > 0.0, life, 0.0)).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+    return np.where(total > 0.0, mean, np.nan)
+
+
+def _lasts(state: RunLengthBelief, stamp_s: Any, which: int) -> FloatArray:
+    """Probability that nothing changes before instants ahead, given that the present state is `which`."""
+    from evermap.existence.run_length_kernels import lasting_rows
+
+    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
+    if (np.diff(time) < 0.0).any():
+        raise InputError("the instants asked for are not in order of time", field="stamp_s", hint="sort them")
+    checks.check_times(time, np.full(len(time), state.stamp_s.max(initial=-np.inf)), noun="instant")
+    out = np.empty((len(state), len(time)))
+    lasting_rows(state.rows, which, time, state.model.law, out)
+    return out

@@ -15,7 +15,7 @@ import numpy as np
 from numba import prange
 
 from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel
-from evermap.existence.hazard_table import SHIFT
+from evermap.existence.lifetimes import SHIFT
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -44,6 +44,56 @@ class Law(NamedTuple):
     offset: int
     hazard_hz: FloatArray
     intercept: FloatArray
+
+
+class RunHypotheses(NamedTuple):
+    """A feature's belief; with one more dimension in front, those of N features.
+
+    Attributes:
+        start: (2, S) since when it has been in state `s`.
+        weight: (2, S) with which probability.
+        number: (2,) of hypotheses; places beyond it hold anything.
+    """
+
+    start: FloatArray
+    weight: FloatArray
+    number: IntArray
+
+
+class BeliefRows(NamedTuple):
+    """Beliefs of N features.
+
+    Attributes:
+        held: their hypotheses.
+        now_s: (N,) when these held.
+        evidence: (N,) log evidence so far.
+        moved: (N,) mass merged so far.
+    """
+
+    held: RunHypotheses
+    now_s: FloatArray
+    evidence: FloatArray
+    moved: FloatArray
+
+
+class LookColumns(NamedTuple):
+    """M looks: when, and their likelihoods if the feature is absent and if it is present."""
+
+    stamp_s: FloatArray
+    absent: FloatArray
+    present: FloatArray
+
+
+class Workspace(NamedTuple):
+    """Room to work in.
+
+    Attributes:
+        scratch: (2, S).
+        merged: (2,) filled in: where lists were merged in the last step.
+    """
+
+    scratch: FloatArray
+    merged: IntArray
 
 
 class First(NamedTuple):
@@ -146,20 +196,14 @@ def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float) ->
 
 @kernel
 def _step(
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    now: float,
-    later: float,
-    law: Law,
-    scale: tuple[float, float],
-    scratch: FloatArray,
-    merged: IntArray,
+    held: RunHypotheses, now: float, later: float, law: Law, scale: tuple[float, float], space: Workspace
 ) -> float:
-    """One step without a look; where lists were merged goes into `merged`. Returns the mass merged.
+    """Take one step without a look and return the mass merged.
 
     Hazards are those of the law times `scale`.
     """
+    start, weight, count = held
+    scratch, merged = space
     middle = 0.5 * (now + later)
     week = _week_bin(middle, law.factor.shape[1])
     for s in range(2):
@@ -202,16 +246,9 @@ def _look(weight: FloatArray, count: IntArray, absent: float, present: float) ->
 
 
 @kernel
-def _present(
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    now: float,
-    later: float,
-    law: Law,
-    scratch: FloatArray,
-) -> float:
+def _present(held: RunHypotheses, now: float, later: float, law: Law, scratch: FloatArray) -> float:
     """Probability of presence at `later`, at most a step after `now`."""
+    start, weight, count = held
     week = _week_bin(0.5 * (now + later), law.factor.shape[1])
     for s in range(2):
         _hazards(start, count[s], s, now, later, law.factor[s, week], law, scratch)
@@ -225,15 +262,7 @@ def _present(
 
 @kernel
 def advance(
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    now: float,
-    until: float,
-    law: Law,
-    scratch: FloatArray,
-    merged: IntArray,
-    whole: bool,
+    held: RunHypotheses, now: float, until: float, law: Law, space: Workspace, whole: bool
 ) -> tuple[float, float]:
     """Whole steps from `now` on as long as they end before `until`, and the rest of the way unless `whole`.
 
@@ -242,23 +271,29 @@ def advance(
     """
     moved = 0.0
     while until - now > law.step_s:
-        moved += _step(start, weight, count, now, now + law.step_s, law, AS_THEY_ARE, scratch, merged)
+        moved += _step(held, now, now + law.step_s, law, AS_THEY_ARE, space)
         now += law.step_s
     if not whole and until > now:
-        moved += _step(start, weight, count, now, until, law, AS_THEY_ARE, scratch, merged)
+        moved += _step(held, now, until, law, AS_THEY_ARE, space)
         now = until
     return now, moved
 
 
 @kernel
-def begin(
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    stamp_s: float,
-    prior: First,
-) -> None:
+def _room(slots: int) -> Workspace:
+    return Workspace(np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
+
+
+@kernel
+def nothing_held(slots: int) -> RunHypotheses:
+    """Return room for the hypotheses of a feature."""
+    return RunHypotheses(np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
+
+
+@kernel
+def begin(held: RunHypotheses, stamp_s: float, prior: First) -> None:
     """The belief before anything is known: ages and weights for this time of the week."""
+    start, weight, count = held
     week = _week_bin(stamp_s, len(prior.number))
     for s in range(2):
         count[s] = prior.number[week, s]
@@ -268,27 +303,19 @@ def begin(
 
 
 @kernel
-def begin_rows(start: FloatArray, weight: FloatArray, count: IntArray, stamp_s: FloatArray, prior: First) -> None:
+def begin_rows(held: RunHypotheses, stamp_s: FloatArray, prior: First) -> None:
     """`begin` for every row."""
     for f in range(len(stamp_s)):
-        begin(start[f], weight[f], count[f], stamp_s[f], prior)
+        begin(RunHypotheses(held.start[f], held.weight[f], held.number[f]), stamp_s[f], prior)
 
 
 @kernel
 def _track_one(
-    stamp_s: FloatArray,
-    absent: FloatArray,
-    present: FloatArray,
-    asked_s: FloatArray,
-    slots: int,
-    law: Law,
-    prior: First,
-    answer: FloatArray,
+    looks: LookColumns, asked_s: FloatArray, slots: int, law: Law, prior: First, answer: FloatArray
 ) -> tuple[float, float, int]:
     """All looks at one feature and all instants asked for; log evidence, mass merged, impossible look or -1."""
-    start, weight = np.zeros((2, slots)), np.zeros((2, slots))
-    count, merged = np.zeros(2, dtype=np.int64), np.zeros(2, dtype=np.int64)
-    scratch = np.zeros((2, slots))
+    stamp_s, absent, present = looks
+    held, space = nothing_held(slots), _room(slots)
     evidence, moved = 0.0, 0.0
     m, n = stamp_s.size, asked_s.size
     if m + n == 0:
@@ -296,18 +323,18 @@ def _track_one(
     now = stamp_s[0] if m else asked_s[0]
     if n and asked_s[0] < now:
         now = asked_s[0]
-    begin(start, weight, count, now, prior)
+    begin(held, now, prior)
     k = 0
     for i in range(m + 1):
         while k < n and (i == m or asked_s[k] < stamp_s[i]):
-            now, mass = advance(start, weight, count, now, asked_s[k], law, scratch, merged, True)
+            now, mass = advance(held, now, asked_s[k], law, space, True)
             moved += mass
-            answer[k] = _present(start, weight, count, now, asked_s[k], law, scratch)
+            answer[k] = _present(held, now, asked_s[k], law, space.scratch)
             k += 1
         if i < m:
-            now, mass = advance(start, weight, count, now, stamp_s[i], law, scratch, merged, False)
+            now, mass = advance(held, now, stamp_s[i], law, space, False)
             moved += mass
-            likelihood = _look(weight, count, absent[i], present[i])
+            likelihood = _look(held.weight, held.number, absent[i], present[i])
             if not likelihood > 0.0:
                 return evidence, moved, i
             evidence += np.log(likelihood)
@@ -317,95 +344,75 @@ def _track_one(
 @parallel_kernel
 def track(
     first: IntArray,
-    stamp_s: FloatArray,
-    absent: FloatArray,
-    present: FloatArray,
+    looks: LookColumns,
     first_asked: IntArray,
     asked_s: FloatArray,
     slots: int,
     law: Law,
     prior: First,
-    answer: FloatArray,
-    evidence: FloatArray,
-    moved: FloatArray,
-    impossible: IntArray,
-) -> None:
-    """`_track_one` for every feature, over all threads."""
-    for f in prange(len(first) - 1):
+) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+    """`_track_one` for every feature, over all threads.
+
+    Returns:
+        (Q,) presence at the instants asked for, (F,) log evidence, (F,) mass merged, and (F,) the number of the first
+        look that is impossible under both states, or -1.
+    """
+    # arrays of its own, taken out of tuples: what is written to others, a parallel loop takes for dead
+    stamp_s, absent, present = looks
+    n = len(first) - 1
+    p_present, evidence, moved = np.empty(len(asked_s)), np.empty(n), np.empty(n)
+    impossible = np.empty(n, dtype=np.int64)
+    for f in prange(n):
         a, b, c, d = first[f], first[f + 1], first_asked[f], first_asked[f + 1]
-        evidence[f], moved[f], impossible[f] = _track_one(
-            stamp_s[a:b], absent[a:b], present[a:b], asked_s[c:d], slots, law, prior, answer[c:d],
-        )  # fmt: skip
+        own = LookColumns(stamp_s[a:b], absent[a:b], present[a:b])
+        evidence[f], moved[f], impossible[f] = _track_one(own, asked_s[c:d], slots, law, prior, p_present[c:d])
+    return p_present, evidence, moved, impossible
 
 
 @kernel
-def look_rows(
-    rows: IntArray,
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    now_s: FloatArray,
-    stamp_s: FloatArray,
-    absent: FloatArray,
-    present: FloatArray,
-    law: Law,
-    evidence: FloatArray,
-    moved: FloatArray,
-    belief: FloatArray,
-) -> int:
+def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law, belief: FloatArray) -> int:
     """One look at each of many features, in place; the first row that is impossible under both states, or -1."""
-    scratch, merged = np.zeros((2, start.shape[2])), np.zeros(2, dtype=np.int64)
+    everyone, now_s, evidence, moved = state
+    stamp_s, absent, present = looks
+    space = _room(everyone.start.shape[2])
     for i in range(len(rows)):
         f = rows[i]
-        now, mass = advance(start[f], weight[f], count[f], now_s[f], stamp_s[i], law, scratch, merged, False)
-        likelihood = _look(weight[f], count[f], absent[i], present[i])
+        held = RunHypotheses(everyone.start[f], everyone.weight[f], everyone.number[f])
+        now, mass = advance(held, now_s[f], stamp_s[i], law, space, False)
+        likelihood = _look(held.weight, held.number, absent[i], present[i])
         if not likelihood > 0.0:
             return i
         now_s[f] = now
         moved[f] += mass
         evidence[f] += np.log(likelihood)
-        belief[i] = min(_sum(weight[f], 1, count[f, 1]), 1.0)
+        belief[i] = min(_sum(held.weight, 1, held.number[1]), 1.0)
     return -1
 
 
 @kernel
-def predict_rows(
-    rows: IntArray,
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    now_s: FloatArray,
-    stamp_s: FloatArray,
-    law: Law,
-    belief: FloatArray,
-) -> None:
+def predict_rows(rows: IntArray, state: BeliefRows, stamp_s: FloatArray, law: Law, belief: FloatArray) -> None:
     """Presence of many features at one instant each; nothing of the state changes."""
-    scratch, merged = np.zeros((2, start.shape[2])), np.zeros(2, dtype=np.int64)
+    everyone, now_s = state.held, state.now_s
+    space = _room(everyone.start.shape[2])
     for i in range(len(rows)):
         f = rows[i]
-        begun, mass, number, now = start[f], weight[f], count[f], now_s[f]
+        held, now = RunHypotheses(everyone.start[f], everyone.weight[f], everyone.number[f]), now_s[f]
         if stamp_s[i] - now > law.step_s:
-            begun, mass, number = begun.copy(), mass.copy(), number.copy()
-            now, _ = advance(begun, mass, number, now, stamp_s[i], law, scratch, merged, True)
-        belief[i] = _present(begun, mass, number, now, stamp_s[i], law, scratch)
+            held = RunHypotheses(held.start.copy(), held.weight.copy(), held.number.copy())
+            now, _ = advance(held, now, stamp_s[i], law, space, True)
+        belief[i] = _present(held, now, stamp_s[i], law, space.scratch)
 
 
 @kernel
-def week_of_beliefs(
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    law: Law,
-    ages: FloatArray,
-    weights: FloatArray,
-    counts: IntArray,
-) -> None:
+def week_of_beliefs(held: RunHypotheses, law: Law, week: First) -> None:
     """Let a belief run for two weeks from a Monday 00:00, and keep it at every ten minutes of the second."""
-    scratch, merged = np.zeros((2, start.shape[1])), np.zeros(2, dtype=np.int64)
+    start, weight, count = held
+    ages, weights, counts = week
+    space = _room(start.shape[1])
     now = MONDAY_S
     for i in range(2 * BINS):
         at = MONDAY_S + i * BIN_S
-        now, _ = advance(start, weight, count, now, at, law, scratch, merged, False)
+        now, _ = advance(held, now, at, law, space, False)
         _look(weight, count, 1.0, 1.0)
         if i >= BINS:
             for s in range(2):
@@ -413,3 +420,83 @@ def week_of_beliefs(
                 for j in range(count[s]):
                     ages[i - BINS, s, j] = now - start[s, j]
                     weights[i - BINS, s, j] = weight[s, j]
+
+
+_NOTHING = 1e-10
+"""Probability of going on below which what remains does not matter."""
+_SLIVER_S = 1e-3
+"""Shortest step, lest rounding makes one of nothing."""
+
+
+@kernel
+def _step_end(now: float, law: Law) -> float:
+    """End of a step that begins now: as the filter's, but within one ten minutes of the week."""
+    rest = BIN_S - (now - MONDAY_S) % BIN_S
+    return now + min(law.step_s, rest if rest > _SLIVER_S else rest + BIN_S)
+
+
+@kernel
+def _go_on(
+    held: RunHypotheses, s: int, now: float, later: float, law: Law, scratch: FloatArray, spent: FloatArray
+) -> None:
+    """Take from the weights of state `s` what ends before `later`; `spent[s]`: its time, times probability."""
+    start, left, n = held.start, held.weight, held.number[s]
+    week = _week_bin(0.5 * (now + later), law.factor.shape[1])
+    _hazards(start, n, s, now, later, law.factor[s, week], law, scratch)
+    gap = later - now
+    for j in range(n):
+        x, mass = scratch[s, j], left[s, j]
+        spent[s, j] = mass * gap * (-expm1(-x) / x if x > 1e-9 else 1.0)
+        left[s, j] = mass * exp(-x) if x < MOST else 0.0
+
+
+@kernel
+def lasting_rows(state: BeliefRows, s: int, asked_s: FloatArray, law: Law, out: FloatArray) -> None:
+    """Probability that state `s` goes on without a break until instants in order, given that it is the present one."""
+    start, weight, count = state.held
+    now_s = state.now_s
+    scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
+    constant = law.factor.shape[1] == 1
+    for f in range(len(now_s)):
+        left, n, now = weight[f].copy(), count[f, s], now_s[f]
+        held = RunHypotheses(start[f], left, count[f])
+        total = _sum(left, s, n)
+        for k in range(len(asked_s)):
+            while now < asked_s[k]:
+                later = asked_s[k] if constant else min(_step_end(now, law), asked_s[k])
+                _go_on(held, s, now, later, law, scratch, spent)
+                now = later
+            out[f, k] = min(_sum(left, s, n) / total, 1.0) if total > 0.0 else np.nan
+
+
+@kernel
+def remaining_rows(state: BeliefRows, s: int, law: Law, weeks: int, out: FloatArray) -> None:
+    """Expected time that state `s` goes on, given that it is the present one: step by step for some weeks.
+
+    Of what is left then, each further week leaves the same part as the last one did.
+    """
+    start, weight, count = state.held
+    now_s = state.now_s
+    scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
+    for f in range(len(now_s)):
+        left, n, now = weight[f].copy(), count[f, s], now_s[f]
+        held = RunHypotheses(start[f], left, count[f])
+        total = _sum(left, s, n)
+        if total == 0.0:
+            out[f] = np.nan
+            continue
+        passed, of_week, kept = 0.0, 0.0, 1.0
+        for _ in range(weeks):
+            before, of_week = _sum(left, s, n), 0.0
+            end_of_week = now + WEEK_S
+            while now < end_of_week:
+                later = min(_step_end(now, law), end_of_week)
+                _go_on(held, s, now, later, law, scratch, spent)
+                of_week += _sum(spent, s, n)
+                now = later
+            passed += of_week
+            kept = _sum(left, s, n) / before
+            if _sum(left, s, n) < _NOTHING * total:
+                kept = 0.0
+                break
+        out[f] = np.inf if kept == 1.0 else (passed + of_week * kept / (1.0 - kept)) / total

@@ -1,8 +1,8 @@
 """Forward and backward through the run-length filter's hypotheses, compiled: what happened, given all looks.
 
-The backward pass runs through the lattice of hypotheses that the forward pass kept. To store all of it would take a
-megabyte for every thousand steps, so the forward pass keeps a checkpoint every few thousand steps, and each stretch is
-run again when the backward pass arrives there.
+Looks are laid out on the time steps of the filter (`lattice`). The backward pass runs through the hypotheses that the
+forward pass kept. To store all of it would take a megabyte for every thousand steps, so the forward pass keeps a
+checkpoint every few thousand steps, and each stretch is run again when the backward pass arrives there.
 """
 
 from __future__ import annotations
@@ -12,25 +12,57 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.existence.elementary import exp, expm1, kernel
+from evermap.existence.protocol import Looks
 from evermap.existence.run_length_kernels import (
     MOST,
     NO_MERGE,
     First,
     Law,
+    RunHypotheses,
+    Workspace,
     _hazards,
     _look,
     _step,
     _week_bin,
     age_bin,
     begin,
+    nothing_held,
 )
 from evermap.types import FloatArray, IntArray
+
+
+class Lattice(NamedTuple):
+    """Instants at most a step apart, the looks among them.
+
+    Attributes:
+        stamp_s: (T + 1,) in order, all different.
+        absent: (T + 1,) likelihood of the looks there if the feature is absent; 1 where there was none.
+        present: (T + 1,) the same if it is present.
+    """
+
+    stamp_s: FloatArray
+    absent: FloatArray
+    present: FloatArray
+
+
+def lattice(looks: Looks, step_s: float) -> Lattice:
+    """One feature's looks, with whole steps after each and a shorter one before the next, as the filter takes them."""
+    stamp, first = np.unique(looks.stamp_s, return_index=True)
+    present, absent = (np.multiply.reduceat(values, first) for values in looks.likelihoods())
+    steps = np.maximum(np.ceil(np.diff(stamp) / step_s * (1.0 - 1e-12)).astype(np.int64), 1)
+    place = np.concatenate([[0], np.cumsum(steps)])
+    times = np.repeat(stamp[:-1], steps) + step_s * (np.arange(place[-1]) - np.repeat(place[:-1], steps))
+    whole = [np.ones(place[-1] + 1), np.ones(place[-1] + 1)]
+    for column, values in zip(whole, (absent, present), strict=True):
+        column[place] = values
+    return Lattice(np.append(times, stamp[-1]), whole[0], whole[1])
+
 
 STRETCH = 4096
 """Steps between two checkpoints."""
 
 
-class Counts(NamedTuple):
+class SojournCounts(NamedTuple):
     """Expected events and exposure of absences (0) and stays (1), by age and time of the week.
 
     Attributes:
@@ -48,60 +80,73 @@ class Counts(NamedTuple):
     expected_of_period: FloatArray
 
 
+class Calendar(NamedTuple):
+    """What time it is in T steps.
+
+    Attributes:
+        importance: (T,) weight of what happens in each step.
+        period: (T,) period of the calendar of each step.
+        level: (2, P) by what hazards are multiplied in each period.
+    """
+
+    importance: FloatArray
+    period: IntArray
+    level: FloatArray
+
+
+class KeptSteps(NamedTuple):
+    """What is kept of the steps between two checkpoints.
+
+    Attributes:
+        before: hypotheses before each step.
+        merges: where it merged lists.
+        scales: probability of its look.
+    """
+
+    before: RunHypotheses
+    merges: IntArray
+    scales: FloatArray
+
+
 @kernel
 def _forward(
-    a: int,
-    b: int,
-    stamp_s: FloatArray,
-    absent: FloatArray,
-    present: FloatArray,
+    steps: tuple[int, int],
+    looks: Lattice,
+    calendar: Calendar,
     law: Law,
-    period: IntArray,
-    level: FloatArray,
-    start: FloatArray,
-    weight: FloatArray,
-    count: IntArray,
-    scratch: FloatArray,
-    starts: FloatArray,
-    weights: FloatArray,
-    counts: IntArray,
-    merges: IntArray,
-    scales: FloatArray,
+    held: RunHypotheses,
+    space: Workspace,
+    kept: KeptSteps,
 ) -> None:
-    """Steps `a` to `b`, keeping the belief before each, where it merged, and the probability of its look."""
-    merged = np.zeros(2, dtype=np.int64)
+    """Take some steps, keeping the belief before each, where it merged, and the probability of its look."""
+    a, b = steps
+    stamp_s, absent, present = looks
+    _, period, level = calendar
+    before, merges, scales = kept
     for k in range(a, b):
         i = k - a
-        starts[i], weights[i], counts[i] = start, weight, count
+        before.start[i], before.weight[i], before.number[i] = held
         scale = (level[0, period[k]], level[1, period[k]])
-        _step(start, weight, count, stamp_s[k], stamp_s[k + 1], law, scale, scratch, merged)
-        merges[i] = merged
-        scales[i] = _look(weight, count, absent[k + 1], present[k + 1])
+        _step(held, stamp_s[k], stamp_s[k + 1], law, scale, space)
+        merges[i] = space.merged
+        scales[i] = _look(held.weight, held.number, absent[k + 1], present[k + 1])
 
 
 @kernel
 def expectations(
-    stamp_s: FloatArray,
-    absent: FloatArray,
-    present: FloatArray,
-    importance: FloatArray,
-    period: IntArray,
-    level: FloatArray,
+    looks: Lattice,
+    calendar: Calendar,
     slots: int,
     law: Law,
     prior: First,
-    counts_out: Counts,
+    counts_out: SojournCounts,
     smoothed: FloatArray,
 ) -> tuple[float, float]:
     """Add one feature's expected counts, and fill in its presence given all looks.
 
     Args:
-        stamp_s: (T + 1,) instants of the lattice, at most a step apart, in order and different.
-        absent: (T + 1,) likelihoods of the looks there if the feature is absent, 1 where there was none.
-        present: (T + 1,) the same if it is present.
-        importance: (T,) weight of what happens in each step.
-        period: (T,) period of the calendar of each step.
-        level: (2, P) by what hazards are multiplied in each.
+        looks: T + 1 instants at most a step apart, in order and different, with their likelihoods.
+        calendar: of the T steps.
         slots: places of a list of hypotheses.
         law: the model.
         prior: its belief before the first look.
@@ -111,25 +156,26 @@ def expectations(
     Returns:
         Log evidence of the looks (-inf if they are impossible), and the presence at the first instant, given all.
     """
+    stamp_s, absent, present = looks
+    importance, period, level = calendar
     steps = stamp_s.size - 1
     stretches = (steps + STRETCH - 1) // STRETCH
-    start, weight, count = np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64)
-    scratch = np.zeros((2, slots))
+    held = nothing_held(slots)
+    start, weight, count = held
+    space = Workspace(np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
     starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 2, slots))
     counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
     scales = np.zeros(STRETCH)
+    kept = KeptSteps(RunHypotheses(starts, weights, counts), merges, scales)
     kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 2, slots))
     kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
 
-    begin(start, weight, count, stamp_s[0], prior)
+    begin(held, stamp_s[0], prior)
     evidence = np.log(_look(weight, count, absent[0], present[0]))
     for c in range(stretches):
         kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
-        _forward(
-            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
-            starts, weights, counts, merges, scales,
-        )  # fmt: skip
+        _forward((a, b), looks, calendar, law, held, space, kept)
         for i in range(b - a):
             evidence += np.log(scales[i])
     if not np.isfinite(evidence):
@@ -150,10 +196,7 @@ def expectations(
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
-        _forward(
-            a, b, stamp_s, absent, present, law, period, level, start, weight, count, scratch,
-            starts, weights, counts, merges, scales,
-        )  # fmt: skip
+        _forward((a, b), looks, calendar, law, held, space, kept)
         for k in range(b - 1, a - 1, -1):
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]

@@ -16,14 +16,15 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import ConfigError, NumericalError
-from evermap.existence import checks
+from evermap.existence import protocol as checks
 from evermap.existence.lifetimes import log_death_odds
+from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Belief:
+class Belief(Shown):
     """Persistence of `N` features, one row each.
 
     Attributes:

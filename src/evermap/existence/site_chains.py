@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Chains:
+class CliqueChains:
     """Rows of the seats, see `site_kernels`.
 
     Attributes:
@@ -28,7 +28,7 @@ class Chains:
     row_of_site: IntArray
 
     @classmethod
-    def of(cls, clique_of_site: IntArray, n_cliques: int) -> Chains:
+    def of(cls, clique_of_site: IntArray, n_cliques: int) -> CliqueChains:
         count = 1 + np.bincount(clique_of_site, minlength=n_cliques)
         first = np.append(0, np.cumsum(count))
         order = np.argsort(clique_of_site, kind="stable")
@@ -105,20 +105,50 @@ def odds(priors: tuple[LifetimePrior, ...], prior: IntArray, start_s: FloatArray
     return np.exp(np.where(certain, log_odds, bounded)).reshape(start_s.shape)
 
 
-def transitions(
-    chains: Chains,
-    priors: tuple[LifetimePrior, ...],
-    prior: IntArray,
-    since_s: FloatArray,
-    came_s: FloatArray,
-    moves: FloatArray,
-    frame_clique: IntArray,
-    frame_stamp: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """(F, 2, W) log probabilities to be at the same seat since the frame before, and to have left it for another one.
+class Seats(NamedTuple):
+    """Rows of the seats of all cliques.
 
-    Without meaning at the first frame of a clique.
+    Attributes:
+        priors: the different lifetimes.
+        prior: (R,) which of these each seat has.
+        since_s: (R,) when the old ones came there.
+        came_s: (R,) when the new ones did, on average.
+        route: (R, W) where one that leaves a seat goes.
+        moves: (R,) sum of that.
     """
+
+    priors: tuple[LifetimePrior, ...]
+    prior: IntArray
+    since_s: FloatArray
+    came_s: FloatArray
+    route: FloatArray
+    moves: FloatArray
+
+
+class Transitions(NamedTuple):
+    """What happens between frames; without meaning at the first frame of a clique.
+
+    Attributes:
+        log_route: (R, W) log probability that one that leaves a seat goes to another of its clique.
+        log_rest: (F, 2, W) log probabilities to be at the same seat since the frame before, of the old and the new.
+        log_leave: (F, 2, W) to have left it for another one, that is `log_route`.
+    """
+
+    log_route: FloatArray
+    log_rest: FloatArray
+    log_leave: FloatArray
+
+
+def transitions(chains: CliqueChains, seats: Seats, frame_clique: IntArray, frame_stamp: FloatArray) -> Transitions:
+    """Return what happens between frames.
+
+    Args:
+        chains: R rows of seats.
+        seats: their lifetimes and routes.
+        frame_clique: (F,) clique of each frame, those of a clique next to each other.
+        frame_stamp: (F,) when, in order of time within a clique.
+    """
+    priors, prior, since_s, came_s, route, moves = seats
     width = chains.width
     row = chains.first[frame_clique][:, None] + np.arange(width)
     frame, seat = np.nonzero(row < chains.first[1:][frame_clique][:, None])
@@ -136,4 +166,5 @@ def transitions(
         leave, rest = -np.logaddexp(0.0, -log_odds), -np.logaddexp(0.0, log_odds)
         log_rest[frame, age, seat] = np.logaddexp(rest, leave + log_stays)
         log_leave[frame, age, seat] = np.where(log_moves > -np.inf, leave, -np.inf)
-    return log_rest, log_leave
+    with np.errstate(divide="ignore"):
+        return Transitions(np.log(route), log_rest, log_leave)

@@ -7,7 +7,7 @@ clique and one for its 'away', cliques after one another, `seat[c]` to `seat[c +
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,27 +22,91 @@ def _log_add(a: Any, b: Any) -> Any:
     return high if low == -np.inf else high + np.log1p(np.exp(low - high))
 
 
+class FrameRows(NamedTuple):
+    """N looks in F frames.
+
+    Attributes:
+        first: (F + 1,) rows of frame f are `first[f]` to `first[f + 1]`, those of a seat next to each other.
+        clique: (F,) frames of a clique are next to each other, in order of time.
+        stamp_s: (F,) of the frames.
+        slot: (N,) rows of `Slots`: one for each pair of seat and line of sight.
+        seat: (N,) number of the seat within its clique.
+        hit: (N,) detected.
+    """
+
+    first: IntArray
+    clique: IntArray
+    stamp_s: FloatArray
+    slot: IntArray
+    seat: IntArray
+    hit: BoolArray
+
+
+class Slots(NamedTuple):
+    """Pairs of seat and line of sight.
+
+    Attributes:
+        p_free: that the line of sight is free.
+        hits: pseudo counts of detections along it if it is, updated in place.
+        misses: of misses.
+    """
+
+    p_free: FloatArray
+    hits: FloatArray
+    misses: FloatArray
+
+
+class SensorNumbers(NamedTuple):
+    """`sites.SiteSensor` in numbers.
+
+    Attributes:
+        p_blocked: probability of a detection along a line of sight that is not free.
+        p_false: of a detection of nothing.
+        p_occluded: that something stands before the whole clique.
+        occluded_s: mean duration of that; 0 for an occlusion of its own in every frame.
+        use_misses: False has only hits count.
+    """
+
+    p_blocked: float
+    p_false: float
+    p_occluded: float
+    occluded_s: float
+    use_misses: bool
+
+
+class FrameEvidence(NamedTuple):
+    """What F frames say of W seats.
+
+    Attributes:
+        log_ratio: (F, W) log likelihood of each seat, less that of being away.
+        n_hits, n_misses: (F, W) detections and misses of its places.
+        expected: (F, W) mean number of detections, had the clique been there.
+    """
+
+    log_ratio: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+    expected: FloatArray
+
+
+class SiteChain(NamedTuple):
+    """Chains of C cliques.
+
+    Attributes:
+        seat: (C + 1,) rows of the seats of each clique.
+        first_frame: (C + 1,) frames of each clique; at least one.
+        log_route, log_rest, log_leave: as in `site_chains.Transitions`.
+    """
+
+    seat: IntArray
+    first_frame: IntArray
+    log_route: FloatArray
+    log_rest: FloatArray
+    log_leave: FloatArray
+
+
 @kernel
-def frame_evidence(
-    first: IntArray,
-    clique: IntArray,
-    stamp_s: FloatArray,
-    slot: IntArray,
-    seat: IntArray,
-    hit: BoolArray,
-    p_free: FloatArray,
-    hits: FloatArray,
-    misses: FloatArray,
-    p_blocked: float,
-    p_false: float,
-    p_occluded: float,
-    occluded_s: float,
-    use_misses: bool,
-    log_ratio: FloatArray,
-    n_hits: IntArray,
-    n_misses: IntArray,
-    expected: FloatArray,
-) -> None:
+def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: FrameEvidence) -> None:
     """What frames say for each seat against 'away', the lines of sight being learned on the way.
 
     All is given that the clique has been at a site all the time. (Of one that comes while it is watched, the looks
@@ -51,27 +115,11 @@ def frame_evidence(
     exchangeable (Beta-Bernoulli): their probabilities multiply, each given those before. And somebody may stand before
     the whole clique (MATH.md section 3), for a while: a chain in continuous time over the frames. What is seen of it
     then is false, and teaches nothing.
-
-    Args:
-        first: (F + 1,) rows of frame f are `first[f]` to `first[f + 1]`, those of a seat next to each other.
-        clique: (F,) frames of a clique are next to each other, in order of time.
-        stamp_s: (F,) of the frames.
-        slot: (N,) rows of `hits` and `misses`: one for each pair of seat and line of sight.
-        seat: (N,) number of the seat within its clique.
-        hit: (N,) detected.
-        p_free: of every slot, that its line of sight is free.
-        hits: pseudo counts of detections along it if it is, updated in place.
-        misses: of misses.
-        p_blocked: probability of a detection if it is not.
-        p_false: of a detection of nothing.
-        p_occluded: that somebody stands before the whole clique.
-        occluded_s: mean time that he stays; 0 for another one in every frame.
-        use_misses: False has only hits speak.
-        log_ratio: (F, W) filled in: log likelihood, of a seat less that of being away.
-        n_hits: (F, W) filled in: detections.
-        n_misses: (F, W) filled in.
-        expected: (F, W) filled in: mean number of detections.
     """
+    first, clique, stamp_s, slot, seat, hit = rows
+    p_free, hits, misses = slots
+    p_blocked, p_false, p_occluded, occluded_s, use_misses = sensor
+    log_ratio, n_hits, n_misses, expected = said
     width = log_ratio.shape[1]
     free, likely = np.empty(width), np.empty(width)  # of each seat: after the last frame, and by its lines alone
     veil, looked_s = np.empty(width), np.empty(width)  # that somebody stood before it then, if its line is free
@@ -200,11 +248,7 @@ def _rest(odds: Any, moves: Any) -> Any:
 
 @kernel
 def forward(
-    seat: IntArray,
-    first_frame: IntArray,
-    log_route: FloatArray,
-    log_rest: FloatArray,
-    log_leave: FloatArray,
+    chain: SiteChain,
     log_here: FloatArray,
     log_ratio: FloatArray,
     filtered: FloatArray,
@@ -214,17 +258,14 @@ def forward(
     """Beliefs after each frame of every clique, the first of which lies where they are known.
 
     Args:
-        seat: (C + 1,) rows of the seats of each clique.
-        first_frame: (C + 1,) frames of each clique; at least one.
-        log_route: (R, W) log probability that one that leaves a seat goes to another of its clique.
-        log_rest: (F, 2, W) log probabilities to be at the same seat still since the last frame, of the old and the new.
-        log_leave: (F, 2, W) to have left for somewhere, that is `log_route`.
+        chain: of the cliques.
         log_here: (R, 2) log probabilities at the first frame, before it: old and new.
         log_ratio: (F, W) what each frame says for the seats, against 'away'.
         filtered: (F, 2, W) filled in: log probabilities after each frame.
         log_odds: (F,) filled in: what each frame says for 'at one of its sites' against 'away'.
         log_evidence: (C,) filled in: log probability of all frames over that if it were away.
     """
+    seat, first_frame, log_route, log_rest, log_leave = chain
     flow = np.empty(log_ratio.shape[1])
     for c in range(seat.size - 1):
         low, n = seat[c], seat[c + 1] - seat[c]
@@ -259,28 +300,9 @@ def forward(
 
 
 @kernel
-def backward(
-    seat: IntArray,
-    first_frame: IntArray,
-    log_route: FloatArray,
-    log_rest: FloatArray,
-    log_leave: FloatArray,
-    log_ratio: FloatArray,
-    filtered: FloatArray,
-    smoothed: FloatArray,
-) -> None:
-    """Beliefs at each frame given all of them, from those of `forward`.
-
-    Args:
-        seat: as above, like all down to `filtered`.
-        first_frame: see there.
-        log_route: see there.
-        log_rest: see there.
-        log_leave: see there.
-        log_ratio: see there.
-        filtered: what `forward` filled in.
-        smoothed: (F, 2, W) filled in: log probabilities.
-    """
+def backward(chain: SiteChain, log_ratio: FloatArray, filtered: FloatArray, smoothed: FloatArray) -> None:
+    """Fill in `smoothed` (F, 2, W), log probabilities at each frame given all of them, from those of `forward`."""
+    seat, first_frame, log_route, log_rest, log_leave = chain
     width = log_ratio.shape[1]
     flow = np.empty(width)
     ahead = np.empty((2, width))

@@ -1,29 +1,275 @@
 """The belief of a living map: every clique stands at one of its known sites, or is away.
 
-One chain a clique (MATH.md section 5, "Uniting the papers"). Who stands at a site stays over a gap with the conditional
-survival of its lifetime; who leaves stands at another known site at once with `p_hop`, else is away, and who is away
-returns as its absence ends. With one site and no return this is Rosen's persistence filter, with several landmarks on
-the clique Bateman's joint clique filter, with a constant hazard and `p_hop = 1` Nielsen's chain of modes.
+One chain a clique (MATH.md section 5, "Uniting the papers"). A clique at a site stays over a gap with the conditional
+survival of its lifetime; one that leaves stands at another known site at once with `p_hop`, else is away, and one that
+is away returns as its absence ends. With one site and no return this is Rosen's persistence filter, with several
+landmarks on the clique Bateman's joint clique filter, with a constant hazard and `p_hop = 1` Nielsen's chain of modes.
 
 Misses are weighed by what is known of the lines of sight (`sensing.sightlines`) and by what the same session says of
 them, so that false negatives are explained instead of suppressed: a site that is hidden from where the robot looks, or
-that somebody stands before, is not one that was left.
+occluded, is not one that was left.
 """
 
 from __future__ import annotations
 
-from functools import partial
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from evermap.existence import checks
-from evermap.existence.site_chains import Chains, distinct, odds, transitions
-from evermap.existence.site_frames import Frames, Said, said_by
-from evermap.existence.site_records import SiteBeliefs, SiteDynamics, SiteLooks, SiteTrace, check_sites
+from evermap.errors import InputError
+from evermap.existence import protocol as checks
+from evermap.existence.site_chains import CliqueChains, Seats, Transitions, distinct, odds, transitions
 from evermap.sensing.sightlines import Lines
+from evermap.show import Shown
+from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
-__all__ = ["SiteBeliefs", "SiteDynamics", "SiteLooks", "SiteTrace", "follow_sites"]
+if TYPE_CHECKING:
+    from evermap.existence.site_kernels import FrameEvidence
+
+
+@dataclass(frozen=True, slots=True)
+class SiteLooks(Shown):
+    """Places that were looked at: (N,) rows in any order, one for each place and frame.
+
+    Attributes:
+        stamp_s: of the frame; rows of one clique and stamp are one frame.
+        clique: row of the clique, 0 to C - 1.
+        site: row of the site the place belongs to, 0 to S - 1.
+        key: row of its line of sight, 0 to K - 1.
+        hit: whether it was detected.
+    """
+
+    stamp_s: FloatArray
+    clique: IntArray
+    site: IntArray
+    key: IntArray
+    hit: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.stamp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class SiteDynamics(Shown):
+    """How S sites of C cliques are left and returned to.
+
+    Attributes:
+        stay: S lifetimes of a stay at each site.
+        since_s: (S,) when the newest stay there began.
+        absence: C lifetimes of the time away of each clique.
+        away_since_s: (C,) when it went away, if it is away.
+        p_hop: (C,) probability that who leaves a site stands at another site at once.
+        return_share: (S,) probability that who turns up does so at this site, at most 1 in sum of a clique; the rest
+            turns up at places that are not known, which is 'away'. One that hops from a site has the shares of the
+            others and of unknown places, scaled to sum 1. 0 for a clique that never returns.
+    """
+
+    stay: tuple[LifetimePrior, ...]
+    since_s: FloatArray
+    absence: tuple[LifetimePrior, ...]
+    away_since_s: FloatArray
+    p_hop: FloatArray
+    return_share: FloatArray
+
+
+class SiteSensor(NamedTuple):
+    """How well places are seen.
+
+    Attributes:
+        lines: what is known of K lines of sight before the session.
+        p_false: probability of a detection at a place where nothing of the clique is.
+        p_occluded: that something stands before the whole clique.
+        occluded_s: mean duration of that, so that a blind spell is one event and not as many as it has frames; 0 for an
+            occlusion of its own in every frame.
+        use_misses: False has only hits count.
+    """
+
+    lines: Lines
+    p_false: float
+    p_occluded: float = 0.02
+    occluded_s: float = 5.0
+    use_misses: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class SiteTrace(Shown):
+    """What was said of cliques, frame by frame: (E,) rows by clique, then by time.
+
+    Attributes:
+        clique, stamp_s: which frame of which clique.
+        n_hits, n_misses: at its most probable site.
+        expected: mean number of detections, had it stood there.
+        log_odds: of the frame for 'at one of its sites' against 'away' [nats].
+        p_exists: probability that it stands at one of its sites, after the frame.
+    """
+
+    clique: IntArray
+    stamp_s: FloatArray
+    n_hits: IntArray
+    n_misses: IntArray
+    expected: FloatArray
+    log_odds: FloatArray
+    p_exists: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SiteBeliefs(Shown):
+    """Beliefs of C cliques with S sites after a session of N looks.
+
+    Attributes:
+        p_here: (S,) probability that its clique stands at each site, at the end.
+        p_stayed: (S,) part of it: that it has stood there since before the start.
+        p_before: (S,) before the clique's first look; at the end where there was none.
+        since_s: (S,) mean begin of the stay there, given that it stands there at the end.
+        weight: (N,) probability that the clique stood at the looks' sites then, given all hits of the session. Misses
+            are left out: whether they are due to the line of sight or to the clique is what is learned from them.
+        log_evidence: (C,) log probability of all looks at a clique, less that of the same looks if it were away.
+        trace: what every frame said.
+    """
+
+    p_here: FloatArray
+    p_stayed: FloatArray
+    p_before: FloatArray
+    since_s: FloatArray
+    weight: FloatArray
+    log_evidence: FloatArray
+    trace: SiteTrace
+
+
+def _check_sites(
+    p_here: FloatArray,
+    clique_of_site: IntArray,
+    dynamics: SiteDynamics,
+    looks: SiteLooks,
+    lines: Lines,
+    start_s: FloatArray,
+    until_s: float,
+) -> None:
+    """Raise `InputError` for what cannot be."""
+    n_cliques, n_sites, n_looks = len(dynamics.p_hop), len(p_here), len(looks)
+    lengths: dict[str, tuple[Any, int]] = {
+        "p_here": (p_here, n_sites), "clique_of_site": (clique_of_site, n_sites), "stay": (dynamics.stay, n_sites),
+        "since_s": (dynamics.since_s, n_sites), "return_share": (dynamics.return_share, n_sites),
+        "absence": (dynamics.absence, n_cliques), "away_since_s": (dynamics.away_since_s, n_cliques),
+        "p_hop": (dynamics.p_hop, n_cliques), "clique": (looks.clique, n_looks), "site": (looks.site, n_looks),
+        "key": (looks.key, n_looks), "hit": (looks.hit, n_looks), "misses": (lines.misses, len(lines.hits)),
+        "p_free": (lines.p_free, len(lines.hits)),
+    }  # fmt: skip
+    for field, (column, n) in lengths.items():
+        shape = (len(column),) if isinstance(column, tuple) else np.shape(column)
+        if shape != (n,):
+            raise InputError(f"shape {shape} instead of ({n},)", field=field)
+    checks.check_rows(clique_of_site, n_cliques, twice=True, field="clique_of_site")
+    checks.check_rows(looks.clique, n_cliques, twice=True, field="clique")
+    checks.check_rows(looks.site, n_sites, twice=True, field="site")
+    checks.check_rows(looks.key, len(lines.hits), twice=True, field="key")
+    for field, values in (
+        ("p_here", p_here),
+        ("p_hop", dynamics.p_hop),
+        ("return_share", dynamics.return_share),
+    ):
+        checks.check_probability(np.asarray(values, dtype=np.float64), field)
+    for field, summed in (("p_here", p_here), ("return_share", dynamics.return_share)):
+        total = np.bincount(clique_of_site, summed, minlength=n_cliques)
+        if (total > 1.0 + 1e-9).any():
+            row = int(np.argmax(total))
+            raise InputError(f"clique {row}: {total[row]} is more than 1 in sum", field=field)
+    for field, stamps in (("since_s", dynamics.since_s), ("away_since_s", dynamics.away_since_s), ("start_s", start_s)):
+        if not np.isfinite(stamps).all():
+            raise InputError(f"row {int(np.argmin(np.isfinite(stamps)))}: no instant", field=field, hint="finite times")
+    wrong = np.flatnonzero(clique_of_site[looks.site] != looks.clique)
+    if wrong.size:
+        raise InputError(f"row {wrong[0]}: site {looks.site[wrong[0]]} is of another clique", field="site")
+    checks.check_times(looks.stamp_s, start_s[looks.clique], noun="look")
+    last = max(np.max(looks.stamp_s, initial=-np.inf), np.max(start_s, initial=-np.inf))
+    if not last <= until_s < np.inf:
+        raise InputError(f"{until_s} s lies before the last look", field="until_s")
+
+
+def _check_sensor(sensor: SiteSensor) -> None:
+    """Raise `InputError` for what cannot be."""
+    lines, p_false, p_occluded, occluded_s, _ = sensor
+    checks.check_probability(np.asarray(lines.p_free, dtype=np.float64), "p_free")
+    if not 0.0 < p_false < 1.0:
+        raise InputError(f"{p_false} is no probability between 0 and 1", field="p_false")
+    if not 0.0 <= lines.p_blocked < 1.0:
+        raise InputError(f"{lines.p_blocked} is no probability below 1", field="p_blocked")
+    if not 0.0 <= p_occluded < 1.0:
+        raise InputError(f"{p_occluded} is no probability below 1", field="p_occluded")
+    if not 0.0 <= occluded_s < np.inf:
+        raise InputError(f"{occluded_s} s is no time", field="occluded_s")
+    for field, counts in (("hits", lines.hits), ("misses", lines.misses)):
+        good = np.isfinite(counts) & (np.asarray(counts) > 0.0)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise InputError(f"row {row}: {counts[row]} is no pseudo count", field=field, hint="a number above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class CliqueFrames:
+    """F frames, by clique and time; the last of every clique is the end of the session, at which nothing is looked at.
+
+    Attributes:
+        clique, stamp_s: (F,).
+        is_look: (F,) False for the ends.
+        first: (C + 1,) frames of clique c are `first[c]` to `first[c + 1]`.
+        order: (N,) rows of the looks, by frame and site.
+        of_look: (N,) frame of each look, in that order.
+    """
+
+    clique: IntArray
+    stamp_s: FloatArray
+    is_look: BoolArray
+    first: IntArray
+    order: IntArray
+    of_look: IntArray
+
+    @classmethod
+    def of(cls, looks: SiteLooks, n_cliques: int, until_s: float) -> CliqueFrames:
+        """The frames of a session that ends at `until_s`."""
+        order = np.lexsort((looks.site, looks.stamp_s, looks.clique))
+        clique, stamp = looks.clique[order], looks.stamp_s[order]
+        opens = np.append(True, (np.diff(clique) != 0) | (np.diff(stamp) != 0))[: len(order)]
+        clique = np.append(clique[opens], np.arange(n_cliques))
+        stamp = np.append(stamp[opens], np.full(n_cliques, until_s))
+        by_clique = np.argsort(clique, kind="stable")  # those of a clique are in order already, its end last
+        is_look = (by_clique < np.count_nonzero(opens)).astype(np.bool_)
+        first = np.searchsorted(clique[by_clique], np.arange(n_cliques + 1)).astype(np.int64)
+        of_look = np.flatnonzero(is_look)[np.cumsum(opens) - 1]
+        return cls(clique[by_clique], stamp[by_clique], is_look, first, order, of_look)
+
+    def __len__(self) -> int:
+        return len(self.clique)
+
+
+def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, sensor: SiteSensor) -> FrameEvidence:
+    """What every frame says."""
+    from evermap.existence.site_kernels import FrameEvidence, FrameRows, SensorNumbers, Slots, frame_evidence
+
+    lines, p_false, p_occluded, occluded_s, use_misses = sensor
+    site, key = looks.site[frames.order], looks.key[frames.order]
+    n_lines = max(len(lines.hits), 1)
+    pair, slot = np.unique(site * n_lines + key, return_inverse=True)  # lines of sight to each site learn by themselves
+    slots = Slots(*(np.asarray(column, dtype=np.float64)[pair % n_lines] for column in lines[:3]))
+    shape = len(frames), chains.width
+    n_hits, n_misses = np.zeros((2, *shape), dtype=np.int64)
+    said = FrameEvidence(np.zeros(shape), n_hits, n_misses, np.zeros(shape))
+    rows = FrameRows(
+        np.searchsorted(frames.of_look, np.arange(len(frames) + 1)),
+        frames.clique,
+        frames.stamp_s,
+        slot.ravel(),
+        chains.row_of_site[site] - chains.first[looks.clique[frames.order]],
+        np.asarray(looks.hit, dtype=np.bool_)[frames.order],
+    )
+    numbers = SensorNumbers(
+        float(lines.p_blocked), float(p_false), float(p_occluded), float(occluded_s), bool(use_misses)
+    )
+    frame_evidence(rows, slots, numbers, said)
+    return said
+
 
 STEPS = 32
 """Of a gap between sessions, in each of which a clique leaves or returns at most once."""
@@ -36,15 +282,11 @@ def follow_sites(
     clique_of_site: IntArray,
     dynamics: SiteDynamics,
     looks: SiteLooks,
-    lines: Lines,
+    sensor: SiteSensor,
     *,
     start_s: FloatArray | float,
     until_s: float,
-    p_false: float,
-    p_occluded: float = 0.02,
-    occluded_s: float = 5.0,
     held: BoolArray | None = None,
-    use_misses: bool = True,
 ) -> SiteBeliefs:
     """Take all looks of a session in.
 
@@ -53,15 +295,10 @@ def follow_sites(
         clique_of_site: (S,) row of the clique of each site; a clique may have none.
         dynamics: how sites are left and returned to.
         looks: what was looked at.
-        lines: what is known of K lines of sight before the session.
+        sensor: how well places are seen.
         start_s: when `p_here` held, for all or (C,) of each clique; none of its looks is earlier.
         until_s: end of the session; no look is later.
-        p_false: probability of a detection at a place where nothing of the clique is.
-        p_occluded: that somebody stands before the whole clique.
-        occluded_s: mean time that he stays, so that a blind spell is one event and not as many as it has frames; 0 for
-            another one in every frame.
         held: (C,) cliques that are never believed away (an operator's word); none where None.
-        use_misses: False has only hits speak.
 
     Raises:
         InputError: shapes, rows that do not exist, numbers out of range, or time running back.
@@ -71,11 +308,66 @@ def follow_sites(
     n_cliques, n_sites = len(dynamics.p_hop), len(p_here)
     start = checks.as_rows(start_s, n_cliques, "start_s")
     pinned = np.zeros(n_cliques, dtype=np.bool_) if held is None else np.asarray(held, dtype=np.bool_)
-    check_sites(p_here, clique_of_site, dynamics, looks, lines, start, until_s, p_false, p_occluded, occluded_s)
-    chains = Chains.of(clique_of_site, n_cliques)
-    frames = Frames.of(looks, n_cliques, until_s)
+    _check_sites(p_here, clique_of_site, dynamics, looks, sensor.lines, start, until_s)
+    _check_sensor(sensor)
+    chains = CliqueChains.of(clique_of_site, n_cliques)
+    frames = CliqueFrames.of(looks, n_cliques, until_s)
+    first = _first_beliefs(chains, frames, dynamics, chains.start(p_here, pinned), start, pinned)
+    chain = kernels.SiteChain(chains.first, frames.first, *first.steps)
+    with np.errstate(divide="ignore"):
+        log_here = np.log(np.column_stack([first.old, first.new]))
+    shape = first.steps.log_rest.shape
 
-    # From the last session to the first look, in steps; then from look to look.
+    def filtered(said: FrameEvidence) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Log probabilities after each frame, what it said for the sites, and the evidence of all."""
+        found = np.empty(shape), np.empty(len(frames)), np.empty(n_cliques)
+        kernels.forward(chain, log_here, said.log_ratio, *found)
+        return found
+
+    hits = _said_by(frames, looks, chains, sensor._replace(use_misses=False))
+    said = _said_by(frames, looks, chains, sensor)
+    log_after, log_odds, log_evidence = filtered(said)
+    smoothed = np.empty(shape)
+    kernels.backward(chain, hits.log_ratio, filtered(hits)[0], smoothed)
+
+    seat = chains.row_of_site - chains.first[clique_of_site]
+    stayed, returned = np.exp(log_after[frames.first[1:][clique_of_site] - 1, :, seat]).T
+    share = np.divide(stayed, stayed + returned, out=np.ones(n_sites), where=stayed + returned > 0.0)
+    weight = np.empty(len(looks))
+    weight[frames.order] = np.exp(smoothed[frames.of_look, :, seat[looks.site[frames.order]]]).sum(axis=1)
+    since_s = share * dynamics.since_s + (1.0 - share) * first.came_s[chains.row_of_site]
+    before = (first.old + first.new)[chains.row_of_site]
+    trace = _trace(frames, said, log_after, log_odds)
+    return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, log_evidence, trace)
+
+
+class _FirstBeliefs(NamedTuple):
+    """Beliefs of R seats before the first look, and what happens from look to look.
+
+    Attributes:
+        old, new: (R,) probability to be there since before the gap, and to have come within it.
+        came_s: (R,) when those that came did so, on average.
+        steps: from frame to frame.
+    """
+
+    old: FloatArray
+    new: FloatArray
+    came_s: FloatArray
+    steps: Transitions
+
+
+def _first_beliefs(
+    chains: CliqueChains,
+    frames: CliqueFrames,
+    dynamics: SiteDynamics,
+    old: FloatArray,
+    start: FloatArray,
+    pinned: BoolArray,
+) -> _FirstBeliefs:
+    """From the last session to the first look, in steps; then from look to look."""
+    from evermap.existence.site_kernels import renew
+
+    n_sites = len(dynamics.since_s)
     priors, number = distinct((*dynamics.stay, *dynamics.absence))
     prior = chains.by_row(number[:n_sites], number[n_sites:])
     since = chains.by_row(dynamics.since_s, dynamics.away_since_s)
@@ -85,49 +377,17 @@ def follow_sites(
     brief = odds(priors, prior, np.stack([age, np.zeros(len(age))], 1), np.stack([age + gap_s, gap_s], 1)) < SELDOM
     steps = 1 if brief.all() else STEPS
     step_s = gap_s / steps
-    old, new, came = chains.start(p_here, pinned), np.zeros(len(since)), np.zeros(len(since))
+    new, came = np.zeros(len(since)), np.zeros(len(since))
     edges = age[:, None] + np.arange(steps + 1) * step_s[:, None]
     since_middle = np.maximum(np.arange(steps + 1) - 0.5, 0.0) * step_s[:, None]
     death_old, death_new = (odds(priors, prior, age_s[:, :-1], age_s[:, 1:]) for age_s in (edges, since_middle))
-    kernels.renew(chains.first, route, moves, death_old, death_new, old, new, came)
+    renew(chains.first, route, moves, death_old, death_new, old, new, came)
     came = start[chains.clique] + came * step_s
-    log_rest, log_leave = transitions(chains, priors, prior, since, came, moves, frames.clique, frames.stamp_s)
-    with np.errstate(divide="ignore"):
-        log_route, log_here = np.log(route), np.log(np.column_stack([old, new]))
-    chain = chains.first, frames.first, log_route, log_rest, log_leave
-
-    def filtered(said: Said) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log probabilities after each frame, what it said for the sites, and the evidence of all."""
-        found = np.empty(log_rest.shape), np.empty(len(frames)), np.empty(n_cliques)
-        kernels.forward(*chain, log_here, said.log_ratio, *found)
-        return found
-
-    say = partial(
-        said_by, frames, looks, chains, lines,
-        p_false=float(p_false), p_occluded=float(p_occluded), occluded_s=float(occluded_s),
-    )  # fmt: skip
-    hits, said = say(use_misses=False), say(use_misses=use_misses)
-    log_after, log_odds, log_evidence = filtered(said)
-    smoothed = np.empty(log_rest.shape)
-    kernels.backward(*chain, hits.log_ratio, filtered(hits)[0], smoothed)
-
-    seat = chains.row_of_site - chains.first[clique_of_site]
-    stayed, returned = np.exp(log_after[frames.first[1:][clique_of_site] - 1, :, seat]).T
-    share = np.divide(stayed, stayed + returned, out=np.ones(n_sites), where=stayed + returned > 0.0)
-    weight = np.empty(len(looks))
-    weight[frames.order] = np.exp(smoothed[frames.of_look, :, seat[looks.site[frames.order]]]).sum(axis=1)
-    return SiteBeliefs(
-        p_here=stayed + returned,
-        p_stayed=stayed,
-        p_before=(old + new)[chains.row_of_site],
-        since_s=share * dynamics.since_s + (1.0 - share) * came[chains.row_of_site],
-        weight=weight,
-        log_evidence=log_evidence,
-        trace=_trace(frames, said, log_after, log_odds),
-    )
+    seats = Seats(priors, prior, since, came, route, moves)
+    return _FirstBeliefs(old, new, came, transitions(chains, seats, frames.clique, frames.stamp_s))
 
 
-def _trace(frames: Frames, said: Said, log_after: FloatArray, log_odds: FloatArray) -> SiteTrace:
+def _trace(frames: CliqueFrames, said: FrameEvidence, log_after: FloatArray, log_odds: FloatArray) -> SiteTrace:
     """The frames in which something was looked at."""
     rows = np.flatnonzero(frames.is_look)
     at_sites = np.exp(log_after[rows]).sum(axis=1)[:, 1:]

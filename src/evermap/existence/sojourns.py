@@ -13,9 +13,9 @@ from math import exp
 
 import numpy as np
 
-from evermap.existence.hazard_table import CERTAIN
-from evermap.existence.rhythm import Rhythm
-from evermap.existence.smooth_rates import HALF_AN_EVENT, SmoothRates, age_basis, constant, fit, week_basis
+from evermap.existence.lifetimes import CERTAIN
+from evermap.existence.rhythm import HALF_AN_EVENT, Rhythm, SmoothRates, age_basis, constant, fit, week_basis
+from evermap.show import Shown
 from evermap.survival import Exponential, Gamma, LogNormal, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray
@@ -35,7 +35,7 @@ _ROUNDS = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Sojourns:
+class Sojourns(Shown):
     """Counts of one state.
 
     Attributes:
@@ -63,7 +63,7 @@ class Sojourns:
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class Fitted(Shown):
     """A lifetime that was fitted.
 
     Attributes:

@@ -204,7 +204,7 @@ def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> 
         ConfigError: the text of no prior.
         InputError: a file that cannot be read, or that says nothing of the class.
     """
-    from evermap.existence.storage import lifetimes_of
+    from evermap.existence.models import lifetimes_of
 
     try:
         found = {} if common is None else lifetimes_of(common)

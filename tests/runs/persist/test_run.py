@@ -12,12 +12,11 @@ import pytest
 from evermap.cli.options import priors_by_class
 from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, EvermapError, InputError
-from evermap.existence.one import PersistenceFilter
-from evermap.existence.one_stay import OneStay
+from evermap.existence.models import save_model
+from evermap.existence.one_stay import OneStay, PersistenceFilter
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants
 from evermap.existence.run_length import RunLength
-from evermap.existence.storage import save_model
 from evermap.metrics.belief import belief_scores
 from evermap.runs.persist.models import ModelOfEach, looks_at, some_looks
 from evermap.runs.persist.run import nice_step, run_persist

@@ -9,8 +9,8 @@ import pytest
 from evermap.config import TrackConfig
 from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, InputError
+from evermap.existence.models import NamedModels, save_models
 from evermap.existence.one_stay import OneStay
-from evermap.existence.storage import NamedModels, save_models
 from evermap.runs.track.run import _priors
 from evermap.survival import Exponential, GeneralPurpose
 from evermap.survival.text import parse_prior

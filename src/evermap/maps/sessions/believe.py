@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks, follow_sites
+from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks, SiteSensor, follow_sites
 from evermap.maps.lives import Life
 from evermap.maps.living import Evidence, LivingMap, Sites, class_of, clique_rows, site_middles
 from evermap.maps.sessions.looks import PlaceLooks
@@ -138,11 +138,9 @@ def _followed(
         row,
         dynamics_of(living, config),
         rows,
-        lines,
+        SiteSensor(lines, p_false, use_misses=config.misses),
         start_s=start_s,
         until_s=until_s,
-        p_false=p_false,
-        use_misses=config.misses,
         held=_pinned(living, cliques),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.config import PersistConfig
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.existence.choose import KINDS, Choice, choose
+from evermap.existence.models import KINDS, Choice, choose
 from evermap.existence.protocol import Looks
 from evermap.existence.rhythm import BIN_S
 from evermap.io.text import quote

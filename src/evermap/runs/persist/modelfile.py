@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.existence import storage
+from evermap.existence import models as storage
 from evermap.io.text import quote
 from evermap.runs.persist.models import ModelOfEach
 from evermap.runs.persist.table import LookTable

@@ -13,7 +13,7 @@ from evermap.config import TrackConfig
 from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, DataError
 from evermap.existence.lifetimes import Lifetimes
-from evermap.existence.storage import lifetimes_of
+from evermap.existence.models import lifetimes_of
 from evermap.io.text import counted, quote
 from evermap.runs.track.detections import DetectionTable, said_of
 from evermap.show import Shown

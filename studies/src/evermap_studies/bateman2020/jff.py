@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import ConfigError, InputError
-from evermap.existence import checks, joint, single
+from evermap.existence import joint, single
+from evermap.existence import protocol as checks
 from evermap.existence.single import Belief
 from evermap.survival import LifetimePrior
 from evermap.types import FloatArray, IntArray

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.existence.one import PersistenceFilter
+from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import CallableHazard, Exponential, GeneralPurpose, LifetimePrior, PeriodicHazard
 from evermap.types import BoolArray, FloatArray
 from evermap.viz.belief_figure import plot_belief
