@@ -14,8 +14,6 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 ROW = re.compile(r"^\| (?P<noun>[a-z ]+) \| (?P<meaning>[^|]+) \| `(?P<path>[\w.]+)` \|", re.MULTILINE)
 TERMS = list(ROW.finditer((REPOSITORY / "docs" / "glossary.md").read_text(encoding="utf-8")))
 USED_FOR_SEVERAL = {
-    "Candidate",
-    "Frames",
     "Method",
     "Stamps",
 }
