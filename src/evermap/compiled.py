@@ -22,13 +22,15 @@ from evermap.interrupts import held, raises
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def kept(**options: Any) -> Callable[[_Function], _Function]:
+def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]:
     """Return a decorator that compiles a function at its first call and keeps the machine code for all processes.
 
     It is kept beside the source, or where that is read-only in the user's cache folder, or in a temporary one. It is
     compiled again when the function, what it calls, or a constant that either of them reads has changed.
 
     Args:
+        effort: LLVM's level of optimisation, from 1. Level 1 compiles in two thirds of the time; level 3 pays where
+            loops are to be vectorised. No level changes a result, but for the rounding that `fastmath` permits.
         options: as for numba's `njit`.
 
     Warns:
@@ -41,24 +43,50 @@ def kept(**options: Any) -> Callable[[_Function], _Function]:
         dispatcher = njit(**options)(function)
         dispatcher._cache = _keeper()(function)
         dispatcher._cache.of = dispatcher
-        dispatcher.compile = _whole(dispatcher.compile)
+        dispatcher.effort = effort
+        dispatcher.compile = _whole(dispatcher.compile, effort)
         return cast("_Function", dispatcher)
 
     return decorate
 
 
-def _whole(compile_for: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiling that no `KeyboardInterrupt` cuts in two.
+def _whole(compile_for: Callable[..., Any], effort: int) -> Callable[..., Any]:
+    """Compiling that no `KeyboardInterrupt` cuts in two, at an effort of its own.
 
     LLVM asks for kept machine code, and hands over the new, through callbacks of ctypes. These drop an exception: the
     interrupt would be forgotten, or LLVM would get no code, and the kernel's address would be 0.
     """
 
     def compile_whole(signature: Any) -> Any:
-        with held() if raises() else contextlib.nullcontext():
+        with held() if raises() else contextlib.nullcontext(), _optimising(effort):
             return compile_for(signature)
 
     return compile_whole
+
+
+@contextlib.contextmanager
+def _optimising(effort: int) -> Iterator[None]:
+    """Numba knows one level for all functions: it is ours while this thread, alone, compiles."""
+    from numba import config
+    from numba.core.compiler_lock import global_compiler_lock
+
+    settings: Any = config
+    with global_compiler_lock:
+        before = settings.OPT
+        try:
+            settings.OPT = type(before)(min(effort, _asked()))
+            yield
+        finally:
+            settings.OPT = before
+
+
+@functools.cache
+def _asked() -> int:
+    """The level that the user allows (NUMBA_OPT), 3 if nothing is said."""
+    from numba import config
+
+    settings: Any = config
+    return int(settings.OPT)
 
 
 @functools.cache
@@ -172,7 +200,7 @@ def _parts(value: Any, seen: dict[int, int]) -> Iterator[str]:
         yield f"function {number}"
         if number == len(seen) - 1:
             captured = [cell.cell_contents for cell in function.__closure__ or ()]
-            options = getattr(value, "targetoptions", {})
+            options = {"effort": getattr(value, "effort", 3), **getattr(value, "targetoptions", {})}
             for part in (*sorted(options), *map(options.get, sorted(options)), function.__defaults__, captured):
                 yield from _parts(part, seen)
             yield from _parts_of_code(function.__code__, function.__doc__, function.__globals__, seen)

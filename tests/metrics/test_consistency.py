@@ -6,6 +6,7 @@ from scipy import stats
 
 from evermap.metrics.consistency import (
     chi2_interval,
+    chi2_quantile,
     lag1_autocorrelation,
     nees,
     running_mean,
@@ -40,6 +41,12 @@ def test_exact_poses_have_no_nees():
     covariance = np.array([np.eye(2), np.zeros((2, 2)), [[1.0, 1.0], [1.0, 1.0]]])
     np.testing.assert_array_equal(np.isnan(nees(np.ones((3, 2)), covariance)), [False, True, True])
     assert np.isfinite(nees(np.ones((1, 2)), np.eye(2)[None] * 1e-12))
+
+
+def test_quantiles_are_those_of_scipy_bit_by_bit():
+    for dof in (1, 2, 3, 17, 12_345):
+        for p in (1e-6, 0.025, 0.5, 0.95, 0.999):
+            assert chi2_quantile(p, dof) == stats.chi2.ppf(p, dof)
 
 
 def test_mean_interval_covers_simulated_means():

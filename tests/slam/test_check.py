@@ -101,13 +101,14 @@ def test_the_template_is_honest(tmp_path: Path) -> None:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("dataset", [1, 2, 3, 6])
+@pytest.mark.parametrize("dataset", [6, *(pytest.param(number, marks=pytest.mark.slow) for number in (1, 2, 3))])
 def test_honest_mrclam_raises_no_alarm_and_mistakes_are_told(shared_data: Path, dataset: int) -> None:
     path = shared_data / "mrclam" / f"MRCLAM_Dataset{dataset}.zip"
     robots = list_robots(path)
-    for robot in robots:
-        assert check_recording(read_mrclam(path, robot)).findings == ()
-    honest = read_mrclam(path, robots[0])
+    recordings = [read_mrclam(path, robot) for robot in robots]
+    for recording in recordings:
+        assert check_recording(recording).findings == ()
+    honest = recordings[0]
     for name, (mistake, codes, words) in MISTAKES.items():
         found, messages = raw_check(mistake(honest))
         assert len(found) == 1, (name, messages)

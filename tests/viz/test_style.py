@@ -23,6 +23,7 @@ from evermap.viz.style import (
     ROLES,
     class_looks,
     house_style,
+    inline_svg,
     new_figure,
     save_svg,
     settle,
@@ -108,3 +109,17 @@ def test_the_page_has_a_variable_a_role_in_both_themes() -> None:
     for colour, (role, in_the_dark) in ROLES.items():
         assert f"--{role}:{colour}" in light
         assert f"--{role}:{in_the_dark}" in dark
+
+
+def test_a_figure_is_drawn_again_where_it_was_changed() -> None:
+    with house_style():
+        figure = new_figure(2.0, 1.5)
+        axes = figure.subplots()
+        (line,) = axes.plot([0.0, 1.0], [0.0, 1.0])
+    first = inline_svg(figure, "one")
+    assert inline_svg(figure, "one") == first
+    line.set_ydata([0.0, 0.5])
+    second = inline_svg(figure, "one")
+    assert second != first
+    axes.set_title("changed")
+    assert inline_svg(figure, "one") != second

@@ -188,9 +188,12 @@ def run_and_write(
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
     from evermap.runs.folder import RunInfo, write_run
+    from evermap.slam.changes.joint import may_search
+    from evermap.slam.warmup import warm_up as compile_kernels
     from evermap.viz.change_words import explanations
 
-    warm_up()
+    in_map = prior is not None
+    warm_up(lambda: compile_kernels(search=may_search(len(recording.frames.stamp_s), in_map=in_map)))
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)

@@ -34,21 +34,27 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     return out
 
 
+def chi2_quantile(p: float, dof: float) -> float:
+    """Return the value below which a chi-square variable with `dof` degrees stays with probability `p`.
+
+    As scipy.stats computes it, whose import takes as long as a short recording.
+    """
+    from scipy.special import gammaincinv
+
+    return float(2.0 * gammaincinv(dof / 2.0, p))
+
+
 def chi2_interval(dof: float, count: int = 1, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return the two-sided interval of the mean of `count` independent chi-square variables with `dof` degrees."""
-    from scipy.stats import chi2
-
     tail = (1.0 - confidence) / 2.0
     total = dof * count
-    return float(chi2.ppf(tail, total)) / count, float(chi2.ppf(1.0 - tail, total)) / count
+    return chi2_quantile(tail, total) / count, chi2_quantile(1.0 - tail, total) / count
 
 
 def share_in_band(values: FloatArray, dof: float = 2, confidence: float = CONFIDENCE) -> float | None:
     """Return the share of finite values below the chi-square quantile, `confidence` if consistent; None if no value."""
-    from scipy.stats import chi2
-
     finite = values[np.isfinite(values)]
-    return float(np.mean(finite <= chi2.ppf(confidence, dof))) if len(finite) else None
+    return float(np.mean(finite <= chi2_quantile(confidence, dof))) if len(finite) else None
 
 
 def running_mean(values: FloatArray, window: int) -> FloatArray:

@@ -13,7 +13,7 @@ from evermap.config import SlamConfig
 from evermap.interrupts import watched
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.gain import ChangePrior
-from evermap.slam.changes.joint import Joint
+from evermap.slam.changes.joint import Joint, may_search
 from evermap.slam.intake import Prepared
 from evermap.slam.method import Method, Static
 from evermap.slam.problem import Noise
@@ -84,7 +84,7 @@ def solve(
     Raises:
         NumericalError: no finite optimum.
     """
-    warm_up()
+    warm_up(search=may_search(len(prepared.problem.stamp_s), in_map=prepared.prior_map is not None))
     slam = StreamingSlam(
         prepared.problem,
         noise,

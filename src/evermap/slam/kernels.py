@@ -33,7 +33,8 @@ MAX_STEP_S = 0.1
 AT_PLACES = 12
 """Where places begin in a joint covariance: behind the newest pose (3) and the calibration states (9)."""
 
-kernel = kept(error_model="numpy")
+kernel = kept(effort=1, error_model="numpy")
+"""Matrices of two to fifteen rows: there is nothing to vectorise, and much to compile."""
 
 
 @kernel

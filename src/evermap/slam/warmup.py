@@ -17,9 +17,22 @@ from evermap.slam.problem import Drive, Problem
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
 
 
+def warm_up(*, search: bool = True) -> None:
+    """Compile the kernels, or load them where that was done before; estimating does it by itself.
+
+    Worth calling ahead where the first frame must not wait: compiling takes half a minute, once on a machine.
+
+    Args:
+        search: those of the search for changes, too; see `changes.joint.may_search`.
+    """
+    _drive()
+    if search:
+        _search()
+
+
 @functools.cache
-def warm_up() -> None:
-    """Drive past one landmark, through all compiled functions, once per process; compiled code is kept."""
+def _drive() -> None:
+    """Drive past one landmark, through everything that is compiled."""
     count = FIRST_RELINEARISATION + 2
     stamps = np.linspace(0.0, 0.1 * count, count)
     prior = CalibrationPrior.from_settings(calibrated=True, fix={})
@@ -55,9 +68,9 @@ def warm_up() -> None:
         START,
     )
     dead_reckoned(stamps[:2], problem.drive, prior.mean, START)
-    _search()
 
 
+@functools.cache
 def _search() -> None:
     """Three landmarks at their places, searched for changes."""
     place, sure, count = 3.0 * np.eye(3, 2), np.eye(6), 3

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -340,13 +341,20 @@ def page_theme() -> str:
 
 
 def _svg(figure: Figure) -> str:
-    """The drawing as matplotlib writes it."""
+    """The drawing as matplotlib writes it; drawn once, unless the figure was changed since."""
+    if figure in _DRAWN and not figure.stale:
+        return _DRAWN[figure]
     _write_powers(figure)
     buffer = io.StringIO()
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     with house_style():
         figure.savefig(buffer, format="svg", facecolor=PAPER, metadata=metadata)
-    return buffer.getvalue()
+    figure.stale = False  # from here on it says whether anybody changes the figure
+    _DRAWN[figure] = buffer.getvalue()
+    return _DRAWN[figure]
+
+
+_DRAWN: WeakKeyDictionary[Figure, str] = WeakKeyDictionary()
 
 
 def _file_theme() -> str:

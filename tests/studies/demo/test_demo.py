@@ -153,6 +153,7 @@ def test_the_world_is_that_of_the_simulation(summary, building) -> None:
     assert sum(session["changed"] for session in summary["demo"]["sessions"]) > 20
 
 
+@pytest.mark.slow
 def test_same_seed_same_numbers_in_one_process_and_in_two(folder: Path, summary, tmp_path: Path) -> None:
     again = run_demo(tmp_path / "again", seed=SEED, scenario=SCENARIO, processes=2)
     changing = ("timing", "versions")

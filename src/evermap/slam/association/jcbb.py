@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from evermap.slam.kernels import kernel
 from evermap.types import FloatArray, IntArray
@@ -65,7 +65,7 @@ class Matching:
 @functools.cache
 def gates(n: int, confidence: float) -> FloatArray:
     """Return (n + 1,) chi-square quantiles with 2 k degrees of freedom for k = 0..n pairings."""
-    bounds: FloatArray = np.append(0.0, chi2.ppf(confidence, 2 * np.arange(1, n + 1)))
+    bounds: FloatArray = np.append(0.0, 2.0 * gammaincinv(np.arange(1, n + 1), confidence))
     bounds.setflags(write=False)
     return bounds
 

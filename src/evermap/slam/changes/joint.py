@@ -50,6 +50,11 @@ MOST_ITEMS = 400
 """Landmarks times windows, so that a search stays a matter of milliseconds."""
 
 
+def may_search(n_frames: int, *, in_map: bool) -> bool:
+    """Return whether a session of this many frames is ever searched for changes: one window alone has no before."""
+    return in_map or n_frames >= 2 * POSES_A_WINDOW
+
+
 class Joint(Method):
     """Which landmarks moved together, before the session or within it.
 
