@@ -134,8 +134,10 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
             return steps.lost(alone, living, config.living, steps.NOT_FOUND)
         if where is not None:
             before = living
-            living, where, visit = steps.refit(living, aged.p_here, where, alone, robust=config.slam.robust)
-            if config.living.search == "joint" and not steps.fits(visit, alone):
+            living, where, visit = steps.refit(
+                living, aged.p_here, where, alone, config.living, robust=config.slam.robust
+            )
+            if config.living.search == "joint" and not steps.fits(visit, alone, config.living):
                 return steps.lost(alone, before, config.living, steps.CONTRADICTED)
         # judged twice: the second time by the lifetimes that the first has learned
         known = steps.judged(living, where, visit, config.living)

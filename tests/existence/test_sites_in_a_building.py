@@ -14,7 +14,7 @@ import pytest
 
 from evermap.existence.sites import SiteDynamics, SiteLooks
 from evermap.geometry import se2
-from evermap.sensing.sightlines import CLEAR, P_HIDDEN, Lines, SightLines, nominal_lines
+from evermap.sensing.sightlines import USUAL, Lines, SightLines, nominal_lines
 from evermap.sensing.visibility import NominalField
 from evermap.survival import Exponential, LifetimePrior
 from evermap.types import BoolArray, Detections, FloatArray, IntArray, Recording, rows_of
@@ -161,7 +161,7 @@ def known_to_be_clear(
     table: SightLines, places: Places, place: IntArray, cell: IntArray, nominal: FloatArray
 ) -> tuple[Lines, BoolArray]:
     lines, p_clear, seen = table.lines(places, place, cell, nominal)
-    return lines._replace(p_free=np.full(len(nominal), 1.0 - P_HIDDEN[1])), (p_clear >= CLEAR) & seen
+    return lines._replace(p_free=np.full(len(nominal), 1.0 - USUAL.p_hidden_beside)), (p_clear >= USUAL.clear) & seen
 
 
 def in_the_field(

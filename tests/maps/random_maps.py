@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import Evidence, LivingMap, Members, Places, Sites, Stays
-from evermap.sensing.sightlines import HEADINGS, P_HIDDEN, SightLines, Views
+from evermap.sensing.sightlines import HEADINGS, SightLines, Views
 from evermap.survival import Exponential, GeneralPurpose, Mixture, PiecewiseConstantHazard, Weibull
 from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange
 
@@ -124,7 +124,7 @@ def random_lines(random: np.random.Generator, places: Places) -> SightLines:
     lines = SightLines.empty().learned(
         (places.site_id, places.landmark_id), place, cell, hit, random.random(len(place)) + 0.1
     )
-    return replace(lines, hidden=random.uniform(0, 9, len(P_HIDDEN)), shown=random.uniform(0, 99, len(P_HIDDEN)))
+    return replace(lines, hidden=random.uniform(0, 9, 3), shown=random.uniform(0, 99, 3))
 
 
 def random_evidence(seed: int, living: LivingMap, *, looks: int = 40) -> Evidence:

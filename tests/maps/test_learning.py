@@ -10,7 +10,8 @@ import pytest
 from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
-from evermap.maps.learning import NEWEST, class_survival, learned_lives
+from evermap.config import LifetimeConfig
+from evermap.maps.learning import class_survival, learned_lives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
 from evermap.survival.general_purpose import GeneralPurpose
@@ -166,9 +167,9 @@ def test_learning_does_not_depend_on_how_long_ago_a_class_was_first_seen() -> No
     classes = (ObjectClass("swing", "hinge", count=8, stay=Duration(2.0)),)
     looks_s = two_looks_a_day(180)
     stays = as_seen(histories(classes, 180 * DAY_S, np.random.default_rng(6), 0.0), looks_s)
-    assert len(stays) > 1.5 * NEWEST
+    assert len(stays) > 1.5 * LifetimeConfig().newest
     lives = learned_lives(stays, Lives(looks_s=looks_s[:-1]), looks_s[-1])
-    assert lives.of(0, np.zeros(2)).n_stays == NEWEST
+    assert lives.of(0, np.zeros(2)).n_stays == LifetimeConfig().newest
     mean, lower, upper = class_survival(stays, lives, 0, [2.0 * DAY_S])
     assert lower < np.exp(-1.0) < upper
     assert upper - lower < 0.15

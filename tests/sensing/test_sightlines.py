@@ -10,17 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import betabinom
 
+from evermap.config import SightConfig
 from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.sensing.sightlines import (
-    BLOCKED,
     HEADINGS,
-    HIDDEN_LOOKS,
-    MOST_LOOKS,
-    MOST_SESSIONS,
-    NEIGHBOUR,
-    P_HIDDEN,
-    STRENGTH,
     SightLines,
     Views,
     nominal_lines,
@@ -30,6 +24,11 @@ from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray, Recording
 from evermap_studies.sim.config import BuildingConfig
 from evermap_studies.sim.world import simulate_building
+
+RULES = SightConfig()
+BLOCKED, HIDDEN_LOOKS, MOST_LOOKS = RULES.p_blocked_detect, RULES.hidden_looks, RULES.most_looks
+MOST_SESSIONS, NEIGHBOUR, STRENGTH = RULES.most_sessions, RULES.neighbour, RULES.strength
+P_HIDDEN = np.array(RULES.p_hidden)
 
 PLACES = np.array([2, 2, 3, 7], dtype=np.int64), np.array([10, 11, 12, 10], dtype=np.int64)
 """Sites and landmarks of the places of a map."""

@@ -19,7 +19,16 @@ from typing import Any, get_args
 
 from pydantic import Field, ValidationError
 
-from evermap.config.living import LivingConfig
+from evermap.config.living import (
+    DecisionConfig,
+    FitConfig,
+    GroupingConfig,
+    LifetimeConfig,
+    LivingConfig,
+    LooksConfig,
+    OverlayConfig,
+    SightConfig,
+)
 from evermap.config.section import Section, config_error
 from evermap.config.slam import (
     CalibrationConfig,
@@ -183,13 +192,20 @@ __all__ = [
     "CheckConfig",
     "CleaningConfig",
     "Config",
+    "DecisionConfig",
+    "FitConfig",
+    "GroupingConfig",
+    "LifetimeConfig",
     "LivingConfig",
+    "LooksConfig",
     "ModesConfig",
     "NoiseConfig",
     "OutputConfig",
+    "OverlayConfig",
     "PersistConfig",
     "Section",
     "SensorConfig",
+    "SightConfig",
     "SlamConfig",
     "SurvivalConfig",
     "TrackConfig",

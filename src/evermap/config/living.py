@@ -6,7 +6,148 @@ from typing import Literal
 
 from pydantic import Field
 
-from evermap.config.section import Positive, Section
+from evermap.config.section import Count, NotNegative, Positive, Probability, Section, Share
+
+
+class FitConfig(Section):
+    """When a session is believed to lie in the map, and which of its landmarks are believed."""
+
+    least_fit: Share = Field(
+        default=0.75, description="share of the sightings that fit in a session by itself that must fit in the map, too"
+    )
+    most_lost: Share = Field(
+        default=0.03, description="a session whose sightings fit less often in the map by this share was bent"
+    )
+    inlier: Share = Field(default=0.5, description="inlier probability from which on a sighting counts")
+    sightings: Positive = Field(default=1.5, description="inliers that a landmark needs to be believed")
+    sightings_in_place: Positive = Field(default=0.5, description="the same where it stands as in the map")
+    glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is there [m]")
+    bent_m: Positive = Field(default=0.15, description="bodies that moved alike to within this are a bend [m]")
+    bent_cliques: int = Field(default=3, ge=2, description="bodies that must have moved alike for that")
+    window: Count = Field(default=12, description="sightings by which each pose of a bent session is placed")
+    placing_m: Positive = Field(default=0.3, description="residual from which sightings count for less in that [m]")
+
+
+class OverlayConfig(Section):
+    """Priors of the search for what stands where the map has it."""
+
+    nudge_m: Positive = Field(default=0.7, description="standard deviation of a small move, each axis [m]")
+    share_nudged: Share = Field(default=0.5, description="share of moves that are small; the others lead anywhere")
+    turn_m: Positive = Field(default=0.35, description="standard deviation of how members of a moved body turn [m]")
+    p_split: Share = Field(default=1e-3, description="probability that landmarks taken for one body are not")
+    p_another_place: Share = Field(default=1e-3, description="probability that a session is of another place")
+    smallest_room_m2: Positive = Field(default=50.0, description="least area that moved bodies may be found in [m^2]")
+    drifts_m: tuple[Positive, ...] = Field(
+        default=(0.01, 0.02, 0.04, 0.08),
+        min_length=1,
+        description="standard deviations by which landmarks that nobody moved may be off from session to session [m]",
+    )
+    p_coarser: Share = Field(default=0.5, description="probability of each of these, relative to the one before")
+
+
+class LooksConfig(Section):
+    """What counts as having looked at a place of the map."""
+
+    settled_s: NotNegative = Field(default=300.0, description="what is seen within this time of a look was there [s]")
+    beside_m: Positive = Field(default=1.0, description="what is seen this close to a place is seen along its line [m]")
+    beside_rad: Positive = Field(default=0.15, description="what is seen behind it at this angle is, too [rad]")
+    along_m: Positive = Field(default=0.3, description="distance from a line of sight that shows it to be clear [m]")
+    witnesses: Count = Field(default=3, description="frames in which something else must be seen along a line")
+    sides: Count = Field(default=6, description="sectors around a place that count as sides of it")
+    most_sides: Count = Field(default=3, description="sides that count for having been seen all around")
+    together_m: NotNegative = Field(
+        default=2.0, description="cliques missed from places this close may be hidden by the same thing [m]"
+    )
+    near_m: NotNegative = Field(
+        default=0.6, description="positions this close to one from which a place was seen see it, too [m]"
+    )
+    least_expected: Positive = Field(
+        default=2.0, description="detections that earlier looks must be expected to have given to count as looks"
+    )
+    sticky: float = Field(default=2.0, ge=1.0, description="frames in a row that say as much as an independent one")
+
+
+class DecisionConfig(Section):
+    """What is told of a session, and what a map forgets."""
+
+    least_evidence: NotNegative = Field(
+        default=1.5, description="log likelihood ratio of looks against a clique before it is told to have left"
+    )
+    credible: Share = Field(
+        default=0.6,
+        description="what is missed is gone if it is for the upper bound of this lifetime interval, too",
+    )
+    new_clique_p: Share = Field(default=0.9, description="belief in a new body before its sightings are counted")
+    surely_away: Probability = Field(default=0.02, description="belief below which a clique may be forgotten")
+    forgotten_p: Probability = Field(default=0.05, description="probability of a return below which it is forgotten")
+    most_away: int = Field(
+        default=20, ge=0, description="cliques that are away and remembered, beside as many as stand"
+    )
+    most_stays: Count = Field(default=5000, description="newest stays that lifetimes are learned from")
+
+
+class GroupingConfig(Section):
+    """Which landmarks are on one body, by how they moved."""
+
+    p_one_body: Share = Field(default=0.9, description="that two landmarks of a clique are on one body")
+    p_split_before: Share = Field(default=0.05, description="that two near ones of different cliques are")
+    p_other_class: Share = Field(default=0.001, description="that two near ones of different classes are")
+    p_moved: Share = Field(default=0.1, description="that a body moves between two sessions")
+    move_sigma_m: Positive = Field(default=2.0, description="standard deviation of displacements, each axis [m]")
+    misses_in_a_row: float = Field(
+        default=4.0, ge=1.0, description="misses of one session that say as much as an independent one"
+    )
+    p_wrong: Share = Field(default=1e-3, description="that detections of a landmark are of another, a session long")
+
+
+class LifetimeConfig(Section):
+    """How lifetimes are learned from the history of a map."""
+
+    newest: Count = Field(default=300, description="stays of a class that are learned from: the last that began")
+    strength: Positive = Field(default=2.0, description="events that the average over classes counts for in each")
+    least_ended: Count = Field(default=5, description="ends in a chunk before it has lifetimes of its own")
+    sure: Share = Field(default=0.999, description="ends of stays that are more probable count as certain")
+
+
+class SightConfig(Section):
+    """What is believed of lines of sight, and how it is learned."""
+
+    most_looks: Positive = Field(
+        default=200.0, description="looks along one line; with more, old ones fade, so that a moved wall is learned"
+    )
+    strength: Positive = Field(
+        default=4.0, description="looks along one line that the rate of all clear lines of its length is worth"
+    )
+    nominal_looks: Positive = Field(
+        default=20.0, description="looks that the nominal rate is worth against those along all lines of a length"
+    )
+    p_blocked_detect: Share = Field(default=0.03, description="detection rate along blocked lines")
+    least_rate: Share = Field(default=0.002, description="no kind of line has a lower detection rate")
+    highest_rate: Share = Field(default=0.98, description="no kind of line has a higher detection rate")
+    neighbour: Probability = Field(
+        default=0.35, description="what looks from the eight cells around say of a line, in looks along it"
+    )
+    clear: Share = Field(default=0.9, description="a line is known to be clear from this probability on")
+    blocked: Share = Field(default=0.25, description="a line is known to be blocked up to this probability")
+    p_hidden_unseen: Share = Field(
+        default=0.1, description="that a place is hidden a session long (a shut door) if its lines were clear before"
+    )
+    p_hidden_beside: Share = Field(default=0.03, description="the same if something else is seen along them now")
+    p_hidden_unknown: Share = Field(
+        default=0.2, description="the same if they were unknown, but something close to them and behind is seen"
+    )
+    hidden_looks: Positive = Field(default=5.0, description="sessions that these are worth against what is learned")
+    most_sessions: Positive = Field(default=2000.0, description="sessions of cliques after which old ones fade")
+
+    @property
+    def p_hidden(self) -> tuple[float, float, float]:
+        """That a place cannot be seen for a whole session, by what is known of its lines; see `SightLines.hidden`."""
+        return self.p_hidden_unseen, self.p_hidden_beside, self.p_hidden_unknown
+
+    @property
+    def rates(self) -> tuple[float, float]:
+        """Bounds of detection rates along lines."""
+        return self.least_rate, self.highest_rate
 
 
 class LivingConfig(Section):
@@ -35,3 +176,10 @@ class LivingConfig(Section):
         default=True, description="learn from where to where the sensor sees; off: its nominal field of view"
     )
     most_sites: int = Field(default=3, ge=1, le=100, description="sites that are remembered of one clique, at most")
+    fit: FitConfig = Field(default_factory=FitConfig, description="whether a session lies in the map")
+    overlay: OverlayConfig = Field(default_factory=OverlayConfig, description="priors of what moved")
+    sight: SightConfig = Field(default_factory=SightConfig, description="lines of sight")
+    looks: LooksConfig = Field(default_factory=LooksConfig, description="what counts as a look")
+    decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="what is told and forgotten")
+    grouping: GroupingConfig = Field(default_factory=GroupingConfig, description="which landmarks are on one body")
+    lifetimes: LifetimeConfig = Field(default_factory=LifetimeConfig, description="how lifetimes are learned")

@@ -23,20 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import GroupingConfig
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
-P_ONE_BODY = 0.9
-"""Of two landmarks of a clique, before they are seen to move: that they are on one body."""
-P_SPLIT_BEFORE = 0.05
-"""Of two landmarks that are near, but of different cliques."""
-P_OTHER_CLASS = 0.001
-"""Of two landmarks that are near, but of different classes."""
-P_MOVED = 0.1
-"""Of a body, between two sessions."""
-MOVE_SIGMA_M = 2.0
-"""Standard deviation of displacements, each axis."""
+USUAL = GroupingConfig()
 
 
 class Fate(IntEnum):
@@ -96,6 +88,7 @@ def regrouped(
     reach_m: float,
     next_id: int,
     p_wrong: float | FloatArray = 1e-3,
+    settings: GroupingConfig = USUAL,
 ) -> IntArray:
     """Cliques after a session: split where one rigid motion does not explain it, joined where it does.
 
@@ -107,23 +100,25 @@ def regrouped(
         reach_m: largest extent of a body.
         next_id: first free id.
         p_wrong: probability that a fate is wrong, of all or (L,) of each.
+        settings: priors of bodies and of their moves.
 
     Returns:
         (L,) cliques. Of one that is split the largest part keeps the id, with those that were not seen.
     """
     log_wrong = np.log(np.broadcast_to(np.asarray(p_wrong, dtype=np.float64), clique_id.shape))
-    moves = _Moves(*displaced)
+    moves = _Moves(*displaced, settings.move_sigma_m)
+    one_body = _logit(settings.p_one_body)
     label, moved = clique_id.copy(), []
     for name in np.unique(clique_id[fate != Fate.UNSEEN]):
         of_fate = {one: np.flatnonzero((clique_id == name) & (fate == one)) for one in Fate}
-        bodies = moves.joined([np.array([row]) for row in of_fate[Fate.MOVED]], _of_one_clique)
+        bodies = moves.joined([np.array([row]) for row in of_fate[Fate.MOVED]], lambda _a, _b: one_body)
         moved += bodies
         parts = [*bodies, *(of_fate[one] for one in (Fate.STAYED, Fate.GONE) if len(of_fate[one]))]
         parts.sort(key=len, reverse=True)
         for part in parts[1:]:
             rest = np.concatenate([other for other in parts if other is not part])
             log_mistaken = max(float(log_wrong[part].sum()), float(log_wrong[rest].sum()))
-            if fate[part[0]] == Fate.MOVED or _logit(P_ONE_BODY) + log_mistaken < math.log(P_MOVED):
+            if fate[part[0]] == Fate.MOVED or one_body + log_mistaken < math.log(settings.p_moved):
                 label[part] = next_id
                 next_id += 1
 
@@ -132,7 +127,7 @@ def regrouped(
         if max(_extent(displaced.before_m[both]), _extent(displaced.after_m[both])) > reach_m:
             return -math.inf
         one_class = len(np.unique(class_id[both][class_id[both] >= 0])) <= 1
-        return _logit(P_SPLIT_BEFORE if one_class else P_OTHER_CLASS)
+        return _logit(settings.p_split_before if one_class else settings.p_other_class)
 
     # what did not move with its clique is a clique of its own by now, unless it was mistaken
     whole = [body for body in moved if (fate[(label == label[body[0]]) & (fate != Fate.UNSEEN)] == Fate.MOVED).all()]
@@ -142,22 +137,20 @@ def regrouped(
     return label
 
 
-def _of_one_clique(a: IntArray, b: IntArray) -> float:  # noqa: ARG001
-    return _logit(P_ONE_BODY)
-
-
 class _Moves:
     """Evidence of displacements for one rigid motion of a set of landmarks."""
 
-    def __init__(self, before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray) -> None:
-        self._before, self._after, self._covariance = before_m, after_m, covariance_m2
+    def __init__(self, before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float) -> None:
+        self._before, self._after, self._covariance, self._sigma_m = before_m, after_m, covariance_m2, sigma_m
         self._known: dict[tuple[int, ...], float] = {}
 
     def log_evidence(self, rows: IntArray) -> float:
         key = tuple(sorted(rows.tolist()))
         if key not in self._known:
             mine = np.array(key)
-            self._known[key] = log_evidence_of_motion(self._before[mine], self._after[mine], self._covariance[mine])
+            self._known[key] = log_evidence_of_motion(
+                self._before[mine], self._after[mine], self._covariance[mine], self._sigma_m
+            )
         return self._known[key]
 
     def joined(self, sets: list[IntArray], log_prior: Callable[[IntArray, IntArray], float]) -> list[IntArray]:
@@ -180,8 +173,10 @@ class _Moves:
             del sets[i]
 
 
-def log_evidence_of_motion(before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray) -> float:
-    """`log p(after | before)` if one rigid motion made it all: any turn, the middle moved by `MOVE_SIGMA_M` each axis.
+def log_evidence_of_motion(
+    before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float = USUAL.move_sigma_m
+) -> float:
+    """`log p(after | before)` if one rigid motion made it all: any turn, the middle moved by `sigma_m` each axis.
 
     Of one landmark exact, of more by Laplace's method about the most probable motion.
 
@@ -189,17 +184,18 @@ def log_evidence_of_motion(before_m: FloatArray, after_m: FloatArray, covariance
         before_m: (n, 2) old places.
         after_m: (n, 2) new places.
         covariance_m2: (n, 2, 2) of each difference.
+        sigma_m: standard deviation of displacements, each axis.
     """
     count = len(before_m)
     if count == 1:
-        spread = covariance_m2[0] + MOVE_SIGMA_M**2 * np.eye(2)
+        spread = covariance_m2[0] + sigma_m**2 * np.eye(2)
         return -0.5 * float(_square(after_m - before_m, spread[None])[0] + _log_det(2.0 * math.pi * spread))
     middle, new_middle = before_m.mean(axis=0), after_m.mean(axis=0)
     arm, new_arm = before_m - middle, after_m - new_middle
     turn = math.atan2(float(np.sum(_perpendicular(arm) * new_arm)), float(np.sum(arm * new_arm)))
     shift = new_middle - middle
     precision = np.linalg.inv(covariance_m2)
-    prior = np.diag([MOVE_SIGMA_M**-2, MOVE_SIGMA_M**-2, 1e-6])  # landmarks may be at one point
+    prior = np.diag([sigma_m**-2, sigma_m**-2, 1e-6])  # landmarks may be at one point
     for _ in range(5):  # Gauss-Newton from the rotation that suits equal variances best
         turned = arm @ se2.rotation(turn).T
         jacobian = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), _perpendicular(turned)[:, :, None]], axis=2)
@@ -210,7 +206,7 @@ def log_evidence_of_motion(before_m: FloatArray, after_m: FloatArray, covariance
         shift, turn = shift + step[:2], turn + float(step[2])
     residual = after_m - middle - shift - arm @ se2.rotation(turn).T
     log_likelihood = -0.5 * float(np.sum(_square(residual, covariance_m2) + _log_det(2.0 * math.pi * covariance_m2)))
-    log_prior = -0.5 * float(shift @ shift) / MOVE_SIGMA_M**2 - math.log(2.0 * math.pi * MOVE_SIGMA_M**2)
+    log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - math.log(2.0 * math.pi * sigma_m**2)
     log_width = 1.5 * math.log(2.0 * math.pi) - 0.5 * float(_log_det(information))
     return log_likelihood + log_prior - math.log(2.0 * math.pi) + log_width
 
@@ -322,18 +318,13 @@ def _of_sum_one(owner: IntArray, p_here: FloatArray) -> FloatArray:
     return np.asarray(p_here / np.maximum(total, 1.0)[row.ravel()])
 
 
-STICKY = 4.0
-"""Misses of one session come in runs: so many of them say as much as one that is independent of all others."""
-P_WRONG = 1e-3
-"""Of detections that fit a landmark, that they are of another one, all through a session."""
-
-
-def without_missed(before: LivingMap, after: LivingMap) -> LivingMap:
+def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig = USUAL) -> LivingMap:
     """The map after a session, its bodies without members that were missed alone; whether these exist is then open.
 
     Args:
         before: the map as the session found it.
         after: as the session leaves it, beliefs and counts up to date.
+        settings: how bodies move; and that misses of one session come in runs.
     """
     members = after.members
     site = after.site_of()
@@ -341,7 +332,7 @@ def without_missed(before: LivingMap, after: LivingMap) -> LivingMap:
     usual_hits, usual_misses = (_at(counted, column) for column in (before.places.n_hits, before.places.n_misses))
     hits = _at(place, after.places.n_hits) - usual_hits
     misses = _at(place, after.places.n_misses) - usual_misses
-    p_missed = np.exp(-_owed(members.clique_id, usual_hits, usual_misses, hits, misses) / STICKY)
+    p_missed = np.exp(-_owed(members.clique_id, usual_hits, usual_misses, hits, misses) / settings.misses_in_a_row)
     known = (place >= 0) & (counted >= 0)
     fate = np.select([known & (hits > 0), known & (p_missed < 0.5)], [Fate.STAYED, Fate.GONE], Fate.UNSEEN)
     if not (fate == Fate.GONE).any():
@@ -354,7 +345,8 @@ def without_missed(before: LivingMap, after: LivingMap) -> LivingMap:
         Displacements(nowhere, nowhere, np.zeros((len(members), 2, 2))),
         reach_m=0.0,
         next_id=after.n_cliques_ever,
-        p_wrong=np.where(fate == Fate.GONE, p_missed, P_WRONG),
+        p_wrong=np.where(fate == Fate.GONE, p_missed, settings.p_wrong),
+        settings=settings,
     )
     if np.array_equal(clique_id, members.clique_id):
         return after

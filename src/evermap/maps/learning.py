@@ -21,6 +21,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evermap.config import LifetimeConfig
 from evermap.errors import ConfigError, suggestion
 from evermap.existence.lifetimes import Lifetimes
 from evermap.maps.lives import EVERYWHERE, Life, Lives, general_purpose
@@ -40,10 +41,7 @@ from evermap.survival.class_lifetimes import (
 )
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, rows_of
 
-NEWEST = 300
-"""Stays of a class that are learned from: the last that began, whatever became of them, so that none is preferred."""
-STRENGTH = 2.0
-"""Events that the average over classes counts for in the probabilities of one."""
+USUAL = LifetimeConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +60,7 @@ class History:
         to_known: whether the next stay is at a site that had been known; `had_choice` whether there was one.
         back_here: whether the next stay is at this very site.
         there_again: hopped twice and was where it had been; `hopped_twice` whether it did.
+        strength: events that the average over classes counts for in the probabilities of one.
     """
 
     stays: Stays
@@ -78,9 +77,10 @@ class History:
     back_here: BoolArray
     there_again: BoolArray
     hopped_twice: BoolArray
+    strength: float
 
     @classmethod
-    def of(cls, stays: Stays, looks_s: FloatArray) -> Self:
+    def of(cls, stays: Stays, looks_s: FloatArray, settings: LifetimeConfig = USUAL) -> Self:
         """From the stays of a map in any order."""
         stays = stays[np.lexsort((stays.first_s, stays.clique_id))]
         class_ids, kind = np.unique(stays.class_id, return_inverse=True)
@@ -113,7 +113,7 @@ class History:
             looks_s=looks_s,
             class_ids=class_ids,
             kind=kind.ravel(),
-            recent=_newest(kind.ravel(), stays.first_s),
+            recent=_newest(kind.ravel(), stays.first_s, settings.newest),
             hopped=hopped,
             away=away,
             seen_away_s=seen_away_s,
@@ -123,15 +123,16 @@ class History:
             back_here=site_after == site,
             there_again=site[after[after]] == site,
             hopped_twice=hopped_twice,
+            strength=settings.strength,
         )
 
     def shares(self, event: BoolArray, chance: BoolArray) -> FloatArray:
         """(C + 1,) probability of an event for each class, and for one never seen; classes lean on their average."""
         chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
         # classes differ: every one counts for one event at most, however often it was seen
-        weight = 1.0 / (chances[:-1] + STRENGTH)
+        weight = 1.0 / (chances[:-1] + self.strength)
         average = (0.5 + events[:-1] @ weight) / (1.0 + chances[:-1] @ weight)
-        of_classes = (events[:-1] + STRENGTH * average) / (chances[:-1] + STRENGTH)
+        of_classes = (events[:-1] + self.strength * average) / (chances[:-1] + self.strength)
         return np.append(of_classes, average)
 
     def counts(self, rows: BoolArray, weight: FloatArray | None = None) -> FloatArray:
@@ -158,19 +159,15 @@ class History:
         return Sightings(stays.elsewhere_s, stays.first_s, stays.last_s, stays.gone_s, gap_s, back_by_stay, back_rate)
 
 
-def _newest(kind: IntArray, first_s: FloatArray) -> BoolArray:
-    """(K,) the last `NEWEST` stays of every class, by their beginning."""
+def _newest(kind: IntArray, first_s: FloatArray, most: int) -> BoolArray:
+    """(K,) the last `most` stays of every class, by their beginning."""
     order = np.lexsort((-first_s, kind))
     start = np.searchsorted(kind[order], kind[order])
     newest = np.zeros(len(kind), dtype=np.bool_)
-    newest[order] = np.arange(len(kind)) - start < NEWEST
+    newest[order] = np.arange(len(kind)) - start < most
     return newest
 
 
-LEAST_ENDED = 5
-"""Ends in a chunk before it has lifetimes of its own."""
-SURE = 0.999
-"""Ends of stays that are more probable than this count as ends."""
 QUANTILES = 64
 """Lengths of stays that stand for a prior that a user gives."""
 _SHORTEST_S, _LONGEST_S = 60.0, 1.5e9
@@ -178,15 +175,16 @@ _FIRMNESS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
 """Ends that the lifetimes of a class may count for in those of a chunk; how many is learned."""
 
 
-def learned_lives(stays: Stays, before: Lives, now_s: float) -> Lives:
+def learned_lives(stays: Stays, before: Lives, now_s: float, settings: LifetimeConfig = USUAL) -> Lives:
     """Learn lifetimes by class and place from all stays of a map until now.
 
     Args:
         stays: of all cliques, also those that go on.
         before: what was learned after the session before; its chunks, looks and priors are kept.
         now_s: end of the session.
+        settings: what is learned from, and how firmly.
     """
-    return ClassLives.of(stays, before, now_s).lives
+    return ClassLives.of(stays, before, now_s, settings).lives
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,25 +202,27 @@ class ClassLives:
     stay: ClassPosterior
 
     @classmethod
-    def of(cls, stays: Stays, before: Lives, now_s: float | None = None) -> Self:
+    def of(cls, stays: Stays, before: Lives, now_s: float | None = None, settings: LifetimeConfig = USUAL) -> Self:
         """Learn from all stays of a map; see `learned_lives`.
 
         Args:
             stays: of all cliques.
             before: what was learned before, whose looks are told of.
             now_s: end of the newest session; None where `before` tells of it, too.
+            settings: what is learned from, and how firmly.
         """
         looks_s = before.looks_s if now_s is None else np.append(before.looks_s[before.looks_s < now_s], now_s)
         if not len(stays):
             nothing = stay_posterior(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
             return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
-        history = History.of(stays, looks_s)
-        learned = _learned(history, before)
+        history = History.of(stays, looks_s, settings)
+        learned = _learned(history, before, settings.sure)
         entries: list[tuple[int, tuple[int, int], Life]] = []
         for row, class_id in enumerate(history.class_ids.tolist()):
             life = learned.life(row)
             entries.append((class_id, (EVERYWHERE, EVERYWHERE), life))
-            entries += [(class_id, chunk, own) for chunk, own in _of_chunks(history, row, life, before.chunk_m)]
+            own_lives = _of_chunks(history, row, life, before.chunk_m, settings.least_ended)
+            entries += [(class_id, chunk, own) for chunk, own in own_lives]
         if UNKNOWN not in history.class_ids:
             said, of_all = before.prior_of(UNKNOWN), learned.life(-1)
             entries.append((UNKNOWN, (EVERYWHERE, EVERYWHERE), of_all if said is None else of_all.as_said(said)))
@@ -292,7 +292,7 @@ class _Learned:
         )
 
 
-def _learned(history: History, before: Lives) -> _Learned:
+def _learned(history: History, before: Lives, sure: float) -> _Learned:
     stays, n_classes = history.stays, len(history.class_ids)
     ended = np.isfinite(stays.gone_s)
     said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
@@ -314,7 +314,7 @@ def _learned(history: History, before: Lives) -> _Learned:
     kind = history.kind[history.recent]
     seen = history.sightings(back_by_hop[kind], back_rate[kind])
     log_likelihood = stay_log_likelihood(seen)
-    doubted = ended[history.recent] & (stays.p_gone[history.recent] < SURE)
+    doubted = ended[history.recent] & (stays.p_gone[history.recent] < sure)
     if doubted.any():  # expected log likelihood: perhaps it goes on
         p_gone = stays.p_gone[history.recent][doubted, None, None]
         going_on = rows_of(seen, doubted)
@@ -407,7 +407,9 @@ def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
     return found
 
 
-def _of_chunks(history: History, row: int, life: Life, chunk_m: float) -> list[tuple[tuple[int, int], Life]]:
+def _of_chunks(
+    history: History, row: int, life: Life, chunk_m: float, least_ended: int
+) -> list[tuple[tuple[int, int], Life]]:
     """Chunks in which stays of a class end sooner or later than everywhere, as far as they say so.
 
     Rates of a chunk are those of the class times a factor with a gamma prior of mean 1 (Clayton and Kaldor 1987): with
@@ -437,7 +439,7 @@ def _of_chunks(history: History, row: int, life: Life, chunk_m: float) -> list[t
     weight = np.exp(log_weight - log_weight.max())
     factor = (weight / weight.sum()) @ ((firm + n_ended) / (firm + n_expected))
     own: list[tuple[tuple[int, int], Life]] = []
-    for k in np.flatnonzero(n_ended >= LEAST_ENDED):
+    for k in np.flatnonzero(n_ended >= least_ended):
         assert isinstance(life.stay, PiecewiseConstantHazard)
         rates = tuple(float(factor[k]) * rate for rate in life.stay.rates)
         stay = PiecewiseConstantHazard(life.stay.edges_s, rates)

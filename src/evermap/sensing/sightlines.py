@@ -16,35 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import SightConfig
 from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray
 
-MOST_LOOKS = 200.0
-"""Along one line: with more, old ones fade. So a wall that is moved is learned, and misses by chance are not."""
-STRENGTH = 4.0
-"""Looks along one line that the rate of all clear lines of its length is worth."""
-NOMINAL_LOOKS = 20.0
-"""Looks that the nominal rate is worth against those along all lines of a length; one line counts no more than that."""
-BLOCKED = 0.03
-"""Detection rate along blocked lines: round corners, and because places are not quite known."""
+USUAL = SightConfig()
 OUT_OF_VIEW = 0.01
 """Nominal detection rate below which lines of sight do not matter."""
-RATES = (0.002, 0.98)
-"""No kind of line has a rate outside: nothing is certain."""
-NEIGHBOUR = 0.35
-"""What looks along a line say of those from the eight cells around, in looks along these."""
-CLEAR, BLOCKED_P = 0.9, 0.25
-"""A line is known to be clear from this probability on, and to be blocked up to that one."""
-P_HIDDEN = np.array([0.1, 0.03, 0.2])
-"""That a place cannot be seen for a whole session (a closed door, a parked truck), to begin with, by what is known of
-the lines to it: clear before, but nothing else is seen along them in this session; clear before, and something is;
-unknown before, but something is seen close to them and behind the place."""
-HIDDEN_LOOKS = 5.0
-"""Sessions that this is worth against those that were seen."""
-MOST_SESSIONS = 2000.0
-"""Sessions, of all cliques, after which old ones fade from what is learned of hidden places."""
 LONGEST = 80
 """Cells; lines longer than this are taken together."""
 ROUNDS = 10
@@ -86,8 +66,9 @@ class SightLines:
         cell: (K,) the sensor's cell, counted from the place.
         hits, looks: (K,) detections, and looks at what was there, both weighted by the belief that it was.
         hidden, shown: (3,) sessions of cliques that were looked at and stood there: how many could not be seen, and
-            were; by what was known of the lines, see `P_HIDDEN`.
+            were; by what was known of the lines, see `SightConfig.p_hidden`.
         cell_m: side of a cell.
+        rules: what is believed of lines of sight, and how it is learned.
     """
 
     site_id: IntArray
@@ -98,6 +79,7 @@ class SightLines:
     hidden: FloatArray = field(default_factory=lambda: np.zeros(3))
     shown: FloatArray = field(default_factory=lambda: np.zeros(3))
     cell_m: float = 0.5
+    rules: SightConfig = USUAL
 
     def __len__(self) -> int:
         return len(self.cell)
@@ -105,12 +87,13 @@ class SightLines:
     @property
     def p_hidden(self) -> FloatArray:
         """(3,) probability that a place cannot be seen, a whole session long, by what is known of the lines to it."""
-        return np.asarray((P_HIDDEN * HIDDEN_LOOKS + self.hidden) / (HIDDEN_LOOKS + self.hidden + self.shown))
+        at_first, worth = np.array(self.rules.p_hidden), self.rules.hidden_looks
+        return np.asarray((at_first * worth + self.hidden) / (worth + self.hidden + self.shown))
 
     def after_session(self, hidden: FloatArray, shown: FloatArray) -> SightLines:
         """Return the profile with expected numbers (3,) of cliques that were hidden, or shown, along clear lines."""
         hidden, shown = self.hidden + hidden, self.shown + shown
-        fade = np.minimum(1.0, MOST_SESSIONS / np.maximum(hidden + shown, 1.0))
+        fade = np.minimum(1.0, self.rules.most_sessions / np.maximum(hidden + shown, 1.0))
         return replace(self, hidden=fade * hidden, shown=fade * shown)
 
     @classmethod
@@ -156,10 +139,11 @@ class SightLines:
         rate, share = self._kinds(middle)
         length = _length(cell)
         hits, looks = self._around(places, place, cell)
-        free = np.clip(rate[length] * nominal / middle, *RATES)
-        p_clear = _p_clear(hits, looks, share, free)
+        strength = self.rules.strength
+        free = np.clip(rate[length] * nominal / middle, *self.rules.rates)
+        p_clear = _p_clear(hits, looks, share, free, self.rules)
         misses = np.maximum(looks - hits, 0.0)
-        lines = Lines(np.ones(len(length)), hits + STRENGTH * free, misses + STRENGTH * (1.0 - free), 0.0)
+        lines = Lines(np.ones(len(length)), hits + strength * free, misses + strength * (1.0 - free), 0.0)
         return lines, p_clear, hits > 0.0
 
     def learned(
@@ -190,10 +174,10 @@ class SightLines:
         hits = np.bincount(old, self.hits[kept], n) + np.bincount(new, weight * hit, n)
         used = looks > 1e-3
         every, looks, hits = every[used], looks[used], hits[used]
-        scale = MOST_LOOKS / np.maximum(looks, MOST_LOOKS)
+        scale = self.rules.most_looks / np.maximum(looks, self.rules.most_looks)
         at = every // _SPAN
         rows = places[0][at], places[1][at], every % _SPAN
-        return SightLines(*rows, hits * scale, looks * scale, self.hidden, self.shown, self.cell_m)
+        return SightLines(*rows, hits * scale, looks * scale, self.hidden, self.shown, self.cell_m, self.rules)
 
     def _rows(self, places: tuple[IntArray, IntArray]) -> IntArray:
         """(K,) row of the place of each line, -1 where the map has it no more."""
@@ -219,7 +203,7 @@ class SightLines:
         for dx, dy in _AROUND:
             wanted = place * _SPAN + cell + dx * _REACH + dy
             at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-            counts = (key[at] == wanted) * (1.0 if dx == dy == 0 else NEIGHBOUR)
+            counts = (key[at] == wanted) * (1.0 if dx == dy == 0 else self.rules.neighbour)
             hits += counts * self.hits[order[at]]
             looks += counts * self.looks[order[at]]
         return hits, looks
@@ -230,15 +214,16 @@ class SightLines:
         What few lines say gives way to what is nominal.
         """
         length, n = _length(self.cell), LONGEST + 1
-        voice = np.minimum(1.0, NOMINAL_LOOKS / np.maximum(self.looks, 1.0))
+        worth, rates = self.rules.nominal_looks, self.rules.rates
+        voice = np.minimum(1.0, worth / np.maximum(self.looks, 1.0))
         hits, looks = voice * self.hits, voice * self.looks
-        free: FloatArray = np.full(n, np.clip(nominal, *RATES), dtype=np.float64)
+        free: FloatArray = np.full(n, np.clip(nominal, *rates), dtype=np.float64)
         share = 0.5
         for _ in range(ROUNDS if len(self) else 0):
-            p_clear = _p_clear(self.hits, self.looks, share, free[length])
+            p_clear = _p_clear(self.hits, self.looks, share, free[length], self.rules)
             own = np.bincount(length, p_clear * hits, n), np.bincount(length, p_clear * looks, n)
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
-            free = np.clip((own[0] + NOMINAL_LOOKS * nominal) / (own[1] + NOMINAL_LOOKS), *RATES)
+            free = np.clip((own[0] + worth * nominal) / (own[1] + worth), *rates)
         return np.asarray(free, dtype=np.float64), share
 
 
@@ -248,10 +233,10 @@ def offsets(cell: IntArray, cell_m: float) -> FloatArray:
     return np.asarray(middle * cell_m, dtype=np.float64)
 
 
-def nominal_lines(p_detect: FloatArray) -> Lines:
+def nominal_lines(p_detect: FloatArray, rules: SightConfig = USUAL) -> Lines:
     """Return lines of a sensor whose nominal field of view (N,) is taken for the truth."""
-    nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *RATES)
-    return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), BLOCKED)
+    nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *rules.rates)
+    return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), rules.p_blocked_detect)
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +262,9 @@ class LearnedField:
         along = nominal[frame, place]
         lines, p_clear, _ = self.lines.lines(self.places, place, cell, along)
         p = np.zeros(nominal.shape)
-        p[frame, place] = p_clear * lines.p_detect + (1.0 - p_clear) * np.minimum(BLOCKED, along)
+        p[frame, place] = p_clear * lines.p_detect + (1.0 - p_clear) * np.minimum(
+            self.lines.rules.p_blocked_detect, along
+        )
         return p
 
 
@@ -325,15 +312,17 @@ class Views:
         return Views(every[:, :2], every[:, 2], stamps, frames[first], self.cell_m)
 
 
-def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray) -> FloatArray:
+def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray, rules: SightConfig) -> FloatArray:
     """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
     from scipy.special import expit, gammaln
 
     def log_likelihood(rate: FloatArray | float) -> FloatArray:
-        a, b = STRENGTH * np.asarray(rate), STRENGTH * (1.0 - np.asarray(rate))
+        a, b = rules.strength * np.asarray(rate), rules.strength * (1.0 - np.asarray(rate))
         return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + np.maximum(looks - hits, 0.0)) - gammaln(b))
 
-    return np.asarray(expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(BLOCKED)))
+    return np.asarray(
+        expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(rules.p_blocked_detect))
+    )
 
 
 def _length(cell: IntArray) -> IntArray:

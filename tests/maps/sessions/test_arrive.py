@@ -9,15 +9,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from evermap.config import LooksConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.lives import EVERYWHERE, Life, Lives
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.looks import LEAST_EXPECTED, STICKY, Arrivals, PlaceLooks, arrivals
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks, arrivals
 from evermap.sensing.sightlines import HEADINGS, SightLines, Views, nominal_lines
 from evermap.survival import Exponential
 from evermap.types import UNKNOWN, FloatArray, Sensor
 
 from .scenes import begun, found, next_map
+
+LEAST_EXPECTED, STICKY = LooksConfig().least_expected, LooksConfig().sticky
 
 SENSOR = Sensor(
     range_max_m=10.0, bearing_min_rad=-1.5, bearing_max_rad=1.5, p_detect=0.8, mount_robot_sensor=(0.2, 0.0, 0.0)

@@ -450,7 +450,7 @@ def test_whatever_is_believed_nothing_is_told_without_looks(seed: int) -> None:
             assert 0.5 <= change.probability * (1.0 + 1e-9) <= 1.0 + 1e-9 or change.kind is ChangeKind.RETURNED
             if change.kind is ChangeKind.VANISHED:
                 assert change.n_misses > 0
-                assert said[np.searchsorted(cliques, clique)] <= -decide.LEAST_EVIDENCE
+                assert said[np.searchsorted(cliques, clique)] <= -decide.USUAL.least_evidence
         for clique in set(cliques.tolist()) - looked:  # stays as they were
             mine, then = after.stays.clique_id == clique, stays.clique_id == clique
             np.testing.assert_array_equal(after.stays.gone_s[mine], stays.gone_s[then])
@@ -562,7 +562,7 @@ def test_of_too_many_that_are_away_the_first_that_went_are_forgotten() -> None:
     kept = decide.without_forgotten(crowd(60, Life(absence=Exponential(1e-7))), 3)
     assert_consistent(kept)
     away = kept.members.landmark_id[10:]
-    assert len(away) == decide.MOST_AWAY + 10  # twenty, and as many again as stand somewhere
+    assert len(away) == decide.USUAL.most_away + 10  # twenty, and as many again as stand somewhere
     assert away.tolist() == list(range(70 - len(away), 70))
 
 
@@ -574,11 +574,11 @@ def test_what_an_operator_spoke_about_is_never_forgotten() -> None:
 
 def test_of_old_stays_the_newest_are_kept() -> None:
     living = wandered(1)
-    count = decide.MOST_STAYS + 7
+    count = decide.USUAL.most_stays + 7
     last = np.random.default_rng(0).permutation(count).astype(np.float64)
     name = np.zeros(count, dtype=np.int64)
     many = Stays(name, name, name, np.zeros((count, 2)), last - 2, np.sort(last) - 2, last, last + 1, np.ones(count))
     kept = decide.without_forgotten(replace(living, stays=many), 3).stays
-    assert len(kept) == decide.MOST_STAYS
+    assert len(kept) == decide.USUAL.most_stays
     assert kept.last_s.min() == 7.0
     assert (np.diff(kept.first_s) > 0).all()

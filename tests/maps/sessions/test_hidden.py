@@ -11,12 +11,14 @@ from evermap.config import LivingConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.living import LivingMap, clique_rows
 from evermap.maps.sessions.believe import believed, said
-from evermap.maps.sessions.decide import LEAST_EVIDENCE
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, looked_at
-from evermap.sensing.sightlines import P_HIDDEN, SightLines
+from evermap.sensing.sightlines import SightLines
 from evermap.types import FloatArray, Sensor
 
 from .scenes import begun, found
+
+LEAST_EVIDENCE = LivingConfig().decisions.least_evidence
+P_HIDDEN, HIDDEN_LOOKS = LivingConfig().sight.p_hidden, LivingConfig().sight.hidden_looks
 
 SENSOR = Sensor(range_max_m=15.0, bearing_min_rad=-1.5, bearing_max_rad=1.5, p_detect=0.8)
 EYE = np.array([0.25, 0.25, 0.0])
@@ -42,7 +44,7 @@ def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> Plac
     place = np.flatnonzero(np.isin(living.places.landmark_id, seen))
     frame = np.repeat(np.arange(frames), len(place))
     sighting = Sighting(1000.0 + np.arange(frames), np.tile(EYE, (frames, 1)), frame, np.tile(place, frames))
-    return looked_at(living, living.sites.p_here, sighting, SENSOR, learn_sight=True)
+    return looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig())
 
 
 def evidence(living: LivingMap, looks: PlaceLooks) -> dict[int, float]:
@@ -119,7 +121,6 @@ def test_one_closed_door_over_many_things_is_not_told_as_many_leavings(n: int) -
 
 def hidden_alone(missed: int, p_gone: float, seen: int) -> float:
     """Probability of a hidden place, by expectation maximisation of counts: Beta mean of prior and session."""
-    from evermap.sensing.sightlines import HIDDEN_LOOKS
 
     p = P_HIDDEN[0]
     for _ in range(5):
@@ -141,7 +142,7 @@ def test_things_in_different_rooms_are_not_behind_one_door() -> None:
     none = np.zeros(0, dtype=np.int64)
     pose = np.column_stack([np.repeat(eyes, 12, axis=0), np.zeros(36)])
     sighting = Sighting(1000.0 + np.arange(36), pose, none, none)
-    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, learn_sight=True)
+    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig())
     np.testing.assert_allclose(p_hidden_of(living, looks), hidden_alone(3, 0.05, seen=0), rtol=1e-6)
 
 
@@ -159,7 +160,7 @@ def test_sight_that_is_not_learned_takes_the_field_of_view_for_the_truth() -> No
     living = a_map({1: (6.0, 0.25), 2: (6.0, 4.0)}, clear=(1,))
     none = np.zeros(0, dtype=np.int64)
     sighting = Sighting(1000.0 + np.arange(5), np.tile(EYE, (5, 1)), none, none)
-    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, learn_sight=False)
+    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig(learn_sight=False))
     assert isinstance(looks.rows, SiteLooks)
     assert looks.counts.all()
     assert len(looks.rows) == 10

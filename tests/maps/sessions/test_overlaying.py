@@ -14,7 +14,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.overlay import ELSEWHERE
-from evermap.maps.sessions.placing import BENT_CLIQUES, BENT_M, Laid, unbent, with_glimpsed
+from evermap.maps.sessions.placing import USUAL, Laid, unbent, with_glimpsed
 from evermap.types import FloatArray, IntArray
 
 from .scenes import begun, found
@@ -76,11 +76,11 @@ def test_bodies_that_moved_each_in_its_way_have_moved(seed: int, n: int, togethe
         np.testing.assert_array_equal(where.probability, before.probability)
     back = np.flatnonzero((before.place < 0) & (where.place >= 0))
     np.testing.assert_array_equal(where.place[back], row[back])  # never to another's
-    assert len(back) == 0 or len(back) >= BENT_CLIQUES
+    assert len(back) == 0 or len(back) >= USUAL.bent_cliques
 
 
 def _fit(at: FloatArray, home: FloatArray) -> bool:
-    return bool(np.hypot(*(home - se2.transform(rigid(at, home), at)).T).max() < BENT_M)
+    return bool(np.hypot(*(home - se2.transform(rigid(at, home), at)).T).max() < USUAL.bent_m)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -11,7 +11,7 @@ from evermap.config import Config
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import own_landmarks
-from evermap.maps.sessions.placing import refitted
+from evermap.maps.sessions.placing import Held, refitted
 from evermap.pipeline import solve_alone
 from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate
@@ -38,7 +38,7 @@ def alone() -> Solved:
 def in_map(alone: Solved, outcome: Outcome, row: IntArray, place_m: FloatArray) -> tuple[Outcome, bool]:
     """Solved with places that are known to a centimetre, in the frame of the session."""
     covariance = 1e-4 * np.eye(2 * len(row))
-    return refitted(outcome, alone.prior, np.zeros(3), 1.0, row, place_m, covariance, robust=True)
+    return refitted(outcome, alone.prior, np.zeros(3), 1.0, Held(row, place_m, covariance), robust=True)
 
 
 @pytest.mark.parametrize("bend", [(0.0, 0.0, 0.6), (4.0, -3.0, 0.0), (-6.0, 5.0, 2.5)])

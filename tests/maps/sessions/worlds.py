@@ -11,14 +11,9 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.maps.sessions.overlay import (
-    DRIFTS_M,
     ELSEWHERE,
     FREE_MOTION,
-    LOG_P_COARSER,
-    NUDGE_M,
-    SHARE_NUDGED,
-    SMALLEST_ROOM_M2,
-    TURN_M,
+    USUAL,
     Known,
     Overlay,
     Sighted,
@@ -129,7 +124,7 @@ class Densely:
         slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(3)])
         self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(np.square(FREE_MOTION)) @ slope.T
         both = np.vstack([self.at, known.position_m])
-        self.room_m2 = max(float(np.prod(both.max(axis=0) - both.min(axis=0))), SMALLEST_ROOM_M2)
+        self.room_m2 = max(float(np.prod(both.max(axis=0) - both.min(axis=0))), USUAL.smallest_room_m2)
         clique = sighted.clique[known.landmark]
         self.sites = [sorted({int(s) for s in known.site[clique == c]}) for c in range(len(known.log_p_elsewhere))]
 
@@ -167,9 +162,9 @@ class Densely:
         """The most probable assignment, the drift with it, and by how much the next one is less probable."""
         scored = sorted(
             (
-                (self.log_probability(chosen, drift) + k * LOG_P_COARSER, tuple(chosen), drift)
+                (self.log_probability(chosen, drift) + k * math.log(USUAL.p_coarser), tuple(chosen), drift)
                 for chosen in self.assignments()
-                for k, drift in enumerate(DRIFTS_M)
+                for k, drift in enumerate(USUAL.drifts_m)
             ),
             reverse=True,
         )
@@ -182,11 +177,15 @@ class Densely:
         rows = np.flatnonzero(self.known.site == site)
         step = self.at[self.known.landmark[rows]] - self.known.position_m[rows]
         middle = step.mean(axis=0)
-        nudged = math.exp(-0.5 * float(middle @ middle) / NUDGE_M**2) / (2.0 * math.pi * NUDGE_M**2)
-        whole = math.log(SHARE_NUDGED * nudged + (1.0 - SHARE_NUDGED) / self.room_m2)
+        nudged = math.exp(-0.5 * float(middle @ middle) / USUAL.nudge_m**2) / (2.0 * math.pi * USUAL.nudge_m**2)
+        whole = math.log(USUAL.share_nudged * nudged + (1.0 - USUAL.share_nudged) / self.room_m2)
         rest = step - middle
         free = 2 * (len(rows) - 1)
-        return whole - 0.5 * float((rest**2).sum()) / TURN_M**2 - 0.5 * free * math.log(2.0 * math.pi * TURN_M**2)
+        return (
+            whole
+            - 0.5 * float((rest**2).sum()) / USUAL.turn_m**2
+            - 0.5 * free * math.log(2.0 * math.pi * USUAL.turn_m**2)
+        )
 
 
 def sites_of(overlay: Overlay, known: Known, sighted: Sighted) -> IntArray:

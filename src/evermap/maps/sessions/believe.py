@@ -59,7 +59,7 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     until_s = max(until_s, living.stamp_s)
     none = np.zeros(0, dtype=np.int64)
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
-    lines = nominal_lines(np.zeros(0))
+    lines = nominal_lines(np.zeros(0), living.sightlines.rules)
     after = _followed(living, living.sites.p_here, nothing, lines, config, living.stamp_s, until_s, 0.01)
     return with_beliefs(living.sites, living.sites.p_here, after)
 

@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from evermap.config import DecisionConfig
 from evermap.maps.diff import SAME_SPOT_M, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
@@ -14,17 +15,7 @@ from evermap.maps.sessions.gaussian import of_places
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
-LEAST_EVIDENCE = 1.5
-"""What looks must say against a clique, as a log likelihood ratio, before it is told to have left."""
-CREDIBLE = 0.6
-"""Of lifetimes: what is missed is gone if it is for the upper bound of this interval, too."""
-SURELY_AWAY = 0.02
-FORGOTTEN_P = 0.05
-"""Cliques that are more probably away than to 1 - `SURELY_AWAY`, and return with less than this, are forgotten."""
-MOST_AWAY = 20
-"""Cliques that are away are remembered up to this number, and as many again as stand somewhere."""
-MOST_STAYS = 5000
-"""Newest stays that lifetimes are learned from: a year of a large building."""
+USUAL = DecisionConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +47,8 @@ def decided(
     arrivals: Arrivals,
     start_s: float,
     longest: ClassLives | None = None,
+    *,
+    settings: DecisionConfig = USUAL,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """The map with its stays up to date, and what changed since it was told last, by clique.
 
@@ -71,8 +64,9 @@ def decided(
         start_s: beginning of the session.
         longest: how long things stay: a clique is told to have vanished where the looks outweigh the longest lifetimes
             that are credible. None where nothing is known of lifetimes.
+        settings: how much it takes.
     """
-    session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest)
+    session = _Session.of(before, after, looks, log_evidence, arrivals, start_s, longest, settings)
     told = _told(before, after)
     for row, clique in enumerate(session.cliques.tolist()):
         session.weigh(row)
@@ -98,7 +92,7 @@ class _Session:
     Attributes:
         cliques: (C,) ids; site: (C,) row of the most probable site of each.
         p_away: (C,) probability that it stands nowhere; log_evidence: (C,) of the looks, for 'it stands somewhere'.
-        least: (C,) evidence against it that it takes to tell that it vanished.
+        least: (C,) evidence against it that it takes to tell that it vanished; least_evidence: that it was missed.
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
@@ -117,6 +111,7 @@ class _Session:
     p_away: FloatArray
     log_evidence: FloatArray
     least: FloatArray
+    least_evidence: float
     hits: IntArray
     misses: IntArray
     was_hit: BoolArray
@@ -140,6 +135,7 @@ class _Session:
         arrivals: Arrivals,
         start_s: float,
         longest: ClassLives | None,
+        settings: DecisionConfig,
     ) -> Self:
         """Before anything is decided."""
         sites, stays = after.sites, after.stays
@@ -150,10 +146,10 @@ class _Session:
         order = np.argsort(-sites.p_here, kind="stable")[::-1]
         site[row[order]] = order  # the last that is written is the most probable, the first of equal ones
         np.maximum.at(newest_s, row, sites.seen_s)
-        least = np.full(count, LEAST_EVIDENCE)
+        least = np.full(count, settings.least_evidence)
         if longest is not None:
             age_s = np.maximum(after.stamp_s - newest_s, 0.0)
-            p_stays = longest.longest(class_of(after, cliques), age_s, CREDIBLE)
+            p_stays = longest.longest(class_of(after, cliques), age_s, settings.credible)
             p_stays = np.clip(p_stays, 1e-12, 1.0 - 1e-12)
             least = np.maximum(least, np.log(p_stays / (1.0 - p_stays)))
         return cls(
@@ -167,6 +163,7 @@ class _Session:
             p_away=np.clip(1.0 - np.bincount(row, sites.p_here, minlength=count), 0.0, 1.0),
             log_evidence=log_evidence,
             least=least,
+            least_evidence=settings.least_evidence,
             hits=hits,
             misses=misses,
             was_hit=np.bincount(row, hits, minlength=count) > 0,
@@ -253,7 +250,7 @@ class _Session:
         return bool(self.after.sites.p_here[self.site[row]] >= EXISTS)
 
     def _missed(self, row: int) -> bool:
-        return bool(self.log_evidence[row] <= -LEAST_EVIDENCE)
+        return bool(self.log_evidence[row] <= -self.least_evidence)
 
     def _sight(self, row: int) -> int:
         return int(self.looks.sight[row]) % 2
@@ -362,7 +359,7 @@ def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
     return told
 
 
-def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
+def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConfig = USUAL) -> LivingMap:
     """The map without what it need not remember: its cost is that of what stands there, whatever its age.
 
     Left out are the least probable sites of cliques that have more than `most_sites`, and cliques that are away for
@@ -374,11 +371,11 @@ def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
     rank = np.arange(len(order)) - np.searchsorted(sites.clique_id[order], sites.clique_id[order])
     kept = np.zeros(len(sites), dtype=np.bool_)
     kept[order[rank < most_sites]] = True
-    gone = _gone_for_good(living)
+    gone = _gone_for_good(living, settings)
     kept &= ~np.isin(sites.clique_id, gone)
     stays = living.stays
-    if len(stays) > MOST_STAYS:
-        stays = stays[np.sort(np.argsort(stays.last_s, kind="stable")[-MOST_STAYS:])]
+    if len(stays) > settings.most_stays:
+        stays = stays[np.sort(np.argsort(stays.last_s, kind="stable")[-settings.most_stays :])]
     if kept.all():
         return replace(living, stays=stays)
     rows = np.flatnonzero(np.isin(living.places.site_id, sites.site_id[kept]))
@@ -392,7 +389,7 @@ def without_forgotten(living: LivingMap, most_sites: int) -> LivingMap:
     )
 
 
-def _gone_for_good(living: LivingMap) -> IntArray:
+def _gone_for_good(living: LivingMap, settings: DecisionConfig) -> IntArray:
     """Ids of cliques that are away and need not be remembered."""
     sites = living.sites
     cliques, row = clique_rows(sites)
@@ -400,7 +397,7 @@ def _gone_for_good(living: LivingMap) -> IntArray:
     np.add.at(p_here, row, sites.p_here)
     np.maximum.at(seen, row, sites.seen_s)
     operated = living.members.pinned | living.members.deleted
-    away = np.flatnonzero((p_here < SURELY_AWAY) & ~np.isin(cliques, living.members.clique_id[operated]))
+    away = np.flatnonzero((p_here < settings.surely_away) & ~np.isin(cliques, living.members.clique_id[operated]))
     kinds, middle = class_of(living, cliques[away]), site_middles(living)
     newest = {int(row[s]): s for s in np.argsort(sites.seen_s, kind="stable")}
     p_return = np.zeros(len(away))
@@ -408,9 +405,9 @@ def _gone_for_good(living: LivingMap) -> IntArray:
         absence = living.lives.of(int(kinds[k]), middle[newest[int(clique)]]).absence
         still_away = float(np.exp(absence.log_survival(max(living.stamp_s - seen[clique], 0.0))))
         p_return[k] = 1.0 - absence.p_never_leaves / still_away if still_away > 0.0 else 0.0
-    hopeless = away[p_return < FORGOTTEN_P]
-    waiting = away[p_return >= FORGOTTEN_P]
-    most = MOST_AWAY + len(cliques) - len(away)
+    hopeless = away[p_return < settings.forgotten_p]
+    waiting = away[p_return >= settings.forgotten_p]
+    most = settings.most_away + len(cliques) - len(away)
     too_many = waiting[np.argsort(seen[waiting], kind="stable")][: max(len(waiting) - most, 0)]
     return np.asarray(cliques[np.concatenate([hopeless, too_many])])
 

@@ -60,10 +60,6 @@ class Extended:
     is_new: BoolArray
 
 
-NEW_CLIQUE_P = 0.9
-"""Belief in a body that nobody knew, before its sightings are counted."""
-
-
 def extended(living: LivingMap, p_site: FloatArray, found: Found, config: LivingConfig, drift_m: float) -> Extended:
     """Enter what a session found.
 
@@ -98,7 +94,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
     places = replace(places, position_m=position)
-    sites, p_start, is_new = _with_sites(living, p_site, found, clique, fresh, new_ids)
+    sites, p_start, is_new = _with_sites(living, p_site, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
     rank = np.empty(len(sorted_rows), dtype=np.int64)
     rank[sorted_rows] = np.arange(len(sorted_rows))
@@ -212,6 +208,7 @@ def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: floa
         Displacements(before, after, spread),
         reach_m=config.clique_reach_m,
         next_id=living.n_cliques_ever,
+        settings=config.grouping,
     )
     return _torn(living, clique_id, found, config.clique_reach_m)
 
@@ -260,17 +257,17 @@ def _with_sites(
     p_site: FloatArray,
     found: Found,
     clique: IntArray,
-    fresh: IntArray,
-    new_ids: IntArray,
+    new: tuple[IntArray, IntArray],
+    p_fresh: float,
 ) -> tuple[Sites, FloatArray, BoolArray]:
     """The map's sites and the new ones, with beliefs before the session's looks are counted."""
-    p_start = p_site.copy()
+    p_start, (fresh, new_ids) = p_site.copy(), new
     p_new, first, last = np.zeros(len(fresh)), np.zeros(len(fresh)), np.zeros(len(fresh))
     for k, name in enumerate(fresh):
         mine = np.flatnonzero((clique == name) & (found.place < 0))
         first[k], last[k] = found.first_s[mine].min(), found.last_s[mine].max()
         old = np.flatnonzero(living.sites.clique_id == name)
-        p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else NEW_CLIQUE_P
+        p_new[k] = min(float(found.probability[mine].min()), 0.999) if len(old) else p_fresh
         p_start[old] *= 1.0 - p_new[k]
     sites = living.sites.joined(Sites(new_ids, fresh, p_new, p_new, first, last))
     return sites, np.append(p_start, p_new), np.arange(len(sites)) >= len(living.sites)

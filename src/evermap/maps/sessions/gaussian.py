@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.config import FitConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
@@ -107,10 +108,7 @@ def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
     return np.asarray(covariance_m2[np.ix_(at, at)])
 
 
-SIGHTINGS = 1.5
-"""Inliers that a landmark needs to be believed: one sighting may carry a wrong identity."""
-SIGHTINGS_IN_PLACE = 0.5
-"""The same, of one that stands where the map has it: a wrong identity is hardly ever the right one there."""
+USUAL = FitConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,17 +126,19 @@ class OwnLandmarks:
     covariance_m2: FloatArray
 
 
-def own_landmarks(outcome: Outcome, in_place: IntArray | None = None) -> OwnLandmarks:
+def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntArray | None = None) -> OwnLandmarks:
     """What a session says of its landmarks, in its own metres: those of the map where it was solved with one.
 
     Args:
         outcome: of the session.
+        settings: how many sightings make a landmark: one may carry a wrong identity, which is hardly ever the right one
+            of a landmark that stands where the map has it.
         in_place: rows of landmarks that were laid at places of the map.
     """
     estimate = outcome.graph_estimate
     landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
-    least = np.full(len(estimate.known), SIGHTINGS)
-    least[[] if in_place is None else in_place] = SIGHTINGS_IN_PLACE
+    least = np.full(len(estimate.known), settings.sightings)
+    least[[] if in_place is None else in_place] = settings.sightings_in_place
     row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
     at = se2.xy_rows(row)
     position = estimate.landmark[row] * outcome.scale

@@ -15,28 +15,19 @@ known of a class). Without a look the map grew, and nothing has changed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import LivingConfig, LooksConfig
 from evermap.existence.sites import SiteLooks
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
-from evermap.sensing.sightlines import BLOCKED_P, CLEAR, HEADINGS, Lines, SightLines, Views, nominal_lines, offsets
+from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets
 from evermap.sensing.visibility import NominalField, looks_at
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
-SETTLED_S = 300.0
-"""What is seen within this time of a look was there at that look."""
-BESIDE_M, BESIDE_RAD = 1.0, 0.15
-"""What is seen this close to a place, or behind it at this angle, is seen along its line of sight."""
-ALONG_M = 0.3
-"""What is seen farther away, and at this distance from a line of sight, tells that this line is clear."""
-WITNESSES = 3
-"""Frames in which something else must be seen along the lines to a clique to know that they are clear."""
-SIDES, MOST_SIDES = 6, 3
-"""Sectors around a place that are sides of it, and how many of them count for being seen all around."""
-TOGETHER_M = 2.0
-"""Cliques that are missed from places this close to each other may be hidden by the same thing."""
+USUAL = LooksConfig()
 ROUNDS = 5
 
 
@@ -67,7 +58,7 @@ class PlaceLooks:
         lines: (K,) what is known of the different lines of sight.
         counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
         settled: (N,) whether the place was seen shortly before or after.
-        sight: (C,) what is known of the lines to each clique, as a row of `sightlines.P_HIDDEN`.
+        sight: (C,) what is known of the lines to each clique, as a row of `SightConfig.p_hidden`.
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
     """
 
@@ -82,7 +73,7 @@ class PlaceLooks:
 
 
 def looked_at(
-    living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, *, learn_sight: bool
+    living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, config: LivingConfig
 ) -> PlaceLooks:
     """Which places of a map were looked at, frame by frame, and which of them were seen.
 
@@ -91,7 +82,7 @@ def looked_at(
         p_start: (S,) beliefs in these when it began.
         sighting: what the session saw of it.
         sensor: its nominal field of view.
-        learn_sight: False takes that for the truth, whatever is in the way.
+        config: `looks`; without `learn_sight` that is taken for the truth, whatever is in the way.
     """
     places = living.places
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
@@ -109,34 +100,37 @@ def looked_at(
         np.bincount(key, minlength=len(line)), 1
     )
     rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, hit)
-    settled = surely_there(rows)
-    if not learn_sight:
+    settings, rules = config.looks, living.sightlines.rules
+    settled = surely_there(rows, settings.settled_s)
+    if not config.learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)
         sight = np.zeros(len(np.unique(living.sites.clique_id)), dtype=np.int64)
-        return PlaceLooks(rows, place, cell, nominal_lines(p_nominal), everything, settled, sight, np.zeros(2))
+        return PlaceLooks(rows, place, cell, nominal_lines(p_nominal, rules), everything, settled, sight, np.zeros(2))
     names = places.site_id, places.landmark_id
     now = living.sightlines.learned(
         names, place[settled], cell[settled], rows.hit[settled], np.ones(int(settled.sum()))
     )
     lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
     _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
-    clear = ((p_clear >= CLEAR) & seen)[key]
-    beside, behind = _beside(rows, frame, places.position_m[place], eye[frame])
-    unknown = behind & ~clear & (p_clear > BLOCKED_P)[key]
-    was_unknown = behind & ~((p_before >= CLEAR) & seen_before)[key] & (p_before > BLOCKED_P)[key]
+    clear = ((p_clear >= rules.clear) & seen)[key]
+    beside, behind = _beside(rows, frame, places.position_m[place], eye[frame], settings)
+    unknown = behind & ~clear & (p_clear > rules.blocked)[key]
+    was_unknown = behind & ~((p_before >= rules.clear) & seen_before)[key] & (p_before > rules.blocked)[key]
     tried, found = (np.bincount(rows.clique[was_unknown & some], minlength=len(np.unique(living.sites.clique_id)))
                     for some in (np.ones(len(rows), dtype=np.bool_), rows.hit))  # fmt: skip
-    there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= WITNESSES)
+    there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= settings.witnesses)
     unwitnessed = np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
     counts, sight, p_hidden = _hidden(
-        living, p_start, rows, clear, beside & clear, unknown, eye[frame], eye[frame, :2] - places.position_m[place]
+        living, p_start, rows, _Seen(clear, beside & clear, unknown), eye[frame], places.position_m[place], settings
     )
     lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
         np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
     return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
 
 
-def _beside(rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray) -> tuple[BoolArray, BoolArray]:
+def _beside(
+    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray, settings: LooksConfig
+) -> tuple[BoolArray, BoolArray]:
     """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
     beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
     hit = np.flatnonzero(rows.hit)
@@ -148,24 +142,31 @@ def _beside(rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArr
     away, there = place_m[one] - eye[one, :2], place_m[other] - eye[other, :2]
     range_m, beyond_m = np.hypot(*away.T), np.hypot(*there.T)
     angle = np.abs(se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(there[:, 1], there[:, 0])))
-    near = np.hypot(*(place_m[one] - place_m[other]).T) < BESIDE_M
-    behind = (angle < BESIDE_RAD) & (beyond_m > range_m - 0.5 * BESIDE_M)
+    near = np.hypot(*(place_m[one] - place_m[other]).T) < settings.beside_m
+    behind = (angle < settings.beside_rad) & (beyond_m > range_m - 0.5 * settings.beside_m)
     others = rows.clique[one] != rows.clique[other]
     beside[one[(near | behind) & others]] = True
-    close = (angle * range_m < ALONG_M) & (angle < np.pi / 4.0) & (beyond_m > range_m + ALONG_M)
+    close = (angle * range_m < settings.along_m) & (angle < np.pi / 4.0) & (beyond_m > range_m + settings.along_m)
     along[one[close & others]] = True
     return beside, along
+
+
+class _Seen(NamedTuple):
+    """(N,) looks along clear lines, those of them with something seen beside or behind, and along unknown lines."""
+
+    clear: BoolArray
+    beside: BoolArray
+    unknown: BoolArray
 
 
 def _hidden(
     living: LivingMap,
     p_start: FloatArray,
     rows: SiteLooks,
-    clear: BoolArray,
-    beside: BoolArray,
-    unknown: BoolArray,
+    seen: _Seen,
     eye: FloatArray,
-    away: FloatArray,
+    place_m: FloatArray,
+    settings: LooksConfig,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
     """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
 
@@ -174,16 +175,17 @@ def _hidden(
     while they would leave one by one.
     """
     cliques, row = clique_rows(living.sites)
-    n = len(cliques)
+    n, least = len(cliques), settings.witnesses
+    clear, beside, unknown = seen
     hits, n_clear, n_beside, n_unknown = (
         np.bincount(rows.clique[some], minlength=n) for some in (rows.hit, clear, beside, unknown)
     )
-    sight = np.select([n_beside >= WITNESSES, n_unknown >= WITNESSES], [1, 2], 0).astype(np.int64)
+    sight = np.select([n_beside >= least, n_unknown >= least], [1, 2], 0).astype(np.int64)
     known = np.bincount(row, p_start, minlength=n) >= 0.5
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
-    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= WITNESSES), hits > 0, p_gone)
+    p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= least), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    of_clique = p_hidden[sight] ** _sides(rows, counts & ~rows.hit, away, n)
+    of_clique = p_hidden[sight] ** _sides(rows, counts & ~rows.hit, eye[:, :2] - place_m, n, settings)
     alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
     looks = clear & np.isin(rows.clique, alone)
     middle = np.column_stack(
@@ -191,13 +193,13 @@ def _hidden(
     ) / np.maximum(np.bincount(rows.clique[looks], minlength=n), 1)[:, None]  # fmt: skip
     for clique in alone:
         others = alone[(alone != clique) & known[alone]]
-        others = others[np.hypot(*(middle[others] - middle[clique]).T) < TOGETHER_M]
+        others = others[np.hypot(*(middle[others] - middle[clique]).T) < settings.together_m]
         together = float(np.prod(p_gone[others]))
         of_clique[clique] /= of_clique[clique] + (1.0 - of_clique[clique]) * together
     return counts, sight, of_clique
 
 
-def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int) -> IntArray:
+def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
     """(C,) from how many sides each clique was looked at, one at least: what hides it from one need not from others.
 
     Args:
@@ -205,11 +207,13 @@ def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int) -> IntA
         missed: (N,) those that count, and missed.
         away: (N, 2) from the places to the sensor.
         n: number of cliques.
+        settings: what is a side.
     """
-    side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (SIDES / (2.0 * np.pi))).astype(np.int64)
-    count = np.bincount(rows.clique[missed] * SIDES + side[missed] % SIDES, minlength=n * SIDES).reshape(n, SIDES)
-    sides: IntArray = np.sum(count >= WITNESSES, axis=1)
-    return np.asarray(np.clip(sides, 1, MOST_SIDES))
+    every = settings.sides
+    side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (every / (2.0 * np.pi))).astype(np.int64)
+    count = np.bincount(rows.clique[missed] * every + side[missed] % every, minlength=n * every).reshape(n, every)
+    sides: IntArray = np.sum(count >= settings.witnesses, axis=1)
+    return np.asarray(np.clip(sides, 1, settings.most_sides))
 
 
 def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolArray, p_gone: FloatArray) -> FloatArray:
@@ -230,7 +234,7 @@ def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
     return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
 
 
-def surely_there(rows: SiteLooks) -> BoolArray:
+def surely_there(rows: SiteLooks, settled_s: float) -> BoolArray:
     """(N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
 
     They teach lines of sight before anything is judged by these, so that a robot on a way that it never took does not
@@ -244,16 +248,8 @@ def surely_there(rows: SiteLooks) -> BoolArray:
         last = np.maximum.accumulate(np.where(np.isfinite(times), np.arange(len(times)), -1))
         seen = (last >= 0) & (along[last] == along)
         gap = np.abs(rows.stamp_s[step] - times[last])
-        near[step[seen]] |= gap[seen] <= SETTLED_S
+        near[step[seen]] |= gap[seen] <= settled_s
     return near
-
-
-NEAR_M = 0.6
-"""Positions this close to one from which a place was seen have a clear line to it, too [m]."""
-LEAST_EXPECTED = 2.0
-"""Detections that earlier looks must have been expected to give to count as looks."""
-STICKY = 2.0
-"""Frames in a row that say as much as one that is independent of all others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,7 +267,9 @@ class Arrivals:
     p_appeared: FloatArray
 
 
-def arrivals(before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor) -> Arrivals:
+def arrivals(
+    before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor, settings: LooksConfig = USUAL
+) -> Arrivals:
     """What earlier sessions saw of the places of new sites.
 
     Args:
@@ -279,6 +277,7 @@ def arrivals(before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sen
         after: with the sites that it found.
         looks: of the session, at places of `after`.
         sensor: of the session.
+        settings: what counts as a look.
     """
     new = np.flatnonzero(~np.isin(after.sites.site_id, before.sites.site_id))
     looked, p_appeared = np.full(len(new), -np.inf), np.zeros(len(new))
@@ -297,19 +296,20 @@ def arrivals(before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sen
             mine = looks.rows.hit & (looks.place == place)
             place_m = after.places.position_m[place]
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
-            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye)
+            frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye, settings)
             for stamp in np.unique(stamps):
                 then = stamps == stamp
                 expected[stamp] = expected.get(stamp, 0.0) + float(frames[then] @ rate[then])
-                log_missed[stamp] = log_missed.get(stamp, 0.0) + float(frames[then] @ np.log1p(-rate[then])) / STICKY
-        enough = [stamp for stamp, number in expected.items() if number >= LEAST_EXPECTED]
+                missed = float(frames[then] @ np.log1p(-rate[then])) / settings.sticky
+                log_missed[stamp] = log_missed.get(stamp, 0.0) + missed
+        enough = [stamp for stamp, number in expected.items() if number >= settings.least_expected]
         if not enough:
             continue
         looked[k] = max(enough)
-        missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
+        p_missed = p_hidden + (1.0 - p_hidden) * np.exp(log_missed[looked[k]])
         stay = after.lives.of(int(kinds[row[site]]), middle[site]).stay
         young = -float(np.expm1(stay.log_survival(after.stamp_s - looked[k])))
-        p_appeared[k] = young / (young + (1.0 - young) * missed)
+        p_appeared[k] = young / (young + (1.0 - young) * p_missed)
     return Arrivals(new, looked, p_appeared)
 
 
@@ -328,25 +328,26 @@ class _Rays:
         to_m = living.places.position_m[row[used]]
         return cls(to_m + offsets(lines.cell[used], lines.cell_m), to_m)
 
-    def pass_by(self, eye_m: FloatArray, place_m: FloatArray) -> BoolArray:
+    def pass_by(self, eye_m: FloatArray, place_m: FloatArray, settings: LooksConfig) -> BoolArray:
         """(V,) whether something behind a place (2,) was seen from eyes (V, 2), past the place."""
         away = place_m - self.from_m
         ahead = self.to_m - self.from_m
         length = np.maximum(np.hypot(*ahead.T), 1e-9)
         along = (away * ahead).sum(axis=1) / length
         across = np.abs(away[:, 0] * ahead[:, 1] - away[:, 1] * ahead[:, 0]) / length
-        past = self.from_m[(across < ALONG_M) & (along > 0.0) & (length > along + ALONG_M)]
+        past = self.from_m[(across < settings.along_m) & (along > 0.0) & (length > along + settings.along_m)]
         gap = np.linalg.norm(eye_m[:, None] - past[None], axis=2).min(axis=1, initial=np.inf)
-        return np.asarray(gap <= NEAR_M)
+        return np.asarray(gap <= settings.near_m)
 
 
 def _empty_looks(
-    views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor
+    views: Views, rays: _Rays, seen_from_m: FloatArray, place_m: FloatArray, sensor: Sensor, settings: LooksConfig
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Frames of earlier views that would have shown a place, its detection rate in them, and when they were."""
     pose = views.pose
-    near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf) <= NEAR_M
-    near |= rays.pass_by(pose[:, :2], place_m)
+    near = np.linalg.norm(pose[:, None, :2] - seen_from_m[None], axis=2).min(axis=1, initial=np.inf)
+    near = near <= settings.near_m
+    near |= rays.pass_by(pose[:, :2], place_m, settings)
     pose = pose[near]
     half, field = np.pi / HEADINGS, NominalField(sensor)
     rate = np.min(

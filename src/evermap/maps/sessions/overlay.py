@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from evermap.config import OverlayConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import AGREE_M, consensus, rigid
 from evermap.types import FloatArray, IntArray
@@ -24,23 +25,10 @@ ELSEWHERE = -1
 """Option of a clique that stands at no known site."""
 FREE_MOTION = (20.0, 20.0, 3.0)
 """Standard deviations (m, m, rad) of the motion between session and map, around the one that was agreed on."""
-NUDGE_M = 0.7
-SHARE_NUDGED = 0.5
-"""Moves: this share are shifts of this standard deviation an axis, the others lead anywhere."""
-TURN_M = 0.35
-"""Standard deviation of how members of a body move against each other when it is moved: it may be turned."""
-LOG_P_SPLIT = math.log(1e-3)
-"""Log probability that landmarks which were taken for one body are not."""
-SMALLEST_ROOM_M2 = 50.0
-DRIFTS_M = (0.01, 0.02, 0.04, 0.08)
-"""Standard deviations by which landmarks may not quite be where they were, though nobody moved them: another robot with
-errors of its own, warmth, a sensor that sees another corner. Each is half as probable as the one before, a session."""
 FAR_M = 2.0
 HOPELESS = -200.0
 """Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
-LOG_P_COARSER = math.log(0.5)
-LOG_P_ANOTHER_PLACE = math.log(1e-3)
-"""Log probability that a session is of another place, where the map's identities stand anywhere."""
+USUAL = OverlayConfig()
 MOST_FLIPS = 400
 
 
@@ -96,7 +84,7 @@ class Overlay:
     drift_m: float
 
 
-def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay | None:
+def lay_over(sighted: Sighted, known: Known, search: str = "joint", settings: OverlayConfig = USUAL) -> Overlay | None:
     """The most probable assignment of sites to cliques, and the motion that goes with it.
 
     Args:
@@ -104,6 +92,8 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
         known: their places in the map.
         search: 'joint' weighs every clique with the motion, and all it depends on, marginalised; 'gate' decides each by
             itself, at the motion that most landmarks agree on; 'none' leaves each at its most probable site.
+        settings: priors of what moved. Landmarks that nobody moved may be off by one of `drifts_m`: another robot with
+            errors of its own, warmth, a sensor that sees another corner.
 
     Returns:
         None where no two landmarks stand to each other as in the map, or where another place explains all better.
@@ -117,7 +107,7 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
     gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
     if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
         return None
-    options = _Options(sighted, known, motion)
+    options = _Options(sighted, known, motion, settings)
     if search == "none":
         chosen = options.likeliest_sites()
     elif search == "gate":
@@ -133,15 +123,16 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint") -> Overlay |
 
 def _joint(options: _Options) -> IntArray:
     """The most probable assignment, and with it how well sessions agree at all."""
-    best, highest, drift_m = options.agreeing(), -math.inf, DRIFTS_M[0]
-    for k, options.drift_m in enumerate(DRIFTS_M):
+    settings = options.settings
+    best, highest, drift_m = options.agreeing(), -math.inf, settings.drifts_m[0]
+    for k, options.drift_m in enumerate(settings.drifts_m):
         chosen = options.climb(best)
         score = options.log_probability(chosen)
         # bodies that moved together agree, too, on a motion of their own: what stands may be the rest
         rest = options.climb(options.rest_of(chosen))
         if np.sum(rest != ELSEWHERE) >= 2 and (at := options.log_probability(rest)) > score:  # two tell the motion
             chosen, score = rest, at
-        score += k * LOG_P_COARSER
+        score += k * math.log(settings.p_coarser)
         if score > highest:  # the next may still be better: with more drift other bodies stay
             best, highest, drift_m = chosen, score, options.drift_m
     options.drift_m = drift_m
@@ -151,7 +142,8 @@ def _joint(options: _Options) -> IntArray:
 class _Options:
     """Cliques with their options, linearised at one motion."""
 
-    def __init__(self, sighted: Sighted, known: Known, motion: FloatArray) -> None:
+    def __init__(self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig) -> None:
+        self.settings = settings
         self.sighted, self.known, self.motion = sighted, known, motion
         self.landmark_m = se2.transform(motion, sighted.position_m)
         turn = np.kron(np.eye(len(self.landmark_m)), se2.rotation(motion[2]))
@@ -160,9 +152,9 @@ class _Options:
         freedom = se2.rigid_directions(middle) * FREE_MOTION
         self._session = turn @ sighted.covariance_m2 @ turn.T
         self._freedom = freedom @ freedom.T
-        self.drift_m = DRIFTS_M[0]
+        self.drift_m = settings.drifts_m[0]
         spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
-        self._log_room = -math.log(max(float(np.prod(spread)), SMALLEST_ROOM_M2))
+        self._log_room = -math.log(max(float(np.prod(spread)), settings.smallest_room_m2))
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
         order = np.argsort(known.site, kind="stable")
         parts = np.split(order, np.flatnonzero(np.diff(known.site[order])) + 1)
@@ -235,7 +227,7 @@ class _Options:
         In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
         """
         here, count = self._log_standing(chosen)
-        return here > LOG_P_ANOTHER_PLACE + count * self._log_room
+        return here > math.log(self.settings.p_another_place) + count * self._log_room
 
     def outweighs_the_rest(self, chosen: IntArray) -> bool:
         """False where a single body says where the session is, and is less likely to have stayed than what it denies.
@@ -295,7 +287,7 @@ class _Options:
         error, inverse, rows = self._field(chosen)
         for site in self.sites[clique]:
             stay = []
-            total = LOG_P_SPLIT + float(self.known.log_p_elsewhere[clique])
+            total = math.log(self.settings.p_split) + float(self.known.log_p_elsewhere[clique])
             for row in self._rows[site]:
                 one = np.array([row])
                 at_place = self._log_at(one, rows, error, inverse)
@@ -386,11 +378,12 @@ class _Options:
         """Log density of the landmarks of places `of`, if their body was moved."""
         step = self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]
         middle = step.mean(axis=0)
-        near = math.log(SHARE_NUDGED) - math.log(2.0 * math.pi * NUDGE_M**2) - 0.5 * float(middle @ middle) / NUDGE_M**2
-        log_density = float(np.logaddexp(near, math.log(1.0 - SHARE_NUDGED) + self._log_room))
+        share, nudge_m, turn_m = float(self.settings.share_nudged), self.settings.nudge_m, self.settings.turn_m
+        near = math.log(share) - math.log(2.0 * math.pi * nudge_m**2) - 0.5 * float(middle @ middle) / nudge_m**2
+        log_density = float(np.logaddexp(near, math.log(1.0 - share) + self._log_room))
         rest = step - middle
         count = 2 * (len(of) - 1)
-        return log_density - 0.5 * float((rest**2).sum()) / TURN_M**2 - 0.5 * count * math.log(2 * math.pi * TURN_M**2)
+        return log_density - 0.5 * float((rest**2).sum()) / turn_m**2 - 0.5 * count * math.log(2 * math.pi * turn_m**2)
 
     def _field(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Differences, inverse of their covariance, and rows of all places that are chosen."""

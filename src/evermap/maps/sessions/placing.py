@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from evermap.config import FitConfig, LivingConfig
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus, rigid
 from evermap.maps.living import LivingMap
@@ -17,9 +19,8 @@ from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
+USUAL = FitConfig()
 SMALLEST_P = 1e-6
-BENT_M, BENT_CLIQUES = 0.15, 3
-"""A session is bent where this many bodies seem to have moved by one rigid motion, to within this distance [m]."""
 BENT_ROUNDS = 5
 """Refits of that motion to the bodies that agree with it."""
 
@@ -56,7 +57,7 @@ def laid_over(
     landmark_id: IntArray,
     position_m: FloatArray,
     covariance_m2: FloatArray,
-    search: str,
+    config: LivingConfig,
 ) -> Laid | None:
     """Find a session in the map.
 
@@ -66,7 +67,7 @@ def laid_over(
         landmark_id: (K,) landmarks of the session.
         position_m: (K, 2) in its own frame.
         covariance_m2: (2 K, 2 K).
-        search: see `overlay.lay_over`.
+        config: `search` and `overlay`, see `overlay.lay_over`.
 
     Returns:
         None where the session shows nothing that stands as in the map.
@@ -96,7 +97,8 @@ def laid_over(
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
             log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
         ),
-        search,
+        config.search,
+        config.overlay,
     )
     if found is None:
         return None
@@ -108,7 +110,9 @@ def laid_over(
     return Laid(landmark_id, found.pose_map_session, place, probability, found.drift_m, assumed)
 
 
-def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray) -> Laid:
+def unbent(
+    living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray, settings: FitConfig = USUAL
+) -> Laid:
     """Where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid motion.
 
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
@@ -120,6 +124,7 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
         p_site: (S,) belief in its sites.
         where: as most landmarks have it.
         position_m: (K, 2) landmarks of `where` in the session's frame.
+        settings: which bodies moved alike.
     """
     home = _homes(living, p_site, where)
     moved = np.flatnonzero((where.place < 0) & (home >= 0))
@@ -134,10 +139,10 @@ def unbent(living: LivingMap, p_site: FloatArray, where: Laid, position_m: Float
             motion = rigid(position_m[moved[agree]], places.position_m[home[moved[agree]]])
             rest = places.position_m[home[moved]] - se2.transform(motion, position_m[moved])
             gap = np.hypot(*rest.T)
-            agree = gap < max(BENT_M, float(np.median(gap[agree])))
-        agree &= gap < BENT_M
+            agree = gap < max(settings.bent_m, float(np.median(gap[agree])))
+        agree &= gap < settings.bent_m
         fits = moved[agree]
-        if len(np.unique(body[fits])) < BENT_CLIQUES:
+        if len(np.unique(body[fits])) < settings.bent_cliques:
             break
         place[fits], probability[fits] = home[fits], 1.0
         moved = moved[~agree]
@@ -193,12 +198,22 @@ def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid
 
 
 HEAVY_STEPS = 6
-MOST_LOST = 0.03
-"""A session that fitted by itself and whose sightings fit the map less often, by this share, was bent."""
-WINDOW = 12
-"""Sightings around a pose by which it is placed in the map."""
-PLACING_ROUNDS, PLACING_M = 10, 0.3
-"""Reweighted rigid fits for that, and the residual from which sightings count for less."""
+PLACING_ROUNDS = 10
+"""Reweighted rigid fits by which a pose is placed in the map."""
+
+
+class Held(NamedTuple):
+    """Landmarks that a map holds.
+
+    Attributes:
+        row: (K,) landmarks of the problem that stand at places of the map.
+        mean_m: (K, 2) positions of these places.
+        covariance_m2: (2 K, 2 K) joint covariance of them.
+    """
+
+    row: IntArray
+    mean_m: FloatArray
+    covariance_m2: FloatArray
 
 
 def refitted(
@@ -206,10 +221,9 @@ def refitted(
     prior: CalibrationPrior,
     pose_map_session: FloatArray,
     size: float,
-    row: IntArray,
-    mean_m: FloatArray,
-    covariance_m2: FloatArray,
+    held: Held,
     *,
+    settings: FitConfig = USUAL,
     robust: bool,
 ) -> tuple[Outcome, bool]:
     """The session in the frame of the map, and whether it had to be straightened for that.
@@ -219,21 +233,20 @@ def refitted(
         prior: of the calibration states.
         pose_map_session: (3,) where the session's frame is in the map.
         size: metres of the map for one of the session's graph.
-        row: (K,) landmarks of the problem that stand at places of the map.
-        mean_m: (K, 2) positions of these places.
-        covariance_m2: (2 K, 2 K) joint covariance of them.
+        held: landmarks that stand at places of the map.
+        settings: when it was bent, and how it is straightened then.
         robust: explain outliers.
 
     Raises:
         NumericalError: no finite optimum.
     """
-    problem, start = _in_map(outcome, prior, pose_map_session, size, row, mean_m, covariance_m2)
+    problem, start = _in_map(outcome, prior, pose_map_session, size, *held)
     noise = outcome.noise.noise
     smoother, estimate = _solved(problem, noise, start, robust=robust)
     straightened = False
-    if smoother.inlier_probability(estimate).mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
+    if smoother.inlier_probability(estimate).mean() < (1.0 - settings.most_lost) * outcome.inlier.mean():
         # a blind stretch bent the session by more than a descent can take back: every stretch placed by itself
-        other, straight = _solved(problem, noise, _placed(problem, start, row), robust=robust)
+        other, straight = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
         if other.cost(straight) < smoother.cost(estimate):
             smoother, estimate, straightened = other, straight, True
     marginals = smoother.marginals(estimate)
@@ -296,7 +309,7 @@ def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) ->
     return smoother, smoother.optimum(start, tolerance=FINAL_TOLERANCE)
 
 
-def _placed(problem: Problem, start: Estimate, row: IntArray) -> Estimate:
+def _placed(problem: Problem, start: Estimate, row: IntArray, settings: FitConfig) -> Estimate:
     """`start` with every pose where the sightings around it show the landmarks `row` (K,) of the map.
 
     Each pose is moved by the rigid motion that brings these sightings, as the poses nearby have them, onto the
@@ -309,14 +322,15 @@ def _placed(problem: Problem, start: Estimate, row: IntArray) -> Estimate:
         return start
     seen_m = sighted_at(start.pose[problem.pose_row], problem.reading, start.states, problem.mount)
     middle = np.searchsorted(problem.pose_row[used], np.arange(len(start.pose)))
-    first = np.clip(middle - WINDOW // 2, 0, max(len(used) - WINDOW, 0))
-    window = used[np.minimum(first[:, None] + np.arange(WINDOW), len(used) - 1)]
+    count = settings.window
+    first = np.clip(middle - count // 2, 0, max(len(used) - count, 0))
+    window = used[np.minimum(first[:, None] + np.arange(count), len(used) - 1)]
     a, b = seen_m[window], start.landmark[problem.landmark_row[window]]
     weight = np.ones(window.shape)
     for _ in range(PLACING_ROUNDS):
         motion = rigid(a, b, weight)
         gap = np.hypot(*np.moveaxis(se2.transform(motion[:, None, :], a) - b, -1, 0))
-        weight = 1.0 / (1.0 + (gap / PLACING_M) ** 2)
+        weight = 1.0 / (1.0 + (gap / settings.placing_m) ** 2)
     pose = se2.compose(motion, start.pose)
     landmark = start.landmark.copy()
     anew = sighted_at(pose[problem.pose_row], problem.reading, start.states, problem.mount)

@@ -25,7 +25,7 @@ from evermap.maps.sessions.gaussian import (
     settled,
 )
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, arrivals, looked_at, sensor_poses
-from evermap.maps.sessions.placing import MOST_LOST, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
+from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
@@ -34,11 +34,6 @@ from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Misses, Reco
 NOT_FOUND = "too few of its landmarks were seen standing to each other as it says"
 CONTRADICTED = "most sightings contradict it; the session is bent, or of another place"
 """Why a session cannot be localised in a map."""
-INLIER = 0.5
-LEAST_FIT = 0.75
-"""Of the sightings that fit in a session by itself this share must fit in the map, for the session to be believed."""
-GLIMPSE_M = 0.4
-"""A landmark that was seen once, this close to its place, was seen there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,20 +113,20 @@ def check_in_order(recording: Recording, living: LivingMap) -> None:
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
     """Where the session lies in the map; None where it shows nothing that stands as in the map."""
-    own = own_landmarks(alone.outcome)
+    own = own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
-    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config.search)
+    where = laid_over(living, p_site, names, own.position_m, of_unknown_size(own, float(log_sigma)), config)
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
-        where = unbent(living, p_site, where, own.position_m)
+        where = unbent(living, p_site, where, own.position_m, config.fit)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, where, glimpsed)
 
 
 def refit(
-    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, *, robust: bool
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool
 ) -> tuple[LivingMap, Laid, Solved]:
     """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized.
 
@@ -140,7 +135,7 @@ def refit(
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
-        own = own_landmarks(outcome)
+        own = own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
         shown = log_ratio(
@@ -160,10 +155,12 @@ def refit(
         position = living.places.position_m[where.place[stand]]
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
         covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
-        return refitted(outcome, alone.prior, motion, size, row, position, covariance, robust=robust)
+        return refitted(
+            outcome, alone.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
+        )
 
     solved, straightened = in_map(where)
-    if where.assumed.any() and solved.inlier.mean() < (1.0 - MOST_LOST) * outcome.inlier.mean():
+    if where.assumed.any() and solved.inlier.mean() < (1.0 - config.fit.most_lost) * outcome.inlier.mean():
         as_seen = where.as_seen()
         other, straightened_too = in_map(as_seen)
         if other.inlier.mean() > solved.inlier.mean():  # it was not bent: they did move together
@@ -183,9 +180,9 @@ def refit(
     return living, where, replace(alone, outcome=solved)
 
 
-def fits(visit: Solved, alone: Solved) -> bool:
+def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
     """False for a session that the map contradicts: what fits together by itself does not fit once it is held there."""
-    return bool(visit.outcome.inlier.mean() >= LEAST_FIT * alone.outcome.inlier.mean())
+    return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +220,7 @@ def judged(
     """
     if known is not None:
         living = replace(living, lives=replace(known.living.lives, looks_s=living.lives.looks_s))
+    living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
     aged = believe.aged(living, config, visit.start_s)
     living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
     entry = entered(living, aged.p_here, where, visit, config)
@@ -242,8 +240,8 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: So
         living = replace(living, log_size_variance=variance, log_size_information=information)
     else:
         in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
-    own = own_landmarks(visit.outcome, in_place)
-    detection, landmark = _inliers(visit)
+    own = own_landmarks(visit.outcome, config.fit, in_place)
+    detection, landmark = _inliers(visit, config.fit.inlier)
     stamps = visit.recording.frames.stamp_s[visit.recording.detections.frame[detection]]
     count = len(visit.prepared.landmark_id)
     first, last = np.full(count, np.inf), np.full(count, -np.inf)
@@ -275,19 +273,19 @@ def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLo
     stamps = recording.frames.stamp_s
     frames = np.flatnonzero((stamps >= visit.start_s) & (stamps <= visit.end_s + 1e-9)).astype(np.int64)
     pose = trajectory.pose_world_robot[of_slam.rows_at(trajectory, recording, frames)]
-    detection, landmark = _inliers(visit)
+    detection, landmark = _inliers(visit, config.fit.inlier)
     place_of = np.full(len(prepared.landmark_id), -1, dtype=np.int64)
     _, rows, found = np.intersect1d(prepared.landmark_id, entry.landmark_id, return_indices=True)
     place_of[rows] = entry.place[found]
-    _place_glimpsed(place_of, entry, visit)
+    _place_glimpsed(place_of, entry, visit, config.fit.glimpse_m)
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-    seen = looked_at(entry.living, entry.p_start, sighting, recording.sensor, learn_sight=config.learn_sight)
+    seen = looked_at(entry.living, entry.p_start, sighting, recording.sensor, config)
     return seen, sensor_poses(sighting, recording.sensor)
 
 
-def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
+def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: float) -> None:
     """Sightings too few for a place of their own are of the place that the map has, if they are near it."""
     living, estimate = entry.living, visit.outcome.estimate
     names = visit.prepared.landmark_id
@@ -296,7 +294,7 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved) -> None:
     member = np.searchsorted(living.members.landmark_id, names[row])
     place = living.place_row(names[row], living.site_of()[member])
     row, place = row[place >= 0], place[place >= 0]
-    near = np.hypot(*(estimate.landmark[row] - living.places.position_m[place]).T) < GLIMPSE_M
+    near = np.hypot(*(estimate.landmark[row] - living.places.position_m[place]).T) < near_m
     place_of[row[near]] = place[near]
 
 
@@ -363,14 +361,16 @@ def decided(
         config: which parts of the engine are on.
         classes: how long things stay, as the session teaches; None for nothing.
     """
-    came = arrivals(before, now.living, seen, visit.recording.sensor)
-    after, changes = decide.decided(before, now.living, seen, now.log_evidence, came, visit.start_s, classes)
+    came = arrivals(before, now.living, seen, visit.recording.sensor, config.looks)
+    after, changes = decide.decided(
+        before, now.living, seen, now.log_evidence, came, visit.start_s, classes, settings=config.decisions
+    )
     changes = tuple(change.named(after.landmark_names) for change in changes)
     if not config.learn_sight:
         after = replace(after, sightlines=before.sightlines)
     if config.cliques and config.existence and config.misses:
-        after = without_missed(before, after)
-    return decide.without_forgotten(after, config.most_sites), changes
+        after = without_missed(before, after, config.grouping)
+    return decide.without_forgotten(after, config.most_sites, config.decisions), changes
 
 
 def learned(
@@ -385,7 +385,7 @@ def learned(
         after = replace(after, sightlines=lines, views=after.views.seen_from(eye, after.stamp_s))
     if not config.learn_lifetimes:
         return after, None
-    classes = ClassLives.of(after.stays, after.lives, after.stamp_s)
+    classes = ClassLives.of(after.stays, after.lives, after.stamp_s, config.lifetimes)
     return replace(after, lives=classes.lives), classes
 
 
@@ -430,6 +430,7 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
         last_s=mapped.last_seen_s,
     )
     empty = LivingMap(clock=visit.recording.clock, class_names=visit.recording.class_names)
+    empty = replace(empty, sightlines=replace(empty.sightlines, rules=config.sight))
     entry = extended(empty, np.zeros(0), found, config, 0.0)
     seen, _ = looks(entry, visit, config)
     now = believed(entry, seen, visit, config).living
@@ -440,9 +441,9 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
     return replace(slam, landmarks=mapped, misses=missed(now, seen, visit))
 
 
-def _inliers(visit: Solved) -> tuple[IntArray, IntArray]:
+def _inliers(visit: Solved, least: float) -> tuple[IntArray, IntArray]:
     """Rows of the detections that fit, and of their landmarks."""
-    good = np.flatnonzero(visit.outcome.inlier >= INLIER)
+    good = np.flatnonzero(visit.outcome.inlier >= least)
     return visit.prepared.used[good], visit.prepared.problem.landmark_row[good]
 
 

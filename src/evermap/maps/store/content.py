@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from evermap.errors import EvermapError
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap
-from evermap.sensing.sightlines import P_HIDDEN
 from evermap.survival.base import LifetimePrior
 from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.types import UNKNOWN, FloatArray
@@ -219,7 +218,7 @@ def _flaw_of_shapes(living: LivingMap) -> str:
         return "columns of different lengths in 'sightlines'"
     if len({len(getattr(living.views, name)) for name in ("cell", "heading", "stamp_s", "frames")}) > 1:
         return "columns of different lengths in 'views'"
-    if len(lines.hidden) != len(P_HIDDEN) or len(lines.shown) != len(P_HIDDEN):
+    if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
         return "'sightlines.hidden' of another length"
     if living.covariance_m2.shape != (2 * len(places), 2 * len(places)):
         return f"a covariance of shape {living.covariance_m2.shape} for {len(places)} places"
