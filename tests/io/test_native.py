@@ -299,7 +299,7 @@ BAD = {
         edit("landmarks.csv", "8,3.3", "7,3.3"),
         ["landmarks.csv:3", "'landmark_id'", "7 is listed twice"],
     ),
-    "bad toml": (edit(TOML, "range_min_m = 0.1", "range_min_m = "), [f"{TOML}:6", "not valid TOML"]),
+    "bad toml": (edit(TOML, "range_min_m = 0.1", "range_min_m = "), [TOML, "not valid TOML", "line 6"]),
     "unknown section": (edit(TOML, "[mount]", "[mounting]"), [f"{TOML}:15", "'mounting'", "try: mount"]),
     "unknown key": (edit(TOML, "\nx_m =", "\nx ="), [f"{TOML}:16", "'mount.x'", "try: x_m"]),
     "wrong type": (

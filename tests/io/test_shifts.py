@@ -53,7 +53,7 @@ def test_anything_else_is_one_line(text: str, problem: str) -> None:
     with pytest.raises(ConfigError) as caught:
         parse_shift(text)
     line = caught.value.one_line()
-    assert line.startswith("field '--shift': ")
+    assert line.startswith("field 'shift': ")
     assert problem in line
     assert "\n" not in line
 
@@ -80,7 +80,7 @@ def test_shifts_add_up_one_after_the_other() -> None:
 
 
 def test_an_unknown_landmark_is_named_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"'--shift': no landmark 4 in the prior map \(try: one of 3, 5, 8, 11\)"):
+    with pytest.raises(ConfigError, match=r"'shift': no landmark 4 in the prior map \(try: one of 3, 5, 8, 11\)"):
         shifted(MAP, [parse_shift("3,4:1")])
 
 

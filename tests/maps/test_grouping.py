@@ -9,7 +9,7 @@ from scipy.spatial.distance import pdist
 from scipy.stats import multivariate_normal
 
 from evermap.geometry import se2
-from evermap.maps.bodies import MOVE_SIGMA_M, Displacements, Fate, group, log_evidence_of_motion, regrouped
+from evermap.maps.bodies import USUAL, Displacements, Fate, group, log_evidence_of_motion, regrouped
 from evermap.types import FloatArray, IntArray
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -61,7 +61,7 @@ def test_evidence_of_a_motion_is_the_integral_over_all(turn_rad: float) -> None:
     after = se2.move_together(before, np.array([1.0, -0.5]), turn_rad) + rng.normal(0.0, SIGMA_M, (3, 2))
     arm = before - before.mean(axis=0)
     # given the turn, places are jointly normal: noise of their own, and one displacement for all
-    spread = np.kron(np.ones((3, 3)), MOVE_SIGMA_M**2 * np.eye(2))
+    spread = np.kron(np.ones((3, 3)), USUAL.move_sigma_m**2 * np.eye(2))
     for k in range(3):
         spread[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += covariance[k]
 
@@ -75,7 +75,7 @@ def test_evidence_of_a_motion_is_the_integral_over_all(turn_rad: float) -> None:
 
 def test_evidence_of_one_landmark_is_a_normal_density() -> None:
     before, after, covariance = np.zeros((1, 2)), np.array([[0.4, -1.0]]), np.array([[[0.03, 0.01], [0.01, 0.02]]])
-    truth = multivariate_normal.logpdf(after[0], before[0], covariance[0] + MOVE_SIGMA_M**2 * np.eye(2))
+    truth = multivariate_normal.logpdf(after[0], before[0], covariance[0] + USUAL.move_sigma_m**2 * np.eye(2))
     assert log_evidence_of_motion(before, after, covariance) == pytest.approx(truth, rel=1e-12)
 
 

@@ -7,26 +7,21 @@ from typing import Annotated, Any
 
 import typer
 
+from evermap.cli.options import AsJson, ConfigFile, Robot, Settings, ShowConfig, configured
 from evermap.cli.terminal import fail, print_json, print_table, say, warn
 
 EXIT_NOT_USABLE = 2
 
 
 def check(
-    recording_path: Annotated[
+    input: Annotated[
         Path, typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.")
     ],
-    robot: Annotated[
-        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
-    ] = None,
-    config_file: Annotated[
-        Path | None, typer.Option("--config", help="TOML file, as of evermap slam.", show_default=False)
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. sensor.range_max_m=8; repeatable."),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print what was found as JSON.")] = False,
+    robot: Robot = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    show_config: ShowConfig = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell whether a recording can be used, and what is odd.
 
@@ -38,12 +33,11 @@ def check(
       evermap check my-recording
       evermap check MRCLAM_Dataset6.zip --robot 1 --json
     """
-    from evermap.config import load_config
+    chosen = configured(config, settings, within="slam.check", show=show_config)
     from evermap.io import read_recording
     from evermap.slam.check import check_recording
 
-    config = load_config(config_file, settings or [])
-    found = check_recording(read_recording(recording_path, robot=robot), config)
+    found = check_recording(read_recording(input, robot=robot), chosen)
     if as_json:
         print_json(found.as_dict())
     else:

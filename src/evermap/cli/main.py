@@ -92,7 +92,7 @@ app = typer.Typer(
 )
 
 app.command("check")(check.check)
-app.command("slam")(slam.slam)
+app.command("slam", help=slam.HELP)(slam.slam)
 app.command("persist", help=persist.HELP)(persist.persist)
 app.command("track", help=track.HELP)(track.track)
 app.command("convert")(convert.convert)

@@ -28,10 +28,6 @@ ShowConfig = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")]
 Robot = Annotated[int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)]
-Recorded = Annotated[
-    Path,
-    typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False),
-]
 TableOut = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<input>")]
 Priors = Annotated[
     list[str] | None,
@@ -42,7 +38,7 @@ Priors = Annotated[
     ),
 ]
 
-_OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed"}
+_OTHER_NAMES = {"class_priors": "prior", "class_speed_mps": "speed", "speeds_mps": "speed", "living": "map_file"}
 """Arguments of the core that are given by an option of another name."""
 
 

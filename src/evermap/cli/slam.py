@@ -4,174 +4,166 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
-from enum import StrEnum
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.summary import show_run
-from evermap.cli.terminal import command_line, progress_bar, say, warm_up, warn
+from evermap.cli.options import AsJson, ConfigFile, Force, Robot, Settings, ShowConfig, configured
+from evermap.cli.terminal import command_line, echo, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.types import Landmarks, Recording
 
+# (section, key, label, format); a number that the run does not have is left out
+_ROWS = (
+    ("metrics", "pose_rmse_m", "position error, RMSE", "{:.3f} m"),
+    ("metrics", "heading_rmse_deg", "heading error, RMSE", "{:.2f} deg"),
+    ("metrics", "heading_rmse_in_view_deg", "  while landmarks were in view", "{:.2f} deg"),
+    ("metrics", "landmark_rmse_m", "landmark error, RMSE", "{:.3f} m"),
+    ("metrics", "dead_reckoning_rmse_m", "odometry alone, RMSE", "{:.3f} m"),
+    ("metrics", "nis_mean", "innovations (2 is consistent)", "{:.2f}"),
+    ("timing", "real_time_factor", "speed", "{:.0f} x real time"),
+    ("timing", "step_p99_ms", "99 % of the steps within", "{:.1f} ms"),
+)
 
-class SensorModel(StrEnum):
-    """How far readings are believed."""
+Recorded = Annotated[
+    Path | None,
+    typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False),
+]
+Out = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<recording>")]
+SensorModel = Annotated[
+    str | None,
+    typer.Option(
+        metavar="calibrated|plain",
+        help="Estimate sensor and odometry errors, or believe the readings.",
+        show_default="calibrated",
+    ),
+]
+HowMoved = Annotated[
+    str | None,
+    typer.Option(
+        metavar="joint|nohyp|max-mixture|nn|em|mcts|viterbi",
+        help="How landmarks that moved are explained; nohyp: the world is static.",
+        show_default="joint",
+    ),
+]
+UnknownIds = Annotated[
+    bool, typer.Option("--unknown-ids", help="Ignore the landmark ids of the detections; associate by geometry.")
+]
+PriorMap = Annotated[
+    str | None,
+    typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
+]
+PriorSigma = Annotated[
+    float,
+    typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
+]
+LivingMapFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="FILE",
+        help="Continue this living map, or begin it: localise in it, find what changed, extend it.",
+        show_default=False,
+    ),
+]
+MapPriors = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="[CLASS=]PRIOR|FILE.json",
+        help="With --map: how long things stay, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
+        "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
+    ),
+]
+Localize = Annotated[
+    bool, typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map stays.")
+]
+Shifts = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="IDS:DX[,DY[,TURN]]",
+        help="Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
+    ),
+]
+Realtime = Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")]
+Template = Annotated[
+    Path | None,
+    typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
+]
 
-    CALIBRATED = "calibrated"
-    PLAIN = "plain"
-
-
-class Method(StrEnum):
-    """How landmarks that moved are explained; the choices of `slam.method`."""
-
-    NOHYP = "nohyp"
-    MAX_MIXTURE = "max-mixture"
-    NN = "nn"
-    EM = "em"
-    MCTS = "mcts"
-    VITERBI = "viterbi"
-    JOINT = "joint"
+HELP = """\
+Estimate where the robot was and where the landmarks are.
+\b
+Examples:
+  evermap slam --init my-recording
+  evermap slam my-recording --out out/mine
+  evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
+  evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
+  evermap slam monday --map building.evermap
+  evermap slam tuesday --map building.evermap --localize
+  evermap slam monday --map building.evermap --prior "cart=exponential:half-life=2d" --prior wall=never-leaves
+"""
 
 
 def slam(
-    recording_path: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False
-        ),
-    ] = None,
-    robot: Annotated[
-        int | None, typer.Option(help="Robot of a recording that has several.", show_default=False)
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<recording>")
-    ] = None,
-    config_file: Annotated[
-        Path | None, typer.Option("--config", help="TOML file; see --show-config.", show_default=False)
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override one setting, e.g. slam.robust=false; repeatable."),
-    ] = None,
-    sensor_model: Annotated[
-        SensorModel | None,
-        typer.Option(help="Estimate sensor and odometry errors, or believe the readings.", show_default="calibrated"),
-    ] = None,
-    method: Annotated[
-        Method | None,
-        typer.Option(
-            help="How landmarks that moved are explained; nohyp: the world is static.", show_default=Method.JOINT.value
-        ),
-    ] = None,
-    unknown_ids: Annotated[
-        bool, typer.Option("--unknown-ids", help="Ignore the landmark ids of the detections; associate by geometry.")
-    ] = False,
-    prior_map: Annotated[
-        str | None,
-        typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
-    ] = None,
-    prior_sigma: Annotated[
-        float,
-        typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
-    ] = 0.02,
-    map_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--map",
-            metavar="FILE",
-            help="Continue this living map, or begin it: localise in it, find what changed, extend it.",
-            show_default=False,
-        ),
-    ] = None,
-    prior: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="[CLASS=]PRIOR|FILE.json",
-            help="With --map: how long things stay, as 'cart=weibull:scale=3d,shape=1.5', or a file of survival fit, "
-            "survival learn or map export --lifetimes; worth living.prior_stays stays; repeatable.",
-        ),
-    ] = None,
-    localize: Annotated[
-        bool, typer.Option("--localize", help="With --map: only localise, at a fixed cost per frame; the map stays.")
-    ] = False,
-    shift: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="IDS:DX[,DY[,TURN]]",
-            help="Move landmarks of the prior map, e.g. 11,12,13:+1.0 [m, m, degrees]; for experiments; repeatable.",
-        ),
-    ] = None,
-    realtime: Annotated[bool, typer.Option("--realtime", help="Process at the pace of the recording.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the summary as JSON.")] = False,
-    force: Annotated[
-        bool, typer.Option("--force", help="Write into --out even if it holds other files; they stay.")
-    ] = False,
-    init: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
-    ] = None,
-    show_config: Annotated[
-        bool, typer.Option("--show-config", help="Print the configuration in force as commented TOML and exit.")
-    ] = False,
+    input: Recorded = None,
+    robot: Robot = None,
+    out: Out = None,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    sensor_model: SensorModel = None,
+    method: HowMoved = None,
+    unknown_ids: UnknownIds = False,
+    prior_map: PriorMap = None,
+    prior_sigma: PriorSigma = 0.02,
+    map_file: LivingMapFile = None,
+    prior: MapPriors = None,
+    localize: Localize = False,
+    shift: Shifts = None,
+    realtime: Realtime = False,
+    as_json: AsJson = False,
+    force: Force = False,
+    init: Template = None,
+    show_config: ShowConfig = False,
 ) -> None:
-    """Estimate where the robot was and where the landmarks are.
-
-    \b
-    Examples:
-      evermap slam --init my-recording
-      evermap slam my-recording --out out/mine
-      evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
-      evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
-      evermap slam monday --map building.evermap
-      evermap slam tuesday --map building.evermap --localize
-      evermap slam monday --map building.evermap --prior "cart=exponential:half-life=2d" --prior wall=never-leaves
-    """
+    """Estimate trajectory and landmarks of a recording and write the folder of the run."""
     if init is not None:
         _write_template(init)
         return
-    from evermap.config import load_config, to_toml
-
-    shortcuts = [] if sensor_model is None else [f"slam.sensor_model={sensor_model.value}"]
-    shortcuts += [] if method is None else [f"slam.method={method.value}"]
-    shortcuts += ["slam.unknown_ids=true"] if unknown_ids else []
-    config = load_config(config_file, [*(settings or []), *shortcuts])
-    if show_config:
-        typer.echo(to_toml(config), nl=False)
-        return
-    if recording_path is None:
+    given = {"slam.sensor_model": sensor_model, "slam.method": method, "slam.unknown_ids": unknown_ids or None}
+    chosen = configured(config, settings, given, within="slam", show=show_config)
+    if input is None:
         raise ConfigError(
-            "a recording is needed", field="INPUT", hint="a folder or zip; --init DIR shows what to put in"
+            "a recording is needed", field="input", hint="a folder or zip; --init DIR shows what to put in"
         )
+    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
+    if prior and (map_file is None or localize):
+        raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
+    if shift and prior_map is None:
+        raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
     from evermap.io import parse_shift, read_recording, shifted
     from evermap.runs.folder import check_replaceable
 
     shifts = [parse_shift(text) for text in shift or []]
-    if shifts and prior_map is None:
-        raise ConfigError("there is no map to shift", field="--shift", hint="--prior-map truth, or --prior-map FILE")
-    _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
-    if prior and (map_file is None or localize):
-        raise ConfigError("is for a session of a map", field="--prior", hint="--map FILE, without --localize")
-    inputs = [recording_path, config_file, None if prior_map == "truth" else prior_map, map_file]
+    inputs = [input, config, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force, inputs=inputs)
-    recording = read_recording(recording_path, robot=robot)
+    recording = read_recording(input, robot=robot)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)
+    how: dict[str, Any] = {"as_json": as_json, "force": force, "inputs": inputs}
     if map_file is not None:
         from evermap.cli.slam_in_map import MapOptions, run_in_map
 
-        options = MapOptions(map_file, prior or [], localize, realtime)
-        run_in_map(recording, config, options, out, as_json=as_json, force=force, inputs=inputs)
+        run_in_map(recording, chosen, MapOptions(map_file, prior or [], localize, realtime), out, **how)
         return
-    start = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-    run_and_write(recording, config, out, prior=start, realtime=realtime, as_json=as_json, force=force, inputs=inputs)
+    known = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
+    run_and_write(recording, chosen, out, prior=known, realtime=realtime, **how)
 
 
 def run_and_write(
@@ -212,16 +204,16 @@ def run_and_write(
         raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
 
 
-def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: Method | None) -> None:
+def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:
     if map_file is None:
         if localize:
-            raise ConfigError("needs a map", field="--localize", hint="--map FILE")
+            raise ConfigError("needs a map", field="localize", hint="--map FILE")
         return
     if prior_map is not None:
-        raise ConfigError("a living map takes no other one", field="--prior-map", hint="either --map or --prior-map")
+        raise ConfigError("a living map takes no other one", field="prior_map", hint="either --map or --prior-map")
     if method is not None:
         raise ConfigError(
-            "a living map finds changes by itself", field="--method", hint="--set living.search=gate, for example"
+            "a living map finds changes by itself", field="method", hint="--set living.search=gate, for example"
         )
 
 
@@ -246,7 +238,7 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> La
     survey = recording.true_landmarks
     if survey is None:
         problem = "this recording has no surveyed landmarks"
-        raise ConfigError(problem, field="--prior-map", hint="a landmarks.csv of your own: --prior-map FILE")
+        raise ConfigError(problem, field="prior_map", hint="a landmarks.csv of your own: --prior-map FILE")
     return Landmarks.at(
         survey.landmark_id,
         survey.position_m,
@@ -255,3 +247,20 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> La
         class_names=survey.class_names,
         frame="prior_map",
     )
+
+
+def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool, findings: Sequence[str] = ()) -> None:
+    """The summary as JSON, or its main numbers as a table with the files to look at, and what was found, in words."""
+    if as_json:
+        print_json(summary)
+        return
+    rows = [
+        (label, form.format(summary[section][key]))
+        for section, key, label, form in _ROWS
+        if summary.get(section, {}).get(key) is not None
+    ]
+    files = (out / name for name in ("report.html", "summary.json"))
+    rows += [(file.stem, str(file)) for file in files if file.is_file()]
+    print_table(str(summary.get("recording", {}).get("name", "run")), rows)
+    for finding in findings:
+        echo(finding)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from evermap.cli.options import priors_by_class
-from evermap.cli.summary import show_run
+from evermap.cli.slam import show_run
 from evermap.cli.terminal import command_line, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import held, kept
@@ -54,7 +54,7 @@ def run_in_map(
 
     map_file, priors, localize, realtime = options
     if realtime and not localize:
-        raise ConfigError("a session is solved when it ends", field="--realtime", hint="--localize")
+        raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
     said = priors_of(*priors_by_class(priors))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from evermap.errors import ConfigError, similar
+from evermap.errors import ConfigError, similar, suggestion
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
@@ -60,7 +60,16 @@ def config_error(root: Any, error: ValidationError, path: Path | None = None) ->
     if isinstance(told, ValueError):
         return ConfigError(str(told), path=path, field=field or None)
     problem = f"{first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"
-    return ConfigError(problem, path=path, field=field)
+    hint = suggestion(str(first["input"]), _choices(root, names)) if first["type"] == "literal_error" else None
+    return ConfigError(problem, path=path, field=field, hint=hint)
+
+
+def _choices(section: type[Section], names: list[str]) -> list[str]:
+    """Return the words that a key may be."""
+    annotation: Any = section
+    for name in names:
+        annotation = annotation.model_fields[name].annotation
+    return [option for option in get_args(annotation) if isinstance(option, str)]
 
 
 def known_keys(section: type[Section], prefix: tuple[str, ...] = ()) -> Iterator[str]:

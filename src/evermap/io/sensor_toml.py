@@ -50,8 +50,8 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
     try:
         document = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        line = re.search(r"at line (\d+)", str(error))
-        raise InputError(f"not valid TOML: {reason(error)}", path=path, line=int(line[1]) if line else None) from None
+        line = getattr(error, "lineno", None)  # of Python 3.14; before, only the message tells
+        raise InputError(f"not valid TOML: {reason(error)}", path=path, line=line) from None
     reader = _Reader(document, text, path)
     reader.expect(("recording", *_LIMITS), document, section=None)
     values: dict[str, float] = {}

@@ -13,7 +13,7 @@ from evermap.geometry import se2
 from evermap.types import ChangeKind, Landmarks, MapChange
 
 _EXAMPLE = '"11,12,13:+1.0,-0.5" moves three landmarks 1 m in x and -0.5 m in y; a third number turns them [deg]'
-_FIELD = "--shift"
+_FIELD = "shift"
 
 
 @dataclass(frozen=True, slots=True)
