@@ -28,7 +28,7 @@ from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import align_points, interpolate, scored_stamps
 from evermap.pipeline import run_session
 from evermap.types import FloatArray, Landmarks, Recording
-from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, FaultConfig, with_faults
 
 SESSION_S = 180.0
@@ -104,7 +104,7 @@ def world(hours: float, seed: int) -> tuple[Recording, ...]:
         patrol_s=SESSION_S,
         drive=DriveConfig(truth_hz=20.0),
         odometry=OdometryConfig(rate_hz=10.0),
-        sensor=SensorConfig(rate_hz=2.0),
+        sensor=SimulatedSensor(rate_hz=2.0),
     )
     return simulate_building(config, seed).sessions[:sessions]
 

@@ -18,7 +18,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.pipeline import run_session
 from evermap.types import Recording
-from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 
 LARGEST_FACTOR = 1.5
@@ -46,7 +46,7 @@ def visits() -> tuple[Recording, ...]:
         change_rate=2.0,
         drive=DriveConfig(truth_hz=20.0),
         odometry=OdometryConfig(rate_hz=10.0),
-        sensor=SensorConfig(rate_hz=2.0),
+        sensor=SimulatedSensor(rate_hz=2.0),
     )
     return simulate_building(config, seed=1).sessions
 

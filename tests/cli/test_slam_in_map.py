@@ -19,7 +19,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.io import read_tum, write_native
 from evermap.maps.store import open_store
-from evermap_studies.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, BuildingSimulation, SimulatedSensor, simulate_building
 
 # pictures have tests of their own, and take most of the time
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
@@ -56,7 +56,7 @@ def building() -> BuildingSimulation:
             length_m=14.0,
             depth_m=13.0,
             rooms_per_side=1,
-            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0),
+            sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0),
         ),
         seed=4,
     )

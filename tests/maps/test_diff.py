@@ -210,11 +210,11 @@ def part_of(recording: em.Recording, begin: float, end: float) -> em.Recording:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of five days of which three see only a part, each with its run folder beside it."""
     from evermap.io import write_native
-    from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+    from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 
     folder = tmp_path_factory.mktemp("site")
     config = BuildingConfig(days=5, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1, change_rate=2.0,
-                            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0))  # fmt: skip
+                            sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0))  # fmt: skip
     views = [(0.0, 0.6), (0.0, 1.0), (0.3, 1.0), (0.0, 1.0), (0.0, 0.7)]
     for day, (recording, view) in enumerate(zip(simulate_building(config, seed=11).sessions, views, strict=True)):
         write_native(part_of(recording, *view), folder / f"day{day}")

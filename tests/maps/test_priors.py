@@ -150,12 +150,12 @@ def run(*arguments: str | Path):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of two sessions, the first of them with what a user says of pallets and of all else."""
     from evermap.io import write_native
-    from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+    from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 
     folder = tmp_path_factory.mktemp("priors")
     priors = ["--prior", "pallet=weibull:scale=3d,shape=1.5", "--prior", "unknown:1d..1y"]
     config = BuildingConfig(days=2, patrol_s=60.0, length_m=14.0, depth_m=13.0, rooms_per_side=1,
-                            sensor=SensorConfig(range_slope=0.0, rate_hz=2.0))  # fmt: skip
+                            sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0))  # fmt: skip
     for day, recording in enumerate(simulate_building(config, seed=4).sessions):
         write_native(recording, folder / f"day{day}")
         result = run("slam", folder / f"day{day}", "--map", folder / "site.evermap", "--out", folder / f"out{day}",

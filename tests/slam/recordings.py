@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from evermap.types import Frames, Recording
-from evermap_studies.sim import BuildingConfig, BuildingSimulation, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, BuildingSimulation, SimulatedSensor, simulate_building
 
 
 @cache
 def building(seed: int = 0, *, patrol_s: float = 60.0, faults: float = 0.0, **sensor: float) -> BuildingSimulation:
     """A static building patrolled once; `faults` is the probability of a wrong identity."""
-    sensor_config = SensorConfig(**{"p_wrong_identity": faults, "p_false": faults / 3, **sensor})
+    sensor_config = SimulatedSensor(**{"p_wrong_identity": faults, "p_false": faults / 3, **sensor})
     return simulate_building(
         BuildingConfig(days=1, patrol_s=patrol_s, change_rate=0.0, sensor=sensor_config), seed=seed
     )

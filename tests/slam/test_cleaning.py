@@ -18,7 +18,7 @@ from evermap.io import read_recording, write_template
 from evermap.pipeline import run_slam
 from evermap.slam.cleaning import clean
 from evermap.types import Recording
-from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
 
 RATE_HZ = 5.0
@@ -26,7 +26,7 @@ RATE_HZ = 5.0
 
 @cache
 def patrol(seconds: float = 60.0) -> Recording:
-    config = BuildingConfig(days=1, patrol_s=seconds, sensor=SensorConfig(rate_hz=RATE_HZ))
+    config = BuildingConfig(days=1, patrol_s=seconds, sensor=SimulatedSensor(rate_hz=RATE_HZ))
     return simulate_building(config, seed=4).sessions[0]
 
 

@@ -97,6 +97,7 @@ Template = Annotated[
 
 HELP = """\
 Estimate where the robot was and where the landmarks are.
+
 \b
 Examples:
   evermap slam --init my-recording

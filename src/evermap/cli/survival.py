@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 PLOT = """\
 Draw lifetime priors in four views.
+
 The views are hazard, cumulative hazard, survival and density over the time since a feature was first seen.
 Durations have a unit (us, ms, s, min, h, d, w, y), rates are per such a unit, shares are below 1.
 
@@ -49,6 +50,7 @@ Example:
 """
 FIT = """\
 Estimate lifetimes of which only bounds are known.
+
 \b
 The table has a row a lifetime, in seconds: left, for how long it was seen to stay, and right, when it was found
 gone (equal: the end was watched; empty: never seen gone). It may have entry (known only because it was still
@@ -76,6 +78,7 @@ Examples:
 """
 LEARN = """\
 Learn how long things stay and stay away.
+
 From looks alone: no truth, no list of changes. Every kind of model is learned without the last part of the looks
 and asked to predict it; the best is learned again from all of them.
 

@@ -65,6 +65,7 @@ Example = Annotated[
 
 HELP = """\
 Follow objects in space, and learn how long they stay.
+
 \b
 The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a covariance
 (cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m, sensor_y_m, sensor_z_m. A row without a

@@ -98,15 +98,28 @@ class RunFolder:
         return sorted({*_entries(self._partial), MANIFEST})
 
     def finish(self, summary: dict[str, Any], *more: str) -> dict[str, Any]:
-        """Write `summary.json` and return its content, with the names of all files as `outputs`.
+        """Write `summary.json` and return its content as plain JSON values, with the names of all files as `outputs`.
 
         Args:
-            summary: content, with the keys of `summary_head`.
+            summary: content; what is missing of the keys that every summary has is added. Settings of a study are its
+                configuration.
             more: names of files that are still to be written.
         """
-        summary["outputs"] = sorted({*self.files(), SUMMARY, *more})
-        self.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
-        return summary
+        head = {
+            "schema_version": SUMMARY_SCHEMA_VERSION,
+            "evermap": __version__,
+            "version": __version__,
+            "command": "",
+            "config": summary.get("settings", {}),
+            "input": "",
+            "warnings": [],
+            "timing": {},
+        }
+        summary = {**head, **summary, "outputs": sorted({*self.files(), SUMMARY, *more})}
+        text = summary_text(summary)
+        self.path(SUMMARY).write_text(text, encoding="utf-8")
+        content: dict[str, Any] = json.loads(text)
+        return content
 
     def _take_place(self) -> None:
         """Whole by a rename where the old folder is evermap's alone, else file by file among those of the user."""
@@ -417,7 +430,7 @@ def write_run(
             outputs=(),
             warnings=remarks,
         )
-        folder.finish(summary, *(["report.html"] if tell else []))
+        summary = folder.finish(summary, *(["report.html"] if tell else []))
         if tell:
             from evermap.viz.report import render_report
 

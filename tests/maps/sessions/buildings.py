@@ -18,7 +18,7 @@ from evermap_studies.sim import (
     BuildingSimulation,
     Duration,
     ObjectClass,
-    SensorConfig,
+    SimulatedSensor,
     simulate_building,
 )
 from evermap_studies.sim.world import positions_at
@@ -48,7 +48,7 @@ def building(seed: int, *, days: int = 4, change_rate: float = 1.0) -> BuildingS
         depth_m=13.0,
         rooms_per_side=1,
         classes=CLASSES,
-        sensor=SensorConfig(range_slope=0.0, rate_hz=2.0),
+        sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0),
     )
     return simulate_building(config, seed=seed)
 

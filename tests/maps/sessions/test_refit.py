@@ -17,7 +17,7 @@ from evermap.slam.estimate import Solved
 from evermap.slam.problem import Estimate
 from evermap.slam.streaming import Outcome
 from evermap.types import FloatArray, IntArray
-from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SimulatedSensor, simulate_building
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def alone() -> Solved:
         rooms_per_side=1,
         drive=DriveConfig(truth_hz=20.0),
         odometry=OdometryConfig(rate_hz=10.0),
-        sensor=SensorConfig(rate_hz=2.0),
+        sensor=SimulatedSensor(rate_hz=2.0),
     )
     return solve_alone(simulate_building(config, seed=1).sessions[0], LivingMap(), Config())
 

@@ -11,10 +11,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation, Slerp
 
 from evermap.types import UNKNOWN
-from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 from evermap_studies.sim.detect import sticky_uniform
 
-CLEAN = SensorConfig(stickiness=0.0, p_wrong_identity=0.0, p_false=0.0, p_detect_near=0.95, p_detect_far=0.6)
+CLEAN = SimulatedSensor(stickiness=0.0, p_wrong_identity=0.0, p_false=0.0, p_detect_near=0.95, p_detect_far=0.6)
 CONFIG = BuildingConfig(days=2, patrol_s=165.0, sensor=CLEAN)
 
 

@@ -21,7 +21,7 @@ from evermap_studies.sim import (
     BuildingSimulation,
     Duration,
     LookedAt,
-    SensorConfig,
+    SimulatedSensor,
     looked_at,
     simulate_building,
 )
@@ -35,7 +35,7 @@ HARD = BuildingConfig(
     patrol_lengths_s=LENGTHS_S,
     doors=ROOM_DOORS,
     wing_opens_day=4,
-    sensor=SensorConfig(rate_hz=2.0),
+    sensor=SimulatedSensor(rate_hz=2.0),
 )
 
 

@@ -20,7 +20,7 @@ from evermap_studies.sim import (
     Duration,
     ObjectClass,
     OdometryConfig,
-    SensorConfig,
+    SimulatedSensor,
     simulate_building,
 )
 
@@ -150,7 +150,7 @@ def test_any_config_in_range_gives_finite_recordings(
         classes=tuple(replace(kind, count=min(kind.count, 2)) for kind in DEFAULT_CLASSES),
         drive=DriveConfig(speed_mps=speed),
         odometry=OdometryConfig(delay_s=delay, rate_hz=max(5.0, rate_hz)),
-        sensor=SensorConfig(
+        sensor=SimulatedSensor(
             field_of_view_rad=field_of_view, sigma_range_m=sigma, rate_hz=rate_hz, stickiness=stickiness,
             p_false=faults, p_wrong_identity=faults, p_no_identity=1.0 - faults,
         ),
@@ -220,9 +220,9 @@ BAD = {
     "patrol_lengths_s[1]": replace(SMALL, patrol_lengths_s=(20.0, 1.0)),
     "doors.shut.mean_days": replace(SMALL, doors=(Duration(1.0), Duration(0.0))),
     "wing_opens_day": replace(SMALL, wing_opens_day=1.5),
-    "sensor.p_false": replace(SMALL, sensor=SensorConfig(p_false=2.0)),
-    "sensor.range_min_m": replace(SMALL, sensor=SensorConfig(range_min_m=5.0, range_max_m=3.0)),
-    "sensor.mount_robot_sensor": replace(SMALL, sensor=SensorConfig(mount_robot_sensor=(2.0, 0.0, 0.0))),
+    "sensor.p_false": replace(SMALL, sensor=SimulatedSensor(p_false=2.0)),
+    "sensor.range_min_m": replace(SMALL, sensor=SimulatedSensor(range_min_m=5.0, range_max_m=3.0)),
+    "sensor.mount_robot_sensor": replace(SMALL, sensor=SimulatedSensor(mount_robot_sensor=(2.0, 0.0, 0.0))),
 }
 
 

@@ -11,7 +11,7 @@ from scipy.stats import binomtest, kstest, poisson
 
 from evermap.errors import ConfigError
 from evermap.types import Recording
-from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import (
     FAULTLESS,
     NOTHING,
@@ -28,7 +28,7 @@ STAMP_S = 100.0 + 0.1 * np.arange(20_000)
 
 @cache
 def patrol() -> Recording:
-    config = BuildingConfig(days=1, patrol_s=60.0, sensor=SensorConfig(rate_hz=5.0))
+    config = BuildingConfig(days=1, patrol_s=60.0, sensor=SimulatedSensor(rate_hz=5.0))
     return simulate_building(config, seed=4).sessions[0]
 
 

@@ -85,10 +85,7 @@ def reproduce(
         save_all(figures, folder.path)
         record_example(settings, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
-    return table
+        return folder.finish(table)
 
 
 def compute(

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from evermap.runs.folder import SUMMARY, RunFolder, RunInfo, summary_text, write_run
+from evermap.runs.folder import RunFolder, RunInfo, write_run
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.study import Progress, run_study
@@ -85,9 +85,7 @@ def run_demo(
             save_svg(figure.figure, folder.path(f"figures/{figure.name}.svg"))
         folder.path(TRUE_EVENTS).write_text(_events_text(study.building.events), encoding="utf-8")
         summary["timing"] |= {"demo": costs}
-        summary |= {"demo": numbers, "outputs": folder.files()}
-        folder.path(SUMMARY).write_text(summary_text(summary), encoding="utf-8")
-    return summary
+        return folder.finish(summary | {"demo": numbers})
 
 
 def _events_text(events: Iterable[ChangeEvent]) -> str:

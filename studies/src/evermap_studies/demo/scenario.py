@@ -12,7 +12,7 @@ from evermap_studies.sim import (
     BuildingSimulation,
     Duration,
     ObjectClass,
-    SensorConfig,
+    SimulatedSensor,
     simulate_building,
 )
 
@@ -85,7 +85,7 @@ class Scenario:
             wing_opens_day=self.wing_opens_day,
             # without a length standard no estimator can tell the size of a building: 1 % of slope would put 0.1 m of
             # error into every map and hide what is to be shown
-            sensor=SensorConfig(range_slope=0.0, rate_hz=self.sensor_hz),
+            sensor=SimulatedSensor(range_slope=0.0, rate_hz=self.sensor_hz),
         )
         return simulate_building(config, seed=seed)
 

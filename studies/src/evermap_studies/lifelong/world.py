@@ -143,12 +143,12 @@ def scripted(script: Script, recordings: Sequence[Recording], references: Sequen
 def simulated_world(days: int, seed: int) -> World:
     """Four rooms with the furniture of the demonstration, patrolled twice a day in full laps."""
     from evermap_studies.demo.scenario import FURNITURE
-    from evermap_studies.sim import BuildingConfig, SensorConfig, simulate_building
+    from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
     from evermap_studies.sim.world import positions_at
 
     config = BuildingConfig(
         days=days, sessions_per_day=2, patrol_s=110.0, length_m=20.0, depth_m=14.5, rooms_per_side=2,
-        classes=FURNITURE, sensor=SensorConfig(range_slope=0.0, rate_hz=2.0),
+        classes=FURNITURE, sensor=SimulatedSensor(range_slope=0.0, rate_hz=2.0),
     )  # fmt: skip
     building = simulate_building(config, seed=seed)
     starts = [truth.start_s for truth in building.truths]

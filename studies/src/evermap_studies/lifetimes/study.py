@@ -7,7 +7,6 @@ the minute, if somebody looks only now and then.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -138,9 +137,7 @@ def reproduce(
         _record(tracked, folder.path("tracks.rrd"))
         table["processing_s"] = time.perf_counter() - start
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
+        table = folder.finish(table)
         tell(total)
     return table
 

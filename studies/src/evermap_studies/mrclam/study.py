@@ -6,7 +6,6 @@ Every robot is run on its own, one run after the other in this process, so that 
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import time
@@ -132,10 +131,7 @@ def reproduce(
         }
         draw_robots(ledger.drawn, folder.path("mrclam.png"))
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
-    return table
+        return folder.finish(table)
 
 
 def _jobs(data: Path, datasets: tuple[int, ...]) -> Iterator[Job]:

@@ -113,9 +113,7 @@ def reproduce(
         draw_all(simulation, runs, paths, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
         folder.path(PATHS).write_text(json.dumps(paths, sort_keys=True) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
+        table = folder.finish(table)
     if interrupted:
         raise KeyboardInterrupt(f"{len(done)} of {len(planned)} runs were done; they are in {out}")
     return table

@@ -147,10 +147,7 @@ def reproduce(
             figures = {"reliability": draw_reliability(content), "false-changes": draw_false_changes(content)}
             save_all(figures, folder.path)
         folder.path("table.md").write_text(as_markdown(content) + "\n", encoding="utf-8")
-        content["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
-    return content
+        return folder.finish(content)
 
 
 def _each_world(settings: Settings, worlds: list[tuple[int, int]]) -> Iterable[Row]:

@@ -6,7 +6,6 @@ learned and chosen comes from the training files; the test files are only scored
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -124,10 +123,7 @@ def reproduce(
         }  # fmt: skip
         draw_all(room, found, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
-    return table
+        return folder.finish(table)
 
 
 class _Steps:

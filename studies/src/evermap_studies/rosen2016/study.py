@@ -6,7 +6,6 @@ The paper's numbers are only in its plots. They are compared with a rerun of its
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
@@ -133,10 +132,7 @@ def reproduce(
         }
         draw_all(settings, values, folder.path)
         folder.path("table.md").write_text(as_markdown(table) + "\n", encoding="utf-8")
-        table["outputs"] = sorted([*folder.files(), "summary.json"])
-        text = json.dumps(table, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        folder.path("summary.json").write_text(text, encoding="utf-8")
-    return table
+        return folder.finish(table)
 
 
 def compute(settings: Settings, progress: Progress | None = None) -> list[Value]:

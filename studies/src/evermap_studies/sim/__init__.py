@@ -13,7 +13,7 @@ from evermap_studies.sim.config import (
     Duration,
     ObjectClass,
     OdometryConfig,
-    SensorConfig,
+    SimulatedSensor,
 )
 from evermap_studies.sim.looked import LookedAt, looked_at
 from evermap_studies.sim.world import BuildingSimulation, SessionTruth, simulate_building
@@ -33,8 +33,8 @@ __all__ = [
     "ObjectClass",
     "OdometryConfig",
     "Room",
-    "SensorConfig",
     "SessionTruth",
+    "SimulatedSensor",
     "Stay",
     "looked_at",
     "simulate_building",

@@ -196,7 +196,7 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SensorConfig:
+class SimulatedSensor:
     """A range-bearing sensor that reads identities, and its faults.
 
     Reported are `range_bias_m + r (1 + range_slope + range_bearing b + range_bearing2 b^2)` and `b + bearing_bias_rad`
@@ -320,7 +320,7 @@ class BuildingConfig:
     classes: tuple[ObjectClass, ...] = DEFAULT_CLASSES
     drive: DriveConfig = field(default_factory=DriveConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sensor: SimulatedSensor = field(default_factory=SimulatedSensor)
     patrol_lengths_s: tuple[float, ...] = ()
     doors: tuple[Duration, Duration] | None = None
     wing_opens_day: int = 0
@@ -392,7 +392,7 @@ def require_within(value: object, name: str, low: float, high: float) -> None:
         raise ConfigError(f"is {value}, outside [{low:g}, {high:g}]", field=name, hint="a value in that range")
 
 
-def _all_within(config: BuildingConfig | DriveConfig | OdometryConfig | SensorConfig, where: str,
+def _all_within(config: BuildingConfig | DriveConfig | OdometryConfig | SimulatedSensor, where: str,
                 bounds: dict[str, tuple[float, float]]) -> None:  # fmt: skip
     known = {item.name for item in fields(config)}
     for name, (low, high) in bounds.items():

@@ -13,7 +13,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray
 from evermap_studies.sim.building import FloorPlan
-from evermap_studies.sim.config import SensorConfig
+from evermap_studies.sim.config import SimulatedSensor
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class Scene:
 
 
 def in_view(
-    pose_world_sensor: FloatArray, scene: Scene, plan: FloorPlan, config: SensorConfig
+    pose_world_sensor: FloatArray, scene: Scene, plan: FloorPlan, config: SimulatedSensor
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return which landmarks (rows) are in view of which sensor poses (columns).
 
@@ -65,7 +65,7 @@ def sticky_uniform(rng: np.random.Generator, rows: int, columns: int, stickiness
 
 
 def detect(
-    pose_world_robot: FloatArray, scene: Scene, plan: FloorPlan, config: SensorConfig, seed: np.random.SeedSequence
+    pose_world_robot: FloatArray, scene: Scene, plan: FloorPlan, config: SimulatedSensor, seed: np.random.SeedSequence
 ) -> tuple[Detections, IntArray]:
     """Simulate detections, one frame a robot pose (F, 3), sorted by frame, then by true landmark.
 

@@ -27,7 +27,7 @@ REST_S: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class PatrolDrive:
     """What the robot truly did; row `i` of the twist holds from `stamp_s[i]` to `stamp_s[i + 1]`.
 
     Attributes:
@@ -138,7 +138,9 @@ def _speed_limits(route: FloatArray, config: DriveConfig) -> FloatArray:
     return np.asarray(np.sqrt(square), dtype=np.float64)
 
 
-def drive(route: FloatArray, config: DriveConfig, start_s: float, duration_s: float, rng: np.random.Generator) -> Drive:
+def drive(
+    route: FloatArray, config: DriveConfig, start_s: float, duration_s: float, rng: np.random.Generator
+) -> PatrolDrive:
     """Follow the closed route from its first point for the given time, by pure pursuit.
 
     Args:
@@ -187,10 +189,10 @@ def drive(route: FloatArray, config: DriveConfig, start_s: float, duration_s: fl
         x, y, theta = x + c * ahead - s * left, y + s * ahead + c * left, theta + angle
         twist[step] = v, slip[step], w
     pose[:, 2] = se2.wrap(pose[:, 2])
-    return Drive(stamp_s=start_s + np.arange(steps, dtype=np.float64) * dt, pose_world_robot=pose, twist=twist)
+    return PatrolDrive(stamp_s=start_s + np.arange(steps, dtype=np.float64) * dt, pose_world_robot=pose, twist=twist)
 
 
-def report_odometry(path: Drive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
+def report_odometry(path: PatrolDrive, config: OdometryConfig, rng: np.random.Generator) -> Odometry:
     """Simulate what the encoders report of a drive: delayed, scaled and noisy forward and angular velocity."""
     start_s, end_s = path.stamp_s[0], path.stamp_s[-1]
     period_s = 1.0 / config.rate_hz
