@@ -28,7 +28,7 @@ RULES = {
     "valid": "errors types",
     "io": "errors interrupts types geometry valid",
     "metrics": "errors show types geometry",
-    "sensing": "errors compiled types geometry",
+    "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",
     "slam": "errors interrupts compiled plugins types config geometry valid sensing",
     "maps": "errors show types config geometry stamps survival sensing existence slam",
