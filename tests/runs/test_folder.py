@@ -254,6 +254,8 @@ def test_changes_and_alternatives_are_kept_in_every_form(run, tmp_path):
     assert first == {
         "landmarks": ids[0],
         "kind": "moved",
+        "stamp_s": None,
+        "decided_s": None,
         "stamp_from_s": None,
         "stamp_to_s": result.trajectory.stamp_s[0],
         "displacement_m": [-1.0, 0.0],

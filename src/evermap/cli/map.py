@@ -165,7 +165,7 @@ def export(
     ] = 0.5,
     as_json: _AsJson = False,
 ) -> None:
-    """Write the landmarks that exist as a table, or what was learned of lifetimes.
+    """Write existing landmarks, or learned lifetimes, to a file.
 
     For other tools, for `evermap slam --prior-map`, and for `--prior` of another map.
 
