@@ -229,8 +229,8 @@ def test_command_works_without_reference_and_says_so(tmp_path: Path, monkeypatch
     ("arguments", "named"),
     [
         (["--data", "nowhere"], "nowhere/rosen2016.json: cannot be read"),
-        (["--sequences", "1"], "field 'sequences'"),
-        (["--seed", "-1"], "field 'seed'"),
+        (["--sequences", "1"], "field '--sequences'"),
+        (["--seed", "-1"], "field '--seed'"),
         (["--all"], "No such option: --all"),
     ],
 )
