@@ -228,10 +228,10 @@ def test_command_runs_what_it_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        (["--world", "mars"], "field 'world': there is no 'mars' (try: nominal, uniform-lifetimes, angle60,"),
-        (["--filters", "jcf,kalman"], "field 'filters': there is no 'kalman' (try: iff, jff,"),
-        (["--runs", "1"], "field 'runs': must be 2 at least"),
-        (["--seed", "-1"], "field 'seed'"),
+        (["--world", "mars"], "field '--world': there is no 'mars' (try: nominal, uniform-lifetimes, angle60,"),
+        (["--filters", "jcf,kalman"], "field '--filters': there is no 'kalman' (try: iff, jff,"),
+        (["--runs", "1"], "field '--runs': must be 2 at least"),
+        (["--seed", "-1"], "field '--seed'"),
         (["--data", "here"], "No such option: --data"),
     ],
 )
