@@ -11,7 +11,9 @@ _DAY_S = 86_400
 
 
 def stamp_text(stamp_s: float, clock: Clock) -> str:
-    """'2026-11-21 14:20:05', or 'day 3 04:05:06' since the start of a recording's own clock; '-' for no stamp."""
+    """Return '2026-11-21 14:20:05', or 'day 3 04:05:06' since the start of a recording's own clock; '-' for no
+    stamp.
+    """
     if not math.isfinite(stamp_s):
         return "-"
     if clock is not Clock.RECORDING:
@@ -25,7 +27,7 @@ def stamp_text(stamp_s: float, clock: Clock) -> str:
 
 
 def between_text(from_s: float, to_s: float, clock: Clock) -> str:
-    """'between A and B'; 'before B' where nobody had looked before."""
+    """Return 'between A and B'; 'before B' where nobody had looked before."""
     late = stamp_text(to_s, clock)
     early = stamp_text(from_s, clock)
     if early == "-":

@@ -196,7 +196,9 @@ class SensorConfig(Section):
     )
 
     def applied_to(self, sensor: Sensor) -> Sensor:
-        """The recording's sensor with the fields that are set here; ConfigError if then nothing can be in view."""
+        """Return the recording's sensor with the fields that are set here; ConfigError if then nothing can be in
+        view.
+        """
         merged = replace(sensor, **self.model_dump(exclude_none=True))
         for low, high in (("range_min_m", "range_max_m"), ("bearing_min_rad", "bearing_max_rad")):
             if getattr(merged, low) >= getattr(merged, high):

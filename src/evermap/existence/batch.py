@@ -113,7 +113,9 @@ def look_general_purpose(
     out: Looked | None = None,
     threads: bool = False,
 ) -> Looked:
-    """As `look_exponential`, for lifetimes of unknown rate between `low_hz` and `high_hz` (Rosen 2016 eqs. 26-29)."""
+    """Look as `look_exponential` does, for lifetimes of unknown rate between `low_hz` and `high_hz` (Rosen 2016 eqs.
+    26-29).
+    """
     rates = {"low_hz": low_hz, "high_hz": high_hz}
     return _look(_Columns("general_purpose", before, rates, sight), horizon_s, out, threads)
 
@@ -128,7 +130,8 @@ def look_two_state(
     out: Looked | None = None,
     threads: bool = False,
 ) -> Looked:
-    """As `look_exponential`, for features that leave and return: exponential stays and absences (MATH.md section 4).
+    """Look as `look_exponential` does, for features that leave and return: exponential stays and absences (MATH.md
+    section 4).
 
     At birth the inverse odds are 0; of a feature that may have come and gone for long they are
     `leave_hz / return_hz`. With `return_hz = 0` this is `look_exponential`.
@@ -149,7 +152,7 @@ class _Columns(NamedTuple):
         return {**self.before._asdict(), **self.rates, **self.sight._asdict()}
 
     def of(self, columns: dict[str, Any]) -> _Columns:
-        """The same with other columns."""
+        """Return the same with other columns."""
         before, sight = ([columns[name] for name in kind._fields] for kind in (RowState, RowLooks))
         return _Columns(self.kind, RowState(*before), {name: columns[name] for name in self.rates}, RowLooks(*sight))
 
@@ -311,7 +314,7 @@ def _formulas(double: bool) -> dict[str, Any]:
         return torch.where(condition, *sides)
 
     def pick(scalar: Any, tensor: Any) -> Any:
-        """`min` or `max` of two, either of which may be a number."""
+        """Return `min` or `max` of two, either of which may be a number."""
 
         def of(a: Any, b: Any) -> Any:
             if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):

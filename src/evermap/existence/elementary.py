@@ -63,21 +63,23 @@ def _reduced(x: Any) -> Any:
 
 @inlined
 def expm1(x: Any) -> Any:
-    """`e^x - 1` for |x| <= 700."""
+    """Return `e^x - 1` for |x| <= 700."""
     power, p = _reduced(x)
     return power * p + (power - 1.0)
 
 
 @inlined
 def exp(x: Any) -> Any:
-    """`e^x` for |x| <= 700, to the last digit also where it is small."""
+    """Return `e^x` for |x| <= 700, to the last digit also where it is small."""
     power, p = _reduced(x)
     return power * p + power
 
 
 @inlined
 def split(x: Any) -> Any:
-    """Exponent and fraction of a normal positive number: `x = 2^exponent (1 + f)`, `1 + f` in [sqrt(1/2), sqrt(2))."""
+    """Return the exponent and fraction of a normal positive number: `x = 2^exponent (1 + f)`, `1 + f` in [sqrt(1/2),
+    sqrt(2)).
+    """
     bits = np.float64(x).view(np.int64)
     exponent = (bits - np.int64(0x3FE6A09E667F3BCD)) >> 52
     return np.float64(exponent), np.int64(bits - (exponent << 52)).view(np.float64) - 1.0
@@ -85,7 +87,7 @@ def split(x: Any) -> Any:
 
 @inlined
 def log_of_split(exponent: Any, s: Any) -> Any:
-    """`log x` from `split(x)`, `s = f / (2 + f)`: twice the inverse hyperbolic tangent (minimax, 5e-18).
+    """Return `log x` from `split(x)`, `s = f / (2 + f)`: twice the inverse hyperbolic tangent (minimax, 5e-18).
 
     The quotient is the caller's, who may have another division to share it with.
     """

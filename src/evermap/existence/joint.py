@@ -20,7 +20,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 
 def iff(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, expected: Any) -> Belief:
-    """Independent feature filter: `single.update` of the landmarks that were expected (Rosen 2016, Algorithm 1).
+    """Return the independent feature filter: `single.update` of expected landmarks (Rosen 2016, Algorithm 1).
 
     Args:
         state: beliefs of K landmarks.
@@ -41,7 +41,7 @@ def iff(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, e
 def jcf(
     state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, expected: Any, clique: IntArray
 ) -> Belief:
-    """Joint clique filter: all landmarks of a clique share one survival time (Bateman 2020, Algorithm 1).
+    """Return the joint clique filter: all landmarks of a clique share one survival time (Bateman 2020, Algorithm 1).
 
     Given that time detections are independent, so a look at a clique weighs as the product of the likelihoods of its
     expected landmarks (eqs. 3.9 and 3.10). A clique of which none was expected stays as it is. With
@@ -79,7 +79,7 @@ def jcf(
 
 
 def as_mask(values: Any, n: int) -> BoolArray:
-    """`expected` as booleans of shape (n,).
+    """Return `expected` as booleans of shape (n,).
 
     Raises:
         InputError: not booleans, or a shape that does not fit.

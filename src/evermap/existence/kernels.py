@@ -89,7 +89,7 @@ def stream(looks: Stream, inverse_odds: FloatArray, log_evidence: FloatArray, po
 
 @kernel
 def stream_of_logs(looks: Stream, inverse_odds: FloatArray, log_evidence: FloatArray) -> int:
-    """As `stream`, of likelihoods that only their logarithms can hold."""
+    """Return stream as `stream` does, for likelihoods that only their logarithms can hold."""
     row, log_death_odds, there, gone = looks
     for i in range(row.size):
         k = row[i]

@@ -66,7 +66,7 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, looks: Looks) -> Limits:
-        """From the times of the looks.
+        """Return from the times of the looks.
 
         Raises:
             DataError: no feature has looks at two instants.
@@ -173,7 +173,7 @@ def learn(
     seed: int = 0,
     progress: Callable[[str], None] | None = None,
 ) -> LearnedPhases:
-    """One model of how these features come and go.
+    """Return one model of how these features come and go.
 
     Args:
         looks: at features that share their habits; one feature alone is `looks.of(feature)`.

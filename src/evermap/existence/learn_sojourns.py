@@ -54,7 +54,7 @@ class Expected(Shown):
     expected_of_period: FloatArray
 
     def levels(self) -> FloatArray:
-        """(2, P) by what the hazards of each week differ from those of the last."""
+        """Return (2, P) by what the hazards of each week differ from those of the last."""
         n = self.of_period.shape[1]
         if n == 1:
             return np.ones((2, 1))
@@ -177,7 +177,9 @@ class Ascent(Shown):
 
 
 def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) -> Ascent:
-    """Expectation and maximisation in turn until the evidence settles; families are chosen in the first rounds."""
+    """Iterate expectation and maximisation until the evidence settles; families are chosen in the first
+    rounds.
+    """
     allowed: list[Sequence[str]] = [families, families]
     level = np.ones((2, data.n_periods))
     expected = data.expect(model, level)
@@ -204,7 +206,7 @@ def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) ->
 
 
 def ranked_fits(counts: Sojourns, families: Sequence[str], start: Fitted | None, *, rhythm: bool) -> list[Fitted]:
-    """Lifetimes of some families, the highest score first."""
+    """Return lifetimes of some families, the highest score first."""
     known = WITH_RHYTHM if rhythm else FAMILIES
     fits = [known[name](counts, start if start and start.family == name else None) for name in families]
     return sorted(fits, key=lambda one: -one.score(counts)) if len(fits) > 1 else fits
@@ -217,7 +219,7 @@ def _promising(ranked: Sequence[Fitted], counts: Sojourns) -> list[str]:
 
 
 def with_lifetimes(model: RunLength, fitted: tuple[Fitted, Fitted]) -> RunLength:
-    """A model like `model` with other lifetimes."""
+    """Return a model like `model` with other lifetimes."""
     absence, stay = fitted
     return RunLength(
         stay.prior, absence.prior, model.step_s, stay.rhythm, absence.rhythm, model.newborn, model.hypotheses
@@ -308,7 +310,7 @@ def learn(
     restarts: int = 4,
     progress: Progress | None = None,
 ) -> LearnedSojourns:
-    """One model of the comings and goings of all features in `looks`.
+    """Return one model of the comings and goings of all features in `looks`.
 
     Args:
         looks: uncertain looks; no truth.

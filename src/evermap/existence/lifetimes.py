@@ -148,7 +148,7 @@ def exponential_mixture_of(prior: LifetimePrior, n: int = NODES) -> ExponentialM
 def log_death_odds(
     priors: tuple[LifetimePrior, ...], prior_of_row: IntArray, start_s: FloatArray, stop_s: FloatArray
 ) -> FloatArray:
-    """Log-odds of dying within a gap, `log(1 - q) - log q`, one prior call for each prior in use.
+    """Return the log-odds of dying within a gap, `log(1 - q) - log q`, one prior call for each prior in use.
 
     Args:
         priors: lifetime priors.
@@ -219,12 +219,12 @@ class HazardTable(NamedTuple):
         return np.append(widths, widths[-1])
 
     def survival(self) -> FloatArray:
-        """(B,) `S` at the edges."""
+        """Return (B,) `S` at the edges."""
         return np.asarray(np.exp(-self.cumulative), dtype=np.float64)
 
 
 def edges(step_s: float) -> tuple[int, FloatArray]:
-    """Offset and edges of the bins that suit a filter of this time step."""
+    """Return the offset and edges of the bins that suit a filter of this time step."""
     lowest = 2.0 ** (np.floor(np.log2(step_s)) - DOUBLINGS_BELOW)
     above = lowest * (2.0 ** np.arange(DOUBLINGS_BELOW + DOUBLINGS_ABOVE))[:, None]
     grid = (above * (1.0 + np.arange(PER_DOUBLING) / PER_DOUBLING)).ravel()
@@ -233,7 +233,7 @@ def edges(step_s: float) -> tuple[int, FloatArray]:
 
 
 def tabulate(prior: LifetimePrior, step_s: float) -> HazardTable:
-    """The table of a lifetime for a filter of this time step."""
+    """Return the table of a lifetime for a filter of this time step."""
     offset, edge = edges(step_s)
     widths = np.diff(edge)
     integrated = np.minimum(-prior.log_conditional_survival(edge[:-1], edge[1:]), CERTAIN)
@@ -244,6 +244,6 @@ def tabulate(prior: LifetimePrior, step_s: float) -> HazardTable:
 
 
 def bins_of(age_s: FloatArray, offset: int, n: int) -> IntArray:
-    """The bin of each age."""
+    """Return the bin of each age."""
     leading = np.asarray(age_s, dtype=np.float64).view(np.int64) >> SHIFT
     return np.asarray(np.clip(leading - offset, 0, n - 1), dtype=np.int64)

@@ -229,7 +229,7 @@ def lifetimes_of(source: str | Path) -> dict[str, Lifetimes]:
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:
-    """The content of a model file of a version that we know.
+    """Return the content of a model file of a version that we know.
 
     Raises:
         InputError: no such file, no JSON, or a newer schema.
@@ -258,7 +258,7 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
 
 
 def model_of(data: Any) -> PresenceModel:
-    """The model of which `to_dict` gave these plain numbers and words.
+    """Return the model of which `to_dict` gave these plain numbers and words.
 
     Raises:
         InputError: an unknown kind, or a field that is missing or malformed.

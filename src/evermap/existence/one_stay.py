@@ -69,7 +69,7 @@ class PersistenceFilter(Shown):
         return self._evidence
 
     def predict(self, stamp_s: float) -> float:
-        """Probability that the feature exists at `stamp_s`, which must not lie before the last observation.
+        """Return the probability that the feature exists at `stamp_s`, which must not lie before the last observation.
 
         Raises:
             InputError: a time that is not finite or lies before the last observation.
@@ -162,7 +162,7 @@ class OneStay(Shown):
 
     @classmethod
     def of_text(cls, text: str) -> Self:
-        """The model of a prior as people write it.
+        """Return the model of a prior as people write it.
 
         Raises:
             ConfigError: no prior is written like this.
@@ -222,11 +222,11 @@ class OneStay(Shown):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """What `to_dict` wrote."""
+        """Return the model that `to_dict` wrote."""
         return cls.of_text(str(data["prior"]))
 
     def median_remaining_s(self, age_s: Any) -> FloatArray:
-        """Time by which half of the features that are there at an age have left; inf where half never do.
+        """Return the time by which half of the features that are there at an age have left; inf where half never do.
 
         Args:
             age_s: (N,) time since birth.
@@ -247,7 +247,7 @@ class OneStay(Shown):
 
 
 def births(looks: Looks) -> FloatArray:
-    """(F,) time of every feature's first detection; nan where it never was detected."""
+    """Return (F,) time of every feature's first detection; nan where it never was detected."""
     return np.append(looks.stamp_s, np.nan)[_birth_rows(looks)]
 
 

@@ -46,7 +46,7 @@ class PhaseBelief(Shown):
 
 
 def init(n: int, model: PhaseType, stamp_s: Any) -> PhaseBelief:
-    """Beliefs in `n` features before their first look: the model's start, or its long run at this time.
+    """Return beliefs in `n` features before their first look: the model's start, or its long run at this time.
 
     Args:
         n: number of features.
@@ -67,7 +67,7 @@ def init(n: int, model: PhaseType, stamp_s: Any) -> PhaseBelief:
 
 
 def after(model: PhaseType, looks: Looks) -> PhaseBelief:
-    """Beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
+    """Return beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
 
     Args:
         model: how features come and go.
@@ -88,7 +88,7 @@ def after(model: PhaseType, looks: Looks) -> PhaseBelief:
 
 
 def predict(state: PhaseBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
-    """Probability that each feature is there at `stamp_s`; the state stays as it is.
+    """Return the probability that each feature is there at `stamp_s`; the state stays as it is.
 
     Args:
         state: beliefs in N features.
@@ -105,7 +105,7 @@ def predict(state: PhaseBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray
 def update(
     state: PhaseBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
 ) -> PhaseBelief:
-    """Beliefs after one look at each feature.
+    """Return beliefs after one look at each feature.
 
     Args:
         state: beliefs in N features.
@@ -149,7 +149,7 @@ def _presence(model: PhaseType, phases: FloatArray) -> FloatArray:
 
 
 def time_to_leave(state: PhaseBelief) -> FloatArray:
-    """Expected time until each feature leaves, if it is there.
+    """Return the expected time until each feature leaves, if it is there.
 
     Returns:
         (N,) seconds from `state.stamp_s` on; `inf` where some stay for ever, NaN where the feature is certainly away.
@@ -158,7 +158,7 @@ def time_to_leave(state: PhaseBelief) -> FloatArray:
 
 
 def time_to_return(state: PhaseBelief) -> FloatArray:
-    """Expected time until each feature returns, if it is away.
+    """Return the expected time until each feature returns, if it is away.
 
     Returns:
         (N,) seconds from `state.stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.

@@ -73,7 +73,8 @@ def piece_integral(
     spare: Any,
     integral: FloatArray,
 ) -> float:
-    """Integral over a piece, divided by the probability of the piece; `backward` goes to its begin, likewise divided.
+    """Return the integral over a piece, divided by the probability of the piece; `backward` goes to its begin, likewise
+    divided.
 
     Args:
         forward: (n,) belief at the begin.
@@ -267,7 +268,9 @@ def expect_all(
     fading: Forgetting,
     out: Expectations,
 ) -> tuple[float, int]:
-    """`expect_feature` of all features; the sum of their evidence, and the first look that is impossible or -1."""
+    """Return `expect_feature` of all features; the sum of their evidence, and the first look that is impossible or
+    -1.
+    """
     evidence = 0.0
     for f in range(begin_s.size):
         a, b = first[f], first[f + 1]

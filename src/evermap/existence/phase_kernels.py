@@ -70,7 +70,7 @@ def _two_states(leave: Any, comes: Any, span: Any) -> Any:
 
 @kernel
 def multiply(belief: FloatArray, matrix: FloatArray, spare: FloatArray) -> None:
-    """`belief @ matrix`, in place."""
+    """Compute `belief @ matrix`, in place."""
     n = belief.size
     for j in range(n):
         total = 0.0
@@ -83,7 +83,7 @@ def multiply(belief: FloatArray, matrix: FloatArray, spare: FloatArray) -> None:
 
 @kernel
 def advance(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float, spare: FloatArray) -> None:
-    """`belief @ exp(Q span)`, in place, for constant rates and few jumps; `spare` is (3, n)."""
+    """Compute `belief @ exp(Q span)`, in place, for constant rates and few jumps; `spare` is (3, n)."""
     n = belief.size
     if n == 2:
         a, b = _two_states(rates[0, 1], rates[1, 0], span_s)
@@ -135,7 +135,7 @@ def _product(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def transition(rates: FloatArray, exits: FloatArray, span_s: float, out: FloatArray) -> None:
-    """`exp(Q span)`: a short piece row by row, then squared; rows keep their sum of 1."""
+    """Compute `exp(Q span)`: a short piece row by row, then squared; rows keep their sum of 1."""
     n = exits.size
     fastest = exits.max()
     squarings = 0
@@ -161,7 +161,7 @@ def transition(rates: FloatArray, exits: FloatArray, span_s: float, out: FloatAr
 
 @kernel
 def transitions(rates: FloatArray, exits: FloatArray, span_s: float) -> FloatArray:
-    """`transition` of (B, n, n) rates."""
+    """Return `transition` of (B, n, n) rates."""
     out = np.empty_like(rates)
     for b in range(len(rates)):
         transition(rates[b], exits[b], span_s, out[b])
@@ -170,7 +170,7 @@ def transitions(rates: FloatArray, exits: FloatArray, span_s: float) -> FloatArr
 
 @kernel
 def leap(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float, spare: FloatArray) -> None:
-    """`belief @ exp(Q span)`, in place, for constant rates and any gap."""
+    """Compute `belief @ exp(Q span)`, in place, for constant rates and any gap."""
     if exits.size > 2 and exits.max() * span_s > LONG:
         matrix = np.empty_like(rates)
         transition(rates, exits, span_s, matrix)
@@ -181,7 +181,7 @@ def leap(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float
 
 @kernel
 def travel(belief: FloatArray, chain: Any, from_s: float, to_s: float, spare: FloatArray) -> None:
-    """The belief at `to_s`, in place, through as many tens of minutes of the week as lie between."""
+    """Carry the belief to `to_s`, in place, through as many tens of minutes of the week as lie between."""
     left = to_s - from_s
     if left <= 0.0:
         return
@@ -234,7 +234,7 @@ def first_belief(start: FloatArray, chain: Any, at_s: float, belief: FloatArray,
 def track_feature(
     chain: Any, beginning: Beginning, seen: PhaseLooks, asked_s: FloatArray, p_present: FloatArray, belief: FloatArray
 ) -> tuple[float, int]:
-    """One feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
+    """Return one feature's looks and instants, both in order; evidence, and the look that is impossible or -1.
 
     `belief`, (n,), is filled in with what is believed at the last of them all.
     """
@@ -306,7 +306,7 @@ def track_all_parallel(
     first_asked: IntArray,
     asked_s: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """`track_all`, the features spread over all threads."""
+    """Return `track_all`, the features spread over all threads."""
     # arrays of its own, taken out of tuples: what is written to others, a parallel loop takes for dead
     stamp_s, there, gone = looks
     features = len(first_look) - 1
@@ -322,7 +322,7 @@ def track_all_parallel(
 
 @kernel
 def travel_rows(beliefs: FloatArray, chain: Any, from_s: FloatArray, to_s: FloatArray) -> None:
-    """`travel` of (N, n) beliefs, each between its own instants, in place."""
+    """Carry (N, n) beliefs by `travel`, each between its own instants, in place."""
     spare = np.empty((3, beliefs.shape[1]))
     for row in range(len(beliefs)):
         travel(beliefs[row], chain, from_s[row], to_s[row], spare)

@@ -43,13 +43,14 @@ class Structure:
 
 
 def hyperexponential(stays: int, absences: int, name: str = "") -> Structure:
-    """Several kinds of stays and of absences; each change is between one of these and one of those."""
+    """Return several kinds of stays and of absences; each change is between one of these and one of those."""
     present = np.arange(absences + stays) >= absences
     return Structure(name or f"{stays}+{absences}", present, present[:, None] != present[None, :])
 
 
 def structure_of(name: str) -> Structure:
-    """The structure of a name: 'two-state', 'three-phase' (away, briefly away, there), or '2+3' for two kinds of stays
+    """Return the structure of a name: 'two-state', 'three-phase' (away, briefly away, there), or '2+3' for two kinds
+    of stays
     and three of absences.
 
     Raises:
@@ -113,7 +114,7 @@ class PhaseType(Shown):
 
     @classmethod
     def two_state(cls, leave_hz: float, return_hz: float, *, p_present: float | None = None) -> Self:
-        """Exponential stays and absences.
+        """Return exponential stays and absences.
 
         Args:
             leave_hz: rate at which what is there leaves, in 1/s.
@@ -134,7 +135,7 @@ class PhaseType(Shown):
 
     @classmethod
     def from_mixtures(cls, stay: LifetimePrior, absence: LifetimePrior) -> Self:
-        """Stays and absences that are mixtures of exponentials, each independent of those before.
+        """Return stays and absences that are mixtures of exponentials, each independent of those before.
 
         Args:
             stay: exponential, general purpose (unknown rate), or a mixture of such.
@@ -188,7 +189,9 @@ class PhaseType(Shown):
     def filtered(
         self, looks: Looks, asked: Instants, *, threads: bool = False
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each feature."""
+        """Return presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each
+        feature.
+        """
         from evermap.existence import phase_kernels
 
         there, gone = looks.likelihoods()
@@ -201,7 +204,8 @@ class PhaseType(Shown):
         return p_present, evidence, last
 
     def stationary(self, stamp_s: float | None = None) -> FloatArray:
-        """(n,) probability of each phase in the long run; at this local time of the week where there is a rhythm.
+        """Return (n,) probability of each phase in the long run; at this local time of the week where there is a
+        rhythm.
 
         Raises:
             ConfigError: what lasts depends on the beginning, or a rhythm without a time.
@@ -216,7 +220,7 @@ class PhaseType(Shown):
         return belief
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Return plain numbers, for JSON."""
         assert self.rhythm_of is not None  # filled in above
         return {
             "kind": "phase-type",
@@ -229,7 +233,7 @@ class PhaseType(Shown):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """What `to_dict` wrote."""
+        """Return the model that `to_dict` wrote."""
         return cls(
             np.array(data["present"], dtype=np.bool_),
             np.array(data["rates_hz"], dtype=np.float64),

@@ -18,7 +18,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 
 def as_prior(prior: LifetimePrior | str) -> LifetimePrior:
-    """A lifetime prior, or the one that a text such as `exponential:half-life=30d` describes.
+    """Return a lifetime prior, or the one that a text such as `exponential:half-life=30d` describes.
 
     Raises:
         ConfigError: a text that describes none.
@@ -36,7 +36,7 @@ def as_prior(prior: LifetimePrior | str) -> LifetimePrior:
 
 
 def as_rows(values: Any, n: int, field: str) -> FloatArray:
-    """`values` as float64 of shape (n,): a scalar serves all rows.
+    """Return `values` as float64 of shape (n,): a scalar serves all rows.
 
     Raises:
         InputError: not numbers, or a shape that does not fit.
@@ -125,7 +125,8 @@ def check_looks(
 def as_looks(
     stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, last_s: FloatArray, rows: IntArray | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Looks at as many rows as `last_s` has: their times, and their likelihoods if the feature is there and if not.
+    """Return looks at as many rows as `last_s` has: their times, and their likelihoods if the feature is there and if
+    not.
 
     Raises:
         InputError: shapes, or numbers that `check_looks` refuses.
@@ -140,18 +141,18 @@ def as_looks(
 
 
 def likelihoods(detected: FloatArray, p_miss: FloatArray, p_false: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Likelihood of each look if the feature is there, and if it is not."""
+    """Return the likelihood of each look if the feature is there, and if it is not."""
     seen = detected == 1.0
     return np.where(seen, 1.0 - p_miss, p_miss), np.where(seen, p_false, 1.0 - p_false)
 
 
 def impossible(who: str) -> str:
-    """The one sentence for an observation that neither state of the feature can have caused."""
+    """Return the one sentence for an observation that neither state of the feature can have caused."""
     return f"{who}: this observation is impossible, whether the feature is there or gone"
 
 
 def check_rows(rows: Any, n: int, *, twice: bool = False, field: str = "rows") -> IntArray:
-    """Row numbers as int64, each in range and, unless `twice` is allowed, at most once.
+    """Return row numbers as int64, each in range and, unless `twice` is allowed, at most once.
 
     Raises:
         InputError: a row that does not exist.
@@ -193,17 +194,17 @@ class Looks(Shown):
         return len(self.first) - 1
 
     def of(self, feature: int) -> Looks:
-        """The looks at one feature alone."""
+        """Return the looks at one feature alone."""
         rows = slice(int(self.first[feature]), int(self.first[feature + 1]))
         first = np.array([0, rows.stop - rows.start])
         return Looks(first, self.stamp_s[rows], self.detected[rows], self.p_miss[rows], self.p_false[rows])
 
     def likelihoods(self) -> tuple[FloatArray, FloatArray]:
-        """(M,) likelihood of each look if the feature is there, and if it is not."""
+        """Return (M,) likelihood of each look if the feature is there, and if it is not."""
         return likelihoods(self.detected, self.p_miss, self.p_false)
 
     def impossible(self, row: int) -> NumericalError:
-        """The error of a look that is impossible, whether the feature is there or not."""
+        """Return the error of a look that is impossible, whether the feature is there or not."""
         feature = int(np.searchsorted(self.first, row, side="right")) - 1
         who = f"feature {feature} at {self.stamp_s[row]} s"
         return NumericalError(impossible(who), hint="P_M and P_F strictly between 0 and 1", row=row)
@@ -260,12 +261,12 @@ class Instants(Shown):
 
     @classmethod
     def of_looks(cls, looks: Looks) -> Instants:
-        """The instants of the looks themselves."""
+        """Return the instants of the looks themselves."""
         return cls(looks.first, looks.stamp_s)
 
     @classmethod
     def same_for_all(cls, n_features: int, stamp_s: Any) -> Instants:
-        """The same instants for every feature.
+        """Return the same instants for every feature.
 
         Raises:
             InputError: times that are not finite or not in order.
@@ -316,7 +317,7 @@ class PresenceModel(PresenceFilter, Protocol):
         ...
 
     def to_dict(self) -> dict[str, Any]:
-        """The model as plain numbers and words, for JSON; `evermap.existence.models.model_of` reads it back."""
+        """Return the model as plain numbers and words, for JSON; `evermap.existence.models.model_of` reads it back."""
         ...
 
 

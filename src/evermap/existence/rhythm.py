@@ -53,21 +53,21 @@ class Rhythm(Shown):
         return np.asarray(np.exp(self.log_factor), dtype=np.float64)
 
     def at(self, stamp_s: ArrayLike) -> FloatArray:
-        """The factor at some instants."""
+        """Return the factor at some instants."""
         return np.asarray(self.factor[bin_of_week(stamp_s)], dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Return plain numbers, for JSON."""
         return {"log_factor": [round(float(value), 5) for value in self.log_factor]}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Rhythm:
-        """What `to_dict` wrote."""
+        """Return the model that `to_dict` wrote."""
         return cls(np.array(data["log_factor"], dtype=np.float64))
 
 
 def bin_of_week(stamp_s: ArrayLike) -> IntArray:
-    """Which ten minutes of the week an instant lies in, 0 from Monday 00:00, stamps in local wall time."""
+    """Return which ten minutes of the week an instant lies in, 0 from Monday 00:00, stamps in local wall time."""
     phase = np.mod(np.asarray(stamp_s, dtype=np.float64) - MONDAY_S, WEEK_S)
     return np.minimum((phase / BIN_S).astype(np.int64), BINS - 1)
 
@@ -123,12 +123,12 @@ class SmoothRates(Shown):
 
 
 def constant(n: int) -> Basis:
-    """One level for all of n points."""
+    """Return one level for all of n points."""
     return Basis(np.ones((n, 1)), (), np.zeros((1, 1)))
 
 
 def age_basis(log_age: FloatArray, knots: int) -> Basis:
-    """A cubic spline in the logarithm of age, its second differences penalised (Eilers and Marx 1996)."""
+    """Return a cubic spline in the logarithm of age, its second differences penalised (Eilers and Marx 1996)."""
     low, high = float(log_age[0]), float(log_age[-1])
     columns = _spline(log_age, low, max(high - low, 1e-6) / knots, knots)
     difference = np.diff(np.eye(columns.shape[1]), 2, axis=0)
@@ -136,7 +136,7 @@ def age_basis(log_age: FloatArray, knots: int) -> Basis:
 
 
 def week_basis() -> Basis:
-    """A daily curve shared by all days, a weekend, and a level and a smoother curve of each day of the week."""
+    """Return a daily curve shared by all days, a weekend, and a level and a smoother curve of each day of the week."""
     time = (np.arange(BINS_OF_DAY) + 0.5) / BINS_OF_DAY
     shared, own = _cyclic_spline(time, DAY_KNOTS), _cyclic_spline(time, DEVIATION_KNOTS)
     weekend = np.repeat(np.arange(7) >= 5, BINS_OF_DAY)[:, None].astype(np.float64)
@@ -155,7 +155,9 @@ def week_basis() -> Basis:
 
 
 def steady_level(n: int) -> Basis:
-    """A level for each of n periods, from one to the next changed as little as the events allow: a random walk."""
+    """Return a level for each of n periods, from one to the next changed as little as the events allow: a random
+    walk.
+    """
     difference = np.diff(np.eye(n), axis=0)
     return Basis(np.eye(n), (difference.T @ difference,) if n > 1 else (), np.zeros((n, n)))
 
@@ -163,7 +165,7 @@ def steady_level(n: int) -> Basis:
 def fit(
     events: FloatArray, exposure: FloatArray, age: Basis, week: Basis | None, start: SmoothRates | None = None
 ) -> SmoothRates:
-    """Log rates of greatest penalised likelihood, the penalties' weights by marginal likelihood.
+    """Return log rates of greatest penalised likelihood, the penalties' weights by marginal likelihood.
 
     Args:
         events: (I, J) expected numbers of events by age and time of the week.

@@ -155,7 +155,7 @@ class RunLength(Shown):
         return week
 
     def to_dict(self) -> dict[str, Any]:
-        """The model as plain numbers and words, for JSON."""
+        """Return the model as plain numbers and words, for JSON."""
         from evermap.survival.text import prior_to_dict
 
         return {
@@ -171,7 +171,7 @@ class RunLength(Shown):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> RunLength:
-        """What `to_dict` wrote."""
+        """Return the model that `to_dict` wrote."""
         from evermap.survival.text import prior_from_dict
 
         rhythms = (data["stay_rhythm"], data["absence_rhythm"])
@@ -245,7 +245,7 @@ class RunLengthBelief(Shown):
 
 
 def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
-    """Beliefs about features that are heard of for the first time.
+    """Return beliefs about features that are heard of for the first time.
 
     Args:
         model: how they come and go.
@@ -266,7 +266,7 @@ def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
 
 
 def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
-    """Probability that each feature is present at `stamp_s`; the state stays as it is.
+    """Return the probability that each feature is present at `stamp_s`; the state stays as it is.
 
     Args:
         state: beliefs about N features.
@@ -289,7 +289,7 @@ def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatA
 def update(
     state: RunLengthBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
 ) -> RunLengthBelief:
-    """Beliefs after one look at each feature.
+    """Return beliefs after one look at each feature.
 
     Args:
         state: beliefs about N features.
@@ -328,7 +328,7 @@ WEEKS = 8
 
 
 def after(model: RunLength, looks: Looks) -> RunLengthBelief:
-    """Beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
+    """Return beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
 
     Args:
         model: how features come and go.
@@ -356,7 +356,7 @@ def after(model: RunLength, looks: Looks) -> RunLengthBelief:
 
 
 def time_to_leave(state: RunLengthBelief) -> FloatArray:
-    """Expected time until each feature leaves, if it is there.
+    """Return the expected time until each feature leaves, if it is there.
 
     Returns:
         (N,) seconds from `state.stamp_s` on: the mean residual life `int S(a + t) dt / S(a)` over what is believed of
@@ -367,7 +367,7 @@ def time_to_leave(state: RunLengthBelief) -> FloatArray:
 
 
 def time_to_return(state: RunLengthBelief) -> FloatArray:
-    """Expected time until each feature returns, if it is away; as `time_to_leave`.
+    """Return the expected time until each feature returns, if it is away; as `time_to_leave`.
 
     Returns:
         (N,) seconds from `state.stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.
@@ -376,7 +376,7 @@ def time_to_return(state: RunLengthBelief) -> FloatArray:
 
 
 def p_stays(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
-    """Probability that a feature which is there now is still there, without a break, at instants ahead.
+    """Return the probability that a feature which is there now is still there, without a break, at instants ahead.
 
     Args:
         state: beliefs about N features.
@@ -392,7 +392,7 @@ def p_stays(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
 
 
 def p_stays_away(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
-    """Probability that a feature which is away now has not returned at instants ahead; as `p_stays`.
+    """Return the probability that a feature which is away now has not returned at instants ahead; as `p_stays`.
 
     Args:
         state: beliefs about N features.
@@ -408,7 +408,8 @@ def p_stays_away(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
 
 
 def residual_life(table: HazardTable, age_s: FloatArray) -> FloatArray:
-    """Expected time that is left at an age: closed in every bin of the table, an exponential tail after the last.
+    """Return the expected time that is left at an age: closed in every bin of the table, an exponential tail after the
+    last.
 
     Args:
         table: a lifetime.

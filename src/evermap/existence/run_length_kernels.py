@@ -112,7 +112,7 @@ class First(NamedTuple):
 
 @inlined
 def age_bin(age_s: Any, law: Any) -> Any:
-    """The bin of an age."""
+    """Return the bin of an age."""
     return min(max((np.float64(age_s).view(np.int64) >> SHIFT) - law.offset, 0), law.hazard_hz.shape[1] - 1)
 
 
@@ -264,7 +264,7 @@ def _present(held: RunHypotheses, now: float, later: float, law: Law, scratch: F
 def advance(
     held: RunHypotheses, now: float, until: float, law: Law, space: Workspace, whole: bool
 ) -> tuple[float, float]:
-    """Whole steps from `now` on as long as they end before `until`, and the rest of the way unless `whole`.
+    """Return whole steps from `now` on as long as they end before `until`, and the rest of the way unless `whole`.
 
     Returns:
         The time reached, and the mass merged.
@@ -292,7 +292,7 @@ def nothing_held(slots: int) -> RunHypotheses:
 
 @kernel
 def begin(held: RunHypotheses, stamp_s: float, prior: First) -> None:
-    """The belief before anything is known: ages and weights for this time of the week."""
+    """Set the belief before anything is known: ages and weights for this time of the week."""
     start, weight, count = held
     week = _week_bin(stamp_s, len(prior.number))
     for s in range(2):
@@ -351,7 +351,7 @@ def track(
     law: Law,
     prior: First,
 ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """`_track_one` for every feature, over all threads.
+    """Return `_track_one` for every feature, over all threads.
 
     Returns:
         (Q,) presence at the instants asked for, (F,) log evidence, (F,) mass merged, and (F,) the number of the first
@@ -371,7 +371,7 @@ def track(
 
 @kernel
 def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law, belief: FloatArray) -> int:
-    """One look at each of many features, in place; the first row that is impossible under both states, or -1."""
+    """Return one look at each of many features, in place; the first row that is impossible under both states, or -1."""
     everyone, now_s, evidence, moved = state
     stamp_s, absent, present = looks
     space = _room(everyone.start.shape[2])
@@ -391,7 +391,7 @@ def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law, b
 
 @kernel
 def predict_rows(rows: IntArray, state: BeliefRows, stamp_s: FloatArray, law: Law, belief: FloatArray) -> None:
-    """Presence of many features at one instant each; nothing of the state changes."""
+    """Evaluate presence of many features at one instant each; nothing of the state changes."""
     everyone, now_s = state.held, state.now_s
     space = _room(everyone.start.shape[2])
     for i in range(len(rows)):
@@ -452,7 +452,7 @@ def _go_on(
 
 @kernel
 def lasting_rows(state: BeliefRows, s: int, asked_s: FloatArray, law: Law, out: FloatArray) -> None:
-    """Probability that state `s` goes on without a break until instants in order, given that it is the present one."""
+    """Evaluate the probability that state `s`, the present one, lasts until instants in order."""
     start, weight, count = state.held
     now_s = state.now_s
     scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
@@ -471,7 +471,7 @@ def lasting_rows(state: BeliefRows, s: int, asked_s: FloatArray, law: Law, out: 
 
 @kernel
 def remaining_rows(state: BeliefRows, s: int, law: Law, weeks: int, out: FloatArray) -> None:
-    """Expected time that state `s` goes on, given that it is the present one: step by step for some weeks.
+    """Evaluate the expected time that state `s` goes on, given that it is the present one: step by step for some weeks.
 
     Of what is left then, each further week leaves the same part as the last one did.
     """

@@ -46,7 +46,9 @@ class Lattice(NamedTuple):
 
 
 def lattice(looks: Looks, step_s: float) -> Lattice:
-    """One feature's looks, with whole steps after each and a shorter one before the next, as the filter takes them."""
+    """Return one feature's looks, with whole steps after each and a shorter one before the next, as the filter takes
+    them.
+    """
     stamp, first = np.unique(looks.stamp_s, return_index=True)
     present, absent = (np.multiply.reduceat(values, first) for values in looks.likelihoods())
     steps = np.maximum(np.ceil(np.diff(stamp) / step_s * (1.0 - 1e-12)).astype(np.int64), 1)

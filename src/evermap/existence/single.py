@@ -63,7 +63,7 @@ def init(
     prior_of_row: IntArray | Sequence[int] | None = None,
     evidence: bool = False,
 ) -> Belief:
-    """Beliefs at birth: `n` features that are certainly there, at time 0 of their own clocks.
+    """Return beliefs at birth: `n` features that are certainly there, at time 0 of their own clocks.
 
     Args:
         n: number of features.
@@ -102,7 +102,7 @@ def init(
 
 
 def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
-    """Probability that each feature exists at `stamp_s`; the state stays as it is.
+    """Return the probability that each feature exists at `stamp_s`; the state stays as it is.
 
     Args:
         state: beliefs of N features.
@@ -126,7 +126,7 @@ def predict(state: Belief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
 
 
 def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None) -> Belief:
-    """Beliefs after one look at each feature.
+    """Return beliefs after one look at each feature.
 
     Args:
         state: beliefs of N features.
@@ -148,7 +148,7 @@ def update(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any
 
 
 def observe(state: Belief, stamp_s: Any, log_there: Any, log_gone: Any = 0.0, *, rows: Any = None) -> Belief:
-    """Beliefs after one look at each feature, whatever model of detection says how likely its outcome was.
+    """Return beliefs after one look at each feature, whatever model of detection says how likely its outcome was.
 
     With `log p(y | there) - log p(y | gone)` in the place of `log_there` the beliefs are the same; the evidence is then
     relative to that of a world without the features.

@@ -42,14 +42,14 @@ class CliqueChains:
         return int(np.max(np.diff(self.first), initial=1))
 
     def by_row(self, of_site: Any, of_clique: Any) -> Any:
-        """(R,) a column by seat."""
+        """Return (R,) a column by seat."""
         column = np.empty(len(self.clique), dtype=np.asarray(of_site).dtype)
         column[self.first[:-1]] = of_clique
         column[self.row_of_site] = of_site
         return column
 
     def start(self, p_here: FloatArray, held: BoolArray) -> FloatArray:
-        """(R,) probabilities of all seats; those of a clique that is held are all at its sites."""
+        """Return (R,) probabilities of all seats; those of a clique that is held are all at its sites."""
         n = len(held)
         site_clique = self.clique[self.row_of_site]
         total = np.bincount(site_clique, p_here, minlength=n)
@@ -61,7 +61,7 @@ class CliqueChains:
         return np.asarray(self.by_row(here, np.where(firm, 0.0, np.maximum(1.0 - total, 0.0))))
 
     def routes(self, p_hop: FloatArray, return_share: FloatArray, held: BoolArray) -> tuple[FloatArray, FloatArray]:
-        """(R, W) where one that leaves a seat goes, by seat of its clique, and (R,) the sum: the rest stays."""
+        """Return (R, W) where one that leaves a seat goes, by seat of its clique, and (R,) the sum: the rest stays."""
         share = self.by_row(return_share, 0.0)
         width = self.width
         seat = np.arange(len(self.clique)) - self.first[self.clique]
@@ -81,7 +81,7 @@ class CliqueChains:
 
 
 def distinct(priors: tuple[LifetimePrior, ...]) -> tuple[tuple[LifetimePrior, ...], IntArray]:
-    """The different ones among priors, and which of these each is."""
+    """Return the different ones among priors, and which of these each is."""
     number: dict[object, int] = {}
     row = np.array([number.setdefault(_name(prior), len(number)) for prior in priors], dtype=np.int64)
     first = np.unique(row, return_index=True)[1]
@@ -98,7 +98,7 @@ def _name(prior: LifetimePrior) -> object:
 
 
 def odds(priors: tuple[LifetimePrior, ...], prior: IntArray, start_s: FloatArray, stop_s: FloatArray) -> FloatArray:
-    """(R, M) odds of leaving within gaps [start, stop) of age."""
+    """Return (R, M) odds of leaving within gaps [start, stop) of age."""
     log_odds = log_death_odds(priors, np.repeat(prior, start_s.shape[1]), start_s.ravel(), stop_s.ravel())
     certain = np.isinf(log_odds)
     bounded = np.clip(log_odds, -LOG_LARGEST, LOG_LARGEST)

@@ -107,7 +107,7 @@ class SiteChain(NamedTuple):
 
 @kernel
 def frame_evidence(rows: FrameRows, slots: Slots, sensor: SensorNumbers, said: FrameEvidence) -> None:
-    """What frames say for each seat against 'away', the lines of sight being learned on the way.
+    """Weigh what frames say for each seat against 'away', the lines of sight being learned on the way.
 
     All is given that the clique has been at a site all the time. (Of one that comes while it is watched, the looks
     before count too: a little too cautious then.) Whether the lines of sight to it are free changes as seldom as what
@@ -192,9 +192,9 @@ def renew(
     new: FloatArray,
     began: FloatArray,
 ) -> None:
-    """Beliefs over a long gap, in which a clique may leave and return many times: the renewal equation in M steps.
+    """Carry beliefs over a long gap in which a clique may leave and return many times: the renewal equation in M steps.
 
-    Who comes in one of the steps does so in its middle; who leaves again in the same one comes somewhere in the next.
+    A clique that arrives within a step does so in its middle; one that leaves in the same step arrives in the next.
 
     Args:
         seat: (C + 1,) rows of the seats of each clique.
@@ -255,7 +255,7 @@ def forward(
     log_odds: FloatArray,
     log_evidence: FloatArray,
 ) -> None:
-    """Beliefs after each frame of every clique, the first of which lies where they are known.
+    """Follow beliefs after each frame of every clique, the first of which lies where they are known.
 
     Args:
         chain: of the cliques.

@@ -228,7 +228,7 @@ class CliqueFrames:
 
     @classmethod
     def of(cls, looks: SiteLooks, n_cliques: int, until_s: float) -> CliqueFrames:
-        """The frames of a session that ends at `until_s`."""
+        """Return the frames of a session that ends at `until_s`."""
         order = np.lexsort((looks.site, looks.stamp_s, looks.clique))
         clique, stamp = looks.clique[order], looks.stamp_s[order]
         opens = np.append(True, (np.diff(clique) != 0) | (np.diff(stamp) != 0))[: len(order)]
@@ -319,7 +319,7 @@ def follow_sites(
     shape = first.steps.log_rest.shape
 
     def filtered(said: FrameEvidence) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Log probabilities after each frame, what it said for the sites, and the evidence of all."""
+        """Return log probabilities after each frame, what it said for the sites, and the evidence of all."""
         found = np.empty(shape), np.empty(len(frames)), np.empty(n_cliques)
         kernels.forward(chain, log_here, said.log_ratio, *found)
         return found

@@ -94,12 +94,12 @@ class Fitted(Shown):
         return float((counts.events * log_hazard).sum() - (counts.exposure_s * hazard).sum())
 
     def score(self, counts: Sojourns) -> float:
-        """Log likelihood less the price of the parameters (Schwarz 1978)."""
+        """Return log likelihood less the price of the parameters (Schwarz 1978)."""
         return self.log_likelihood(counts) - 0.5 * self.freedom * float(np.log(max(counts.n_events, 2.0)))
 
 
 def hazards(prior: LifetimePrior, edge_s: FloatArray) -> FloatArray:
-    """(A,) mean hazard of a lifetime in each bin of age."""
+    """Return (A,) mean hazard of a lifetime in each bin of age."""
     return _mean_hazards(prior.cumulative_hazard(edge_s), edge_s)
 
 
@@ -111,7 +111,7 @@ def _mean_hazards(cumulative: FloatArray, edge_s: FloatArray) -> FloatArray:
 
 
 def exponential(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
-    """A hazard that does not depend on age."""
+    """Return a hazard that does not depend on age."""
     total = counts.exposure_s.sum()
     if rhythm:
         events, exposure = counts.events.sum(0)[None, :], counts.exposure_s.sum(0)[None, :]
@@ -124,7 +124,7 @@ def exponential(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool =
 
 
 def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = False) -> Fitted:
-    """Any smooth function of log age as log hazard, constant beyond the ages that were seen."""
+    """Return a smooth function of log age as log hazard, constant beyond the ages that were seen."""
     seen = np.flatnonzero(counts.exposure_s.sum(1) > 0.0)
     if not seen.size:
         return exponential(counts, rhythm=rhythm)
@@ -144,16 +144,16 @@ def smooth(counts: Sojourns, start: Fitted | None = None, *, rhythm: bool = Fals
 
 
 def weibull(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """A hazard that is a power of age."""
+    """Return a hazard that is a power of age."""
     return _two_parameters("weibull", counts, lambda a, b: Weibull(exp(a), exp(b)))
 
 
 def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """A sum of exponential phases."""
+    """Return a sum of exponential phases."""
     from scipy.special import gammaincc
 
     def cumulative(a: float, b: float, edge_s: FloatArray) -> FloatArray:
-        """As `Gamma` has it, but for its far tails, at a fortieth of the time."""
+        """Return what `Gamma` has, but for its far tails, at a fortieth of the time."""
         with np.errstate(divide="ignore"):
             return np.asarray(-np.log(gammaincc(exp(b), edge_s / exp(a - b))), dtype=np.float64)
 
@@ -161,12 +161,12 @@ def gamma(counts: Sojourns, _: Fitted | None = None) -> Fitted:
 
 
 def lognormal(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """One typical duration and its spread."""
+    """Return one typical duration and its spread."""
     return _two_parameters("lognormal", counts, lambda a, b: LogNormal(a, exp(b)))
 
 
 def peaks(counts: Sojourns, _: Fitted | None = None) -> Fitted:
-    """Some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
+    """Return some typical durations, each with a small spread, on a wide background; as many as pay for themselves."""
     best = _mixture(counts, 0)
     for n in range(1, MOST_PEAKS + 1):
         fitted = _mixture(counts, n)

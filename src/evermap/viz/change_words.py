@@ -13,7 +13,9 @@ _MAX_IDS = 12
 
 
 def explanations(result: SlamResult) -> list[str]:
-    """One line for each change, then 'or: ...' for each alternative worth telling; [] where nothing is in question."""
+    """Return one line for each change, then 'or: ...' for each alternative worth telling; [] where nothing is in
+    question.
+    """
     start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
     near = near_alternatives(result)
     lines = [f"{describe(change, start_s)}, {probability(change.probability)}" for change in result.changes]
@@ -26,24 +28,26 @@ def explanations(result: SlamResult) -> list[str]:
 
 
 def near_alternatives(result: SlamResult) -> tuple[Alternative, ...]:
-    """Alternatives within `NATS` of the best explanation, which has at most the probability of each of its changes."""
+    """Return alternatives within `NATS` of the best explanation, which has at most the probability of each of its
+    changes.
+    """
     rest = 1.0 - sum(alternative.probability for alternative in result.alternatives)
     best = min((change.probability for change in result.changes), default=rest)
     return tuple(other for other in result.alternatives if other.probability >= math.exp(-NATS) * best)
 
 
 def describe_all(changes: Sequence[MapChange], start_s: float) -> str:
-    """All changes of one explanation in one line."""
+    """Return all changes of one explanation in one line."""
     return "; ".join(describe(change, start_s) for change in changes) or "nothing moved"
 
 
 def describe(change: MapChange, start_s: float) -> str:
-    """'landmarks 11, 12, 13 moved by (+1.00, 0.00) m before the session'; times count from `start_s`."""
+    """Return 'landmarks 11, 12, 13 moved by (+1.00, 0.00) m before the session'; times count from `start_s`."""
     return f"{what(change)} {_when(change, start_s)}"
 
 
 def what(change: MapChange) -> str:
-    """The change without its time."""
+    """Return the change without its time."""
     if change.kind is ChangeKind.SWAPPED:
         return f"{_group(change)} exchanged their identities"
     if change.kind is ChangeKind.VANISHED:
@@ -60,13 +64,15 @@ def what(change: MapChange) -> str:
 
 
 def probability(value: float) -> str:
-    """'probability 97 %'; never certain."""
+    """Return 'probability 97 %'; never certain."""
     percent = f"{100 * value:.0f} %"
     return "probability " + ("> 99 %" if value > 0.99 else "< 1 %" if value < 0.01 else percent)
 
 
 def grew(count: int | None, labels: Sequence[str] = ()) -> list[str]:
-    """'the map grew by 2 landmarks: 17, 18': what was found, but not seen to appear; [] where that is nothing."""
+    """Return 'the map grew by 2 landmarks: 17, 18': what was found, but not seen to appear; [] where that is
+    nothing.
+    """
     if not count:
         return []
     return [f"the map grew by {count} landmark{'s' if count != 1 else ''}" + (f": {_listed(labels)}" if labels else "")]

@@ -47,7 +47,7 @@ def plot_raster(
     title: str | None = None,
     clock: Clock = Clock.RECORDING,
 ) -> Figure:
-    """Figure of F features over T stretches of time.
+    """Draw a figure of F features over T stretches of time.
 
     Args:
         names: F labels, from top to bottom.
@@ -144,7 +144,8 @@ _HALF_LIVES = 100.0
 
 
 def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
-    """Figure of forecasts, one row a model: presence after it was certainly seen there, or gone, and over the week.
+    """Draw a figure of forecasts, one row a model: presence after it was certainly seen there, or gone, and over the
+    week.
 
     Looks are taken on a Monday at noon. The first eight models are drawn.
 
@@ -166,7 +167,7 @@ def plot_presence_models(models: Mapping[str, PresenceModel]) -> Figure:
 
 
 def week_of_presence(model: PresenceModel) -> tuple[FloatArray, FloatArray]:
-    """Presence over a week that nobody looks at, long after the last look.
+    """Return presence over a week that nobody looks at, long after the last look.
 
     Args:
         model: any model of presence.
@@ -181,7 +182,7 @@ def week_of_presence(model: PresenceModel) -> tuple[FloatArray, FloatArray]:
 
 
 def has_rhythm(model: PresenceModel) -> bool:
-    """Whether the model knows the time of the week."""
+    """Return whether the model knows the time of the week."""
     return any(getattr(model, name, None) for name in ("rhythms", "stay_rhythm", "absence_rhythm"))
 
 
@@ -229,7 +230,7 @@ def _week(axes: Axes, time_s: Any, presence: Any, *, last: bool) -> None:
 
 
 def plot_reliability(bins: Reliability, scores: BeliefScores, *, title: str | None = None) -> Figure:
-    """Figure of the share of truth in each bin of belief, above the count of each bin on a logarithmic scale.
+    """Draw a figure of the share of truth in each bin of belief, above the count of each bin on a logarithmic scale.
 
     Args:
         bins: `reliability(...)`.

@@ -293,17 +293,17 @@ _MAX_LANDMARK_ROWS = 500
 
 
 def is_noise(parameter: ParameterEstimate) -> bool:
-    """Noise levels are named `sigma_...`; everything else is a calibration state."""
+    """Return whether a parameter is a noise level, named `sigma_...`, and not a calibration state."""
     return parameter.name.startswith("sigma_")
 
 
 def calibration_table(result: SlamResult) -> str:
-    """Calibration states with uncertainty and prior; '' if there is none."""
+    """Return calibration states with uncertainty and prior; '' if there is none."""
     return _parameters([parameter for parameter in result.parameters if not is_noise(parameter)])
 
 
 def noise_table(result: SlamResult) -> str:
-    """Noise levels as the recording determined them; '' if there is none."""
+    """Return noise levels as the recording determined them; '' if there is none."""
     return _parameters([parameter for parameter in result.parameters if is_noise(parameter)])
 
 
@@ -358,7 +358,7 @@ def _number(value: float, digits: int) -> str:
 
 
 def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
-    """The map, landmark by landmark, with its error where surveyed; '' if it is empty."""
+    """Return the map, landmark by landmark, with its error where surveyed; '' if it is empty."""
     landmarks, errors = result.landmarks, evaluation.landmarks or evaluation.landmarks_own
     if len(landmarks) == 0:
         return ""

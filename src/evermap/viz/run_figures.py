@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def draw_figures(
     recording: Recording, result: SlamResult, evaluation: Evaluation, *, real_time_factor: float | None = None
 ) -> tuple[NamedFigure, ...]:
-    """All figures that this run has something to show in, in the order of the report.
+    """Return all figures that this run has something to show in, in the order of the report.
 
     Args:
         recording: what was processed.
@@ -65,13 +65,13 @@ _RASTER_FROM = 1500
 
 
 def blind_stretches(stamp_s: FloatArray, longer_than_s: float = BLIND_S) -> FloatArray:
-    """(B, 2) start and end of the gaps between frames."""
+    """Return (B, 2) start and end of the gaps between frames."""
     gaps = np.flatnonzero(np.diff(stamp_s) > longer_than_s)
     return np.stack([stamp_s[gaps], stamp_s[gaps + 1]], axis=1) if len(gaps) else np.zeros((0, 2))
 
 
 def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
-    """Position and heading error with the 2-sigma band; the band alone where there is no truth."""
+    """Draw the position and heading error with the 2-sigma band; the band alone where there is no truth."""
     figure = new_figure(7.2, 4.2)
     above, below = figure.subplots(2, 1, sharex=True)
     start_s = _start(recording)
@@ -116,7 +116,7 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
 
 
 def draw_consistency(result: SlamResult) -> NamedFigure | None:
-    """NIS over time with its 95% band and running mean, and its histogram against the chi-square density."""
+    """Draw the NIS over time with its 95% band and running mean, and its histogram against the chi-square density."""
     finite = np.isfinite(result.innovations.nis)
     if not np.any(finite):
         return None
@@ -167,7 +167,7 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
 
 
 def draw_latency(recording: Recording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
-    """Processing time of every step, with the median, the 99th percentile and the time there was."""
+    """Draw the processing time of every step, with the median, the 99th percentile and the time there was."""
     count = len(result.step_s)
     if count == 0:
         return None
@@ -244,7 +244,7 @@ def _error_caption(evaluation: Evaluation, blind: int) -> str:
 
 
 def quantity(value: float, sigma: float, unit: str) -> str:
-    """`0.2104 ± 0.0038 s`: two digits of the uncertainty decide how many the value gets."""
+    """Return `0.2104 ± 0.0038 s`: two digits of the uncertainty decide how many the value gets."""
     suffix = "" if unit == "1" else f" {unit.replace('^2', '²')}"
     if not math.isfinite(sigma) or sigma <= 0:
         return f"{value:.4g}{suffix}".replace("-", "\N{MINUS SIGN}", 1)
@@ -253,12 +253,12 @@ def quantity(value: float, sigma: float, unit: str) -> str:
 
 
 def has_prior(parameter: ParameterEstimate) -> bool:
-    """Whether it was estimated against a finite prior."""
+    """Return whether it was estimated against a finite prior."""
     return not parameter.fixed and math.isfinite(parameter.prior_mean) and 0 < parameter.prior_sigma < math.inf
 
 
 def draw_calibration(result: SlamResult) -> NamedFigure | None:
-    """Estimates in units of their prior's standard deviation, numbers beside them; None without any prior."""
+    """Return estimates in units of their prior's standard deviation, numbers beside them; None without any prior."""
     shown = [parameter for parameter in result.parameters if has_prior(parameter)]
     if not shown:
         return None

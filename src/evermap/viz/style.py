@@ -143,7 +143,7 @@ class NamedFigure:
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Matplotlib settings of this module while drawing, and only then."""
+    """Yield matplotlib settings of this module while drawing, and only then."""
     import matplotlib as mpl
 
     with mpl.rc_context(_RC), warnings.catch_warnings():
@@ -153,7 +153,7 @@ def house_style() -> Iterator[None]:
 
 
 def legend_name(name: str) -> str:
-    """A name for a legend or a title: as it is, on one line, and also where it begins with an underscore.
+    """Return a name for a legend or a title: as it is, on one line, and also where it begins with an underscore.
 
     Matplotlib leaves what is labelled with a leading underscore out of legends.
     """
@@ -171,7 +171,7 @@ def legend_of(*panels: Axes) -> tuple[list[Any], list[str]]:
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure with an Agg canvas and constrained layout. Call within `house_style`."""
+    """Return an empty figure with an Agg canvas and constrained layout. Call within `house_style`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

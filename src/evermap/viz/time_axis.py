@@ -52,7 +52,7 @@ class TimeUnit:
 
 
 def unit_for(span_s: float) -> TimeUnit:
-    """Seconds up to 5 minutes, then minutes up to 3 hours, hours up to 3 days, days."""
+    """Return seconds up to 5 minutes, then minutes up to 3 hours, hours up to 3 days, days."""
     return next(TimeUnit(name, seconds) for limit, name, seconds in _UNITS if span_s <= limit)
 
 
@@ -72,21 +72,21 @@ class TimeAxis:
 
     @classmethod
     def over(cls, first_s: float, last_s: float, clock: Clock) -> TimeAxis:
-        """For stamps from `first_s` to `last_s`; `Clock.RECORDING` counts from 0 or a far-off start."""
+        """Return the axis for stamps from `first_s` to `last_s`; `Clock.RECORDING` counts from 0 or a far-off start."""
         if clock is Clock.RECORDING:
             start_s = 0.0 if 0.0 <= first_s <= last_s - first_s else first_s
             return cls(start_s, unit_for(last_s - start_s))
         return cls(first_s, None, "UTC" if clock is Clock.UNIX else "local clock")
 
     def coordinates(self, stamp_s: Any) -> Any:
-        """Stamps as matplotlib wants them: floats in the axis' unit, or datetime64."""
+        """Return stamps as matplotlib wants them: floats in the axis' unit, or datetime64."""
         stamps: FloatArray = np.asarray(stamp_s, dtype=np.float64)
         if self.unit is not None:
             return (stamps - self.start_s) / self.unit.seconds
         return np.round(stamps * 1e6).astype(np.int64).astype("datetime64[us]")
 
     def label(self, axes: Axes) -> None:
-        """Ticks and the axis label with its unit."""
+        """Set ticks and the axis label with its unit."""
         if self.unit is not None:
             axes.set_xlabel(f"time{' since the start' if self.start_s else ''} [{self.unit.name}]")
             return
@@ -99,7 +99,7 @@ class TimeAxis:
 
 
 def label_durations(axes: Axes, low_s: float, high_s: float, unit: TimeUnit) -> None:
-    """A logarithmic axis in `unit` from `low_s` to `high_s`, with ticks such as `1 min` and `1 day`."""
+    """Make a logarithmic axis in `unit` from `low_s` to `high_s`, with ticks such as `1 min` and `1 day`."""
     from matplotlib.ticker import NullFormatter, NullLocator
 
     axes.set_xscale("log")
