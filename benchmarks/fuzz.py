@@ -595,7 +595,7 @@ def _models(folder: Path) -> tuple[bytes, ...]:
 
 def _read_model(folder: Path) -> Callable[[Path], Any]:
     from evermap.existence.protocol import Instants
-    from evermap.runs.persist.modelfile import load_models
+    from evermap.runs.persist.models import load_models
     from evermap.runs.persist.table import read_looks
 
     table = folder / "looks-for-models.csv"

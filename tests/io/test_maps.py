@@ -16,7 +16,7 @@ from hypothesis.extra import numpy as hnp
 
 from evermap.errors import DataError, InputError
 from evermap.io import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
-from evermap.io.geojson import ellipse_polygons
+from evermap.io.landmarks import ellipse_polygons
 from evermap.types import Clock, Landmarks
 
 WRITERS = {"map.parquet": write_map_parquet, "map.geojson": write_map_geojson}

@@ -16,7 +16,7 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.existence.models import Choice
-    from evermap.runs.persist.learning import LearnedModels
+    from evermap.runs.persist.models import LearnedModels
     from evermap.runs.track.lifetimes import LifetimeEstimate, LifetimeGroup, LifetimeTable
     from evermap.survival import LifetimePrior
 
@@ -222,8 +222,7 @@ def learn(
     if figure is not None:
         check_picture(figure, "figure", inputs=[input])
     from evermap.runs.folder import check_output_file
-    from evermap.runs.persist.learning import learn_models
-    from evermap.runs.persist.modelfile import save_models
+    from evermap.runs.persist.models import learn_models, save_models
     from evermap.runs.persist.table import read_looks
 
     check_output_file(out, inputs=[input], ending=".json")
@@ -250,8 +249,7 @@ def _keep(out: Path, groups: Sequence[LifetimeGroup], estimates: Sequence[Lifeti
     import numpy as np
 
     from evermap.existence.one_stay import OneStay
-    from evermap.runs.persist.modelfile import save_models
-    from evermap.runs.persist.models import ModelOfEach
+    from evermap.runs.persist.models import ModelOfEach, save_models
 
     models = tuple(OneStay(found.prior, found.text) for found in estimates)
     names = tuple(group.class_id or "" for group in groups)

@@ -31,38 +31,11 @@ import numpy as np
 from evermap.errors import InputError, NumericalError
 from evermap.existence import protocol as checks
 from evermap.existence import recursion
+from evermap.existence.recursion import RowLooks, RowState
 from evermap.types import FloatArray
 
 CHUNK_ROWS = 65536
 """Most rows that a thread takes at a time: much longer than handing them out, short enough for busy cores to help."""
-
-
-class RowState(NamedTuple):
-    """Features before a look.
-
-    Attributes:
-        inverse_odds: (N,) `(1 - p) / p` after the last look, 0 at birth.
-        stamp_s: (N,) time of that look, in seconds since each feature's birth.
-    """
-
-    inverse_odds: Any
-    stamp_s: Any
-
-
-class RowLooks(NamedTuple):
-    """One look at each of N features.
-
-    Attributes:
-        time_s: (N,) when, on each feature's own clock.
-        detected: (N,) bool.
-        p_miss: (N,) `P(no detection | there)`.
-        p_false: (N,) `P(detection | gone)`.
-    """
-
-    time_s: Any
-    detected: Any
-    p_miss: Any
-    p_false: Any
 
 
 class Looked(NamedTuple):

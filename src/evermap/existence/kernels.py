@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.existence import elementary, recursion
-from evermap.existence.batch import RowLooks, RowState
 from evermap.existence.elementary import aligned_stack, inlined, kernel
+from evermap.existence.recursion import RowLooks, RowState
 from evermap.types import FloatArray, IntArray
 
 

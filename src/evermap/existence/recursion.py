@@ -14,7 +14,7 @@ exponential integral were fitted with 50 digits; highest power first.
 from __future__ import annotations
 
 from math import exp, expm1, frexp, log
-from typing import Any
+from typing import Any, NamedTuple
 
 INF, NAN = float("inf"), float("nan")
 SMALLEST = 1e-300
@@ -51,6 +51,34 @@ DIFFERENCE_TRUSTED = 2e-4
 NODE = 0.28867513459481287
 """Gauss-Legendre quadrature with two points: half a gap over the square root of three either side of its middle."""
 EXP_GAMMA = exp(GAMMA)
+
+
+class RowState(NamedTuple):
+    """Features before a look.
+
+    Attributes:
+        inverse_odds: (N,) `(1 - p) / p` after the last look, 0 at birth.
+        stamp_s: (N,) time of that look, in seconds since each feature's birth.
+    """
+
+    inverse_odds: Any
+    stamp_s: Any
+
+
+class RowLooks(NamedTuple):
+    """One look at each of N features.
+
+    Attributes:
+        time_s: (N,) when, on each feature's own clock.
+        detected: (N,) bool.
+        p_miss: (N,) `P(no detection | there)`.
+        p_false: (N,) `P(detection | gone)`.
+    """
+
+    time_s: Any
+    detected: Any
+    p_miss: Any
+    p_false: Any
 
 
 def odds_of(log_odds: Any) -> Any:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from evermap.io.geojson import write_map_geojson
-from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_parquet
+from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojson, write_map_parquet
 from evermap.io.mrclam import read_mrclam
 from evermap.io.native import read_native
 from evermap.io.native_write import write_native

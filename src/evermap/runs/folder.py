@@ -456,8 +456,7 @@ def _plain(config: Any) -> Any:
 
 
 def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
-    from evermap.io.geojson import write_map_geojson
-    from evermap.io.landmarks import write_map_parquet
+    from evermap.io.landmarks import write_map_geojson, write_map_parquet
     from evermap.io.tum import write_tum
 
     write_tum(result.trajectory, folder.path("trajectory.tum"))

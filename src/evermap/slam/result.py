@@ -56,7 +56,7 @@ def concluded(solved: Solved) -> SlamResult:
 
 
 def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None = None) -> SlamResult:
-    """Return bridge the blind stretches, and put all of an estimate into plain arrays.
+    """Bridge the blind stretches, and put all of an estimate into plain arrays.
 
     Args:
         solved: the recording and its estimate.

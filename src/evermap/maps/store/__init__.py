@@ -23,7 +23,7 @@ from evermap.maps.store.protocol import (
 )
 
 if TYPE_CHECKING:
-    from evermap.maps.store.salvage import Verification
+    from evermap.maps.store.sqlite import Verification
 
 __all__ = [
     "Attachment",
@@ -63,7 +63,7 @@ def verify_store(where: str | Path) -> Verification:
     Raises:
         ConfigError, InputError: as `open_store`, but not for damage: that is what the answer tells.
     """
-    from evermap.maps.store.salvage import verify
+    from evermap.maps.store.sqlite import verify
 
     path = _path(where)
     with suppress(DamagedMapError):
@@ -83,7 +83,7 @@ def revert_store(where: str | Path, revision: int, provenance: Provenance | None
         DamagedMapError: the revision itself is damaged.
         ConfigError, InputError: as `open_store` and `MapStore.revert`.
     """
-    from evermap.maps.store.salvage import rescue
+    from evermap.maps.store.sqlite import rescue
 
     if verify_store(where).sound:
         with open_store(where) as store:

@@ -7,16 +7,25 @@ A rollback journal instead of a write-ahead log: between two commits there is on
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
-from contextlib import suppress
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from sqlalchemy import Connection, Engine, NullPool, create_engine, event
 
 from evermap.errors import InputError
-from evermap.maps.store.content import DamagedError
-from evermap.maps.store.salvage import survey
+from evermap.maps.living import LivingMap
+from evermap.maps.store import content
+from evermap.maps.store.content import DTYPES, NAME_BYTES, Chunk, DamagedError
+from evermap.maps.store.history import Record
+from evermap.maps.store.measured import looks_of, read_index
+from evermap.maps.store.protocol import DamagedMapError, Provenance
 from evermap.maps.store.sql import SqlStore
 
 _PATIENCE_S = 20.0
@@ -75,3 +84,383 @@ def _engine(path: Path, *, writable: bool) -> Engine:
                 raise DamagedError(f"SQLite: {' '.join(str(found).split())}")
 
     return engine
+
+
+_PAGE = 4096
+"""Bytes of a page where the header does not say."""
+_TABLE_LEAF = 0x0D
+_INTEGER_BYTES = (0, 1, 2, 3, 4, 6, 8)
+_SHOWN = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What is whole in a map file.
+
+    Attributes:
+        head: the newest revision that is known of.
+        intact: the revisions of which every byte is what was written.
+        damaged: what is wrong with the others.
+        lost: revisions that earlier damage has destroyed, as the map says itself.
+        problems: of the file as a whole: its pages, its lists.
+        n_chunks, n_bytes: pieces that were checked, and the size of the file.
+    """
+
+    head: int
+    intact: tuple[int, ...]
+    damaged: Mapping[int, str]
+    lost: tuple[int, ...]
+    problems: tuple[str, ...]
+    n_chunks: int
+    n_bytes: int
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is damaged."""
+        return not self.damaged and not self.problems
+
+    def error(self, path: Path, problem: str = "") -> DamagedMapError:
+        """One line that says what is damaged, which revisions are whole, and how to go back to them."""
+        told = [problem] if problem else list(self.problems[:1])
+        if self.damaged and not problem:
+            number = min(self.damaged)
+            others = f", and {len(self.damaged) - 1} more revisions" if len(self.damaged) > 1 else ""
+            told.append(f"revision {number}: {self.damaged[number]}{others}")
+        what = "damaged: " + "; ".join(told)
+        if not self.intact:
+            error = DamagedMapError(f"{what}; no revision is intact", path=path, hint="a copy of the file")
+        else:
+            whole = f"revision{'s' if len(self.intact) > 1 else ''} {ranges(self.intact)}"
+            are = "are" if len(self.intact) > 1 else "is"
+            hint = f"evermap map revert {path} {self.intact[-1]}"
+            error = DamagedMapError(f"{what}; {whole} {are} intact", path=path, hint=hint)
+        error.intact = self.intact
+        return error
+
+
+def verify(path: Path) -> Verification:
+    """Check every byte of a map file that means something.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    found = _Found.of_file(path)
+    intact, damaged = found.verdicts(deep=True)
+    problems = list(_problems(path))
+    return Verification(
+        found.head, intact, damaged, tuple(sorted(found.lost)), tuple(problems), len(found.chunks), path.stat().st_size
+    )
+
+
+def survey(path: Path) -> Verification | None:
+    """The same without asking the database; None where there is no trace of a map."""
+    try:
+        found = _Found.of_file(path)
+    except InputError:
+        return None
+    if not found.records and found.anchor is None:
+        return None
+    intact, damaged = found.verdicts(deep=False)
+    return Verification(found.head, intact, damaged, tuple(sorted(found.lost)), (), len(found.chunks), 0)
+
+
+def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path]:
+    """Go back to an intact revision of a damaged file: every intact one is kept, the damaged file is set aside.
+
+    Args:
+        path: the map.
+        revision: whose content the new revision gets; 0 is the empty map.
+        provenance: of the new revision.
+
+    Returns:
+        Its number, and where the damaged file is.
+
+    Raises:
+        DamagedMapError: that revision is not intact.
+    """
+    _finish_transactions(path)
+    found = _Found.of_file(path)
+    intact, damaged = found.verdicts(deep=True)
+    if revision != 0 and revision not in intact:
+        why = damaged.get(revision, "there is no such revision")
+        checked = Verification(found.head, intact, damaged, (), (), 0, 0)
+        raise checked.error(path, f"revision {revision}: {why}")
+    records = {number: found.records[number] for number in intact}
+    kept: set[bytes] = set()
+    for number in intact:
+        kept |= {found.names[number], *found.closure(records[number])}
+    next_ids = [max((record.next_ids[k] for record in found.records.values()), default=0) for k in (0, 1)]
+    before = {number: found.names.get(number - 1) if number - 1 in records else None for number in damaged}
+    lost = {**{number: name if number - 1 in records else None for number, name in found.lost.items()}, **before}
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.rescue")
+    fresh.unlink(missing_ok=True)
+    try:
+        with open_sqlite(fresh, create=True) as store:
+            names = {number: found.names[number] for number in intact}
+            store.fill({name: found.chunks[name] for name in kept}, names, found.head)
+            old = content.unpack(records[revision].content, found.fetch) if revision else LivingMap()
+            number = store.restore(old, revision, found.head, (next_ids[0], next_ids[1]), provenance, lost)
+        aside = _set_aside(path)
+        fresh.replace(path)
+    finally:
+        fresh.unlink(missing_ok=True)
+    return number, aside
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """'1 to 4, 6 and 9 to 12'; the middle of many is left out."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    words = [str(a) if a == b else f"{a} to {b}" if b > a + 1 else f"{a}, {b}" for a, b in runs]
+    if len(words) > _SHOWN:
+        words = [*words[:2], "...", *words[-2:]]
+    return ", ".join(words[:-1]) + (" and " if len(words) > 1 else "") + "".join(words[-1:])
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What was found in a file.
+
+    Attributes:
+        chunks: stored bytes of pieces that are what was written, by name.
+        anchor: number and record of the newest revision; None where the row that names them is damaged.
+        records, names: of revisions whose record is whole, and the names of the records.
+        lost: as `Record.lost`, of all records.
+    """
+
+    chunks: Mapping[bytes, bytes]
+    anchor: tuple[int, bytes | None] | None
+    records: Mapping[int, Record]
+    names: Mapping[int, bytes]
+    lost: Mapping[int, bytes | None]
+
+    @property
+    def head(self) -> int:
+        """The newest revision that is known of."""
+        return max([*self.records, *self.lost, self.anchor[0] if self.anchor else 0])
+
+    @classmethod
+    def of_file(cls, path: Path) -> _Found:
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"cannot be read: {error.strerror}", path=path) from None
+        sizes = [_PAGE]
+        if len(data) >= 18:
+            told = int.from_bytes(data[16:18], "big")
+            told = 65536 if told == 1 else told
+            if told >= 512 and told & (told - 1) == 0 and told != _PAGE:
+                sizes.insert(0, told)
+        for size in sizes:
+            found = cls._of_rows(_rows(data, size))
+            if found.records or found.anchor:
+                break
+        return found
+
+    @classmethod
+    def _of_rows(cls, rows: Iterable[list[Any]]) -> _Found:
+        from evermap.maps.store.sql import is_anchor
+
+        chunks: dict[bytes, bytes] = {}
+        listed: set[bytes] = set()
+        anchor: tuple[int, bytes | None] | None = None
+        candidates: dict[int, dict[bytes, Record]] = {}
+        for row in rows:
+            if len(row) == 6 and is_anchor(row) and (anchor is None or row[3] > anchor[0]):
+                anchor = row[3], row[4]
+            if len(row) != 2 or not isinstance(row[1], bytes):
+                continue
+            name, data = row
+            if name is None or isinstance(name, int):
+                listed.add(data)
+            elif isinstance(name, bytes) and len(name) == NAME_BYTES and name not in chunks and _is_chunk(name, data):
+                chunks[name] = data
+                with suppress(DamagedError):
+                    record = Record.of_text(content.read_text(name, data))
+                    candidates.setdefault(record.number, {})[name] = record
+        records: dict[int, Record] = {}
+        names: dict[int, bytes] = {}
+        lost: dict[int, bytes | None] = {}
+        expected = None if anchor is None else anchor[1]
+        for number in range(max([*candidates, anchor[0] if anchor else 0]), 0, -1):
+            if number in lost:
+                expected = lost[number]
+                continue
+            these = candidates.get(number, {})
+            # the one that its successor names; where that is not known the one that is listed
+            name = expected
+            if expected is None:
+                name = min(these, key=lambda other: (other not in listed, other), default=None)
+            if name is None or name not in these:
+                expected = None
+                continue
+            records[number], names[number] = these[name], name
+            lost |= records[number].lost
+            expected = records[number].parent
+        return cls(chunks, anchor, records, names, lost)
+
+    def verdicts(self, *, deep: bool) -> tuple[tuple[int, ...], dict[int, str]]:
+        """The revisions that are whole, and what is wrong with the others; `deep` builds their maps, too."""
+        intact, damaged = [], {}
+        for number in range(1, self.head + 1):
+            if number in self.lost:
+                continue
+            if number not in self.records:
+                damaged[number] = "its record is missing or damaged"
+                continue
+            try:
+                self.closure(self.records[number])
+                if deep:
+                    content.unpack(self.records[number].content, self.fetch)
+            except DamagedError as error:
+                damaged[number] = str(error)
+            else:
+                intact.append(number)
+        return tuple(intact), damaged
+
+    def closure(self, record: Record) -> set[bytes]:
+        """Names of all chunks of a revision but its record; `DamagedError` if one is not there."""
+        content.read_text(record.config, self.fetch([record.config])[record.config])
+        names = content.names_in(record.content, self.fetch) | record.parts()
+        if record.evidence is not None:
+            index = read_index(content.read_text(record.evidence, self.fetch([record.evidence])[record.evidence]))
+            names |= {row.name for row in index}
+            for row in index:
+                looks_of(row.clique_id, self.fetch([row.name])[row.name], row.name)
+        self.fetch(names)
+        return names
+
+    def fetch(self, names: Iterable[bytes]) -> dict[bytes, bytes]:
+        """`content.Fetch`."""
+        try:
+            return {name: self.chunks[name] for name in names}
+        except KeyError:
+            raise DamagedError("a part of it is missing or damaged") from None
+
+
+def _is_chunk(name: bytes, data: bytes) -> bool:
+    """Whether stored bytes are what their name says, of whichever type."""
+    for dtype in DTYPES:
+        with suppress(DamagedError):
+            Chunk.of_stored(name, dtype, data)
+            return True
+    return False
+
+
+def _problems(path: Path) -> Iterator[str]:
+    """What the database itself finds, and what ordinary reading finds in its lists."""
+    try:
+        with open_sqlite(path, create=False) as store:
+            store.log()
+            store.head()
+    except DamagedMapError as error:
+        yield error.problem.removeprefix("damaged: ").partition("; ")[0]
+        return
+    try:
+        with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
+            found = [str(row[0]) for row in database.execute("PRAGMA integrity_check(3)")]
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
+        found = [str(error)]
+    if found != ["ok"]:
+        yield "SQLite: " + "; ".join(" ".join(line.replace("*** in database main ***", "").split()) for line in found)
+
+
+def _finish_transactions(path: Path) -> None:
+    """Let the database take back what was not committed, if it still can."""
+    with suppress(sqlite3.DatabaseError, UnicodeDecodeError), closing(sqlite3.connect(path)) as database:
+        database.execute("SELECT count(*) FROM sqlite_master").fetchone()
+
+
+def _set_aside(path: Path) -> Path:
+    """Give a damaged file a second name that is free, and what its journal is called with it."""
+    k = 1
+    while (aside := path.with_name(f"{path.name}.damaged{'' if k == 1 else f'-{k}'}")).exists():
+        k += 1
+    try:
+        os.link(path, aside)
+    except OSError:  # a file system without links
+        shutil.copy2(path, aside)
+    for tail in ("-journal", "-wal", "-shm"):
+        with suppress(FileNotFoundError):
+            Path(f"{path}{tail}").replace(f"{aside}{tail}")
+    return aside
+
+
+def _rows(data: bytes, page_size: int) -> Iterator[list[Any]]:
+    """Every row of every table whose page can still be read, without the database (sqlite.org/fileformat2.html)."""
+    usable = page_size - (data[20] if len(data) > 20 and data[:15] == b"SQLite format 3" else 0)
+    if usable < 480:
+        usable = page_size
+    for start in range(0, len(data) - 8, page_size):
+        head = start + (100 if start == 0 else 0)
+        if head + 8 > len(data) or data[head] != _TABLE_LEAF:
+            continue
+        (count,) = struct.unpack_from(">H", data, head + 3)
+        for k in range(min(count, page_size // 4)):
+            with suppress(IndexError, struct.error, ValueError):
+                (at,) = struct.unpack_from(">H", data, head + 8 + 2 * k)
+                yield _values(_payload(data, start, at, page_size, usable))
+
+
+def _payload(data: bytes, start: int, at: int, page_size: int, usable: int) -> bytes:
+    """The bytes of a row, those on overflow pages included."""
+    size, at = _varint(data, start + at)
+    _, at = _varint(data, at)
+    if size > len(data):
+        raise ValueError
+    most = usable - 35
+    if size <= most:
+        return data[at : at + size]
+    least = (usable - 12) * 32 // 255 - 23
+    own = least + (size - least) % (usable - 4)
+    own = own if own <= most else least
+    parts = [data[at : at + own]]
+    (page,) = struct.unpack_from(">I", data, at + own)
+    left = size - own
+    while left > 0:
+        if page == 0:
+            raise ValueError
+        base = (page - 1) * page_size
+        (page,) = struct.unpack_from(">I", data, base)
+        parts.append(data[base + 4 : base + 4 + min(left, usable - 4)])
+        left -= usable - 4
+    return b"".join(parts)
+
+
+def _values(payload: bytes) -> list[Any]:
+    """The columns of a row; `ValueError` or `IndexError` if these bytes are none."""
+    end, at = _varint(payload, 0)
+    body = end
+    values: list[Any] = []
+    while at < end:
+        kind, at = _varint(payload, at)
+        if kind in (0, 8, 9):
+            values.append(None if kind == 0 else kind - 8)
+            continue
+        size = _INTEGER_BYTES[kind] if kind <= 6 else 8 if kind == 7 else (kind - 12) // 2
+        part = payload[body : body + size]
+        if len(part) != size or kind in (10, 11):
+            raise ValueError
+        if kind <= 6:
+            values.append(int.from_bytes(part, "big", signed=True))
+        elif kind == 7:
+            values.append(struct.unpack(">d", part)[0])
+        else:
+            values.append(part if kind % 2 == 0 else part.decode())
+        body += size
+    return values
+
+
+def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """A number of SQLite, and where the next one begins."""
+    value = 0
+    for k in range(8):
+        byte = data[at + k]
+        value = value << 7 | byte & 0x7F
+        if byte < 0x80:
+            return value, at + k + 1
+    return value << 8 | data[at + 8], at + 9

@@ -22,7 +22,7 @@ from evermap.runs.persist.table import LookTable, Truth
 from evermap.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from evermap.runs.persist.learning import LearnedModels
+    from evermap.runs.persist.models import LearnedModels
 
 Progress = Callable[[float, float], None]
 """Called with the steps that are done and how many there are."""

@@ -51,7 +51,7 @@ def write_persist(
         folder.path("forecasts.csv").write_bytes(_forecasts(result))
         folder.path("changes.jsonl").write_text(_changes(result), encoding="utf-8")
         if result.learned is not None:
-            from evermap.runs.persist.modelfile import save_models
+            from evermap.runs.persist.models import save_models
 
             save_models(result.models, result.learned.per, folder.path("model.json"))
         written = perf_counter()
