@@ -18,6 +18,8 @@ from evermap.interrupts import held, kept
 
 if TYPE_CHECKING:
     from evermap.config import Config
+    from evermap.maps.store import MapStore
+    from evermap.runs.sessions import Entered
     from evermap.types import Landmarks, Recording
 
 # (section, key, label, format); a number that the run does not have is left out
@@ -312,6 +314,7 @@ def run_in_map(
     kept(map_file, f"the map {map_file} stays as it was")
     with opened as store:
         start = time.perf_counter()
+        entered: Entered | None = None
         with progress_bar(recording.name) as progress:
             if localize:
                 stamps = recording.frames.stamp_s
@@ -319,15 +322,14 @@ def run_in_map(
                 result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
                 entered = enter_session(store, recording, config, priors=said, progress=progress)
-                session = entered.session
-                result, recording = replace(session.slam, changes=entered.changes), session.recording
+                result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
         elapsed_s = time.perf_counter() - start
         info = RunInfo(
             command=command_line(),
             seeds={"slam": config.slam.seed},
             processing_s=None if realtime else elapsed_s,
             total_s=elapsed_s,
-            grown=None if localize else len(entered.grown),
+            grown=None if entered is None else len(entered.grown),
         )
         summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
         for remark in summary["warnings"]:
@@ -337,13 +339,17 @@ def run_in_map(
             raise KeyboardInterrupt(
                 f"the part of the recording that was processed is in {out}; the map stays as it was"
             )
-        if localize:
-            return
-        if not session.found:
-            raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
-        with held():
-            revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
-            kept(map_file, f"the session is revision {revision} of {map_file}")
-        if entered.replayed:
-            again = ", ".join(entered.replayed)
-            say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")
+        if entered is not None:
+            _commit(entered, store, map_file, config, elapsed_s)
+
+
+def _commit(entered: Entered, store: MapStore, map_file: Path, config: Config, elapsed_s: float) -> None:
+    """Make a session the newest revision of a map."""
+    if not entered.session.found:
+        raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
+    with held():
+        revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
+        kept(map_file, f"the session is revision {revision} of {map_file}")
+    if entered.replayed:
+        again = ", ".join(entered.replayed)
+        say(f"a late session: entered at its time, and {len(entered.replayed)} later brought in again ({again})")

@@ -191,13 +191,7 @@ def learn(
         NumericalError: a look that is impossible, whether the feature is there or not.
     """
     structures = _structures(phases)
-    if not structures or restarts < 1:
-        raise ConfigError("nothing to try", field="phases" if restarts >= 1 else "restarts", hint="at least one")
-    if half_life_s is not None and not half_life_s > 0.0:
-        raise ConfigError(f"{half_life_s} is no half life", field="half_life_s", hint="seconds, above 0")
-    if rhythm not in (True, False, "auto"):
-        raise ConfigError(f"{rhythm!r} is no answer", field="rhythm", hint="True, False or 'auto'")
-
+    _check_settings(structures, rhythm, half_life_s, restarts)
     end_s = float(looks.stamp_s.max())
     data = _Data.of(looks, end_s, np.inf if half_life_s is None else half_life_s)
     span_s, limits = end_s - float(looks.stamp_s.min()), Limits.of(looks)
@@ -228,6 +222,17 @@ def learn(
         half_life_s=data.half_life_s,
         limits=limits,
     )
+
+
+def _check_settings(
+    structures: Sequence[Structure], rhythm: bool | str, half_life_s: float | None, restarts: int
+) -> None:
+    if not structures or restarts < 1:
+        raise ConfigError("nothing to try", field="phases" if restarts >= 1 else "restarts", hint="at least one")
+    if half_life_s is not None and not half_life_s > 0.0:
+        raise ConfigError(f"invalid half life {half_life_s}", field="half_life_s", hint="seconds, above 0")
+    if rhythm not in (True, False, "auto"):
+        raise ConfigError(f"unknown setting {rhythm!r}", field="rhythm", hint="True, False or 'auto'")
 
 
 def _structures(phases: str | Structure | Sequence[str | Structure]) -> list[Structure]:

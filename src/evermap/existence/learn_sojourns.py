@@ -327,11 +327,7 @@ def learn(
         ConfigError: a family that does not exist.
         DataError: no feature with two looks at different times.
     """
-    known = WITH_RHYTHM if rhythm else FAMILIES
-    allowed = tuple(known if families is None else families)
-    for name in allowed:
-        if name not in known:
-            raise ConfigError(f"no family '{name}'", field="families", hint=f"one of {', '.join(known)}")
+    allowed = _allowed(families, rhythm=rhythm)
     step = step_s or _usual_gap(looks)
     data = Data.of(looks, step, half_life_s, rhythm=False)
     tell = progress or (lambda _: None)
@@ -351,19 +347,28 @@ def learn(
         ascents = [*finals, *trials] if rhythm else [*ascents, *trials, *finals]
     tell(1.0)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
-    best = ranked[0]
     candidates: dict[str, SojournCandidate] = {}
     for ascent in ranked:  # the best of each kind
         candidates.setdefault(ascent.name, _candidate(ascent))
     return LearnedSojourns(
-        best.model,
-        best.expected.log_evidence,
+        ranked[0].model,
+        ranked[0].expected.log_evidence,
         tuple(candidates.values()),
         allowed,
         half_life_s,
         data.last_s,
-        best.expected,
+        ranked[0].expected,
     )
+
+
+def _allowed(families: Sequence[str] | None, *, rhythm: bool) -> tuple[str, ...]:
+    """Return the families to choose from."""
+    known = WITH_RHYTHM if rhythm else FAMILIES
+    allowed = tuple(known if families is None else families)
+    for name in allowed:
+        if name not in known:
+            raise ConfigError(f"unknown family '{name}'", field="families", hint=f"one of {', '.join(known)}")
+    return allowed
 
 
 def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> Ascent:

@@ -319,13 +319,11 @@ def follow_sites(
     shape = first.steps.log_rest.shape
 
     def filtered(said: FrameEvidence) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return log probabilities after each frame, what it said for the sites, and the evidence of all."""
         found = np.empty(shape), np.empty(len(frames)), np.empty(n_cliques)
         kernels.forward(chain, log_here, said.log_ratio, *found)
-        return found
+        return found  # log probabilities after each frame, what it said for the sites, and the evidence of all
 
-    hits = _said_by(frames, looks, chains, sensor._replace(use_misses=False))
-    said = _said_by(frames, looks, chains, sensor)
+    hits, said = (_said_by(frames, looks, chains, one) for one in (sensor._replace(use_misses=False), sensor))
     log_after, log_odds, log_evidence = filtered(said)
     smoothed = np.empty(shape)
     kernels.backward(chain, hits.log_ratio, filtered(hits)[0], smoothed)
@@ -337,8 +335,8 @@ def follow_sites(
     weight[frames.order] = np.exp(smoothed[frames.of_look, :, seat[looks.site[frames.order]]]).sum(axis=1)
     since_s = share * dynamics.since_s + (1.0 - share) * first.came_s[chains.row_of_site]
     before = (first.old + first.new)[chains.row_of_site]
-    trace = _trace(frames, said, log_after, log_odds)
-    return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, log_evidence, trace)
+    told = log_evidence, _trace(frames, said, log_after, log_odds)
+    return SiteBeliefs(stayed + returned, stayed, before, since_s, weight, *told)
 
 
 class _FirstBeliefs(NamedTuple):

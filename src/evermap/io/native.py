@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,12 +63,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
     _warn_of_similar_names(files, warnings)
     settings = _read_settings(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in TABLES}
-    odometry_table, detection_table = tables["odometry"], tables["detections"]
-    for name, table in (("odometry", odometry_table), ("detections", detection_table)):
-        if table is None:
-            raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=f"{name}.csv or .parquet")
-    assert odometry_table is not None
-    assert detection_table is not None
+    odometry_table, detection_table = (_needed(name, tables, files) for name in ("odometry", "detections"))
     clock = _clock(settings, tables, files)
     settings = replace(settings, clock=clock)
     names: dict[int, str] = {}
@@ -97,6 +93,14 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         landmark_names=names,
     )
     return finish_recording(recording, warnings=warnings)
+
+
+def _needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Table:
+    """Return a table that a recording cannot do without."""
+    table = tables[name]
+    if table is None:
+        raise InputError("file is missing", path=files.path_of(f"{name}.csv"), hint=f"{name}.csv or .parquet")
+    return table
 
 
 class NativeReader:

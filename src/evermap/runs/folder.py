@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 
 from evermap import __version__
 from evermap.errors import ConfigError
@@ -366,6 +366,21 @@ def _cannot_write(out: Path, error: OSError) -> ConfigError:
     return ConfigError(f"cannot be written: {error.strerror or error}", path=out, field="out", hint="another folder")
 
 
+class Asked(TypedDict, total=False):
+    """What a caller asks of a run folder; what is missing or None is left to the configuration.
+
+    Attributes:
+        figures: whether to draw; `config.output.figures`, or yes.
+        report: likewise `report.html`, `config.output.report`.
+        scene: likewise `scene.rrd`, `config.output.rerun`; left out with a warning where rerun-sdk is missing, unless
+            it was asked for.
+    """
+
+    figures: bool | None
+    report: bool | None
+    scene: bool | None
+
+
 def write_run(
     out: str | Path,
     recording: Recording,
@@ -374,13 +389,11 @@ def write_run(
     *,
     info: RunInfo | None = None,
     sections: Sequence[ReportSection] = (),
-    figures: bool | None = None,
-    report: bool | None = None,
-    scene: bool | None = None,
     force: bool = False,
     inputs: Iterable[str | Path | None] = (),
+    **asked: Unpack[Asked],
 ) -> dict[str, Any]:
-    """Evaluates a run and writes its folder. Returns the content of `summary.json`.
+    """Evaluate a run and write its folder; return the content of `summary.json`.
 
     Args:
         out: the folder; an older run there is replaced at the end (see `RunFolder`).
@@ -389,12 +402,9 @@ def write_run(
         config: a `Config`, or any mapping that JSON can hold; None if there is none.
         info: what the numbers alone cannot say: command, seeds, measured times.
         sections: parts that the caller adds to the report.
-        figures: whether to draw; None leaves it to `config.output.figures`, or draws.
-        report: likewise `report.html`, `config.output.report`.
-        scene: likewise `scene.rrd`, `config.output.rerun`; on None it is left out with a warning where rerun-sdk is
-            missing.
         force: write into a folder that holds other files, too; they stay.
         inputs: files and folders that were read, beside the recording's.
+        asked: `figures`, `report` or `scene`, see `Asked`.
 
     Raises:
         ConfigError: `out` must not or cannot be written.
@@ -409,26 +419,17 @@ def write_run(
         evaluation = compare_with_truth(recording, result, rate_hz=rate_hz)
         timing = timing_dict(recording, result, info)
         _write_estimates(folder, result)
-        drawn: tuple[NamedFigure, ...] = ()
-        draw = _choose(figures, wanted, "figures")
-        tell = _choose(report, wanted, "report")
-        if draw or tell:
-            drawn = _draw(recording, result, evaluation, timing)
+        draw = _choose(asked.get("figures"), wanted, "figures")
+        tell = _choose(asked.get("report"), wanted, "report")
+        drawn = _draw(recording, result, evaluation, timing) if draw or tell else ()
         if draw:
             _write_figures(folder, drawn)
         remarks = []
-        if _choose(scene, wanted, "rerun"):
-            remarks += _write_scene(folder, recording, result, evaluation, must=scene is True)
-
+        if _choose(asked.get("scene"), wanted, "rerun"):
+            remarks += _write_scene(folder, recording, result, evaluation, must=asked.get("scene") is True)
+        measured, settings = metrics_dict(evaluation), _plain(config)
         summary = summary_dict(
-            recording,
-            result,
-            metrics_dict(evaluation),
-            config=_plain(config),
-            info=info,
-            timing=timing,
-            outputs=(),
-            warnings=remarks,
+            recording, result, measured, config=settings, info=info, timing=timing, outputs=(), warnings=remarks
         )
         summary = folder.finish(summary, *(["report.html"] if tell else []))
         if tell:
