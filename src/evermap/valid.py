@@ -39,13 +39,13 @@ class Quantity:
     dates: bool = False
 
     def check(self, values: FloatArray, *, path: Path, line: IntArray) -> None:
-        """Raises InputError at the first value that is not finite (or not given, if needed) or out of limits."""
+        """Raise InputError at the first value that is not finite (or not given, if needed) or out of limits."""
         if (row := self._first_bad(values)) is not None:
             problem = self._complaint(float(values[row]))
             raise InputError(problem, path=path, line=int(line[row]), field=self.name, hint=self.hint or None)
 
     def check_array(self, values: FloatArray, field: str) -> None:
-        """`check` of an array that came from no file: the message names `field` and the row, counted from 0."""
+        """Check an array that came from no file: the message names `field` and the row, counted from 0."""
         if (row := self._first_bad(values)) is not None:
             problem = f"row {row}: {self._complaint(float(values[row]))}"
             raise InputError(problem, field=field, hint=self.hint or None)
@@ -89,7 +89,7 @@ P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
 def validate(recording: Any) -> None:
-    """Whether something is a recording from which a session can be estimated.
+    """Check that something is a recording from which a session can be estimated.
 
     Every reader ends with this, and every function that takes a `Recording` begins with it; only `run_session` mends
     first what a robot on duty logs.
@@ -126,14 +126,14 @@ def validate(recording: Any) -> None:
 
 
 def check_type(recording: Any) -> None:
-    """Raises InputError for anything but a `Recording`, with the way to get one."""
+    """Raise InputError for anything but a `Recording`, with the way to get one."""
     if not isinstance(recording, Recording):
         hint = f"evermap.read_recording({str(recording)!r})" if isinstance(recording, str | Path) else "a Recording"
         raise InputError(f"a Recording is needed, not {type(recording).__name__}", field="recording", hint=hint)
 
 
 def check_landmarks(landmarks: Any, field: str) -> None:
-    """Raises InputError unless `landmarks` are records of a map, each once and with numbers that can be."""
+    """Raise InputError unless `landmarks` are records of a map, each once and with numbers that can be."""
     if not isinstance(landmarks, Landmarks):
         hint = "evermap.io.read_prior_map(FILE)"
         raise InputError(f"Landmarks are needed, not {type(landmarks).__name__}", field=field, hint=hint)

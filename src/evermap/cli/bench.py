@@ -46,7 +46,7 @@ def bench(
 
 
 def load_benchmarks(root: Path = Path(__file__).resolve().parents[3]) -> ModuleType:
-    """The module `benchmarks.run` of a source checkout.
+    """Return the module `benchmarks.run` of a source checkout.
 
     It is no part of the installed package: it compares with libraries that users need not have.
 

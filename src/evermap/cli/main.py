@@ -135,7 +135,7 @@ def options(
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of a defect.")] = False,
 ) -> None:
-    """Options of all verbs; they are read in `Verbs.invoke`."""
+    """Take the options of all verbs; they are read in `Verbs.invoke`."""
 
 
 def run() -> None:

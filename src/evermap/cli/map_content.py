@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def number(value: float | None) -> float | None:
-    """Of JSON: null for nan and infinity."""
+    """Return values of JSON: null for nan and infinity."""
     return None if value is None or not math.isfinite(value) else float(value)
 
 
 def revision_dict(item: Revision) -> dict[str, Any]:
-    """One line of the history."""
+    """Return one line of the history."""
     origin = item.provenance
     return {
         "revision": item.number,
@@ -51,7 +51,7 @@ def revision_dict(item: Revision) -> dict[str, Any]:
 
 
 def revision_row(item: Revision, clock: Clock) -> list[str]:
-    """The same in words."""
+    """Return the same in words."""
     origin = item.provenance
     changes = [f"{count} {kind.value}" for kind, count in item.n_changes.items()]
     changes += [f"grew by {item.n_grown}"] if item.n_grown else []
@@ -68,7 +68,9 @@ def revision_row(item: Revision, clock: Clock) -> list[str]:
 
 
 def change_line(change: MapChange, clock: Clock) -> str:
-    """'landmark 5 moved by (+0.50, 0.00) m between 10:02:00 and 10:20:00, probability 97 % (12 hits, 40 misses)'."""
+    """Return 'landmark 5 moved by (+0.50, 0.00) m between 10:02:00 and 10:20:00, probability 97 % (12 hits, 40
+    misses)'.
+    """
     from evermap.viz.change_words import probability, what
 
     when = between_text(change.stamp_from_s, change.stamp_to_s, clock)
@@ -76,7 +78,7 @@ def change_line(change: MapChange, clock: Clock) -> str:
 
 
 def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any]]:
-    """Every landmark at its most probable place.
+    """Return every landmark at its most probable place.
 
     Args:
         living: the map.
@@ -116,7 +118,7 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
 
 
 def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
-    """The same in words."""
+    """Return the same in words."""
     from evermap.maps.why import probability_text
 
     placed = content["x_m"] is not None
@@ -152,7 +154,7 @@ def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
 
 
 def answer_dict(answer: Answer) -> dict[str, Any]:
-    """Everything behind a 'why', with every look."""
+    """Return everything behind a 'why', with every look."""
     from evermap.runs.summary import change_dict
 
     seen, stays = answer.evidence, answer.stays
@@ -207,7 +209,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
 
 
 def class_name(living: LivingMap, class_id: int) -> str:
-    """'' for a class that is not known, its number for one without a name."""
+    """Return '' for a class that is not known, its number for one without a name."""
     if class_id == UNKNOWN:
         return ""
     return living.class_names[class_id] if class_id < len(living.class_names) else str(class_id)
@@ -218,7 +220,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def print_why(answer: Answer) -> None:
-    """The answer, what it rests on, and what every session saw."""
+    """Print the answer, what it rests on, and what every session saw."""
     from evermap.cli.map_content import change_line
     from evermap.maps.why import probability_text
 
@@ -248,7 +250,7 @@ def print_why(answer: Answer) -> None:
 
 
 def draw_why(path: Path, answer: Answer) -> None:
-    """The same as a figure."""
+    """Draw the same as a figure."""
     import numpy as np
 
     from evermap.viz.living_map_figures import LandmarkHistory, plot_why

@@ -80,7 +80,7 @@ def verify(file: _File, as_json: _AsJson = False) -> None:
 
 
 def pin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
-    """Never remove these landmarks, whatever is missed.
+    """Keep these landmarks in the map, whatever is missed.
 
     \b
     Example:
@@ -100,7 +100,7 @@ def unpin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = Fal
 
 
 def delete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
-    """Do not use these landmarks any more.
+    """Leave these landmarks out from now on.
 
     Their detections are ignored until that is taken back.
 

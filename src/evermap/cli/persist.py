@@ -206,7 +206,7 @@ def _run(
 
 
 def default_out(table_path: Path) -> Path:
-    """`evermap-out/looks` for 'data/looks.csv.gz'."""
+    """Return `evermap-out/looks` for 'data/looks.csv.gz'."""
     name = re.sub(r"(\.csv|\.gz|\.parquet)+$", "", table_path.name.lower())
     return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name).strip("-.") or "persist")
 

@@ -221,7 +221,7 @@ def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str 
 
 
 def default_out(name: str) -> Path:
-    """`evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1'."""
+    """Return `evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1'."""
     return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-.") or "run")
 
 
@@ -253,7 +253,7 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> La
 
 
 def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool, findings: Sequence[str] = ()) -> None:
-    """The summary as JSON, or its main numbers as a table with the files to look at, and what was found, in words."""
+    """Print the summary as JSON, or its main numbers, the files to look at and what was found, in words."""
     if as_json:
         print_json(summary)
         return

@@ -346,7 +346,7 @@ def _learned_lines(choice: Choice) -> list[tuple[str, str]]:
 
 
 def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
-    """Quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
+    """Return quartiles and mean in seconds, None for what never comes; and the share that never leaves."""
     quartiles = [float(prior.quantile(p)) for p in (0.25, 0.5, 0.75)]
     values = dict(zip(("quarter_gone_s", "half_gone_s", "three_quarters_gone_s"), quartiles, strict=True))
     values["mean_stay_s"] = prior.mean()
@@ -354,7 +354,7 @@ def lifetime_numbers(prior: LifetimePrior) -> dict[str, float | None]:
 
 
 def lifetime_lines(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The same in words."""
+    """Return the same in words."""
     from evermap.survival.durations import duration_text
 
     names = {

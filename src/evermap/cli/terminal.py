@@ -35,32 +35,32 @@ Progress = Callable[[float, float], None]
 
 
 def echo(line: str) -> None:
-    """A line of the result, with names as they are, but nothing in it that a terminal would obey."""
+    """Print a line of the result, names as they are, without control characters."""
     typer.echo(printable(line))
 
 
 def say(line: str) -> None:
-    """One line for the person at the terminal."""
+    """Print one line for the person at the terminal."""
     typer.echo(f"evermap: {printable(line)}", err=True)
 
 
 def warn(line: str) -> None:
-    """A remark that does not stop the run."""
+    """Print a remark that does not stop the run."""
     typer.secho(f"evermap: warning: {printable(line)}", err=True, fg="yellow", color=_colour(sys.stderr))
 
 
 def fail(line: str) -> None:
-    """The line with which a run ends; the caller chooses the exit code."""
+    """Print the line with which a run ends; the caller chooses the exit code."""
     typer.secho(f"evermap: error: {printable(line, _MOST)}", err=True, fg="red", color=_colour(sys.stderr))
 
 
 def print_json(summary: Mapping[str, Any]) -> None:
-    """The summary for machines; strict JSON, so nan and infinity must have become null before."""
+    """Print the summary for machines; strict JSON, so nan and infinity must have become null before."""
     typer.echo(json.dumps(summary, indent=2, allow_nan=False))
 
 
 def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Two columns: framed on a terminal, aligned text when piped."""
+    """Print two columns: framed on a terminal, aligned text when piped."""
     if not sys.stdout.isatty():
         width = max((len(name) for name, _ in rows), default=0)
         for line in [title, *(f"  {name:<{width}}  {value}" for name, value in rows)]:
@@ -75,7 +75,7 @@ def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Sequence[int] = ()) -> None:
-    """A table with a head: framed on a terminal, aligned text when piped.
+    """Print a table with a head: framed on a terminal, aligned text when piped.
 
     Args:
         title: above it.
@@ -122,7 +122,7 @@ def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
 
 @contextmanager
 def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]:
-    """A progress bar on stderr; None, and silence, where stderr is no terminal.
+    """Yield A progress bar on stderr; None, and silence, where stderr is no terminal.
 
     Args:
         label: in front of the bar.
@@ -153,7 +153,7 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 
 
 def command_line() -> str:
-    """What was typed, for the summary."""
+    """Return what was typed, for the summary."""
     return shlex.join(["evermap", *sys.argv[1:]])
 
 

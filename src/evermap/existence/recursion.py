@@ -192,7 +192,7 @@ def later_general_purpose(odds: Any, low: Any, high: Any, stop: Any, horizon: An
 
 
 def split(x: Any) -> Any:
-    """Return exponent and fraction of a positive number: `x = 2^e (1 + f)`, `1 + f` in [sqrt(1/2), sqrt(2))."""
+    """Return the exponent and fraction of a positive number: `x = 2^e (1 + f)`, `1 + f` in [sqrt(1/2), sqrt(2))."""
     fraction, exponent = frexp(x)
     low = fraction < 0.7071067811865476
     return float(exponent - low), fraction * (1.0 + low) - 1.0

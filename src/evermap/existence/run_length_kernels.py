@@ -304,7 +304,7 @@ def begin(held: RunHypotheses, stamp_s: float, prior: First) -> None:
 
 @kernel
 def begin_rows(held: RunHypotheses, stamp_s: FloatArray, prior: First) -> None:
-    """`begin` for every row."""
+    """Begin every row by `begin`."""
     for f in range(len(stamp_s)):
         begin(RunHypotheses(held.start[f], held.weight[f], held.number[f]), stamp_s[f], prior)
 

@@ -81,7 +81,7 @@ class Fitted(Shown):
     rates: SmoothRates | None = None
 
     def log_likelihood(self, counts: Sojourns) -> float:
-        """`sum events log h - exposure h`, of the table of counts."""
+        """Return `sum events log h - exposure h` of the table of counts."""
         hazard = hazards(self.prior, counts.edge_s)[:, None]
         if self.rhythm is not None:
             hazard = hazard * self.rhythm.factor[None, :]

@@ -19,7 +19,7 @@ ODOMETRY_GAP_S: float = 10.0
 
 
 def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
-    """Raises InputError at the first stamp that is smaller than the one before."""
+    """Raise InputError at the first stamp that is smaller than the one before."""
     back = np.flatnonzero(np.diff(stamp_s) < 0)
     if len(back):
         row = int(back[0]) + 1
@@ -29,25 +29,27 @@ def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str
 
 
 def forward_stamps(table: Table) -> FloatArray:
-    """The column `stamp_s`, checked not to run backwards. Shape (R,)."""
+    """Return the column `stamp_s`, checked not to run backwards. Shape (R,)."""
     stamp_s = table.numbers(STAMP_S)
     check_forward(stamp_s, path=table.path, line=table.line)
     return stamp_s
 
 
 def repeats(values: IntArray) -> IntArray:
-    """Rows that are equal to an earlier one. Shape (N,) or (N, K) -> (number of repeats,)."""
+    """Return rows that are equal to an earlier one. Shape (N,) or (N, K) -> (number of repeats,)."""
     _, first = np.unique(values, axis=0, return_index=True)
     return np.setdiff1d(np.arange(len(values)), first)
 
 
 def wrap_far(angle_rad: FloatArray) -> FloatArray:
-    """Angles beyond half a turn wrapped to (-pi, pi]; the others keep every bit, so that files read back the same."""
+    """Return angles beyond half a turn wrapped to (-pi, pi]; the others keep every bit, so that files read back the
+    same.
+    """
     return np.where(np.abs(angle_rad) <= np.pi, angle_rad, se2.wrap(angle_rad))
 
 
 def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> BoolArray:
-    """Mask (N,) that keeps the last row of every stamp; repeated stamps are counted in `warnings`."""
+    """Return the mask (N,) that keeps the last row of every stamp; repeated stamps are counted in `warnings`."""
     keep = np.append(stamp_s[1:] != stamp_s[:-1], True)[: len(stamp_s)]
     repeated = int(np.sum(~keep))
     if repeated:
@@ -56,7 +58,7 @@ def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> Bo
 
 
 def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
-    """The recording with frames that have no odometry near them left out and all remarks counted.
+    """Return the recording with frames that have no odometry near them left out and all remarks counted.
 
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
@@ -105,7 +107,7 @@ def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
 
 
 def select_detections(detections: Detections, rows: BoolArray | IntArray) -> Detections:
-    """The given rows of the detections, in that order."""
+    """Return the given rows of the detections, in that order."""
     return Detections(
         frame=detections.frame[rows],
         landmark_id=detections.landmark_id[rows],

@@ -13,7 +13,7 @@ from evermap.interrupts import temporary
 
 
 def write_atomic(path: str | Path, content: bytes | str) -> Path:
-    """Writes `content` (text as UTF-8) to `path`, so that no reader ever sees half of it. Returns the path.
+    """Write `content` (text as UTF-8) to `path`, so that no reader ever sees half of it. Returns the path.
 
     Raises:
         InputError: the folder does not exist or cannot be written to; an older file of that name is untouched.
@@ -33,7 +33,7 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
 
 @contextmanager
 def staged_folder(folder: str | Path) -> Iterator[Path]:
-    """A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
+    """Yield A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
 
     Args:
         folder: must not exist, or be empty.

@@ -48,15 +48,15 @@ class Columns:
         return name in self.cells
 
     def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
-        """An error that names file, line and column; `row` None blames the header."""
+        """Return an error that names file, line and column; `row` None blames the header."""
         return self._table({}).error(problem, row=row, field=field, hint=hint)
 
     def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
-        """Raises InputError unless all of `required` and nothing beside `required` and `optional` is there."""
+        """Raise InputError unless all of `required` and nothing beside `required` and `optional` is there."""
         self._table(dict.fromkeys(self.cells, ())).expect(required, optional)
 
     def numbers(self, quantity: Quantity) -> FloatArray:
-        """A numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
+        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
         import pyarrow as pa
         import pyarrow.compute as pc
 
@@ -76,7 +76,7 @@ class Columns:
         return values
 
     def clock(self, name: str = "stamp_s") -> Clock | None:
-        """What the stamps of a column count, where they are dates; else None."""
+        """Return what the stamps of a column count, where they are dates; else None."""
         import pyarrow as pa
 
         cells = self.cells[name][:1]
@@ -84,7 +84,7 @@ class Columns:
         return self._table({name: text}).clock(name) if _is_text(cells.type) or text != cells.to_pylist() else None
 
     def flags(self, name: str, *, hint: str) -> FloatArray:
-        """A column of 1 or true, 0 or false; nan where it is empty. Shape (R,).
+        """Return a column of 1 or true, 0 or false; nan where it is empty. Shape (R,).
 
         Raises:
             InputError: another word or number.
@@ -107,7 +107,7 @@ class Columns:
         return np.array([*(_FLAGS[word] for word in known), np.nan])[row_word]
 
     def labels(self, name: str) -> tuple[list[str], IntArray]:
-        """A column of names or whole numbers: the different ones in natural order, and which each row has.
+        """Return a column of names or whole numbers: the different ones in natural order, and which each row has.
 
         Returns:
             The names (numbers in order of size, else by alphabet), and (R,) the index of each row's, `UNKNOWN` where
@@ -156,7 +156,7 @@ class Columns:
 
 
 def read_columns(path: str | Path, warnings: list[str]) -> Columns:
-    """A `.csv`, `.csv.gz` or `.parquet` file; `warnings` gets a remark on an unfinished last line.
+    """Return a `.csv`, `.csv.gz` or `.parquet` file; `warnings` gets a remark on an unfinished last line.
 
     Raises:
         InputError: it is missing, damaged, or no table.
@@ -171,14 +171,15 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
 
 
 def named(names: Sequence[str], index: IntArray) -> Any:
-    """A column of names for `csv_bytes`: which of `names` each row has."""
+    """Return a column of names for `csv_bytes`: which of `names` each row has."""
     import pyarrow as pa
 
     return pa.array(list(names), type=pa.string()).take(pa.array(index))
 
 
 def csv_bytes(columns: Mapping[str, Any]) -> bytes:
-    """A CSV file of arrays of numbers and of `named` columns; floats in the shortest form that reads back the same.
+    """Return a CSV file of arrays of numbers and of `named` columns; floats in the shortest form that reads back the
+    same.
 
     Missing numbers (nan) are empty cells.
     """

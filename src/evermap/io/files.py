@@ -43,11 +43,11 @@ class FileSet:
         return self.root.stem if self.zipped else self.root.resolve().name
 
     def path_of(self, name: str) -> Path:
-        """Where `name` is or would be, for messages: a zip is shown as if it were a folder."""
+        """Return where `name` is or would be, for messages: a zip is shown as if it were a folder."""
         return self.root / self.members.get(name, str(PurePosixPath(self.folder) / name))
 
     def read(self, name: str) -> bytes:
-        """Content of a file.
+        """Return the content of a file.
 
         Raises:
             InputError: it is missing, unreadable, or damaged inside the zip.
@@ -68,7 +68,7 @@ class FileSet:
 
 
 def file_sets(path: str | Path) -> list[FileSet]:
-    """Every folder with files in it: of a zip all, of a folder itself and the folders directly below.
+    """Return every folder with files in it: of a zip all, of a folder itself and the folders directly below.
 
     A plain file that is no zip gives an empty list.
 
@@ -91,7 +91,7 @@ def file_sets(path: str | Path) -> list[FileSet]:
 
 
 def find_file_set(path: str | Path, wanted: Callable[[FileSet], bool]) -> FileSet | None:
-    """The outermost file set that `wanted` accepts; None where there is none.
+    """Return the outermost file set that `wanted` accepts; None where there is none.
 
     Raises:
         InputError: as `file_sets`, or two such folders lie side by side.

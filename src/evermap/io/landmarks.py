@@ -33,7 +33,7 @@ _P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
 def read_prior_map(path: str | Path, sigma_m: float = 0.02) -> Landmarks:
-    """Landmark positions to start from, for `--prior-map FILE`. Their frame becomes 'prior_map'.
+    """Return landmark positions to start from, for `--prior-map FILE`. Their frame becomes 'prior_map'.
 
     Args:
         path: CSV, Parquet or GeoJSON with `landmark_id, x_m, y_m` and optionally `sigma_m` or all of `cov_xx_m2,
@@ -54,7 +54,7 @@ def read_prior_map(path: str | Path, sigma_m: float = 0.02) -> Landmarks:
 
 
 def read_landmarks(path: str | Path, *, sigma_m: float = 0.0) -> Landmarks:
-    """A map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
+    """Return a map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
     path = _map_file(Path(path))
     try:
         data = path.read_bytes()
@@ -92,7 +92,7 @@ def landmarks_from_table(
     clock: Clock = Clock.RECORDING,
     names: dict[int, str] | None = None,
 ) -> Landmarks:
-    """Landmarks of a table with the columns of `docs/formats.md`, sorted by id.
+    """Return landmarks of a table with the columns of `docs/formats.md`, sorted by id.
 
     Raises:
         InputError: a column or value is not what it must be, or an id appears twice.
@@ -132,7 +132,7 @@ def landmarks_from_table(
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
-    """Writes a map as Parquet, one row a landmark, columns as in `docs/formats.md`. Returns the path.
+    """Write a map as Parquet, one row a landmark, columns as in `docs/formats.md`. Returns the path.
 
     `read_landmarks` gives back equal arrays.
     """
@@ -141,7 +141,7 @@ def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
-    """Writes a map as CSV with the same columns. Returns the path.
+    """Write a map as CSV with the same columns. Returns the path.
 
     `read_landmarks` gives back equal numbers; frame and clock, for which CSV has no place, are not kept.
     """
@@ -149,7 +149,7 @@ def write_map_csv(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def map_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """All columns of a map, in the order of `docs/formats.md`; class ids as labels."""
+    """Return all columns of a map, in the order of `docs/formats.md`; class ids as labels."""
     return {
         **survey_columns(landmarks),
         "class_id": labels_of(landmarks.class_id, landmarks.class_names),
@@ -163,13 +163,13 @@ def map_columns(landmarks: Landmarks) -> dict[str, Any]:
 
 
 def names_column(landmarks: Landmarks) -> dict[str, list[str]]:
-    """`name`, the texts that the landmarks are called by, '' for those with a number; none if all have numbers."""
+    """Return `name`, the texts that the landmarks are called by, '' for those with a number; none if all have numbers."""
     names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
     return {"name": names} if any(names) else {}
 
 
 def survey_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """Ids, positions and covariances."""
+    """Return ids, positions and covariances."""
     return {
         "landmark_id": landmarks.landmark_id,
         "x_m": landmarks.position_m[:, 0],
@@ -181,7 +181,7 @@ def survey_columns(landmarks: Landmarks) -> dict[str, Any]:
 
 
 def about_map(landmarks: Landmarks) -> dict[str, Any]:
-    """What the columns cannot say: version, frame, clock and the order of the classes."""
+    """Return what the columns cannot say: version, frame, clock and the order of the classes."""
     return {
         "schema_version": MAP_SCHEMA_VERSION,
         "frame": landmarks.frame,
@@ -191,7 +191,7 @@ def about_map(landmarks: Landmarks) -> dict[str, Any]:
 
 
 def checked_about(about: Any, path: Path) -> dict[str, Any]:
-    """`about_map` as read from a file.
+    """Return `about_map` as read from a file.
 
     Raises:
         InputError: it is not what evermap writes.
@@ -212,7 +212,7 @@ def checked_about(about: Any, path: Path) -> dict[str, Any]:
 
 
 def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
-    """The description that `write_map_parquet` leaves in a file; empty for files made by others."""
+    """Return the description that `write_map_parquet` leaves in a file; empty for files made by others."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -227,20 +227,20 @@ def parquet_about(data: bytes, path: Path) -> dict[str, Any]:
 
 
 def labels_of(class_id: IntArray, class_names: Sequence[str]) -> list[str]:
-    """Names of classes, '' for `UNKNOWN`; a class without a name is called by its number."""
+    """Return names of classes, '' for `UNKNOWN`; a class without a name is called by its number."""
     names = dict(enumerate(class_names))
     return ["" if number == UNKNOWN else names.get(number, str(number)) for number in class_id.tolist()]
 
 
 def distinct_labels(*tables: Table | None) -> tuple[str, ...]:
-    """All class labels of the tables, sorted."""
+    """Return all class labels of the tables, sorted."""
     labels = {label for table in tables if table is not None and "class_id" in table
               for label in table.labels("class_id")}  # fmt: skip
     return tuple(sorted(labels - {""}))
 
 
 def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
-    """Rows of `class_names` for the column `class_id`, `UNKNOWN` where it is empty or missing. Shape (R,).
+    """Return rows of `class_names` for the column `class_id`, `UNKNOWN` where it is empty or missing. Shape (R,).
 
     Raises:
         InputError: a label is not among the names.
@@ -257,7 +257,7 @@ def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
 
 
 def sort_landmarks(landmarks: Landmarks, order: IntArray) -> Landmarks:
-    """The given rows of a map, in that order."""
+    """Return the given rows of a map, in that order."""
     rows = ("landmark_id", "position_m", "covariance_m2", "class_id", "p_exists", "n_hits", "n_misses",
             "first_seen_s", "last_seen_s")  # fmt: skip
     return replace(landmarks, **{name: getattr(landmarks, name)[order] for name in rows})
@@ -304,7 +304,7 @@ _CORNERS = 36
 
 
 def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
-    """Writes a map as GeoJSON: two features a landmark. Returns the path.
+    """Write a map as GeoJSON: two features a landmark. Returns the path.
 
     The first is a point with all columns of `map.parquet` as properties and `"kind": "landmark"`; the second, where the
     covariance is not zero, the polygon of its 2-sigma ellipse (Mahalanobis distance 2, 86.5 % of the probability) with
@@ -333,7 +333,7 @@ def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
 
 
 def ellipse_polygons(center_m: FloatArray, covariance_m2: FloatArray, sigmas: float = 2.0) -> FloatArray:
-    """Closed counter-clockwise outlines of covariance ellipses. Shapes (L, 2), (L, 2, 2) -> (L, 37, 2)."""
+    """Return the closed counter-clockwise outlines of covariance ellipses. Shapes (L, 2), (L, 2, 2) -> (L, 37, 2)."""
     value, vector = np.linalg.eigh(covariance_m2)
     # eigenvectors may form a left-handed pair; GeoJSON wants outlines counter-clockwise
     vector[..., 1] *= np.sign(np.linalg.det(vector))[..., None]
@@ -346,7 +346,8 @@ def ellipse_polygons(center_m: FloatArray, covariance_m2: FloatArray, sigmas: fl
 
 
 def parse_geojson(data: bytes, path: Path) -> tuple[Table, dict[str, Any]]:
-    """The point features of a map as a table, and the map's description. Lines of the table count features from 1.
+    """Return the point features of a map as a table, and the map's description. Lines of the table count features
+    from 1.
 
     A point without the properties `x_m, y_m` takes them from its coordinates.
 

@@ -69,7 +69,7 @@ _VARIANCE_HINT = "standard deviation in metres"
 
 
 def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
-    """One robot's part of an MRCLAM recording.
+    """Return one robot's part of an MRCLAM recording.
 
     Args:
         path: `MRCLAM_DatasetN.zip`, with a folder inside or not, or the unpacked folder.
@@ -113,7 +113,7 @@ class MrclamReader:
     looks_for = "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat"
 
     def matches(self, path: Path) -> bool:
-        """Whether a file of a robot is there, at the top or one folder down."""
+        """Return whether a file of a robot is there, at the top or one folder down."""
         return find_file_set(path, _is_mrclam) is not None
 
     def read(self, path: Path, robot: int | None) -> Recording:
@@ -121,7 +121,7 @@ class MrclamReader:
         return read_mrclam(path, robot)
 
     def robots(self, path: Path) -> tuple[int, ...]:
-        """Numbers of the robots that have both odometry and measurements."""
+        """Return numbers of the robots that have both odometry and measurements."""
         files = find_file_set(path, _is_mrclam)
         return () if files is None else _complete_robots(files)
 

@@ -38,7 +38,7 @@ _INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
 
 
 def read_native(path: str | Path, robot: int | None = None) -> Recording:
-    """A recording in the plain native format.
+    """Return a recording in the plain native format.
 
     Args:
         path: folder, or zip of a folder, with `odometry` and `detections` as `.csv` or `.parquet`, and optionally
@@ -110,7 +110,7 @@ class NativeReader:
     looks_for = "folder or zip with odometry.csv and detections.csv (or .parquet)"
 
     def matches(self, path: Path) -> bool:
-        """Whether odometry or detections are there, at the top or one folder down."""
+        """Return whether odometry or detections are there, at the top or one folder down."""
         return find_file_set(path, is_native) is not None
 
     def read(self, path: Path, robot: int | None) -> Recording:
@@ -118,12 +118,12 @@ class NativeReader:
         return read_native(path, robot)
 
     def robots(self, path: Path) -> tuple[int, ...]:  # noqa: ARG002 (the protocol's signature)
-        """None: a native recording is of one robot, without a number."""
+        """Return (): a native recording is of one robot, without a number."""
         return ()
 
 
 def is_native(files: FileSet) -> bool:
-    """Whether a file set holds odometry or detections under their native names."""
+    """Return whether a file set holds odometry or detections under their native names."""
     return any(f"{name}{ending}" in files for name in ("odometry", "detections") for ending in ENDINGS)
 
 
@@ -272,7 +272,7 @@ def frames_and_detections(
     warnings: list[str],
     names: dict[int, str],
 ) -> tuple[Frames, Detections]:
-    """Frames of a native recording and the detections in them.
+    """Return frames of a native recording and the detections in them.
 
     Args:
         table: the detections.
@@ -314,7 +314,7 @@ def frames_and_detections(
 
 
 def polar(table: Table) -> tuple[FloatArray, FloatArray]:
-    """Range and bearing, the latter within half a turn. Shapes (R,)."""
+    """Return range and bearing, the latter within half a turn. Shapes (R,)."""
     return table.numbers(q.RANGE_M), wrap_far(table.numbers(q.BEARING_RAD))
 
 

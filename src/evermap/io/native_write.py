@@ -22,7 +22,7 @@ def write_native(
     folder: str | Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 (the word that callers expect)
 ) -> Path:
-    """Writes a recording as a native folder and returns the folder.
+    """Write a recording as a native folder and returns the folder.
 
     Odometry is written as velocities, detections as range and bearing. What is derived from files is not written:
     `source`, `warnings` and the line numbers of detections.
@@ -49,7 +49,7 @@ def write_native(
 
 
 def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
-    """Columns of every table that the recording has something for: arrays, or lists of text."""
+    """Return columns of every table that the recording has something for: arrays, or lists of text."""
     odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
     tables: dict[str, dict[str, Any]] = {
         "odometry": {

@@ -27,15 +27,15 @@ class Reader(Protocol):
     def looks_for(self) -> str: ...
 
     def matches(self, path: Path) -> bool:
-        """Whether the path looks like this format. Reads names, not contents."""
+        """Return whether the path looks like this format. Reads names, not contents."""
         ...
 
     def read(self, path: Path, robot: int | None) -> Recording:
-        """The recording of one robot; None for the format's default."""
+        """Return the recording of one robot; None for the format's default."""
         ...
 
     def robots(self, path: Path) -> tuple[int, ...]:
-        """Robots that can be asked for; empty where the format does not number them."""
+        """Return robots that can be asked for; empty where the format does not number them."""
         ...
 
 
@@ -44,7 +44,7 @@ READERS: tuple[Reader, ...] = (MrclamReader(), NativeReader())
 
 
 def reader_for(path: str | Path) -> Reader:
-    """The first reader that recognises the path.
+    """Return the first reader that recognises the path.
 
     Raises:
         InputError: nothing is there, a zip is damaged, or no reader recognises it; the message says what is looked for.
@@ -63,7 +63,7 @@ def reader_for(path: str | Path) -> Reader:
 
 
 def read_recording(path: str | Path, robot: int | None = None) -> Recording:
-    """Reads a recording of any known format.
+    """Read a recording of any known format.
 
     Args:
         path: folder, zip or file.
@@ -77,5 +77,5 @@ def read_recording(path: str | Path, robot: int | None = None) -> Recording:
 
 
 def list_robots(path: str | Path) -> tuple[int, ...]:
-    """Robots of a recording that can be read, in ascending order; empty where they have no numbers."""
+    """Return robots of a recording that can be read, in ascending order; empty where they have no numbers."""
     return reader_for(path).robots(Path(path))

@@ -35,16 +35,16 @@ class Rows:
         return len(self.values)
 
     def error(self, problem: str, *, row: int, field: str | None = None, hint: str | None = None) -> InputError:
-        """An error that names file, line and column."""
+        """Return an error that names file, line and column."""
         return InputError(problem, path=self.path, line=int(self.line[row]), field=field, hint=hint)
 
     def column(self, index: int) -> FloatArray:
-        """One column, contiguous. Shape (R,)."""
+        """Return one column, contiguous. Shape (R,)."""
         return np.ascontiguousarray(self.values[:, index])
 
 
 def parse_rows(data: bytes, path: Path, quantities: tuple[Quantity, ...], warnings: list[str]) -> Rows:
-    """Numbers of a file; `#` starts a comment anywhere, lines may end in any way.
+    """Return numbers of a file; `#` starts a comment anywhere, lines may end in any way.
 
     A last line with too few numbers, or with a broken number and no line end, was cut off while it was written:
     it is left out, and `warnings` gets a remark.

@@ -41,7 +41,7 @@ class Settings:
 
 
 def parse_sensor_toml(data: bytes, path: Path) -> Settings:
-    """Settings of a recording; every section and key may be left out.
+    """Return settings of a recording; every section and key may be left out.
 
     Raises:
         InputError: not TOML, an unknown section or key, a value of the wrong type or out of its limits.
@@ -64,7 +64,7 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
 
 
 def sensor_toml(settings: Settings) -> str:
-    """The text of a `sensor.toml` that reads back as `settings`."""
+    """Return the text of a `sensor.toml` that reads back as `settings`."""
     sensor = settings.sensor
     sections: dict[str, dict[str, Any]] = {
         "recording": {

@@ -25,7 +25,7 @@ class Shift:
     rotation_rad: float = 0.0
 
     def undone(self, first_stamp_s: float) -> MapChange:
-        """What an estimate that is given the shifted map should find: the world lies the other way.
+        """Return what an estimate that is given the shifted map should find: the world lies the other way.
 
         Args:
             first_stamp_s: of the recording; the change happened before it.
@@ -43,7 +43,7 @@ class Shift:
 
 
 def parse_shift(text: str) -> Shift:
-    """`IDS:DX[,DY[,TURN]]`: ids separated by commas, metres, degrees counter-clockwise about the centroid.
+    """Return `IDS:DX[,DY[,TURN]]`: ids separated by commas, metres, degrees counter-clockwise about the centroid.
 
     Raises:
         ConfigError: the text is not of this form, lists an id twice, or has a number that is not finite.
@@ -67,7 +67,7 @@ def parse_shift(text: str) -> Shift:
 
 
 def shifted(landmarks: Landmarks, shifts: Iterable[Shift]) -> Landmarks:
-    """The map after all shifts, one after the other; covariances turn with their landmarks.
+    """Return the map after all shifts, one after the other; covariances turn with their landmarks.
 
     Raises:
         ConfigError: a landmark is not in the map.

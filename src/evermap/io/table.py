@@ -43,12 +43,12 @@ class Table:
         return name in self.columns
 
     def error(self, problem: str, *, row: int | None, field: str | None = None, hint: str | None = None) -> InputError:
-        """An error that names file, line and column; `row` None blames the header."""
+        """Return an error that names file, line and column; `row` None blames the header."""
         line = self.header_line if row is None else int(self.line[row])
         return InputError(problem, path=self.path, line=line, field=field, hint=hint)
 
     def expect(self, required: Sequence[str], optional: Sequence[str] = ()) -> None:
-        """Raises InputError unless all of `required` and nothing beside `required` and `optional` is there."""
+        """Raise InputError unless all of `required` and nothing beside `required` and `optional` is there."""
         known = [*required, *optional]
         for name in self.columns:
             if name not in known:
@@ -61,18 +61,18 @@ class Table:
                 raise self.error("missing column", row=None, field=name, hint=f"the file has {has}")
 
     def one_form(self, first: tuple[str, ...], second: tuple[str, ...]) -> tuple[str, ...]:
-        """Which of two ways to say the same the table uses; raises InputError where it mixes them."""
+        """Return which of two ways to say the same the table uses; raises InputError where it mixes them."""
         if self.has_any(first) and self.has_any(second):
             problem = f"mixes {', '.join(first)} with {', '.join(second)}"
             raise self.error(problem, row=None, hint="keep one form")
         return second if self.has_any(second) else first
 
     def has_any(self, names: Iterable[str]) -> bool:
-        """Whether at least one of the columns is there."""
+        """Return whether at least one of the columns is there."""
         return any(name in self.columns for name in names)
 
     def numbers(self, quantity: Quantity) -> FloatArray:
-        """A numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
+        """Return a numeric column, checked against its limits. Shape (R,); nan where an optional cell is empty."""
         cells = self.columns[quantity.name]
         if isinstance(cells, np.ndarray):
             values: FloatArray = cells
@@ -82,7 +82,7 @@ class Table:
         return values
 
     def ids(self, name: str, *, optional: bool, names: dict[int, str] | None = None) -> IntArray:
-        """Whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
+        """Return whole numbers from 0; empty or -1 means `UNKNOWN` if `optional`. Shape (R,).
 
         Args:
             name: of the column.
@@ -117,7 +117,7 @@ class Table:
         return Table(self.path, {name: plain}, self.line, self.header_line).ids(name, optional=optional)
 
     def labels(self, name: str) -> list[str]:
-        """A column of names, '' where empty. Whole numbers stand for themselves as text."""
+        """Return a column of names, '' where empty. Whole numbers stand for themselves as text."""
         cells = self.columns[name]
         if not isinstance(cells, np.ndarray):
             broken = [row for row, cell in enumerate(cells) if not cell.isprintable()]
@@ -127,7 +127,9 @@ class Table:
         return ["" if np.isnan(value) else f"{value:.17g}" for value in cells.tolist()]
 
     def clock(self, name: str = STAMP_S.name) -> Clock | None:
-        """What the stamps of a column count, where they are dates (ISO 8601): with a zone, or without; else None."""
+        """Return what the stamps of a column count, where they are dates (ISO 8601): with a zone, or without; else
+        None.
+        """
         cells = self.columns.get(name, ())
         first = "" if isinstance(cells, np.ndarray) else next((cell for cell in cells if cell.strip()), "")
         return None if not first or _is_number(first) else clock_of_date(first)
@@ -171,7 +173,8 @@ class Table:
 
 
 def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
-    """A CSV table: comma separated, the first line that is no comment names the columns, `#` starts a comment line.
+    """Return a CSV table: comma separated, the first line that is no comment names the columns, `#` starts a comment
+    line.
 
     A last line with too few cells, or without line end and with an empty or broken last cell, was cut off while it
     was written: it is left out, and `warnings` gets a remark.
@@ -202,7 +205,7 @@ def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
 
 
 def parse_parquet(data: bytes, path: Path) -> Table:
-    """A Parquet table of numbers and strings.
+    """Return a Parquet table of numbers and strings.
 
     Raises:
         InputError: not Parquet, damaged, a repeated column name, or a column of another type.
@@ -214,7 +217,7 @@ def parse_parquet(data: bytes, path: Path) -> Table:
 
 
 def read_parquet(data: bytes, path: Path) -> Any:
-    """A Parquet file as a pyarrow table.
+    """Return a Parquet file as a pyarrow table.
 
     Raises:
         InputError: not Parquet, damaged, or a repeated column name.
@@ -234,7 +237,7 @@ def read_parquet(data: bytes, path: Path) -> Any:
 
 
 def parquet_bytes(columns: dict[str, Any], metadata: dict[str, str] | None = None) -> bytes:
-    """A Parquet file of arrays and lists of text ('' becomes null), with checksums against later damage."""
+    """Return a Parquet file of arrays and lists of text ('' becomes null), with checksums against later damage."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -251,7 +254,9 @@ def parquet_bytes(columns: dict[str, Any], metadata: dict[str, str] | None = Non
 
 
 def csv_text(columns: dict[str, Any], comment: str = "") -> str:
-    """A CSV file of arrays and lists of text; floats in the shortest form that reads back the same, nan as empty."""
+    """Return a CSV file of arrays and lists of text; floats in the shortest form that reads back the same, nan as
+    empty.
+    """
     head = "".join(f"# {line}\n" for line in comment.splitlines())
     cells = [_csv_cells(column) for column in columns.values()]
     body = "".join(",".join(row) + "\n" for row in zip(*cells, strict=True))
@@ -328,7 +333,7 @@ def _arrow_column(column: Any, path: Path, name: str) -> list[str] | FloatArray:
 
 
 def dates_as_text(column: Any) -> list[str]:
-    """Timestamps of a Parquet column, with or without a zone, as ISO 8601; '' where null."""
+    """Return timestamps of a Parquet column, with or without a zone, as ISO 8601; '' where null."""
     import pyarrow as pa
 
     dates = column.cast(pa.timestamp("us", tz=column.type.tz), safe=False).to_pylist()

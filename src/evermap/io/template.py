@@ -73,7 +73,7 @@ Optional: the landmarks' true positions, for errors or with '--prior-map truth'.
 
 
 def write_template(folder: str | Path) -> Path:
-    """Writes a commented, complete recording of 20 s that can be localised as it is; the same bytes every time.
+    """Write a commented, complete recording of 20 s that can be localised as it is; the same bytes every time.
 
     Raises:
         InputError: the folder exists and is not empty, or cannot be written.

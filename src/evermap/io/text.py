@@ -10,7 +10,7 @@ from evermap.types import Clock
 
 
 def decode_text(data: bytes, path: Path) -> str:
-    """UTF-8 text with newlines as line ends, whatever they were; a byte order mark is dropped.
+    """Return UTF-8 text with newlines as line ends, whatever they were; a byte order mark is dropped.
 
     Raises:
         InputError: the bytes are not text, with the line where that shows first.
@@ -28,7 +28,7 @@ def decode_text(data: bytes, path: Path) -> str:
 
 
 def parse_float(cell: str) -> float:
-    """A number as people write it; unlike `float`, no digit grouping by underscores.
+    """Return a number as people write it; unlike `float`, no digit grouping by underscores.
 
     Raises:
         ValueError: the cell holds none.
@@ -39,7 +39,8 @@ def parse_float(cell: str) -> float:
 
 
 def date_s(cell: str) -> float:
-    """Seconds since 1970-01-01 of an ISO 8601 date: UTC if it has a zone, else as the clocks on the wall show them.
+    """Return seconds since 1970-01-01 of an ISO 8601 date: UTC if it has a zone, else as the clocks on the wall show
+    them.
 
     Raises:
         ValueError, OverflowError: it is none.
@@ -49,7 +50,7 @@ def date_s(cell: str) -> float:
 
 
 def clock_of_date(cell: str) -> Clock | None:
-    """`unix` for a date with a zone, `local_wall` for one without, None for other text."""
+    """Return `unix` for a date with a zone, `local_wall` for one without, None for other text."""
     try:
         return Clock.UNIX if datetime.fromisoformat(cell.strip()).tzinfo else Clock.LOCAL_WALL
     except ValueError:
@@ -57,18 +58,18 @@ def clock_of_date(cell: str) -> Clock | None:
 
 
 def counted(count: int, noun: str) -> str:
-    """'1 row', '2 rows'."""
+    """Return '1 row', '2 rows'."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def reason(error: BaseException) -> str:
-    """What a library has to say about a file, in a short printable line."""
+    """Return what a library has to say about a file, in a short printable line."""
     first = (str(error).splitlines() or [""])[0] or type(error).__name__
     short = first if len(first) <= 120 else first[:117] + "..."
     return "".join(c if c.isprintable() else "?" for c in short)
 
 
 def quote(cell: str) -> str:
-    """A cell of the user's file for a message: short and printable."""
+    """Return a cell of the user's file for a message: short and printable."""
     short = cell if len(cell) <= 24 else cell[:21] + "..."
     return f"'{''.join(c if c.isprintable() else '?' for c in short)}'"

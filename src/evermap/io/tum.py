@@ -18,7 +18,7 @@ _COLUMNS = (STAMP_S, X_M, Y_M, Quantity("z_m", -1e8, 1e8), *_QUATERNION)
 
 
 def write_tum(trajectory: Trajectory, path: str | Path) -> Path:
-    """Writes a trajectory with z = 0 and rotations about z; covariances have no place in this format.
+    """Write a trajectory with z = 0 and rotations about z; covariances have no place in this format.
 
     Numbers are written in the shortest form that reads back the same.
     """
@@ -30,7 +30,7 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> Path:
 
 
 def read_tum(path: str | Path, *, frame: str = "truth", clock: Clock = Clock.RECORDING) -> Trajectory:
-    """A trajectory with its heading taken from the quaternion (z and tilt are left out) and zero covariance.
+    """Return a trajectory with its heading taken from the quaternion (z and tilt are left out) and zero covariance.
 
     Raises:
         InputError: the file is missing or malformed, time runs backwards, or a quaternion is not of unit length.

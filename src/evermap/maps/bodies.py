@@ -42,7 +42,7 @@ class Fate(IntEnum):
 
 
 def group(position_m: FloatArray, class_id: IntArray, *, reach_m: float) -> IntArray:
-    """Cliques by proximity within a class; what has no class stands alone.
+    """Return cliques by proximity within a class; what has no class stands alone.
 
     Complete linkage: no two landmarks of a clique are farther apart than `reach_m`, the closest are joined first.
 
@@ -90,7 +90,7 @@ def regrouped(
     p_wrong: float | FloatArray = 1e-3,
     settings: GroupingConfig = USUAL,
 ) -> IntArray:
-    """Cliques after a session: split where one rigid motion does not explain it, joined where it does.
+    """Return cliques after a session: split where one rigid motion does not explain it, joined where it does.
 
     Args:
         clique_id: (L,) cliques as they were.
@@ -154,7 +154,7 @@ class _Moves:
         return self._known[key]
 
     def joined(self, sets: list[IntArray], log_prior: Callable[[IntArray, IntArray], float]) -> list[IntArray]:
-        """Sets joined as long as the odds are for it, the best pair first."""
+        """Return sets joined as long as the odds are for it, the best pair first."""
         sets = list(sets)
         while True:
             best, pair = 0.0, None
@@ -176,7 +176,8 @@ class _Moves:
 def log_evidence_of_motion(
     before_m: FloatArray, after_m: FloatArray, covariance_m2: FloatArray, sigma_m: float = USUAL.move_sigma_m
 ) -> float:
-    """`log p(after | before)` if one rigid motion made it all: any turn, the middle moved by `sigma_m` each axis.
+    """Return `log p(after | before)` if one rigid motion made it all: any turn, the middle moved by `sigma_m` each
+    axis.
 
     Of one landmark exact, of more by Laplace's method about the most probable motion.
 
@@ -234,7 +235,7 @@ def _logit(p: float) -> float:
 
 
 def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntArray]:
-    """The map after its landmarks were given to other cliques.
+    """Return the map after its landmarks were given to other cliques.
 
     A site of a clique that is taken apart becomes one for each part; its stays are those of the part that keeps the
     site. Where cliques are put together, the sites at which they most probably stood become one; their other sites hold
@@ -319,7 +320,8 @@ def _of_sum_one(owner: IntArray, p_here: FloatArray) -> FloatArray:
 
 
 def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig = USUAL) -> LivingMap:
-    """The map after a session, its bodies without members that were missed alone; whether these exist is then open.
+    """Return the map after a session, its bodies without members that were missed alone; whether these exist is then
+    open.
 
     Args:
         before: the map as the session found it.

@@ -81,7 +81,7 @@ class History:
 
     @classmethod
     def of(cls, stays: Stays, looks_s: FloatArray, settings: LifetimeConfig = USUAL) -> Self:
-        """From the stays of a map in any order."""
+        """Learn from the stays of a map in any order."""
         stays = stays[np.lexsort((stays.first_s, stays.clique_id))]
         class_ids, kind = np.unique(stays.class_id, return_inverse=True)
         n = len(stays)
@@ -127,7 +127,9 @@ class History:
         )
 
     def shares(self, event: BoolArray, chance: BoolArray) -> FloatArray:
-        """(C + 1,) probability of an event for each class, and for one never seen; classes lean on their average."""
+        """Return (C + 1,) probability of an event for each class, and for one never seen; classes lean on their
+        average.
+        """
         chances, events = (self.counts(self.recent & rows, self.stays.p_gone) for rows in (chance, event & chance))
         # classes differ: every one counts for one event at most, however often it was seen
         weight = 1.0 / (chances[:-1] + self.strength)
@@ -136,7 +138,7 @@ class History:
         return np.append(of_classes, average)
 
     def counts(self, rows: BoolArray, weight: FloatArray | None = None) -> FloatArray:
-        """(C + 1,) how many of some rows (K,), or what they weigh, are of each class, and of all together."""
+        """Return (C + 1,) how many of some rows (K,), or what they weigh, are of each class, and of all together."""
         each = np.ones(len(rows)) if weight is None else weight
         return np.append(np.bincount(self.kind[rows], each[rows], minlength=len(self.class_ids)), each[rows].sum())
 
@@ -146,7 +148,7 @@ class History:
         return float(np.median(np.diff(self.looks_s))) if len(self.looks_s) > 1 else 86_400.0
 
     def sightings(self, back_by_stay: FloatArray, back_rate: FloatArray) -> Sightings:
-        """Of the recent stays, with what may have been missed between the looks at them."""
+        """Return the recent stays as samples, with what may have been missed between the looks at them."""
         stays, looks_s = self.stays[self.recent], self.looks_s
         first, last = (np.minimum(np.searchsorted(looks_s, t), len(looks_s) - 1) for t in (stays.first_s, stays.last_s))
         n_gaps = np.maximum(last - first, 1)

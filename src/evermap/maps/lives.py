@@ -14,7 +14,7 @@ DAY_S = 86_400.0
 
 
 def general_purpose() -> LifetimePrior:
-    """Of a class of which nothing is known: anything from an hour to ten years (Rosen 2016, eq. 26)."""
+    """Return the lifetime of an unknown class: anything from an hour to ten years (Rosen 2016, eq. 26)."""
     return GeneralPurpose(1.0 / (3650.0 * DAY_S), 1.0 / 3600.0)
 
 

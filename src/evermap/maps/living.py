@@ -45,7 +45,7 @@ class _Rows(ShownTable):
         return type(self)(*(getattr(self, item.name)[rows] for item in fields(self)))
 
     def joined(self, other: Self) -> Self:
-        """These rows, then those of another."""
+        """Return these rows, then those of another."""
         columns = [(getattr(self, item.name), getattr(other, item.name)) for item in fields(self)]
         return type(self)(*(np.concatenate(both) for both in columns))
 
@@ -73,7 +73,7 @@ class Members(_Rows):
 
     @classmethod
     def empty(cls) -> Members:
-        """No landmark."""
+        """Return members of no landmark."""
         return cls(*np.zeros((3, 0), dtype=np.int64), *np.zeros((2, 0), dtype=np.bool_))
 
 
@@ -102,7 +102,7 @@ class Sites(_Rows):
 
     @classmethod
     def empty(cls) -> Sites:
-        """No site."""
+        """Return a table of no site."""
         return cls(*np.zeros((2, 0), dtype=np.int64), *np.zeros((4, 0)))
 
 
@@ -127,7 +127,7 @@ class Places(_Rows):
 
     @classmethod
     def empty(cls) -> Places:
-        """No place."""
+        """Return a table of no place."""
         none = np.zeros(0, dtype=np.int64)
         return cls(none, none, np.zeros((0, 2)), none, none)
 
@@ -160,7 +160,7 @@ class Stays(_Rows):
 
     @classmethod
     def empty(cls) -> Stays:
-        """No stay."""
+        """Return a table of no stay."""
         names, stamp_s = np.zeros(0, dtype=np.int64), np.zeros(0)
         return cls(names, names, names, np.zeros((0, 2)), stamp_s, stamp_s, stamp_s, stamp_s, stamp_s)
 
@@ -191,7 +191,7 @@ class Evidence(_Rows):
 
     @classmethod
     def empty(cls) -> Evidence:
-        """Nothing was looked at."""
+        """Return evidence of no look."""
         names, numbers = np.zeros(0, dtype=np.int64), np.zeros(0)
         return cls(names, numbers, names, names, numbers, numbers, numbers)
 
@@ -270,11 +270,11 @@ class LivingMap(Shown):
         return {landmark_id_of(text): text for text in self.landmark_texts}
 
     def label(self, landmark_id: int) -> str:
-        """What a landmark is called: its text, or its id."""
+        """Return what a landmark is called: its text, or its id."""
         return self.landmark_names.get(landmark_id, str(landmark_id))
 
     def landmark_called(self, name: str) -> int:
-        """The id of a landmark by its text, or by its id in digits; -1 where that is neither."""
+        """Return the id of a landmark by its text, or by its id in digits; -1 where that is neither."""
         if name in self.landmark_texts:
             return landmark_id_of(name)
         return int(name) if name.isdecimal() and len(name) <= MOST_DIGITS else -1
@@ -304,7 +304,7 @@ class LivingMap(Shown):
         return np.where(found, total[mine] if len(total) else 0.0, 0.0)
 
     def site_of(self) -> IntArray:
-        """(L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
+        """Return (L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
         order = np.lexsort((self.sites.p_here, self.sites.clique_id))
         clique = self.sites.clique_id[order]
         last = np.flatnonzero(np.append(clique[1:] != clique[:-1], True)) if len(clique) else np.zeros(0, np.int64)
@@ -317,7 +317,8 @@ class LivingMap(Shown):
         return site
 
     def told_site(self) -> IntArray:
-        """(L,) `site_id` at which each landmark's clique is said to stand: where its stay goes on; `UNKNOWN` if away.
+        """Return (L,) `site_id` at which each landmark's clique is said to stand: where its stay goes on; `UNKNOWN`
+        if away.
 
         Of a clique without a stay, as in maps made by hand, its most probable site, if it more probably stands.
         """
@@ -332,7 +333,7 @@ class LivingMap(Shown):
         return np.asarray(np.where(stands, told, np.where(known, UNKNOWN, site)))
 
     def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
-        """(K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
+        """Return (K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
         known = {
             (int(site), int(name)): k
             for k, (site, name) in enumerate(zip(self.places.site_id, self.places.landmark_id, strict=True))
@@ -386,7 +387,7 @@ class LivingMap(Shown):
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
-        """(K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
+        """Return (K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
         corner = 2 * row[:, None] + np.arange(2)
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(2)
         arm = self.places.position_m[row] - middle
@@ -394,7 +395,7 @@ class LivingMap(Shown):
         return np.asarray(self.covariance_m2[corner[:, :, None], corner[:, None, :]] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
-        """Every place as a record of its own, in the order of `places`: what a robot may meet.
+        """Return every place as a record of its own, in the order of `places`: what a robot may meet.
 
         Args:
             p_site: (S,) probability of every site.
@@ -420,7 +421,7 @@ class LivingMap(Shown):
         )
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
-        """The map with an operator's word on one landmark; None leaves it as it is.
+        """Return the map with an operator's word on one landmark; None leaves it as it is.
 
         Raises:
             KeyError: no landmark has this id.
@@ -434,7 +435,7 @@ class LivingMap(Shown):
         return replace(self, members=replace(self.members, pinned=pins, deleted=deletions))
 
     def without(self, landmark_ids: IntArray) -> LivingMap:
-        """The map as if these landmarks had never been seen; bodies of which nothing is left go, too."""
+        """Return the map as if these landmarks had never been seen; bodies of which nothing is left go, too."""
         members = self.members[~np.isin(self.members.landmark_id, landmark_ids)]
         kept = np.flatnonzero(~np.isin(self.places.landmark_id, landmark_ids))
         places = self.places[kept]
@@ -450,20 +451,20 @@ class LivingMap(Shown):
 
 
 def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:
-    """Ids of the cliques that have sites, and for every site the row of its own."""
+    """Return ids of the cliques that have sites, and for every site the row of its own."""
     cliques, row = np.unique(sites.clique_id, return_inverse=True)
     return cliques, row.ravel().astype(np.int64)
 
 
 def class_of(living: LivingMap, cliques: IntArray) -> IntArray:
-    """(C,) class of every clique: that of its members."""
+    """Return (C,) class of every clique: that of its members."""
     order = np.argsort(living.members.clique_id, kind="stable")
     first = np.searchsorted(living.members.clique_id[order], cliques)
     return np.asarray(living.members.class_id[order[first]])
 
 
 def site_middles(living: LivingMap) -> FloatArray:
-    """(S, 2) mean position of the places of every site."""
+    """Return (S, 2) mean position of the places of every site."""
     row = np.searchsorted(living.sites.site_id, living.places.site_id)
     count = np.maximum(np.bincount(row, minlength=len(living.sites)), 1)
     columns = [np.bincount(row, living.places.position_m[:, k], minlength=len(living.sites)) / count for k in (0, 1)]

@@ -85,7 +85,7 @@ class Answer(Shown):
 
 
 def why(store: MapStore, landmark: int | str, revision: int | None = None) -> Answer:
-    """The answer for a landmark, in the newest revision or in another.
+    """Return the answer for a landmark, in the newest revision or in another.
 
     Args:
         store: the map.
@@ -250,7 +250,7 @@ def _belief(p: float) -> str:
 
 
 def probability_text(p: float) -> str:
-    """'0.97', and more digits near 0 and 1, where they matter; never certain."""
+    """Return '0.97', and more digits near 0 and 1, where they matter; never certain."""
     if 0.01 <= p <= 0.99:
         return f"{p:.2f}"
     low = min(p, 1.0 - p)

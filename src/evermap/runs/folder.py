@@ -88,13 +88,13 @@ class RunFolder:
             raise _cannot_write(self.out, error) from error
 
     def path(self, name: str) -> Path:
-        """Where to write the file `name` for now, '.' for the folder itself; its folder exists."""
+        """Return where to write the file `name` for now, '.' for the folder itself; its folder exists."""
         path = self._partial / name
         path.parent.mkdir(parents=True, exist_ok=True)
         return path
 
     def files(self) -> list[str]:
-        """Names of all files written so far and of their list, sorted, with forward slashes."""
+        """Return names of all files written so far and of their list, sorted, with forward slashes."""
         return sorted({*_entries(self._partial), MANIFEST})
 
     def finish(self, summary: dict[str, Any], *more: str) -> dict[str, Any]:
@@ -188,7 +188,7 @@ class RunFolder:
 def check_replaceable(
     out: str | Path, *, force: bool = False, inputs: Iterable[str | Path | None] = (), renew: bool = True
 ) -> None:
-    """Whether results may be written to `out`: it does not exist, is empty, or is an output of evermap and no more.
+    """Check that results may be written to `out`: it does not exist, is empty, or holds an output of evermap alone.
 
     Args:
         out: the folder.
@@ -225,7 +225,7 @@ def check_replaceable(
 
 
 def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] = (), ending: str = "") -> None:
-    """Whether a single file may be written: it is nothing that is read, and no living map.
+    """Check that a single file may be written: it is not an input, and no living map.
 
     Args:
         path: the file; an older one of that name is replaced.
@@ -441,7 +441,9 @@ def write_run(
 
 
 def summary_text(summary: Mapping[str, Any]) -> str:
-    """`summary.json` as text: keys sorted, floats in their shortest exact form, so equal runs give equal bytes."""
+    """Return `summary.json` as text: keys sorted, floats in their shortest exact form, so equal runs give equal
+    bytes.
+    """
     return json.dumps(summary, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 
 

@@ -219,7 +219,8 @@ def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> 
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:
-    """The map of a store as it was at a time: of the last revision whose sessions had all begun; the first for earlier.
+    """Return the map of a store as it was at a time: of the last revision whose sessions had all begun; the first for
+    earlier.
 
     Args:
         store: the map.

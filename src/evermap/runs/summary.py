@@ -103,7 +103,7 @@ def summary_dict(
     outputs: Sequence[str],
     warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The content of `summary.json`. Pure; no key is ever missing.
+    """Return the content of `summary.json`. Pure; no key is ever missing.
 
     Args:
         recording: what was processed.
@@ -166,7 +166,9 @@ def changes_text(changes: Iterable[Mapping[str, Any]]) -> str:
 
 
 def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict[str, Any]:
-    """What the run cost: real-time factor, step latencies [ms], total [s] and peak memory [MB]. Not reproducible."""
+    """Return what the run cost: real-time factor, step latencies [ms], total [s] and peak memory [MB]. Not
+    reproducible.
+    """
     step_ms = 1e3 * result.step_s
     p50, p99 = np.percentile(step_ms, [50, 99]) if len(step_ms) else (None, None)
     processing_s = float(np.sum(result.step_s)) if info.processing_s is None else info.processing_s
@@ -185,7 +187,7 @@ def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict
 
 
 def versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Return versions of what the numbers depend on."""
     found = {"python": platform.python_version()}
     for name in ("numpy", "scipy", "gtsam", "numba", "pyarrow", "matplotlib"):
         try:
@@ -196,7 +198,7 @@ def versions() -> dict[str, str]:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident size of this process so far [MB]; None where the system does not tell.
+    """Return the largest resident size of this process so far [MB]; None where the system does not tell.
 
     Linux counts the parent's size at the fork into `ru_maxrss`; the high-water mark of the address space does not.
     """

@@ -17,7 +17,7 @@ from evermap.types import BoolArray, FloatArray, IntArray, Sensor, rows_of
 
 
 def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
-    """How the cliques of a map stay, leave and return, by what was learned of their class and place."""
+    """Return how the cliques of a map stay, leave and return, by what was learned of their class and place."""
     sites = living.sites
     cliques, row = clique_rows(sites)
     class_id = class_of(living, cliques)
@@ -48,12 +48,12 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
 
 
 def predicted(living: LivingMap, config: LivingConfig, until_s: float) -> FloatArray:
-    """(S,) probability of every site to be where its clique stands, at a later instant."""
+    """Return (S,) probability of every site to be where its clique stands, at a later instant."""
     return aged(living, config, until_s).p_here
 
 
 def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
-    """The sites of a map as they are believed in at a later instant, at which nobody has looked again."""
+    """Return the sites of a map as they are believed in at a later instant, at which nobody has looked again."""
     if not config.existence or len(living.sites) == 0:
         return living.sites
     until_s = max(until_s, living.stamp_s)
@@ -65,7 +65,7 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
 
 
 def with_beliefs(sites: Sites, p_start: FloatArray, after: SiteBeliefs) -> Sites:
-    """Sites (S,) with what is believed after a while, and how much of it is the stay that was seen last."""
+    """Return sites (S,) with what is believed after a while, and how much of it is the stay that was seen last."""
     never_left = np.divide(sites.p_kept, p_start, out=np.zeros(len(sites)), where=p_start > 0.0)
     return replace(sites, p_here=after.p_here, p_kept=after.p_stayed * np.minimum(never_left, 1.0))
 
@@ -79,7 +79,7 @@ def believed(
     start_s: float,
     until_s: float,
 ) -> SiteBeliefs:
-    """Beliefs after the looks of a session.
+    """Return beliefs after the looks of a session.
 
     Args:
         living: the map, with the sites that the session found.
@@ -99,7 +99,7 @@ def believed(
 
 
 def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
-    """What was seen of every clique, frame by frame."""
+    """Return what was seen of every clique, frame by frame."""
     cliques, _ = clique_rows(living.sites)
     told = beliefs.trace
     return Evidence(
@@ -108,7 +108,7 @@ def evidence(living: LivingMap, beliefs: SiteBeliefs) -> Evidence:
 
 
 def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
-    """(C,) log likelihood ratio of a session's looks, for 'it stands somewhere' against 'it is away'."""
+    """Return (C,) log likelihood ratio of a session's looks, for 'it stands somewhere' against 'it is away'."""
     cliques, row = clique_rows(living.sites)
     before, after = (
         np.clip(np.bincount(row, p, minlength=len(cliques)), 1e-12, 1.0 - 1e-12)
@@ -118,7 +118,9 @@ def said(living: LivingMap, beliefs: SiteBeliefs) -> FloatArray:
 
 
 def p_false_of(sensor: Sensor, living: LivingMap) -> float:
-    """Probability that a look at an empty place gives a detection of its landmark: a wrong identity, by chance."""
+    """Return the probability that a look at an empty place gives a detection of its landmark: a wrong identity, by
+    chance.
+    """
     return min(max(sensor.p_false / max(len(living.members), 10), 1e-5), 0.1)
 
 

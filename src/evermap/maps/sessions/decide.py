@@ -26,12 +26,12 @@ class Standing:
     site: IntArray
 
     def of(self, clique_id: int) -> int:
-        """The row of a clique's site; -1 where it is away or unknown."""
+        """Return the row of a clique's site; -1 where it is away or unknown."""
         return int(np.append(self.site, -1)[_found(self.clique_id, clique_id)])
 
 
 def standing(living: LivingMap) -> Standing:
-    """The site of every clique that is more probable than all else."""
+    """Return the site of every clique that is more probable than all else."""
     cliques, row = clique_rows(living.sites)
     site = np.full(len(cliques), -1, dtype=np.int64)
     likely = np.flatnonzero(living.sites.p_here >= EXISTS)
@@ -50,7 +50,7 @@ def decided(
     *,
     settings: DecisionConfig = USUAL,
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """The map with its stays up to date, and what changed since it was told last, by clique.
+    """Return the map with its stays up to date, and what changed since it was told last, by clique.
 
     A stay goes on until looks end it: age alone lowers a belief, and is never told as a change. A clique that was away
     and is seen again has returned only if it had really left.
@@ -137,7 +137,7 @@ class _Session:
         longest: ClassLives | None,
         settings: DecisionConfig,
     ) -> Self:
-        """Before anything is decided."""
+        """Return the state before anything is decided."""
         sites, stays = after.sites, after.stays
         cliques, row = clique_rows(sites)
         count = len(cliques)
@@ -179,12 +179,12 @@ class _Session:
         )
 
     def weigh(self, row: int) -> None:
-        """A clique that was missed and stands was hidden: so much is learned of how often that happens."""
+        """Learn from a clique that was missed and stands how often cliques are hidden."""
         if self._missed(row) and not self.was_hit[row]:
             self.hidden[self._sight(row)] += 1.0 - self.p_away[row]
 
     def told_before(self, row: int, old: int, stay: int) -> None:
-        """A clique that is said to stand at the site `old`, by the stay `stay` (-1 for none)."""
+        """Decide on a clique that stood at the site `old`, by the stay `stay` (-1 for none)."""
         site = int(self.site[row])
         if self._stands(row) and site == old:
             self._goes_on(row, stay)
@@ -201,7 +201,7 @@ class _Session:
             self.p_gone[stay] = self.p_away[row]
 
     def was_away(self, row: int) -> None:
-        """A clique that is said to stand nowhere, or is new."""
+        """Decide on a clique that stood nowhere, or is new."""
         clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
         newest = self.newest.get(clique, -1)
         if not (self._stands(row) and self.hits[site]):
@@ -227,7 +227,7 @@ class _Session:
             self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
 
     def stays(self) -> Stays:
-        """Old and new ones, in the order of their beginning."""
+        """Return old and new ones, in the order of their beginning."""
         stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
         if not self.begun:
             return stays
@@ -360,7 +360,7 @@ def _told(before: LivingMap, after: LivingMap) -> dict[int, tuple[int, int]]:
 
 
 def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConfig = USUAL) -> LivingMap:
-    """The map without what it need not remember: its cost is that of what stands there, whatever its age.
+    """Return the map without what it need not remember: its cost is that of what stands there, whatever its age.
 
     Left out are the least probable sites of cliques that have more than `most_sites`, and cliques that are away for
     good: those that return with little probability, or, where too many are away, that went first. Their stays are kept

@@ -30,7 +30,7 @@ def with_session(
     session_covariance_m2: FloatArray,
     drift_m: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions and joint covariance of the old places, then of the new ones.
+    """Return positions and joint covariance of the old places, then of the new ones.
 
     What the session says of the places it saw moves those that it did not see, by their correlation.
 
@@ -66,7 +66,8 @@ def with_session(
 
 
 def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
-    """The joint covariance of a new map in the frame that its places define: as a whole they neither move nor turn.
+    """Return the joint covariance of a new map in the frame that its places define: as a whole they neither move nor
+    turn.
 
     A session knows its landmarks in the frame of its first pose, whose heading is no better known than the robot saw.
     Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
@@ -78,12 +79,12 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
 
 
 def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
-    """Joint covariance (2 K, 2 K) of places of which each may be off by `drift_m` since the map was made."""
+    """Return the joint covariance (2 K, 2 K) of places of which each may be off by `drift_m` since the map was made."""
     return np.asarray(covariance_m2 + drift_m**2 * np.eye(len(covariance_m2)))
 
 
 def resized(living: LivingMap, factor: float, log_size_variance: float, log_size_information: float) -> LivingMap:
-    """The map longer by a factor, about its middle; how well its metre is known goes with it."""
+    """Return the map longer by a factor, about its middle; how well its metre is known goes with it."""
     position = living.places.position_m
     middle = position.mean(axis=0)
     return replace(
@@ -96,14 +97,14 @@ def resized(living: LivingMap, factor: float, log_size_variance: float, log_size
 
 
 def blocks(covariance_m2: FloatArray) -> FloatArray:
-    """(P, 2, 2) covariance of every place by itself, of the joint one (2 P, 2 P)."""
+    """Return (P, 2, 2) covariance of every place by itself, of the joint one (2 P, 2 P)."""
     count = len(covariance_m2) // 2
     rows = np.arange(count)
     return np.asarray(covariance_m2.reshape(count, 2, count, 2)[rows, :, rows, :])
 
 
 def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
-    """(2 K, 2 K) joint covariance of some places, in their order."""
+    """Return (2 K, 2 K) joint covariance of some places, in their order."""
     at = se2.xy_rows(rows)
     return np.asarray(covariance_m2[np.ix_(at, at)])
 
@@ -127,7 +128,7 @@ class OwnLandmarks:
 
 
 def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntArray | None = None) -> OwnLandmarks:
-    """What a session says of its landmarks, in its own metres: those of the map where it was solved with one.
+    """Return what a session says of its landmarks, in its own metres: those of the map where it was solved with one.
 
     Args:
         outcome: of the session.
@@ -146,7 +147,9 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
 
 
 def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
-    """(2 K, 2 K) covariance with a size that is known to `log_sigma`: a longer world moves all away from the origin."""
+    """Return (2 K, 2 K) covariance with a size that is known to `log_sigma`: a longer world moves all away from the
+    origin.
+    """
     longer = own.position_m.ravel() * log_sigma
     return np.asarray(own.covariance_m2 + np.outer(longer, longer))
 
@@ -176,7 +179,7 @@ class Size:
 def settled(
     log_ratio: float, ratio_variance: float, session: tuple[float, float], map_variance: float, information: float
 ) -> Size:
-    """Both sizes after they were compared.
+    """Return both sizes after they were compared.
 
     The map's metre is the mean of those of all sessions. What one robot gets wrong about the metre it gets wrong in
     every session, so errors are taken as fully correlated: more sessions do not make the metre surer.
@@ -204,7 +207,7 @@ def settled(
 def log_ratio(
     session_m: FloatArray, session_m2: FloatArray, map_m: FloatArray, map_m2: FloatArray
 ) -> tuple[float, float]:
-    """Log of the map's size over the session's, and its variance: a similarity by generalised least squares.
+    """Return the log of the map's size over the session's, and its variance: a similarity by generalised least squares.
 
     Where residuals are larger than the covariances allow, as in a session that is bent, the variance grows with them.
 

@@ -75,7 +75,7 @@ class PlaceLooks:
 def looked_at(
     living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, config: LivingConfig
 ) -> PlaceLooks:
-    """Which places of a map were looked at, frame by frame, and which of them were seen.
+    """Return which places of a map were looked at, frame by frame, and which of them were seen.
 
     Args:
         living: the map, with the sites that the session found.
@@ -230,12 +230,12 @@ def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolA
 
 
 def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
-    """(F, 3) poses of the sensor in the map."""
+    """Return (F, 3) poses of the sensor in the map."""
     return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
 
 
 def surely_there(rows: SiteLooks, settled_s: float) -> BoolArray:
-    """(N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
+    """Return (N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
 
     They teach lines of sight before anything is judged by these, so that a robot on a way that it never took does not
     take what stands behind a wall for gone.
@@ -270,7 +270,7 @@ class Arrivals:
 def arrivals(
     before: LivingMap, after: LivingMap, looks: PlaceLooks, sensor: Sensor, settings: LooksConfig = USUAL
 ) -> Arrivals:
-    """What earlier sessions saw of the places of new sites.
+    """Return what earlier sessions saw of the places of new sites.
 
     Args:
         before: the map as the session found it.
@@ -329,7 +329,7 @@ class _Rays:
         return cls(to_m + offsets(lines.cell[used], lines.cell_m), to_m)
 
     def pass_by(self, eye_m: FloatArray, place_m: FloatArray, settings: LooksConfig) -> BoolArray:
-        """(V,) whether something behind a place (2,) was seen from eyes (V, 2), past the place."""
+        """Return (V,) whether something behind a place (2,) was seen from eyes (V, 2), past the place."""
         away = place_m - self.from_m
         ahead = self.to_m - self.from_m
         length = np.maximum(np.hypot(*ahead.T), 1e-9)

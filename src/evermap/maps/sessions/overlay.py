@@ -85,7 +85,7 @@ class Overlay:
 
 
 def lay_over(sighted: Sighted, known: Known, search: str = "joint", settings: OverlayConfig = USUAL) -> Overlay | None:
-    """The most probable assignment of sites to cliques, and the motion that goes with it.
+    """Return the most probable assignment of sites to cliques, and the motion that goes with it.
 
     Args:
         sighted: the session's landmarks.
@@ -166,7 +166,7 @@ class _Options:
             self.sites[int(sighted.clique[known.landmark[rows[0]]])].append(site)
 
     def likeliest_sites(self) -> IntArray:
-        """(C,) for every clique its most probable site; `ELSEWHERE` where it is more probably away."""
+        """Return (C,) for every clique its most probable site; `ELSEWHERE` where it is more probably away."""
         chosen = np.full(len(self.sites), ELSEWHERE, dtype=np.int64)
         for clique, sites in enumerate(self.sites):
             if sites:
@@ -176,7 +176,7 @@ class _Options:
         return chosen
 
     def agreeing(self) -> IntArray:
-        """(C,) for every clique the site that it lies nearest to, if that is near."""
+        """Return (C,) for every clique the site that it lies nearest to, if that is near."""
         chosen = np.full(len(self.sites), ELSEWHERE, dtype=np.int64)
         for clique, sites in enumerate(self.sites):
             near = [(self._gap_m[site], site) for site in sites]
@@ -185,12 +185,12 @@ class _Options:
         return chosen
 
     def rest_of(self, chosen: IntArray) -> IntArray:
-        """(C,) those that are elsewhere at their most probable sites, and those that stand elsewhere."""
+        """Return (C,) those that are elsewhere at their most probable sites, and those that stand elsewhere."""
         likely = self.likeliest_sites()
         return np.asarray(np.where(chosen == ELSEWHERE, likely, ELSEWHERE))
 
     def climb(self, chosen: IntArray) -> IntArray:
-        """From an assignment to one that no change of a single clique makes more probable."""
+        """Climb from an assignment to one that no change of a single clique makes more probable."""
         chosen = chosen.copy()
         seen = {chosen.tobytes()}
         for _ in range(MOST_FLIPS):
@@ -209,12 +209,12 @@ class _Options:
         return chosen
 
     def gated(self, chosen: IntArray) -> IntArray:
-        """(C,) every clique by itself, at the motion that was agreed on."""
+        """Return (C,) every clique by itself, at the motion that was agreed on."""
         table = self._scores(chosen)
         return np.array([max(scores, key=lambda o: scores[o]) for scores in table], dtype=np.int64)
 
     def log_probability(self, chosen: IntArray) -> float:
-        """Of an assignment with all that was seen, up to a constant that all assignments share."""
+        """Return the log probability of an assignment with all that was seen, up to a constant of all assignments."""
         total, _ = self._log_standing(chosen)
         for clique, sites in enumerate(self.sites):
             if sites and chosen[clique] == ELSEWHERE:
@@ -222,7 +222,7 @@ class _Options:
         return total
 
     def is_this_place(self, chosen: IntArray) -> bool:
-        """Whether what stands where it stood outweighs the surprise that all else was moved.
+        """Return whether what stands where it stood outweighs the surprise that all else was moved.
 
         In another place where the map's identities are used again, all landmarks stand anywhere: some agree by chance.
         """
@@ -230,7 +230,8 @@ class _Options:
         return here > math.log(self.settings.p_another_place) + count * self._log_room
 
     def outweighs_the_rest(self, chosen: IntArray) -> bool:
-        """False where a single body says where the session is, and is less likely to have stayed than what it denies.
+        """Return False where a single body says where the session is, and is less likely to have stayed than what it
+        denies.
 
         Two that stand to each other as in the map have hardly both moved. One fits itself wherever it is.
         """
@@ -255,11 +256,11 @@ class _Options:
         return total, len(rows)
 
     def n_standing(self, chosen: IntArray) -> int:
-        """Landmarks that stand where the map has them."""
+        """Return landmarks that stand where the map has them."""
         return len(np.unique(self.known.landmark[self._chosen_rows(chosen)]))
 
     def concluded(self, chosen: IntArray, *, split: bool) -> Overlay:
-        """The assignment, landmark by landmark, with bodies taken apart whose members disagree."""
+        """Return the assignment, landmark by landmark, with bodies taken apart whose members disagree."""
         table = self._scores(chosen)
         place = np.full(len(self.landmark_m), ELSEWHERE, dtype=np.int64)
         probability = np.zeros(len(place))

@@ -46,7 +46,7 @@ class Laid:
     assumed: BoolArray
 
     def as_seen(self) -> Laid:
-        """The same without what is assumed."""
+        """Return the same without what is assumed."""
         place = np.where(self.assumed, ELSEWHERE, self.place)
         return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
@@ -113,7 +113,8 @@ def laid_over(
 def unbent(
     living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray, settings: FitConfig = USUAL
 ) -> Laid:
-    """Where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid motion.
+    """Return where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid
+    motion.
 
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
     by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
@@ -150,7 +151,7 @@ def unbent(
 
 
 def all_at_home(living: LivingMap, p_site: FloatArray, where: Laid) -> Laid:
-    """Where a session lies if nothing has moved: every landmark of the map at its most probable place."""
+    """Return where a session lies if nothing has moved: every landmark of the map at its most probable place."""
     home = _homes(living, p_site, where)
     return replace(where, place=np.where(where.place >= 0, where.place, home))
 
@@ -170,7 +171,8 @@ def _homes(living: LivingMap, p_site: FloatArray, where: Laid) -> IntArray:
 
 
 def with_glimpsed(living: LivingMap, where: Laid, landmark_id: IntArray) -> Laid:
-    """Landmarks that were seen too rarely to say where they are, laid at the sites at which others of their body stand.
+    """Return landmarks that were seen too rarely to say where they are, laid at the sites at which others of their
+    body stand.
 
     Whether their sightings fit there is seen when the session is solved with the map.
 
@@ -226,7 +228,7 @@ def refitted(
     settings: FitConfig = USUAL,
     robust: bool,
 ) -> tuple[Outcome, bool]:
-    """The session in the frame of the map, and whether it had to be straightened for that.
+    """Return the session in the frame of the map, and whether it had to be straightened for that.
 
     Args:
         outcome: of the session alone.

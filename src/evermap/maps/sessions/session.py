@@ -75,7 +75,7 @@ class Believed:
 
 
 def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, LivingMap]:
-    """The recording without landmarks that an operator deleted, and with the map's class numbers.
+    """Return the recording without landmarks that an operator deleted, and with the map's class numbers.
 
     Raises:
         DataError: another clock than the map's.
@@ -112,7 +112,7 @@ def check_in_order(recording: Recording, living: LivingMap) -> None:
 
 
 def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingConfig) -> Laid | None:
-    """Where the session lies in the map; None where it shows nothing that stands as in the map."""
+    """Return where the session lies in the map; None where it shows nothing that stands as in the map."""
     own = own_landmarks(alone.outcome, config.fit)
     names = alone.prepared.landmark_id[own.row]
     log_sigma = np.hypot(alone.outcome.log_scale_sigma, np.sqrt(living.log_size_variance))
@@ -128,7 +128,8 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
 def refit(
     living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool
 ) -> tuple[LivingMap, Laid, Solved]:
-    """The session solved again, its landmarks held by the map's places at which they stand; and the map, resized.
+    """Return the session solved again, its landmarks held by the map's places at which they stand; and the map,
+    resized.
 
     A session that had to be straightened for that is asked again what stands where it stood.
     """
@@ -181,7 +182,9 @@ def refit(
 
 
 def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
-    """False for a session that the map contradicts: what fits together by itself does not fit once it is held there."""
+    """Return False for a session that the map contradicts: what fits together by itself does not fit once it is held
+    there.
+    """
     return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
 
 
@@ -232,7 +235,7 @@ def judged(
 
 
 def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Solved, config: LivingConfig) -> Extended:
-    """The map with the places and sites that the session found."""
+    """Return the map with the places and sites that the session found."""
     in_place = None
     if where is None:
         variance = visit.outcome.log_scale_sigma**2
@@ -267,7 +270,9 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: So
 
 
 def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:
-    """Which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor poses."""
+    """Return which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor
+    poses.
+    """
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = of_slam.trajectory(prepared, outcome, recording, "")
     stamps = recording.frames.stamp_s
@@ -299,7 +304,7 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: 
 
 
 def believed(entry: Extended, seen: PlaceLooks, visit: Solved, config: LivingConfig) -> Believed:
-    """The map with the beliefs and the counts of the session."""
+    """Return the map with the beliefs and the counts of the session."""
     living, rows = entry.living, seen.rows
     hit, missed = rows.hit, seen.counts & ~rows.hit
     places = replace(
@@ -351,7 +356,8 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Solved) -> Misses:
 def decided(
     before: LivingMap, now: Believed, seen: PlaceLooks, visit: Solved, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
-    """The map with its stays up to date and without what is forgotten, and what changed since the session before.
+    """Return the map with its stays up to date and without what is forgotten, and what changed since the session
+    before.
 
     Args:
         before: the map as the session found it.
@@ -376,7 +382,7 @@ def decided(
 def learned(
     after: LivingMap, seen: PlaceLooks, entry: Extended, eye: FloatArray, config: LivingConfig
 ) -> tuple[LivingMap, ClassLives | None]:
-    """The map with what the session taught of lifetimes, and of from where places are seen."""
+    """Return the map with what the session taught of lifetimes, and of from where places are seen."""
     if config.learn_sight and config.existence:
         names = entry.living.places.site_id, entry.living.places.landmark_id
         p_there = entry.living.sites.p_here[seen.rows.site]

@@ -40,7 +40,7 @@ __all__ = [
 
 
 def open_store(where: str | Path, *, create: bool = False) -> MapStore:
-    """The store at a path, or at an address such as `sqlite:///maps/ward.evermap`.
+    """Return the store at a path, or at an address such as `sqlite:///maps/ward.evermap`.
 
     A store of an older schema is brought up to date. A file that may not be written to can still be read.
 

@@ -65,13 +65,15 @@ class Chunk:
         return hashlib.sha256(self.dtype.encode() + self.raw).digest()
 
     def stored(self) -> bytes:
-        """Compressed, all first bytes of the values in front, then all second ones: neighbours are alike in them."""
+        """Compress values, all first bytes of the values in front, then all second ones: neighbours are alike in
+        them.
+        """
         planes = np.frombuffer(self.raw, np.uint8).reshape(-1, np.dtype(self.dtype).itemsize).T
         return zlib.compress(planes.tobytes(), level=1)  # covariances are most of a map, and more levels gain 3 %
 
     @classmethod
     def of_stored(cls, name: bytes, dtype: str, stored: bytes) -> Chunk:
-        """What `stored` wrote under a name; `DamagedError` if it is anything else."""
+        """Return what `stored` wrote under a name; `DamagedError` if it is anything else."""
         try:
             planes = np.frombuffer(zlib.decompress(stored), np.uint8).reshape(np.dtype(dtype).itemsize, -1)
         except (zlib.error, ValueError) as error:
@@ -83,7 +85,7 @@ class Chunk:
 
 
 def text_chunk(text: str) -> Chunk:
-    """Any text."""
+    """Return the value as text."""
     return Chunk("|u1", text.encode("utf-8", "surrogatepass"))
 
 
@@ -146,7 +148,7 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
 
 
 def unpack(name: bytes, fetch: Fetch) -> LivingMap:
-    """The map of this name.
+    """Return the map of this name.
 
     Raises:
         DamagedError: a chunk is missing or is not what was written, or the content contradicts itself.
@@ -180,7 +182,7 @@ def _of_format_1(parts: dict[str, Any]) -> None:
 
 
 def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[str, NDArray[Any]]:
-    """Some columns of a map, such as 'members.landmark_id', without reading the rest. Errors as `unpack`."""
+    """Return some columns of a map, such as 'members.landmark_id', without reading the rest. Errors as `unpack`."""
     listed = _manifest(name, fetch)["columns"]
     wanted = {column: listed.get(column) for column in columns}
     if None in wanted.values():
@@ -189,13 +191,13 @@ def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[st
 
 
 def names_in(name: bytes, fetch: Fetch) -> set[bytes]:
-    """The names of all chunks of a map, its manifest's among them. Errors as `unpack`."""
+    """Return the names of all chunks of a map, its manifest's among them. Errors as `unpack`."""
     columns = _manifest(name, fetch)["columns"].values()
     return {name, *(name_of(part) for _, _, _, names in columns for part in names)}
 
 
 def flaw(living: LivingMap) -> str:
-    """Say in what a map contradicts itself; '' if it is consistent.
+    """Tell in what a map contradicts itself; '' if it is consistent.
 
     The rules are those that the rest of the package relies on: columns of equal length, sorted unique ids, references
     that lead somewhere, finite positions, probabilities in [0, 1].

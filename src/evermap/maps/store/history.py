@@ -82,18 +82,18 @@ class Record:
         return self.number - 1 if restores is None else int(restores)
 
     def parts(self) -> set[bytes]:
-        """The chunks that it names, without those that are named by its content and its evidence in turn."""
+        """Return the chunks that it names, without those that are named by its content and its evidence in turn."""
         named = {self.content, self.config, *(name for name, _ in self.attachments.values())}
         return named | ({self.evidence} if self.evidence is not None else set())
 
     def attached(self) -> list[Attachment]:
-        """Its attachments."""
+        """Return its attachments."""
         return [
             Attachment(self.number, name, chunk.hex(), size) for name, (chunk, size) in sorted(self.attachments.items())
         ]
 
     def revision(self, config: str) -> Revision:
-        """As the history tells it."""
+        """Return as the history tells it."""
         row = self.about
         counts: dict[ChangeKind, int] = {}
         for change in self.changes:
@@ -123,7 +123,7 @@ class Record:
         )
 
     def chunk(self) -> Chunk:
-        """As bytes."""
+        """Return as bytes."""
         return text_chunk(
             json.dumps(
                 {
@@ -182,7 +182,7 @@ _PARTS = {"changes", "attachments", "lost", "n_cliques_ever", "n_sites_ever"}
 
 
 def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
-    """The revisions that one was made from, oldest first, itself included; those that were lost are left out.
+    """Return the revisions that one was made from, oldest first, itself included; those that were lost are left out.
 
     Args:
         origin: the revision whose map each one started from: its parent, or what it restored.
@@ -197,7 +197,7 @@ def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
 
 
 def about(provenance: Provenance, **counts: Any) -> dict[str, Any]:
-    """The values of `Record.about`."""
+    """Return the values of `Record.about`."""
     return {
         "kind": provenance.kind.value,
         "recording": provenance.recording,

@@ -26,7 +26,7 @@ _PLAIN = ("name", "source", "class_names", "clock")
 
 
 def pack_recording(recording: Recording) -> bytes:
-    """The bytes of a recording; equal recordings have equal bytes."""
+    """Return the bytes of a recording; equal recordings have equal bytes."""
     arrays: dict[str, Any] = {"objects": recording.objects}
     values: dict[str, Any] = {name: getattr(recording, name) for name in _PLAIN}
     values["landmark_texts"] = sorted(recording.landmark_names.values())
@@ -42,7 +42,7 @@ def pack_recording(recording: Recording) -> bytes:
 
 
 def unpack_recording(data: bytes) -> Recording:
-    """What `pack_recording` wrote.
+    """Return what `pack_recording` wrote.
 
     Raises:
         DamagedError: anything else.
@@ -106,7 +106,7 @@ class CliqueLooks(NamedTuple):
 
 
 def evidence_to_chunks(evidence: Evidence) -> tuple[Chunk, list[Chunk]]:
-    """The index of what a session saw, and a chunk for each clique."""
+    """Return the index of what a session saw, and a chunk for each clique."""
     listed, parts = [], []
     for clique in np.unique(evidence.clique_id):
         mine = evidence[evidence.clique_id == clique]
@@ -128,7 +128,7 @@ def read_index(text: str) -> list[CliqueLooks]:
 
 
 def looks_of(clique_id: int, stored: bytes, name: bytes) -> Evidence:
-    """The looks at one clique; `DamagedError` if the chunk is not what was written."""
+    """Return the looks at one clique; `DamagedError` if the chunk is not what was written."""
     planes = np.frombuffer(Chunk.of_stored(name, "|u1", stored).raw, np.uint8)
     sizes = [np.dtype(dtype).itemsize for dtype in _COLUMNS.values()]
     count, rest = divmod(len(planes), sum(sizes))

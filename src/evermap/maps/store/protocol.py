@@ -125,19 +125,21 @@ class MapStore(Protocol):
         ...
 
     def head(self) -> int:
-        """The newest revision; 0 where there is none yet."""
+        """Return the newest revision; 0 where there is none yet."""
         ...
 
     def log(self) -> tuple[Revision, ...]:
-        """All revisions, the oldest first."""
+        """Return all revisions, the oldest first."""
         ...
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
-        """The revisions that one was made from, oldest first, itself included; what was reverted is not among them."""
+        """Return the revisions that one was made from, oldest first, itself included; what was reverted is not among
+        them.
+        """
         ...
 
     def load(self, revision: int | None = None) -> LivingMap:
-        """The map as it was committed, bit by bit; revision 0 is the empty map."""
+        """Return the map as it was committed, bit by bit; revision 0 is the empty map."""
         ...
 
     def commit(
@@ -150,7 +152,7 @@ class MapStore(Protocol):
         parent: int,
         attachments: Mapping[str, bytes | Attachment] | None = None,
     ) -> int:
-        """A new revision, durable when this returns its number.
+        """Return a new revision, durable when this returns its number.
 
         Args:
             living: the map.
@@ -168,18 +170,18 @@ class MapStore(Protocol):
         ...
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
-        """A new revision with the content of an older one; reverting to the one before takes it back.
+        """Return a new revision with the content of an older one; reverting to the one before takes it back.
 
         Ids that were given since are not given again.
         """
         ...
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
-        """What was committed as the changes of one revision."""
+        """Return what was committed as the changes of one revision."""
         ...
 
     def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
-        """All changes that a landmark had a part in, each with the revision that told it, in order."""
+        """Return all changes that a landmark had a part in, each with the revision that told it, in order."""
         ...
 
     def evidence(
@@ -190,7 +192,7 @@ class MapStore(Protocol):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """What sessions saw, by time; of one clique, or of the cliques that a landmark belonged to.
+        """Return what sessions saw, by time; of one clique, or of the cliques that a landmark belonged to.
 
         Args:
             clique_id: the clique; None for all.
@@ -201,7 +203,7 @@ class MapStore(Protocol):
         ...
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """What is attached to revisions, oldest first, without reading it.
+        """Return what is attached to revisions, oldest first, without reading it.
 
         Args:
             revisions: which; None for those of `lineage()`.

@@ -46,7 +46,7 @@ chunk = Table(
 
 
 def checksum(schema_version: int, created_at: str, evermap_version: str, head: int, record: bytes | None) -> bytes:
-    """Of the row of `store`, which names the newest revision and so anchors the checksums of all of them."""
+    """Return the checksum of the row of `store`: it names the newest revision and anchors all checksums."""
     values = [schema_version, created_at, evermap_version, head, None if record is None else record.hex()]
     return hashlib.sha256(json.dumps(values).encode()).digest()
 

@@ -64,7 +64,7 @@ class SqlStore(Shown):
         tidy: Callable[[], None] = lambda: None,
         explain: Callable[[str], InputError | None] = lambda _: None,
     ) -> SqlStore:
-        """The store behind an engine; its tables are made or brought up to date. Errors as `open_store`.
+        """Return the store behind an engine; its tables are made or brought up to date. Errors as `open_store`.
 
         Args:
             engine: of the database.
@@ -134,12 +134,12 @@ class SqlStore(Shown):
         self.close()
 
     def head(self) -> int:
-        """The newest revision."""
+        """Return the newest revision."""
         with self._reading() as connection:
             return self._anchor(connection)[0]
 
     def log(self) -> tuple[Revision, ...]:
-        """All revisions."""
+        """Return all revisions."""
         with self._reading() as connection:
             records = self._chain(connection)[0]
             stored = self._fetched(connection, {record.config for record in records.values()})
@@ -147,12 +147,12 @@ class SqlStore(Shown):
             return tuple(record.revision(configs[record.config]) for _, record in sorted(records.items()))
 
     def lineage(self, revision: int | None = None) -> tuple[int, ...]:
-        """The revisions that are in one."""
+        """Return the revisions that are in one."""
         with self._reading() as connection:
             return self._lineage(connection, revision)
 
     def load(self, revision: int | None = None) -> LivingMap:
-        """The map as it was committed."""
+        """Return the map as it was committed."""
         with self._reading() as connection:
             number = self._known(connection, revision)
             return LivingMap() if number == 0 else self._unpacked(connection, self._record(connection, number))
@@ -167,11 +167,11 @@ class SqlStore(Shown):
         parent: int,
         attachments: Mapping[str, bytes | Attachment] | None = None,
     ) -> int:
-        """A new revision."""
+        """Return a new revision."""
         return self._commit(living, provenance, changes, evidence, parent=parent, attachments=attachments)
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
-        """A new revision with the content of an older one."""
+        """Return a new revision with the content of an older one."""
         with self._reading() as connection:
             head = self._known(connection, None)
             number = self._known(connection, revision)
@@ -210,13 +210,13 @@ class SqlStore(Shown):
         return self._commit(restored, origin, (), None, parent=head, restores=revision, lost=lost)
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
-        """Changes of one revision."""
+        """Return changes of one revision."""
         with self._reading() as connection:
             number = self._known(connection, revision)
             return self._record(connection, number).changes if number else ()
 
     def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
-        """Changes of a landmark."""
+        """Return changes of a landmark."""
         with self._reading() as connection:
             records = self._chain(connection)[0]
         told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
@@ -230,7 +230,7 @@ class SqlStore(Shown):
         since_s: float = -np.inf,
         revisions: Collection[int] | None = None,
     ) -> Evidence:
-        """What sessions saw."""
+        """Return what sessions saw."""
         kept = [Evidence.empty()]
         with self._reading() as connection:
             wanted: dict[bytes, set[int | None]] = {}  # None: every clique
@@ -252,12 +252,12 @@ class SqlStore(Shown):
         return found[np.argsort(found.stamp_s, kind="stable")]
 
     def attachments(self, revisions: Collection[int] | None = None) -> tuple[Attachment, ...]:
-        """What is attached to revisions."""
+        """Return what is attached to revisions."""
         with self._reading() as connection:
             return tuple(item for record in self._records_of(connection, revisions) for item in record.attached())
 
     def attached(self, attachment: Attachment) -> bytes:
-        """The bytes of an attachment."""
+        """Return the bytes of an attachment."""
         with self._reading() as connection:
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
@@ -586,7 +586,7 @@ _FAILURES = (
 
 
 def is_anchor(values: Sequence[Any]) -> bool:
-    """Whether these are the values of the row of `store`, as it was written."""
+    """Return whether these are the values of the row of `store`, as it was written."""
     if len(values) != 6:
         return False
     version, created_at, writer, head, record, checksum = values
@@ -601,7 +601,7 @@ def is_anchor(values: Sequence[Any]) -> bool:
 
 
 def now_utc() -> str:
-    """ISO 8601, to the second."""
+    """Return ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 

@@ -120,7 +120,7 @@ class Verification:
         return not self.damaged and not self.problems
 
     def error(self, path: Path, problem: str = "") -> DamagedMapError:
-        """One line that says what is damaged, which revisions are whole, and how to go back to them."""
+        """Return one line that says what is damaged, which revisions are whole, and how to go back to them."""
         told = [problem] if problem else list(self.problems[:1])
         if self.damaged and not problem:
             number = min(self.damaged)
@@ -153,7 +153,7 @@ def verify(path: Path) -> Verification:
 
 
 def survey(path: Path) -> Verification | None:
-    """The same without asking the database; None where there is no trace of a map."""
+    """Return the same without asking the database; None where there is no trace of a map."""
     try:
         found = _Found.of_file(path)
     except InputError:
@@ -208,7 +208,7 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
 
 
 def ranges(numbers: Iterable[int]) -> str:
-    """'1 to 4, 6 and 9 to 12'; the middle of many is left out."""
+    """Return '1 to 4, 6 and 9 to 12'; the middle of many is left out."""
     runs: list[list[int]] = []
     for number in sorted(numbers):
         if runs and number == runs[-1][1] + 1:
@@ -304,7 +304,7 @@ class _Found:
         return cls(chunks, anchor, records, names, lost)
 
     def verdicts(self, *, deep: bool) -> tuple[tuple[int, ...], dict[int, str]]:
-        """The revisions that are whole, and what is wrong with the others; `deep` builds their maps, too."""
+        """Return the revisions that are whole, and what is wrong with the others; `deep` builds their maps, too."""
         intact, damaged = [], {}
         for number in range(1, self.head + 1):
             if number in self.lost:
@@ -323,7 +323,7 @@ class _Found:
         return tuple(intact), damaged
 
     def closure(self, record: Record) -> set[bytes]:
-        """Names of all chunks of a revision but its record; `DamagedError` if one is not there."""
+        """Return names of all chunks of a revision but its record; `DamagedError` if one is not there."""
         content.read_text(record.config, self.fetch([record.config])[record.config])
         names = content.names_in(record.content, self.fetch) | record.parts()
         if record.evidence is not None:
@@ -335,7 +335,7 @@ class _Found:
         return names
 
     def fetch(self, names: Iterable[bytes]) -> dict[bytes, bytes]:
-        """`content.Fetch`."""
+        """Return `content.Fetch`."""
         try:
             return {name: self.chunks[name] for name in names}
         except KeyError:

@@ -44,12 +44,12 @@ class Changes:
         return len(self.feature)
 
     def per_feature(self, n_features: int) -> IntArray:
-        """(F,) number of changes of each feature."""
+        """Return (F,) number of changes of each feature."""
         return np.bincount(self.feature, minlength=n_features)
 
 
 def find_changes(looks: Looks, p_present: FloatArray, confidence: float, tail: float = 0.025) -> Changes:
-    """Changes of all features.
+    """Return changes of all features.
 
     Args:
         looks: by feature and time.

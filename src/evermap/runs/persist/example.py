@@ -34,7 +34,7 @@ optional    present: the truth, 1 or 0, empty where unknown; it only scores the 
 
 
 def write_example(path: str | Path) -> Path:
-    """Writes a commented table that `evermap persist` takes as it is; the same bytes every time.
+    """Write a commented table that `evermap persist` takes as it is; the same bytes every time.
 
     Raises:
         InputError: the file exists, or cannot be written.

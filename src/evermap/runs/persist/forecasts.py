@@ -39,7 +39,7 @@ class Forecasts:
 
 
 def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatArray:
-    """(N,) instants from the latest look on, `horizon_s` far.
+    """Return (N,) instants from the latest look on, `horizon_s` far.
 
     Raises:
         ConfigError: so many steps that one of them must be wrong.
@@ -53,7 +53,7 @@ def forecast_stamps(looks: Looks, now_s: float, config: PersistConfig) -> FloatA
 
 
 def forecasts_of(models: ModelOfEach, looks: Looks, stamp_s: FloatArray, p_exists: FloatArray) -> Forecasts:
-    """Forecasts with what each model expects from their first instant on.
+    """Return forecasts with what each model expects from their first instant on.
 
     Args:
         models: the model of every feature.

@@ -54,18 +54,18 @@ class ModelOfEach:
         return Track(p_present, evidence, merged)
 
     def only(self, features: IntArray) -> ModelOfEach:
-        """The same about some of the features."""
+        """Return the same about some of the features."""
         return ModelOfEach(self.models, self.names, self.of_feature[features])
 
     def to_dict(self) -> dict[str, Any]:
-        """The models by the name of their class."""
+        """Return the models by the name of their class."""
         return {name or "all": model.to_dict() for name, model in zip(self.names, self.models, strict=True)}
 
 
 def models_for(
     config: PersistConfig, table: LookTable, looks: Looks, progress: Callable[[float], None] | None = None
 ) -> tuple[ModelOfEach, LearnedModels | None]:
-    """The model of every feature, and how it was learned where it was.
+    """Return the model of every feature, and how it was learned where it was.
 
     Raises:
         ConfigError: an unknown kind of model, a prior that cannot be, or choices that contradict each other.
@@ -103,7 +103,7 @@ def _one_stay(config: PersistConfig, table: LookTable) -> ModelOfEach:
 
 
 def ask(model: PresenceFilter, looks: Looks, *questions: tuple[IntArray, FloatArray]) -> tuple[list[FloatArray], Track]:
-    """Answers to several lists of (feature, time) in one pass over the looks.
+    """Return answers to several lists of (feature, time) in one pass over the looks.
 
     Args:
         model: of the features.
@@ -143,14 +143,14 @@ def some_looks(looks: Looks, features: IntArray, most: int) -> tuple[Looks, IntA
 
 
 def looks_at(looks: Looks, features: IntArray) -> tuple[Looks, IntArray]:
-    """The looks at some features, and the rows they are."""
+    """Return the looks at some features, and the rows they are."""
     first, rows = _rows_of(looks.first, features)
     columns = (looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
     return Looks(first, *(column[rows] for column in columns)), rows
 
 
 def instants_at(instants: Instants, features: IntArray) -> tuple[Instants, IntArray]:
-    """The instants of some features, and the rows they are."""
+    """Return the instants of some features, and the rows they are."""
     first, rows = _rows_of(instants.first, features)
     return Instants(first, instants.stamp_s[rows]), rows
 

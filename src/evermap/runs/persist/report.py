@@ -23,7 +23,7 @@ _MOST_ROWS = 100
 def render_report(
     result: PersistResult, summary: Mapping[str, Any], figures: Sequence[NamedFigure], clock: Clock
 ) -> str:
-    """The page as text. Contains no address outside of itself, and nothing in it is executed.
+    """Return the page as text. Contains no address outside of itself, and nothing in it is executed.
 
     Args:
         result: of `run_persist`.

@@ -96,7 +96,7 @@ def run_persist(
     truth: Truth | None = None,
     progress: Progress | None = None,
 ) -> PersistResult:
-    """Beliefs, changes and forecasts of a table of looks.
+    """Compute beliefs, changes and forecasts of a table of looks.
 
     Args:
         table: `read_looks(path)`.
@@ -177,7 +177,7 @@ def _grid(table: LookTable, config: PersistConfig) -> tuple[IntArray, FloatArray
 
 
 def nice_step(at_least_s: float) -> float:
-    """The next longer one of 1, 2, 5, 10, ... s or parts of it; 1 s for no span at all."""
+    """Return the next longer one of 1, 2, 5, 10, ... s or parts of it; 1 s for no span at all."""
     if at_least_s <= 0.0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(at_least_s))
@@ -271,7 +271,7 @@ class _Steps:
         self.step_s: dict[str, float] = {}
 
     def within(self, part: float) -> None:
-        """A part of the present step is done."""
+        """Note that a part of the present step is done."""
         if self._progress:
             self._progress(len(self.step_s) + part, len(self._names))
 

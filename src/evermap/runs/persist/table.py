@@ -116,17 +116,17 @@ class LookTable:
         return float(self.stamp_s[self.looked].max())
 
     def order(self) -> IntArray:
-        """(R,) the rows by feature and time."""
+        """Return (R,) the rows by feature and time."""
         return np.lexsort((self.stamp_s, self.feature))
 
     def looks(self, order: IntArray) -> Looks:
-        """The looks by feature and time; `order` is `self.order()`."""
+        """Return the looks by feature and time; `order` is `self.order()`."""
         rows = order[self.looked[order]]
         columns = (self.stamp_s, self.detected, self.p_miss, self.p_false)
         return Looks(_firsts(self.feature[rows], self.n_features), *(column[rows] for column in columns))
 
     def truth(self, order: IntArray) -> Truth | None:
-        """What the column `present` says; None without any. `order` is `self.order()`."""
+        """Return what the column `present` says; None without any. `order` is `self.order()`."""
         if self.present is None:
             return None
         rows = order[~np.isnan(self.present[order])]
@@ -148,7 +148,7 @@ class Truth:
     present: FloatArray
 
     def at(self, feature: IntArray, stamp_s: FloatArray) -> FloatArray:
-        """(N,) truth about features at instants; nan before a feature's first sample and after its last."""
+        """Return (N,) truth about features at instants; nan before a feature's first sample and after its last."""
         of_sample = np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
         n = len(of_sample)
         asked = np.concatenate([np.full(n, -1), np.arange(len(stamp_s))])
@@ -165,7 +165,7 @@ class Truth:
 
 
 def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -> LookTable:
-    """A table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
+    """Return a table with `stamp_s, feature_id, detected` and perhaps `p_miss, p_false, class_id, present`.
 
     Args:
         path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
@@ -214,7 +214,7 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
 
 
 def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ...]]:
-    """A table with `stamp_s, feature_id, present` about the features of `looks`, and remarks about others.
+    """Return a table with `stamp_s, feature_id, present` about the features of `looks`, and remarks about others.
 
     Raises:
         InputError: anything wrong in the file, or no feature in common.

@@ -73,7 +73,8 @@ class DetectionTable:
 
 
 def read_detections(path: str | Path, *, min_score: float = 0.0) -> DetectionTable:
-    """A table with `stamp_s, x_m, y_m, z_m` and perhaps class, covariance, score, appearance and the sensor's position.
+    """Return a table with `stamp_s, x_m, y_m, z_m` and perhaps class, covariance, score, appearance and the sensor's
+    position.
 
     A row without a position is a frame in which nothing was detected.
 
@@ -197,13 +198,14 @@ def _sensor(table: Columns, frame: IntArray, n_frames: int) -> FloatArray | None
 
 
 def said_of(table: DetectionTable) -> list[str]:
-    """Remarks on what was read: its own, and what was left out."""
+    """Return remarks on what was read: its own, and what was left out."""
     weak = [f"{counted(table.n_weak, 'detection')} of low score left out"] if table.n_weak else []
     return [*table.warnings, *weak]
 
 
 def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:
-    """A table with a row a true class: its name in `class_id`, and a column for each class that it is detected as.
+    """Return a table with a row a true class: its name in `class_id`, and a column for each class that it is detected
+    as.
 
     Args:
         path: a `.csv`, `.csv.gz` or `.parquet` file.

@@ -41,7 +41,7 @@ class _Stay(NamedTuple):
 
 
 def write_example(path: str | Path) -> Path:
-    """Writes a commented table that `evermap track --range-m 12` takes as it is; the same bytes every time.
+    """Write a commented table that `evermap track --range-m 12` takes as it is; the same bytes every time.
 
     Raises:
         InputError: the file exists, or cannot be written.

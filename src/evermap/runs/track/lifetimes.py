@@ -92,7 +92,7 @@ class LifetimeGroup:
 
 
 def read_lifetimes(path: str | Path) -> LifetimeTable:
-    """A table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
+    """Return a table with `left, right` and perhaps `entry, weight, class_id, x_m, y_m`.
 
     Args:
         path: a `.csv`, `.csv.gz` or `.parquet` file; rows in any order.
@@ -137,7 +137,7 @@ def read_lifetimes(path: str | Path) -> LifetimeTable:
 def lifetimes_csv(
     data: CensoredLifetimes, class_names: Sequence[str], class_of_row: IntArray, xy_m: FloatArray
 ) -> bytes:
-    """A table that `read_lifetimes` reads.
+    """Return a table that `read_lifetimes` reads.
 
     Args:
         data: N lifetimes, of which `entry_s` and `weight` are written where they say something.
@@ -156,7 +156,7 @@ def lifetimes_csv(
 
 
 def parse_by(text: str) -> tuple[str, ...]:
-    """`class,chunk` as words.
+    """Return `class,chunk` as words.
 
     Raises:
         ConfigError: another word.
@@ -169,7 +169,7 @@ def parse_by(text: str) -> tuple[str, ...]:
 
 
 def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[LifetimeGroup]:
-    """The rows told apart by class, by square chunk of the ground, by both or not at all; in natural order.
+    """Return the rows told apart by class, by square chunk of the ground, by both or not at all; in natural order.
 
     Args:
         table: the lifetimes.
@@ -259,20 +259,20 @@ class LifetimeEstimate:
 
 
 def estimators() -> tuple[str, ...]:
-    """All names that `estimate` takes."""
+    """Return all names that `estimate` takes."""
     from evermap.survival.parametric_fit import KINDS
 
     return (NPMLE, KAPLAN_MEIER, *KINDS, BEST, GP)
 
 
 def check_estimator(name: str) -> None:
-    """Raises ConfigError for a name that `estimate` does not take."""
+    """Raise ConfigError for a name that `estimate` does not take."""
     if name not in estimators():
         raise ConfigError(f"'{name}' is no estimator", field="estimator", hint=", ".join(estimators()))
 
 
 def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:
-    """What an estimator says of each group, one after the other, so that a progress bar can follow.
+    """Yield what an estimator says of each group, one after the other, so that a progress bar can follow.
 
     The Gaussian process learns from all groups what they have in common; the others see one group at a time.
 
