@@ -164,7 +164,7 @@ def kept(place: str | os.PathLike[str], said: str) -> None:
 
 
 def leave_on_signals() -> None:
-    """End this process by Ctrl-C from now on: with one line, exit code 130 and nothing half written (143 for SIGTERM)."""
+    """End this process by Ctrl-C from now on: one line, exit code 130, nothing half written (143 for SIGTERM)."""
     if not raises():
         return
     atexit.register(_end_process)  # the first to be registered is the last to be called

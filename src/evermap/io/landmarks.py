@@ -163,7 +163,7 @@ def map_columns(landmarks: Landmarks) -> dict[str, Any]:
 
 
 def names_column(landmarks: Landmarks) -> dict[str, list[str]]:
-    """Return `name`, the texts that the landmarks are called by, '' for those with a number; none if all have numbers."""
+    """Return `name`, the texts that landmarks are called by, '' for those with a number; none if all have numbers."""
     names = [landmarks.names.get(identity, "") for identity in landmarks.landmark_id.tolist()]
     return {"name": names} if any(names) else {}
 
