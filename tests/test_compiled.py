@@ -152,6 +152,33 @@ def reader_of_a_shipped_package(folder: Path) -> Any:
     return run
 
 
+def test_code_for_a_type_that_is_gone_is_compiled_anew(tmp_path: Path) -> None:
+    """An update renames the types of a kernel's arguments: what is kept names types that nobody finds any more."""
+    program = """
+from typing import NamedTuple
+
+from evermap.compiled import kept
+
+
+class {name}(NamedTuple):
+    value: float
+
+
+@kept(error_model="numpy")
+def twice(argument):
+    return 2.0 * argument.value
+
+
+print(twice({name}(3.0)))
+"""
+    for name in ("Before", "After"):
+        (tmp_path / "kernel_of_an_update.py").write_text(program.format(name=name))
+        code = [sys.executable, "-c", "import kernel_of_an_update"]
+        path = os.pathsep.join([str(tmp_path), str(SOURCES)])
+        done = subprocess.run(code, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path}, check=False)
+        assert (done.stdout, done.stderr) == ("6.0\n", ""), name
+
+
 def test_without_a_place_to_keep_code_a_temporary_one_is_used_and_told_once(tmp_path: Path) -> None:
     run = reader_of_a_shipped_package(tmp_path)
     code = """

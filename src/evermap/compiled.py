@@ -6,6 +6,7 @@ import contextlib
 import functools
 import hashlib
 import os
+import pickle
 import stat
 import sys
 import tempfile
@@ -20,6 +21,10 @@ from evermap.errors import EvermapWarning
 from evermap.interrupts import held, raises
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)
+"""Raised by an index of kept code that names types which this evermap does not have any more, or that was cut off."""
 
 
 def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]:
@@ -113,12 +118,20 @@ def _keeper() -> Callable[[Any], Any]:
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             with _locked(Path(self.cache_path)):
                 self._stamp()
-                return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                try:
+                    return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+                except UNREADABLE:
+                    self.flush()  # type: ignore[no-untyped-call]
+                    return None
 
         def save_overload(self, sig: Any, data: Any) -> None:
             with _locked(Path(self.cache_path)):
                 self._stamp()
-                super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+                try:
+                    super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+                except UNREADABLE:
+                    self.flush()  # type: ignore[no-untyped-call]
+                    super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
         def _stamp(self) -> None:
             """Not before the first call: a kernel may call others that stand below it."""

@@ -134,7 +134,8 @@ def speak_of_options(error: EvermapError, ctx: Any) -> None:
 
     error.problem = replaced(error.problem)
     error.hint = error.hint and replaced(error.hint)
-    error.field = error.field and (option(error.field) or error.field)
+    if error.line is None:  # in a line of a file it is a column or a key
+        error.field = error.field and (option(error.field) or error.field)
 
 
 def _shown(param: Any) -> str:

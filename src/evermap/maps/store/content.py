@@ -327,11 +327,15 @@ def _flaw_of_signs(living: LivingMap) -> str:
     return ""
 
 
+_NOT_STORED = {"sightlines.rules"}
+"""Settings, which each session brings; a revision keeps them with its configuration."""
+
+
 def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
-        if name in _PRIOR and not len(part):
+        if name in _NOT_STORED or (name in _PRIOR and not len(part)):
             continue
         if name in _LIFE:
             text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
@@ -353,7 +357,9 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
     content: dict[str, Any] = {}
     for item in fields(default):
         name, part = prefix + item.name, getattr(default, item.name)
-        if is_dataclass(part):
+        if name in _NOT_STORED:
+            content[item.name] = part
+        elif is_dataclass(part):
             content[item.name] = _build(part, name + ".", parts)
         elif name not in parts:
             content[item.name] = part
