@@ -13,11 +13,6 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[2]
 ROW = re.compile(r"^\| (?P<noun>[a-z ]+) \| (?P<meaning>[^|]+) \| `(?P<path>[\w.]+)` \|", re.MULTILINE)
 TERMS = list(ROW.finditer((REPOSITORY / "docs" / "glossary.md").read_text(encoding="utf-8")))
-USED_FOR_SEVERAL = {
-    "Method",
-    "Stamps",
-}
-"""Names of classes that two modules define, for different things. The list may only become shorter."""
 
 
 def test_there_are_at_most_thirty_nouns_each_with_a_class_of_its_own() -> None:
@@ -41,6 +36,4 @@ def test_a_class_name_is_used_once_in_the_library() -> None:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes[node.name].append(path.relative_to(REPOSITORY).as_posix())
     several = {name: paths for name, paths in homes.items() if len(paths) > 1}
-    new = {name: paths for name, paths in several.items() if name not in USED_FOR_SEVERAL}
-    assert not new, "a class of this name exists already"
-    assert not USED_FOR_SEVERAL - set(several), "used once by now: take it off the list"
+    assert not several, "a class of this name exists already"

@@ -249,7 +249,7 @@ def test_refusals() -> None:
     looks, _ = simulated(0, 100.0, 1.0)
     with pytest.raises(ConfigError, match="is no structure"):
         learn(looks, phases="four-state")
-    with pytest.raises(ConfigError, match="no half life"):
+    with pytest.raises(ConfigError, match="invalid half life"):
         learn(looks, half_life_s=0.0)
     with pytest.raises(DataError, match="two instants"):
         learn(Looks.from_rows([0, 1], [0.0, 0.0], [1, 1], 0.1, 0.1))

@@ -14,6 +14,7 @@ from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.io.mrclam import read_mrclam
 from evermap.pipeline import run_slam
+from evermap.sensing.visibility import WORTH_A_LOOK
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.localize_recording import localize
 from evermap.slam.noise import START
@@ -118,7 +119,7 @@ def test_every_detection_and_every_miss_is_accounted_for():
     in_map = np.isin(detections.landmark_id, result.landmarks.landmark_id)
     assert len(innovations) == (used & in_map).sum()
     # where nothing is hidden by walls, the sensor's own probability of detection says how many misses to expect
-    assert misses.p_detect.min() >= 0.5 * recording.sensor.p_detect
+    assert misses.p_detect.min() >= WORTH_A_LOOK * recording.sensor.p_detect
 
 
 @pytest.mark.slow

@@ -154,7 +154,10 @@ def test_bad_input_is_told_in_one_line(given: dict[str, object], says: str) -> N
         (lambda: TrackerConfig(chunk_m=0.0), "field 'chunk_m': input should be greater than 0, not 0.0"),
         (
             lambda: TrackerConfig(motion="jerk"),  # type: ignore[arg-type]
-            "field 'motion': input should be 'acceleration' or 'velocity', not 'jerk'",
+            (
+                "field 'motion': input should be 'acceleration' or 'velocity', not 'jerk' "
+                "(try: one of acceleration, velocity)"
+            ),
         ),
         (lambda: Tracker(n_classes=0), "field 'n_classes': 0 classes (try: at least 1)"),
         (

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from evermap.types import Clock
 
 
-class Stamps(StrEnum):
+class StampsCount(StrEnum):
     """What stamps count, as `types.Clock`, which would load numpy for `--help`."""
 
     UNIX = "unix"
@@ -86,7 +86,7 @@ Figures = Annotated[
     int | None, typer.Option(min=0, help="How many features get a figure of their own.", show_default="12")
 ]
 ShownClock = Annotated[
-    Stamps | None, typer.Option(help="What stamps count, for the figures.", show_default="by their size")
+    StampsCount | None, typer.Option(help="What stamps count, for the figures.", show_default="by their size")
 ]
 Example = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False)

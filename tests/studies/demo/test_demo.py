@@ -221,7 +221,7 @@ def test_the_folder_is_a_run_with_the_story_on_top(folder: Path, summary, buildi
         parts[-1]
         < page.index(f"<h2>{building.sessions[-1].name}</h2>")
         < page.index('class="cards"')
-        < page.index("<h2>Accuracy")
+        < page.index("<h2>Accuracy</h2>")
     )
     check_replaceable(folder)  # by the next demo, without --force
 
