@@ -84,7 +84,8 @@ def solve(
     Raises:
         NumericalError: no finite optimum.
     """
-    warm_up(search=may_search(len(prepared.problem.stamp_s), in_map=prepared.prior_map is not None))
+    in_map = prepared.prior_map is not None
+    warm_up(search=settings.method == "joint" and may_search(len(prepared.problem.stamp_s), in_map=in_map))
     slam = StreamingSlam(
         prepared.problem,
         noise,
