@@ -189,7 +189,7 @@ FEW = "stamp_s,x_m,y_m,z_m,class_id\n" + "".join(f"{0.1 * k:.1f},1,2,3,car\n" fo
         (FEW, ("--set", "warm_up=two"), "field 'track.warm_up': input should be a valid integer"),
         (FEW, ("--set", "p_detect=1.5"), "field 'track.p_detect': input should be less than 1, not 1.5"),
         (FEW, ("--set", "motion=circles"), "field 'track.motion'"),
-        (FEW, ("--set", "warm_up"), "'warm_up' is no setting"),
+        (FEW, ("--set", "warm_up"), "invalid setting 'warm_up'"),
         ("stamp_s,x_m,y_m,z_m\n1,2,3,4\n", (), "no object was seen often enough"),
         ("stamp_s,x_m,y_m\n1,2,3\n", (), "field 'z_m': missing column"),
     ],

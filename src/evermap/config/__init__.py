@@ -120,7 +120,7 @@ def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, A
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not all(name.strip() for name in key.split(".")):
-            raise ConfigError(f"'{override}' is no setting", hint="section.key=value, for example slam.seed=1")
+            raise ConfigError(f"invalid setting '{override}'", hint="section.key=value, for example slam.seed=1")
         short = within and "." not in key and key.strip() not in Config.model_fields
         _set(content, f"{within}.{key}" if short else key, _toml_value(text.strip()))
     for key, value in values.items():

@@ -78,7 +78,7 @@ class Choice(Shown):
 
 
 def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progress | None = None) -> Choice:
-    """Learn the kind of model that foretells the last part of the looks best.
+    """Learn the kind of model that predicts the last part of the looks best.
 
     The last week is held out where there are four or more, else the last fifth. Rhythms are considered from two weeks
     on.

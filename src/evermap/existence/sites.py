@@ -60,7 +60,7 @@ class SiteDynamics(Shown):
         since_s: (S,) when the newest stay there began.
         absence: C lifetimes of the time away of each clique.
         away_since_s: (C,) when it went away, if it is away.
-        p_hop: (C,) probability that who leaves a site stands at another site at once.
+        p_hop: (C,) probability that a clique that leaves a site stands at another one at once.
         return_share: (S,) probability that who turns up does so at this site, at most 1 in sum of a clique; the rest
             turns up at places that are not known, which is 'away'. One that hops from a site has the shares of the
             others and of unknown places, scaled to sum 1. 0 for a clique that never returns.

@@ -25,7 +25,7 @@ class Life:
     Attributes:
         stay: prior of the time at one site.
         absence: prior of the time away; its `p_never_leaves` is the share that never returns.
-        p_hop: probability that who leaves a site stands at another one at once, instead of being away.
+        p_hop: probability that a clique that leaves a site stands at another one at once, instead of being away.
         p_known: probability that who turns up again does so at a site that the map knows.
         n_stays, n_ended: stays that this was learned from, and how many of them were seen to end.
     """

@@ -3,7 +3,7 @@
 A *look* is a landmark, or one of the places where it may stand, in a frame in which it should be detected:
 `P(detect | there)` is at least `WORTH_A_LOOK` of what the sensor does at best. A detection is a look too, wherever the
 field of view is said to end. A look with a detection is a *hit*, one without is a *miss*. Whether a miss says anything
-depends on the line of sight (`sightlines`); whoever knows of none takes every line for clear.
+depends on the line of sight (`sightlines`); a model without them takes every line for clear.
 
 `P(detect | there)` comes from a `DetectionModel`: `NominalField` here, what was learned of lines of sight in
 `sightlines`, sensors in space in `space`, and what is learned of these in `learned`.

@@ -31,7 +31,7 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     of_clique = [lives[s] for s in newest]
     count = np.bincount(row, minlength=len(cliques))
     p_known = np.array([life.p_known for life in of_clique])
-    # whoever comes back does so to the site it left as often as to all other known ones together
+    # a clique returns to the site it left as often as to all other known ones together
     share = np.where(np.arange(len(row)) == newest[row], 1.0, 1.0 / np.maximum(count[row] - 1, 1))
     total = np.bincount(row, share, minlength=len(cliques))
     share *= p_known[row] / np.where(total > 0.0, total, 1.0)[row]

@@ -164,7 +164,7 @@ def parse_by(text: str) -> tuple[str, ...]:
     words = tuple(dict.fromkeys(word.strip() for word in text.split(",") if word.strip()))
     for word in words:
         if word not in {BY_CLASS, BY_CHUNK}:
-            raise ConfigError(f"'{word}' is no grouping", field="by", hint="class, chunk, or class,chunk")
+            raise ConfigError(f"unknown grouping '{word}'", field="by", hint="class, chunk, or class,chunk")
     return words
 
 
@@ -268,7 +268,7 @@ def estimators() -> tuple[str, ...]:
 def check_estimator(name: str) -> None:
     """Raise ConfigError for a name that `estimate` does not take."""
     if name not in estimators():
-        raise ConfigError(f"'{name}' is no estimator", field="estimator", hint=", ".join(estimators()))
+        raise ConfigError(f"unknown estimator '{name}'", field="estimator", hint=", ".join(estimators()))
 
 
 def estimates(name: str, table: LifetimeTable, groups: Sequence[LifetimeGroup]) -> Iterator[LifetimeEstimate]:

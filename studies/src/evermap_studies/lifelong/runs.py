@@ -50,7 +50,7 @@ def _switched(switches: tuple[tuple[str, str | bool], ...]) -> tuple[str, ...]:
 
 
 CONTENDERS = tuple(Contender(m.label, m.says, _switched(m.switches), m.is_told) for m in METHODS)
-"""Static SLAM, each paper's method alone, evermap, and who is told."""
+"""Static SLAM, each paper's method alone, evermap, and the oracle."""
 WHOLE = next(contender for contender in CONTENDERS if not contender.overrides)
 """evermap."""
 ABLATIONS = (

@@ -109,7 +109,7 @@ def summary(rows: list[Row], names: Sequence[str]) -> str:
 
 
 def changes(rows: list[Row], names: Sequence[str]) -> str:
-    """Changes of landmarks by kind; who is told them finds none."""
+    """Changes of landmarks by kind; the oracle is told them and finds none."""
     kinds = ("all", *(kind.value for kind in KINDS))
     lines = []
     for name in names:
@@ -191,7 +191,7 @@ def verdicts(rows: list[Row]) -> list[Row]:
         growth(lambda part: _median(part, "places"), since=-2),
     )
     return [
-        _verdict("pose RMSE of evermap over that of who is told, five sessions", _ratio(mine, best), "≤", 1.15),
+        _verdict("pose RMSE of evermap over the oracle's, five sessions", _ratio(mine, best), "≤", 1.15),
         _verdict("pose RMSE of static SLAM over that of evermap, five sessions", _ratio(worst, mine), "≥", 1.0),
         _verdict("precision of the map, five sessions", existence(ours).precision, "≥", 0.98),
         _verdict("recall of the map, five sessions", existence(ours).recall, "≥", 0.98),

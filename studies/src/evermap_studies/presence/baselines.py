@@ -1,4 +1,4 @@
-"""Simple ways to foretell presence, written here for comparison: means, the last look, and a sum of harmonics."""
+"""Simple ways to predict presence, written here for comparison: means, the last look, and a sum of harmonics."""
 
 from __future__ import annotations
 

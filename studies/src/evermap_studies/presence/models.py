@@ -36,7 +36,7 @@ MEAN_STAYS_S = tuple(60.0 * minutes for minutes in (1, 3, 10, 30, 60, 240, 720, 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """A way to foretell presence.
+    """A way to predict presence.
 
     Attributes:
         name: in `summary.json`.

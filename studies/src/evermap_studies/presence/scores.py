@@ -130,7 +130,7 @@ def choose_for_week(contender: Contender, early: Any, rehearsal: Trial) -> Any:
 
 
 def choose_by_looks(contender: Contender, looks: Looks) -> Any:
-    """The option that foretells the last looks of the training recording best, each from those before it.
+    """The option that predicts the last looks of the training recording best, each from those before it.
 
     There is no truth to choose with, so what is scored is the probability of the detector's next output.
 
