@@ -9,12 +9,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from evermap.config import Config
-from evermap.types import Landmarks, Recording, SlamResult
+from evermap.types import Landmarks, Progress, Recording, SlamResult
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
-    from evermap.slam.estimate import Progress, Solved
+    from evermap.slam.estimate import Solved
 
 
 def run_slam(

@@ -14,7 +14,7 @@ Conventions that hold everywhere:
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from hashlib import blake2b
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+Progress = Callable[[float, float], None]
+"""Called with what is done and the total: seconds of recordings, or steps."""
 
 UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from rich.console import Console
 
+    from evermap.types import Progress
+
 SUFFIXES = (".png", ".svg")
 """Of pictures."""
 PATIENCE_S = 4.0
@@ -29,9 +31,6 @@ PATIENCE_S = 4.0
 
 _MOST = 2000
 """Characters of an error: of every part of a message there are fewer, so this cuts only what is not made of parts."""
-
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, for most verbs in seconds of the recording."""
 
 
 def echo(line: str) -> None:
@@ -131,7 +130,8 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
     if not sys.stderr.isatty():
         yield None
         return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich import progress
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -141,7 +141,7 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
         TextColumn("{task.fields[speed]}"),
     )
     start = time.perf_counter()
-    with Progress(*columns, console=_console(stderr=True), transient=True) as bars:
+    with progress.Progress(*columns, console=_console(stderr=True), transient=True) as bars:
         task = bars.add_task(printable(label), total=None, speed="")
 
         def advance(done: float, total: float) -> None:

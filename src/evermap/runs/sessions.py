@@ -7,7 +7,7 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError, InputError, suggestion
 from evermap.maps.store import Attachment, MapStore, Provenance, Revision, RevisionKind
+from evermap.types import Progress
 
 if TYPE_CHECKING:
     from evermap.config import Config
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
     from evermap.types import IntArray, MapChange, Recording
-
-Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,10 +19,7 @@ from evermap.slam.method import Method, Static
 from evermap.slam.problem import Noise
 from evermap.slam.streaming import Outcome, StreamingSlam
 from evermap.slam.warmup import warm_up
-from evermap.types import FloatArray, Recording, Sensor
-
-Progress = Callable[[float, float], None]
-"""Called with seconds of the recording that are done, and seconds in all."""
+from evermap.types import FloatArray, Progress, Recording, Sensor
 
 
 @dataclass(frozen=True, slots=True)

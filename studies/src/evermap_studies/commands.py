@@ -9,12 +9,20 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.terminal import Progress, print_json, progress_bar, say, warn
+from evermap.cli.terminal import print_json, progress_bar, say, warn
 from evermap_studies.demo.command import demo
+
+if TYPE_CHECKING:
+    from evermap.types import Progress
+
+    AsText = Callable[[Mapping[str, Any]], str]
+    """Write a table as Markdown."""
+    Compute = Callable[[Path, Progress | None], tuple[dict[str, Any], Callable[..., str]]]
+    """Compute a study into a folder; returns its table, and what writes it as text."""
 
 __all__ = [
     "bateman2020",
@@ -274,12 +282,6 @@ def partial_views(
         return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
 
     _run("partial-views", compute, out, as_json=as_json, force=force, in_seconds=False)
-
-
-AsText = Callable[[Mapping[str, Any]], str]
-"""Write a table as Markdown."""
-Compute = Callable[[Path, Progress | None], tuple[dict[str, Any], Callable[..., str]]]
-"""Compute a study into a folder; returns its table, and what writes it as text."""
 
 
 def _run(

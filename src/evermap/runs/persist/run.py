@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,13 +18,11 @@ from evermap.runs.persist.changes import Changes, find_changes
 from evermap.runs.persist.forecasts import Forecasts, forecast_stamps, forecasts_of
 from evermap.runs.persist.models import ModelOfEach, ask, models_for
 from evermap.runs.persist.table import LookTable, Truth
-from evermap.types import FloatArray, IntArray
+from evermap.types import FloatArray, IntArray, Progress
 
 if TYPE_CHECKING:
     from evermap.runs.persist.models import LearnedModels
 
-Progress = Callable[[float, float], None]
-"""Called with the steps that are done and how many there are."""
 
 MOST_ROWS = 100_000_000
 """More beliefs than this are a mistake in the step, not a wish."""

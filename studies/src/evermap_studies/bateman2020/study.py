@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from evermap import __version__
+from evermap.types import Progress
 from evermap_studies.bateman2020.examples import draw_examples, record_example
 from evermap_studies.bateman2020.expected import verdicts
 from evermap_studies.bateman2020.figures import draw_calibration, draw_learned_sensor, draw_removals, draw_sweeps
@@ -21,9 +21,6 @@ from evermap_studies.bateman2020.published import orderings
 from evermap_studies.bateman2020.scores import Row, Scored, score_world, sweep, sweep_points, tuned_p_miss
 from evermap_studies.bateman2020.settings import IN_THE_TABLE, NOMINAL, SENSORS, Settings, default_settings
 from evermap_studies.bateman2020.table import as_markdown
-
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in simulated seconds."""
 
 SCHEMA_VERSION = "1"
 EXPERIMENT = "bateman2020"

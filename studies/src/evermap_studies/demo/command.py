@@ -7,11 +7,14 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.terminal import Progress, command_line, print_json, print_table, progress_bar, say, warn
+from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warn
+
+if TYPE_CHECKING:
+    from evermap.types import Progress
 
 PATIENCE_S = 12.0
 """The first day takes a few seconds, unless its kernels have to be compiled."""

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from evermap.runs.folder import RunFolder, RunInfo, write_run
+from evermap.types import Progress
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scenario import Scenario
-from evermap_studies.demo.study import Progress, run_study
+from evermap_studies.demo.study import run_study
 from evermap_studies.sim import ChangeEvent
 
 TRUE_EVENTS = "true_events.jsonl"

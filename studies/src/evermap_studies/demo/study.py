@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.interrupts import sheltered
-from evermap.types import IntArray, MapChange, Recording, SlamResult, Trajectory
+from evermap.types import IntArray, MapChange, Progress, Recording, SlamResult, Trajectory
 from evermap_studies.demo.methods import METHODS, Method
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.scores import Snapshot
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from evermap.maps.sessions.session import Session
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-Progress = Callable[[float, float], None]
-"""Called with seconds of recordings that are done, and seconds in all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +73,7 @@ class _Day:
 
     Attributes:
         recordings: the day's, without truth.
-        changed: for each, landmarks that changed since the session before; only who is told looks at it.
+        changed: for each, landmarks that changed since the session before; only the oracle looks at it.
         until_s: for each, when the next session begins; nan where there is none.
         methods: which.
         living: the map of each on the evening before, None on the first day.

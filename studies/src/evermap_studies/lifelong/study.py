@@ -8,22 +8,20 @@ Each part can be run alone: what an older run left of the others stays in the ta
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from evermap import __version__
 from evermap.errors import ConfigError
+from evermap.types import Progress
+from evermap_studies.frame import Stopwatch
 from evermap_studies.lifelong.runs import ABLATIONS, CONTENDERS, SIMULATED, WHOLE, Contender, live
 from evermap_studies.lifelong.scores import NOTHING
 from evermap_studies.lifelong.table import as_markdown, verdicts
 from evermap_studies.lifelong.world import DATASET, recorded_world, simulated_world
-from evermap_studies.mrclam.study import find_dataset, machine
+from evermap_studies.mrclam.study import find_dataset
 
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in sessions."""
 Row = dict[str, Any]
 
 SCHEMA_VERSION = "1"
@@ -121,18 +119,11 @@ def reproduce(
         find_dataset(Path(data), DATASET)
     kept = [row for row in _earlier(Path(out)) if row["part"] not in settings.parts]
     with RunFolder(out, force=force, inputs=[data]) as folder:
-        wall, cpu = time.perf_counter(), time.process_time()
+        stopwatch = Stopwatch()
         rows = [*kept, *_run_all(settings, Path(data), progress)]
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         rows.sort(key=lambda row: PARTS.index(row["part"]))
         table: dict[str, Any] = {
-            "schema_version": SCHEMA_VERSION,
-            "evermap": __version__,
-            "experiment": EXPERIMENT,
-            "scoring": SCORING,
-            "settings": json.loads(json.dumps(asdict(settings))),
-            "machine": machine(cpu / wall),
-            "processing_s": wall,
+            **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
             "expected": verdicts(rows),
             "rows": rows,
         }

@@ -8,7 +8,6 @@ the minute, if somebody looks only now and then.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 
 from evermap import __version__
 from evermap.errors import ConfigError
+from evermap.types import Progress
 from evermap_studies.lifetimes import figures
 from evermap_studies.lifetimes.moving import TrackedRun, study
 from evermap_studies.lifetimes.rooms import as_values, study_rooms
@@ -25,9 +25,6 @@ from evermap_studies.lifetimes.truth import ESTIMATORS, coverage, judge
 from evermap_studies.presence.tasks import HOME
 from evermap_studies.worlds.moving import MovingWorld
 from evermap_studies.worlds.patrol_lifetimes import PatrolWorld, simulate_patrols
-
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in runs."""
 
 SCHEMA_VERSION = "1"
 ROOMS = HOME

@@ -6,10 +6,8 @@ Every robot is run on its own, one run after the other in this process, so that 
 
 from __future__ import annotations
 
-import os
-import platform
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +17,8 @@ import numpy as np
 
 from evermap import __version__
 from evermap.errors import EvermapError, InputError
-from evermap.types import Landmarks, Recording, rows_of
+from evermap.types import Landmarks, Progress, Recording, rows_of
+from evermap_studies.frame import machine
 from evermap_studies.mrclam.figure import Drawn, draw_robots
 from evermap_studies.mrclam.scores import bound_scores, odometry_scores, run_scores
 from evermap_studies.mrclam.table import as_markdown, means, verdicts
@@ -28,15 +27,11 @@ if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.runs.folder import RunFolder
 
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in seconds of recordings."""
 
 SCHEMA_VERSION = "1"
 PRIOR_SIGMA_M = 0.02
 MAIN, OTHERS = 6, (3, 1, 2)
 """Dataset 6 has the whole truth. Of 3 the last part is known, of 1 and 2 the landmarks only."""
-THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Environment variables that must be 1 before numpy is loaded for timings on one core; the command sets them."""
 SCORING = (
     "SE(2) alignment of each trajectory on its own positions, then RMSE at 2 Hz over all stamps that have truth; "
     "landmarks with at least ten sightings, after the alignment of the trajectory where poses are known"
@@ -241,28 +236,4 @@ def first_frames(recording: Recording, count: int) -> Recording:
     )
 
 
-def machine(cores_used: float) -> dict[str, Any]:
-    """Where the timings come from; `cores_used` is processor time over wall time, 1 at most on one core."""
-    from evermap.runs.summary import versions
-
-    return {
-        "processor": _processor(),
-        "cores": os.cpu_count(),
-        "cores_used": cores_used,
-        "thread_limits": {name: os.environ.get(name) for name in THREAD_LIMITS},
-        "system": f"{platform.system()} {platform.machine()}",
-        "versions": versions(),
-    }
-
-
-def _processor() -> str:
-    """Name of the processor where the system tells it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.machine())
-
-
-__all__ = ["SETTINGS", "Setting", "as_markdown", "find_dataset", "first_frames", "machine", "reproduce"]
+__all__ = ["SETTINGS", "Setting", "as_markdown", "find_dataset", "first_frames", "reproduce"]

@@ -9,30 +9,25 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evermap import __version__
 from evermap.compiled import find_place
 from evermap.errors import EvermapError
 from evermap.interrupts import sheltered, watched
-from evermap.types import SlamResult
-from evermap_studies.mrclam.study import machine
+from evermap.types import Progress, SlamResult
+from evermap_studies.frame import Stopwatch
 from evermap_studies.nielsen2024.figures import draw_all
 from evermap_studies.nielsen2024.plan import METHODS, PARTS, QUICK, Settings, jobs
 from evermap_studies.nielsen2024.runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
 from evermap_studies.nielsen2024.simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap_studies.nielsen2024.table import as_markdown, verdicts
 
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in seconds of recordings."""
 Row = dict[str, Any]
 
 SCHEMA_VERSION = "1"
@@ -78,7 +73,7 @@ def reproduce(
     planned = jobs(settings, Path(data))
     earlier, paths = _earlier(Path(out))
     with RunFolder(out, force=force, inputs=[data]) as folder:
-        wall, cpu = time.perf_counter(), time.process_time()
+        stopwatch = Stopwatch()
         simulation = earlier["simulation"]
         if "simulation" in settings.parts:
             asked = (settings.noises_m2, settings.runs, settings.modes, settings.seed)
@@ -96,16 +91,9 @@ def reproduce(
             if not done:
                 raise
             interrupted = True
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         runs = _merged(earlier["runs"], done)
         table: dict[str, Any] = {
-            "schema_version": SCHEMA_VERSION,
-            "evermap": __version__,
-            "experiment": EXPERIMENT,
-            "scoring": SCORING,
-            "settings": json.loads(json.dumps(asdict(settings))),
-            "machine": machine(cpu / wall),
-            "processing_s": wall,
+            **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
             "expected": verdicts(simulation, runs),
             "simulation": simulation,
             "runs": runs,

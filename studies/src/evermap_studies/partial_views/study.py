@@ -8,22 +8,19 @@ for the next session, and how consistent the map's covariances are.
 
 from __future__ import annotations
 
-import json
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
-from evermap_studies.mrclam.study import machine
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
+from evermap_studies.frame import Stopwatch
 from evermap_studies.partial_views.table import as_markdown
 from evermap_studies.sim import (
     CLUTTER,
@@ -39,8 +36,6 @@ from evermap_studies.worlds.scores import stands_at
 
 __all__ = ["QUICK", "Settings", "as_markdown", "reproduce"]
 
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in sessions."""
 Row = dict[str, Any]
 
 SCHEMA_VERSION = "1"
@@ -123,7 +118,7 @@ def reproduce(
     worlds = [(settings.seed + k, patrol) for patrol in settings.patrols_s for k in range(settings.buildings)]
     total = float(len(worlds) * settings.sessions * len(settings.parts))
     with RunFolder(out, force=force) as folder:
-        wall, cpu = time.perf_counter(), time.process_time()
+        stopwatch = Stopwatch()
         found: dict[str, list[Row]] = {part: [] for part in PARTS}
         for part in settings.parts:
             of_part = settings if part == "changing" else replace(settings, change_rate=0.0)
@@ -131,15 +126,8 @@ def reproduce(
                 found[part].append(row)
                 if progress is not None:
                     progress(float(sum(map(len, found.values())) * settings.sessions), total)
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
         content: dict[str, Any] = {
-            "schema_version": SCHEMA_VERSION,
-            "evermap": __version__,
-            "experiment": EXPERIMENT,
-            "scoring": SCORING,
-            "settings": json.loads(json.dumps(asdict(settings))),
-            "machine": machine(cpu / wall),
-            "processing_s": wall,
+            **stopwatch.head(EXPERIMENT, SCHEMA_VERSION, SCORING, settings),
             "worlds": found["changing"],
             "still": found["still"],
         }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from typing import Any
 from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.existence.protocol import Instants
-from evermap.types import FloatArray
+from evermap.types import FloatArray, Progress
 from evermap_studies.presence import models
 from evermap_studies.presence.figures import draw_all
 from evermap_studies.presence.models import Contender
@@ -46,9 +46,6 @@ from evermap_studies.presence.tasks import (
     read_room,
 )
 
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in steps of about a model learned."""
-
 SCHEMA_VERSION = "1"
 
 
@@ -75,7 +72,7 @@ def reproduce(
     progress: Progress | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
-    """Learn, choose, foretell and score; write `summary.json`, `table.md` and the figures as PNG and SVG.
+    """Learn, choose, predict and score; write `summary.json`, `table.md` and the figures as PNG and SVG.
 
     Args:
         data: folder with `room_train.csv.gz`, `room_test.csv.gz` and `door_2016_*.csv.gz`.

@@ -7,7 +7,7 @@ The paper's numbers are only in its plots. They are compared with a rerun of its
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,15 +17,12 @@ import numpy as np
 from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.survival import GeneralPurpose, Uniform
-from evermap.types import FloatArray
+from evermap.types import FloatArray, Progress
 from evermap_studies.rosen2016.figures import draw_all
 from evermap_studies.rosen2016.reference import compare, read_reference
 from evermap_studies.rosen2016.scores import Estimate, Stretches, empirical, filtered, l1_error, removal
 from evermap_studies.rosen2016.table import as_markdown, verdict
 from evermap_studies.worlds.revisits import RevisitConfig, simulate_revisits
-
-Progress = Callable[[float, float], None]
-"""Called with what is done and the total, in simulated seconds."""
 
 Value = dict[str, Any]
 """One number: figure, metric, estimator, its settings, n, value, se, and later what it is compared with."""
