@@ -1,4 +1,6 @@
-"""Simulated worlds with the whole truth: a building patrolled by a robot while things move, come and go."""
+"""Simulated worlds with the whole truth: a building patrolled by a robot while things move, come and go, and a
+warehouse of any size.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +18,7 @@ from evermap_studies.sim.config import (
     SimulatedSensor,
 )
 from evermap_studies.sim.looked import LookedAt, looked_at
+from evermap_studies.sim.warehouse import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.world import BuildingSimulation, SessionTruth, simulate_building
 
 __all__ = [
@@ -36,6 +39,8 @@ __all__ = [
     "SessionTruth",
     "SimulatedSensor",
     "Stay",
+    "WarehouseConfig",
     "looked_at",
     "simulate_building",
+    "simulate_warehouse",
 ]
