@@ -165,7 +165,7 @@ def test_survival_fit_takes_the_lifetimes(yard: Path) -> None:
 def test_without_range_misses_count_for_nothing(yard: Path, tmp_path: Path) -> None:
     result = run("track", yard / "detections.csv", "--no-scene", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.stderr
-    assert "without range_m" in result.stderr
+    assert "without --range-m" in result.stderr
     spells = rows(tmp_path / "out" / "spells.csv")
     pillars = spells[spells["class_id"] == "pillar"]
     assert np.isnan(pillars["gone_s"]).all()

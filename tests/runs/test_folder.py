@@ -223,14 +223,22 @@ def test_symbolic_links_are_followed(run, tmp_path):
     assert (tmp_path / "real" / "summary.json").is_file()
 
 
-def test_without_rerun_the_default_scene_is_a_remark_and_a_wanted_one_an_error(run, tmp_path, monkeypatch):
+def test_without_rerun_a_configured_scene_is_a_remark_and_a_wanted_one_an_error(run, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
-    summary = write_run(tmp_path / "run", *run, figures=False, report=False)
+    config = load_config(None, ["output.figures=false", "output.report=false", "output.rerun=true"])
+    summary = write_run(tmp_path / "run", *run, config)
     assert "scene.rrd" not in summary["outputs"]
     assert any("evermap[rerun]" in warning for warning in summary["warnings"])
     with pytest.raises(MissingExtraError):
         write_run(tmp_path / "run", *run, figures=False, report=False, scene=True)
     assert (tmp_path / "run" / "summary.json").is_file()
+
+
+def test_rerun_is_not_loaded_unless_a_scene_is_wanted(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    summary = write_run(tmp_path / "run", *run, figures=False, report=False)
+    assert "scene.rrd" not in summary["outputs"]
+    assert not any("rerun" in remark for remark in summary["warnings"])
 
 
 def test_configuration_switches_outputs_off_and_sets_the_rate(run, tmp_path):

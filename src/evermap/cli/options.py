@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from evermap.cli.terminal import remark_as
 from evermap.errors import ConfigError, EvermapError
 
 if TYPE_CHECKING:
@@ -103,10 +104,11 @@ def duration_s(text: str | None, field: str) -> float | None:
 
 
 class Verb(TyperCommand):
-    """A command whose errors speak of its options where the core speaks of arguments."""
+    """A command whose errors and remarks speak of its options where the core speaks of arguments."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command."""
+        remark_as.set(lambda text: with_options(text, ctx))
         try:
             return super().invoke(ctx)
         except EvermapError as error:
@@ -115,27 +117,30 @@ class Verb(TyperCommand):
 
 
 def speak_of_options(error: EvermapError, ctx: Any) -> None:
-    """Name the options of a command instead of the core's arguments, in an error's field and in its `backquotes`.
+    """Name the options of a command instead of the core's arguments, in an error's field and in its `backquotes`."""
+    error.problem = with_options(error.problem, ctx)
+    error.hint = error.hint and with_options(error.hint, ctx)
+    if error.line is None:  # in a line of a file it is a column or a key
+        error.field = error.field and (_option(error.field, ctx) or error.field)
+
+
+def with_options(text: str, ctx: Any) -> str:
+    """Return a text with the options of a command instead of the arguments in `backquotes`."""
+    return re.sub(r"`([a-z0-9_.]+)`", lambda found: _option(found[1], ctx) or found[0], text)
+
+
+def _option(name: str, ctx: Any) -> str | None:
+    """Return how an argument of the core is called on the command line; None where it has no option.
 
     An argument `step_s` is the option whose parameter is called so; a configuration key `persist.step_s` is, too, if
     that option was given.
     """
     shown = {param.name: _shown(param) for param in ctx.command.params}
     shown |= {name: shown[other] for name, other in _OTHER_NAMES.items() if other in shown}
-
-    def option(name: str) -> str | None:
-        leaf = name.rpartition(".")[2]
-        if leaf != name and "COMMANDLINE" not in str(ctx.get_parameter_source(_OTHER_NAMES.get(leaf, leaf))):
-            return None
-        return shown.get(leaf)
-
-    def replaced(text: str) -> str:
-        return re.sub(r"`([a-z0-9_.]+)`", lambda found: option(found[1]) or found[0], text)
-
-    error.problem = replaced(error.problem)
-    error.hint = error.hint and replaced(error.hint)
-    if error.line is None:  # in a line of a file it is a column or a key
-        error.field = error.field and (option(error.field) or error.field)
+    leaf = name.rpartition(".")[2]
+    if leaf != name and "COMMANDLINE" not in str(ctx.get_parameter_source(_OTHER_NAMES.get(leaf, leaf))):
+        return None
+    return shown.get(leaf)
 
 
 def _shown(param: Any) -> str:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -29,6 +30,8 @@ SUFFIXES = (".png", ".svg")
 PATIENCE_S = 4.0
 """Loading compiled kernels takes about a second, compiling them much longer."""
 
+remark_as: ContextVar[Callable[[str], str]] = ContextVar("remark_as", default=lambda line: line)
+"""What the command that runs makes of a remark: options instead of the core's arguments."""
 _MOST = 2000
 """Characters of an error: of every part of a message there are fewer, so this cuts only what is not made of parts."""
 
@@ -45,7 +48,9 @@ def say(line: str) -> None:
 
 def warn(line: str) -> None:
     """Print a remark that does not stop the run."""
-    typer.secho(f"evermap: warning: {printable(line)}", err=True, fg="yellow", color=_colour(sys.stderr))
+    typer.secho(
+        f"evermap: warning: {printable(remark_as.get()(line))}", err=True, fg="yellow", color=_colour(sys.stderr)
+    )
 
 
 def fail(line: str) -> None:

@@ -58,7 +58,7 @@ Gap = Annotated[
         help="A longer time between two frames is one at which nobody looked [s].", show_default="ten times the usual"
     ),
 ]
-Scene = Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for rerun, if installed.")]
+Scene = Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for the rerun viewer.")]
 Example = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Write a commented example table and exit.", show_default=False)
 ]
@@ -70,7 +70,7 @@ Follow objects in space, and learn how long they stay.
 The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a covariance
 (cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m, sensor_y_m, sensor_z_m. A row without a
 position is a frame in which nothing was detected. The folder gets tracks.csv and tracks.parquet, detections.csv,
-events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`), summary.json, figures and scene.rrd.
+events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`), summary.json and figures.
 
 \b
 Most useful with --set:
@@ -101,7 +101,7 @@ def track(
     confusion: Confusion = None,
     min_score: MinScore = None,
     gap_s: Gap = None,
-    scene: Scene = True,
+    scene: Scene = False,
     config: ConfigFile = None,
     settings: Settings = None,
     show_config: ShowConfig = False,

@@ -372,8 +372,8 @@ class Asked(TypedDict, total=False):
     Attributes:
         figures: whether to draw; `config.output.figures`, or yes.
         report: likewise `report.html`, `config.output.report`.
-        scene: likewise `scene.rrd`, `config.output.rerun`; left out with a warning where rerun-sdk is missing, unless
-            it was asked for.
+        scene: whether to write `scene.rrd`; `config.output.rerun`, or no. Where rerun-sdk is missing it is left out
+            with a warning if the configuration asks for it, else that is an error.
     """
 
     figures: bool | None
@@ -425,7 +425,7 @@ def write_run(
         if draw:
             _write_figures(folder, drawn)
         remarks = []
-        if _choose(asked.get("scene"), wanted, "rerun"):
+        if _choose(asked.get("scene"), wanted, "rerun", default=False):
             remarks += _write_scene(folder, recording, result, evaluation, must=asked.get("scene") is True)
         measured, settings = metrics_dict(evaluation), _plain(config)
         summary = summary_dict(
@@ -447,8 +447,8 @@ def summary_text(summary: Mapping[str, Any]) -> str:
     return json.dumps(summary, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _choose(asked: bool | None, wanted: Any, name: str) -> bool:
-    return bool(getattr(wanted, name, True)) if asked is None else asked
+def _choose(asked: bool | None, wanted: Any, name: str, *, default: bool = True) -> bool:
+    return bool(getattr(wanted, name, default)) if asked is None else asked
 
 
 def _plain(config: Any) -> Any:
@@ -474,11 +474,10 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
 
 def _write_innovations(innovations: Innovations, path: Path) -> None:
     """One row a detection that had a prediction; columns as the attributes of `Innovations`."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    from evermap.io.table import parquet_bytes
 
-    columns = {name: getattr(innovations, name) for name in ("stamp_s", "detection", "landmark_id", "nis", "p_inlier")}
-    pq.write_table(pa.table(columns), path)
+    columns = ("stamp_s", "detection", "landmark_id", "nis", "p_inlier")
+    path.write_bytes(parquet_bytes({name: getattr(innovations, name) for name in columns}))
 
 
 def _draw(
@@ -490,11 +489,12 @@ def _draw(
 
 
 def _write_figures(folder: RunFolder, figures: Sequence[NamedFigure]) -> None:
-    from evermap.viz.style import save_png, save_svg
+    from evermap.viz.style import house_style, save_png, save_svg
 
-    for named in figures:
-        save_png(named.figure, folder.path(f"figures/{named.name}.png"))
-        save_svg(named.figure, folder.path(f"figures/{named.name}.svg"))
+    with house_style():
+        for named in figures:
+            save_png(named.figure, folder.path(f"figures/{named.name}.png"))
+            save_svg(named.figure, folder.path(f"figures/{named.name}.svg"))
 
 
 def _write_scene(

@@ -207,7 +207,7 @@ def test_features_that_come_back_under_one_stay_are_remarked_on(tmp_path: Path) 
     path.write_text("stamp_s,feature_id,detected\n" + rows)
     result = run_persist(read_looks(path))
     np.testing.assert_array_equal(result.changes.returned, [False, True])
-    assert "1 feature came back, which lifetimes of one stay rule out: try persist.recurrent" in result.warnings
+    assert "1 feature came back, which lifetimes of one stay rule out: try `recurrent`" in result.warnings
 
 
 def test_models_by_class_answer_for_a_part_of_the_features() -> None:

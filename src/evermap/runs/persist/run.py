@@ -200,7 +200,7 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
     remarks = _odd_looks(looks)
     if config.learns and len(looks.stamp_s) > config.learn_from:
         remarks.append(
-            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (persist.learn_from)"
+            f"the model learned from at most {config.learn_from:,} of {len(looks.stamp_s):,} looks (`learn_from`)"
         )
     for name, model in zip(models.names, models.models, strict=True):
         stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
@@ -214,9 +214,7 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
         )
     back = len(np.unique(changes.feature[changes.returned]))
     if back and config.stays_once:
-        remarks.append(
-            f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try persist.recurrent"
-        )
+        remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try `recurrent`")
     return remarks
 
 

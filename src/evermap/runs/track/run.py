@@ -291,7 +291,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     if step_s > _SLOW_STEP_S:
         remarks.append(f"frames are {step_s:.3g} s apart: what moves is hardly followed at that pace")
     if config.range_m is None and table.sensor_m is not None:
-        remarks.append("without range_m, what should be seen and is not counts for nothing")
+        remarks.append("without `range_m`, what should be seen and is not counts for nothing")
     unknown = int((~_bounded(spells)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} with a beginning that nobody can bound"
@@ -317,7 +317,7 @@ def write_track(
     result: TrackResult,
     *,
     info: RunInfo | None = None,
-    scene: bool = True,
+    scene: bool = False,
     force: bool = False,
     inputs: Iterable[str | Path | None] = (),
     progress: Callable[[float, float], None] | None = None,
