@@ -20,9 +20,9 @@ from evermap.existence.single import Belief
 from evermap.sensing import learned
 from evermap.sensing.learned import CliqueLook, LearnedDetection
 from evermap.sensing.profile import Assumed
-from evermap.sensing.space import LIDAR
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
+from evermap_studies.worlds.sensors import LIDAR
 
 N_CLIQUES = 50_000
 LANDMARKS = 20

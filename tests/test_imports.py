@@ -24,7 +24,7 @@ RULES = {
     "config": "errors types",
     "geometry": "types",
     "stamps": "types",
-    "survival": "errors compiled show types",
+    "survival": "errors show types",
     "valid": "errors types",
     "io": "errors interrupts types geometry valid",
     "metrics": "errors show types geometry",

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.special import logsumexp
 
-from evermap.sensing.profile import Profile, facing_middles, range_middles
-from evermap.sensing.space import Field, InField, sight
+from evermap.sensing.profile import Field, Profile, facing_middles, range_middles
+from evermap_studies.worlds.sensors import InField, sight
 
 FACES = np.concatenate([[axis, -axis] for axis in np.eye(3)])
 HIGHEST = 0.98

@@ -14,9 +14,9 @@ from evermap.errors import DataError, InputError
 from evermap.existence import joint, single
 from evermap.sensing import learned
 from evermap.sensing.learned import LearnedDetection
-from evermap.sensing.profile import Assumed, Profile
-from evermap.sensing.space import CAMERA, LIDAR, Field, Projection, sight
+from evermap.sensing.profile import Assumed, Field, Profile, Projection
 from evermap.survival import Exponential
+from evermap_studies.worlds.sensors import CAMERA, LIDAR, sight
 
 from .plain_learned import FACES, PlainModel, chance_in_field
 

@@ -12,9 +12,9 @@ from evermap.existence import single
 from evermap.sensing import learned
 from evermap.sensing.learned import LearnedDetection
 from evermap.sensing.profile import Assumed, Profile, facing_middles, range_middles
-from evermap.sensing.space import LIDAR, sight
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray
+from evermap_studies.worlds.sensors import LIDAR, InField, sight
 
 from .plain_learned import FACES, HIGHEST
 
@@ -36,7 +36,7 @@ class Truth:
         """(K,) probability of a detection if there and free, and of a false alarm."""
         view = sight(model.landmark_m, model.outward, position, turn)
         assumed = model.profile.assumed
-        inside = assumed.in_field.probability(view)
+        inside = InField(assumed.field, assumed.sigma_position_m, assumed.sigma_attitude_rad).probability(view)
         rate = np.interp(view.range_m, range_middles(assumed.field.range_max_m), self.by_range)
         rate *= np.interp(view.facing, facing_middles(), self.by_facing)
         return inside * np.minimum(rate * own, HIGHEST), inside * self.p_false

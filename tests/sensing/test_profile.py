@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from evermap.errors import ConfigError
 from evermap.sensing.profile import Assumed, Profile, facing_middles, range_middles
-from evermap.sensing.space import CAMERA, LIDAR
+from evermap_studies.worlds.sensors import CAMERA, LIDAR
 
 
 def test_a_sensor_that_saw_nothing_detects_as_assumed():

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed
 from evermap.sensing.sightlines import LearnedField, SightLines
-from evermap.sensing.space import CAMERA, LIDAR, Fading, InField, SpatialModel, ViewingAngle
 from evermap.sensing.visibility import WORTH_A_LOOK, DetectionModel, NominalField, looks_at
 from evermap.tracking.views import View
 from evermap.types import FloatArray, IntArray, Sensor
+from evermap_studies.worlds.sensors import CAMERA, LIDAR, Fading, InField, SpatialModel, ViewingAngle
 
 AHEAD = Sensor(range_min_m=0.5, range_max_m=8.0, bearing_min_rad=-1.0, bearing_max_rad=1.2, p_detect=0.8)
 ROUND = Sensor(range_max_m=6.0, p_detect=0.9, mount_robot_sensor=(0.2, 0.1, 0.3))

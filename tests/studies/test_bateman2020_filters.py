@@ -26,6 +26,7 @@ from evermap_studies.bateman2020.settings import (
     default_settings,
 )
 from evermap_studies.worlds.cliques import named_world
+from evermap_studies.worlds.sensors import contains
 
 from .bateman2020_small import P_MISS, small
 
@@ -116,7 +117,7 @@ def test_tracked_landmarks_face_the_sensor_most_and_observable_ones_at_all(runs:
         for f, (position, rotation) in enumerate(zip(run.position_m, run.rotation, strict=True)):
             to_sensor = position - run.landmark_m
             angle = np.arccos((to_sensor * run.normal).sum(axis=1) / np.linalg.norm(to_sensor, axis=1))
-            steps[f] = (angle <= world.viewing_angle_rad) & world.field.contains(-to_sensor @ rotation)
+            steps[f] = (angle <= world.viewing_angle_rad) & contains(world.field, -to_sensor @ rotation)
         for k in range(len(run.landmark_m)):
             assert (k + offset in observable) == steps[: world.period, k].any()
         for c in range(len(run.first)):

@@ -50,10 +50,10 @@ def test_general_purpose_is_the_exponential_averaged_over_its_rate() -> None:
 
 
 def test_words() -> None:
-    assert math.exp(survival.half_life(90.0).log_survival(90.0)) == pytest.approx(0.5, rel=1e-14)
-    assert survival.mean_stay(90.0).mean() == pytest.approx(90.0, rel=1e-14)
+    assert math.exp(survival.Exponential.from_half_life(90.0).log_survival(90.0)) == pytest.approx(0.5, rel=1e-14)
+    assert survival.Exponential.from_mean(90.0).mean() == pytest.approx(90.0, rel=1e-14)
     assert math.exp(survival.LogNormal.from_half_life(90.0, 2.0).log_survival(90.0)) == pytest.approx(0.5, rel=1e-14)
-    assert survival.somewhere_between(1.0, DAY_S) == survival.GeneralPurpose(1.0 / DAY_S, 1.0)
+    assert survival.GeneralPurpose.from_mean_stays(1.0, DAY_S) == survival.GeneralPurpose(1.0 / DAY_S, 1.0)
     walls = survival.never_leaves()
     assert walls.log_survival(1e12) == 0.0
     assert walls.p_never_leaves == 1.0
@@ -119,7 +119,7 @@ def test_a_hazard_of_finite_integral_says_who_stays() -> None:
     [
         (lambda: survival.Exponential(0.0), "rate"),
         (lambda: survival.Exponential.from_half_life(-1.0), "half_life"),
-        (lambda: survival.mean_stay(math.nan), "mean_stay"),
+        (lambda: survival.Exponential.from_mean(math.nan), "mean_stay"),
         (lambda: survival.GeneralPurpose(1.0, 1.0), "high"),
         (lambda: survival.Uniform(math.inf), "limit_s"),
         (lambda: survival.Weibull(1.0, -2.0), "shape"),

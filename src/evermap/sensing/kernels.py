@@ -24,6 +24,7 @@ EXPONENT = 600.0
 """Cut of log likelihood ratios: far from what a double holds, and certain either way."""
 
 kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
+inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
 @kernel
@@ -86,21 +87,11 @@ def between(value: float, count: int) -> tuple[int, float]:
 
 
 class SensorFrame(NamedTuple):
-    """One frame: (3,) position and (3, 3) rotation of the sensor, limits as `learned` packs them, and what was seen.
-
-    Attributes:
-        position_m, rotation, limits: of the sensor.
-        detected: (K,) which landmarks were detected.
-        active: (C,) which cliques are looked at.
-        elapsed_s: (C,) since each was last in the field.
-    """
+    """One pose of the sensor: (3,) position and (3, 3) rotation in the world, limits as `learned` packs them."""
 
     position_m: FloatArray
     rotation: FloatArray
     limits: FloatArray
-    detected: BoolArray
-    active: BoolArray
-    elapsed_s: FloatArray
 
 
 class SensorLaw(NamedTuple):
@@ -114,17 +105,36 @@ class SensorLaw(NamedTuple):
     log_weight: FloatArray
 
 
-class CliqueRows(NamedTuple):
-    """Landmarks and cliques, names as in `learned.LearnedDetection`; all but the first three are changed in place."""
+class LandmarkRows(NamedTuple):
+    """Landmarks, names as in `learned.LearnedDetection`; hits and expected hits are changed in place."""
 
-    first: IntArray
     landmark_m: FloatArray
     outward: FloatArray
     hits: Any
     expected: Any
+
+
+class CliqueRows(NamedTuple):
+    """Cliques, names as in `learned.LearnedDetection`; all but the first are changed in place."""
+
+    first: IntArray
     occluded: FloatArray
     log_chain: FloatArray
     pending: FloatArray
+
+
+class Detections(NamedTuple):
+    """What a frame saw.
+
+    Attributes:
+        detected: (K,) which landmarks were detected.
+        active: (C,) which cliques are looked at.
+        elapsed_s: (C,) since each was last in the field.
+    """
+
+    detected: BoolArray
+    active: BoolArray
+    elapsed_s: FloatArray
 
 
 class LookRows(NamedTuple):
@@ -136,30 +146,62 @@ class LookRows(NamedTuple):
     looked: IntArray
 
 
+@inlined
+def expected(k: Any, frame: Any, law: Any, rows: Any) -> Any:
+    """Return how landmark k is seen: the probability to be in the field, 0 if it is out of it, and its factors.
+
+    Factors are the bin of its range and the part of the next one, the same of its incidence, the detection by each of
+    the two, and the direction that it is seen from.
+    """
+    position_m, rotation, limits = frame
+    ranges, facings = len(law.range_rate), len(law.facing_rate)
+    dx = position_m[0] - rows.landmark_m[k, 0]
+    dy = position_m[1] - rows.landmark_m[k, 1]
+    dz = position_m[2] - rows.landmark_m[k, 2]
+    reach = limits[0] + FAR_OUT * limits[7]
+    squared = dx * dx + dy * dy + dz * dz
+    if squared > reach * reach:
+        return 0.0, 0, 0.0, 0, 0.0, 0.0, 0.0, 0
+    range_m = max(math.sqrt(squared), 1e-9)
+    x = -(rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz)
+    y = -(rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz)
+    z = -(rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz)
+    seen = in_field(x, y, z, range_m, limits)
+    if seen < OUT_OF_FIELD:
+        return 0.0, 0, 0.0, 0, 0.0, 0.0, 0.0, 0
+    low_r, part_r = between(range_m / limits[0] * ranges, ranges)
+    by_range = law.range_rate[low_r] + part_r * (law.range_rate[low_r + 1] - law.range_rate[low_r])
+    outward = rows.outward
+    cosine = (dx * outward[k, 0] + dy * outward[k, 1] + dz * outward[k, 2]) / range_m
+    low_f, part_f = between(0.5 * (cosine + 1.0) * facings, facings)
+    by_facing = law.facing_rate[low_f] + part_f * (law.facing_rate[low_f + 1] - law.facing_rate[low_f])
+    return seen, low_r, part_r, low_f, part_f, by_range, by_facing, face_of(dx, dy, dz)
+
+
 @kernel
-def look(frame: SensorFrame, law: SensorLaw, rows: CliqueRows, out: LookRows) -> None:
-    """Fill `out`, and update what changes of `rows` in place."""
-    position_m, rotation, limits, detected, active, elapsed_s = frame
-    range_rate, facing_rate, p_false, come_hz, go_hz, log_weight = law
-    first, landmark_m, outward, hits, expected, occluded, log_chain, pending = rows
+def p_detect(frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, out: FloatArray) -> None:
+    """Fill `out` (K,) with the probabilities to detect landmarks of which nothing hides any."""
+    for k in range(out.size):
+        seen, _, _, _, _, by_range, by_facing, side = expected(k, frame, law, rows)
+        out[k] = seen * min(by_range * by_facing * (rows.hits[k, side] / rows.expected[k, side]), HIGHEST)
+
+
+@kernel
+def look(
+    frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, cliques: CliqueRows, seen_now: Detections, out: LookRows
+) -> None:
+    """Fill `out`, and update what changes of `rows` and `cliques` in place."""
+    _, _, p_false, come_hz, go_hz, log_weight = law
+    first, occluded, log_chain, pending = cliques
+    detected, active, elapsed_s = seen_now
     log_there, log_gone, p_occluded, looked = out
-    chains, ranges, facings = len(come_hz), len(range_rate), len(facing_rate)
-    largest = 0
-    for c in range(len(first) - 1):
-        largest = max(largest, first[c + 1] - first[c])
-    row = np.empty(largest, np.int64)
-    inside = np.empty(largest)
-    by_range, by_facing = np.empty(largest), np.empty(largest)  # detection by range and incidence
-    own = np.empty(largest)  # the landmark's own factor, by direction
-    face = np.empty(largest, np.int64)
-    low_r, part_r = np.empty(largest, np.int64), np.empty(largest)
-    low_f, part_f = np.empty(largest, np.int64), np.empty(largest)
+    chains, ranges, facings = len(come_hz), len(law.range_rate), len(law.facing_rate)
+    largest = np.diff(first).max()
+    row, face, low_r, low_f = np.empty((4, largest), np.int64)
+    # by range and incidence, the landmark's own factor by direction, and parts of the next bins
+    inside, by_range, by_facing, own, part_r, part_f = np.empty((6, largest))
     weight = np.empty(chains)
     at_facing, at_false = 2 * ranges, 2 * ranges + 2 * facings
-    r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
-    r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
-    r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
-    reach = limits[0] + FAR_OUT * limits[7]
 
     for c in range(len(first) - 1):
         looked[c] = 0
@@ -171,34 +213,16 @@ def look(frame: SensorFrame, law: SensorLaw, rows: CliqueRows, out: LookRows) ->
         n = 0
         log_ratio, log_absent, ratio, absent = 0.0, 0.0, 1.0, 1.0
         for k in range(first[c], first[c + 1]):
-            dx, dy, dz = (
-                position_m[0] - landmark_m[k, 0],
-                position_m[1] - landmark_m[k, 1],
-                position_m[2] - landmark_m[k, 2],
-            )
-            squared = dx * dx + dy * dy + dz * dz
-            if squared > reach * reach:
+            found = expected(k, frame, law, rows)
+            seen = found[0]
+            if seen == 0.0:
                 continue
-            range_m = max(math.sqrt(squared), 1e-9)
-            x = -(r00 * dx + r10 * dy + r20 * dz)
-            y = -(r01 * dx + r11 * dy + r21 * dz)
-            z = -(r02 * dx + r12 * dy + r22 * dz)
-            seen = in_field(x, y, z, range_m, limits)
-            if seen < OUT_OF_FIELD:
-                continue
-            low, part = between(range_m / limits[0] * ranges, ranges)
-            by_range[n] = range_rate[low] + part * (range_rate[low + 1] - range_rate[low])
-            low_r[n], part_r[n] = low, part
-            cosine = (dx * outward[k, 0] + dy * outward[k, 1] + dz * outward[k, 2]) / range_m
-            low, part = between(0.5 * (cosine + 1.0) * facings, facings)
-            by_facing[n] = facing_rate[low] + part * (facing_rate[low + 1] - facing_rate[low])
-            low_f[n], part_f[n] = low, part
-            side = face_of(dx, dy, dz)
-            row[n], inside[n], face[n] = k, seen, side
-            own[n] = hits[k, side] / expected[k, side]
-            p_detect = seen * min(by_range[n] * by_facing[n] * own[n], HIGHEST)
+            row[n] = k
+            inside[n], low_r[n], part_r[n], low_f[n], part_f[n], by_range[n], by_facing[n], face[n] = found
+            own[n] = rows.hits[k, face[n]] / rows.expected[k, face[n]]
+            p = seen * min(by_range[n] * by_facing[n] * own[n], HIGHEST)
             p_alarm = seen * p_false
-            p_either = p_alarm + (1.0 - p_alarm) * p_detect
+            p_either = p_alarm + (1.0 - p_alarm) * p
             if detected[k]:
                 ratio *= p_either / p_alarm
                 absent *= p_alarm
@@ -248,18 +272,18 @@ def look(frame: SensorFrame, law: SensorLaw, rows: CliqueRows, out: LookRows) ->
         for i in range(n):
             k, seen = row[i], inside[i]
             low_range, low_facing = low_r[i], low_f[i]
-            p_detect = min(by_range[i] * by_facing[i] * own[i], HIGHEST)
+            p = min(by_range[i] * by_facing[i] * own[i], HIGHEST)
             hit = 0.0
             if detected[k]:
-                true = clear * p_detect / (p_detect + (1.0 - p_detect) * p_false)
+                true = clear * p / (p + (1.0 - p) * p_false)
                 hit = true
                 pending[c, at_false] += 1.0 - true
                 pending[c, at_false + 2] += 1.0
-                hits[k, face[i]] += true
+                rows.hits[k, face[i]] += true
             view = clear * seen
-            pending[c, at_false + 1] += seen * (1.0 - clear * p_detect)
+            pending[c, at_false + 1] += seen * (1.0 - clear * p)
             pending[c, at_false + 3] += seen
-            expected[k, face[i]] += view * (by_range[i] * by_facing[i])
+            rows.expected[k, face[i]] += view * (by_range[i] * by_facing[i])
             for_range, for_facing = view * by_facing[i] * own[i], view * by_range[i] * own[i]
             part = part_r[i]
             pending[c, low_range] += hit * (1.0 - part)

@@ -21,14 +21,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import DataError, InputError
-from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile, facing_middles, range_middles
-from evermap.sensing.space import Projection, sights
+from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile, Projection
 from evermap.types import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from evermap.sensing.kernels import SensorLaw
 
 FACES = 6
 """Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
@@ -79,26 +82,22 @@ class LearnedDetection:
             position_m: (K, 3) positions of the landmarks of this model, which may have moved a little.
 
         Raises:
-            InputError: another number of landmarks than the model knows.
+            InputError: another number of landmarks than the model knows, or poses of another shape.
         """
-        if len(position_m) != len(self.landmark_m):
-            problem = f"{len(position_m)} positions of {len(self.landmark_m)} landmarks"
-            raise InputError(problem, field="position_m")
-        from evermap.sensing.kernels import HIGHEST, OUT_OF_FIELD
+        from evermap.sensing import kernels
 
-        profile, own = self.profile, self.hits / self.expected
-        middles = range_middles(profile.assumed.field.range_max_m), facing_middles()
-        rows = sights(pose, position_m, self.outward)
-        p = np.empty((len(rows), len(self.landmark_m)))
-        for out, row in zip(p, rows, strict=True):
-            inside = profile.assumed.in_field.probability(row)
-            rate = np.interp(row.range_m, middles[0], profile.range_rate)
-            rate *= np.interp(row.facing, middles[1], profile.facing_rate)
-            axis = np.argmax(np.abs(row.direction), axis=1)
-            face = 2 * axis + (np.take_along_axis(row.direction, axis[:, None], 1)[:, 0] <= 0.0)
-            rate *= own[np.arange(len(own)), face]
-            out[:] = np.where(inside < OUT_OF_FIELD, 0.0, inside * np.minimum(rate, HIGHEST))
-        return p * (1.0 - profile.occlusion.share)
+        if np.shape(position_m) != self.landmark_m.shape:
+            problem = f"shape {np.shape(position_m)} instead of {self.landmark_m.shape}"
+            raise InputError(problem, field="position_m")
+        if np.ndim(pose) != 3 or np.shape(pose)[1:] != (4, 4):
+            raise InputError(f"shape {np.shape(pose)} instead of (F, 4, 4)", field="pose")
+        law = _law(self.profile)
+        rows = kernels.LandmarkRows(np.asarray(position_m, np.float64), self.outward, self.hits, self.expected)
+        p = np.empty((len(pose), len(self.landmark_m)))
+        limits = _limits(self.profile.assumed)
+        for out, one in zip(p, np.asarray(pose, dtype=np.float64), strict=True):
+            kernels.p_detect(kernels.SensorFrame(one[:3, 3].copy(), one[:3, :3].copy(), limits), law, rows, out)
+        return p * (1.0 - self.profile.occlusion.share)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,14 +206,14 @@ def look(
 
     changed = ("hits", "expected", "occluded", "log_chain", "pending")
     after = replace(model, **{name: getattr(model, name).copy() for name in changed})
-    profile, chain = model.profile, model.profile.occlusion
-    seen = CliqueLook(np.empty(c), np.empty(c), np.empty(c), np.empty(c), np.empty(c, dtype=np.int64))
-    rates = profile.range_rate, profile.facing_rate, profile.p_false
-    changing = after.hits, after.expected, after.occluded, after.log_chain, after.pending
+    stamp, log_there, log_gone, p_occluded = np.empty((4, c))
+    seen = CliqueLook(stamp, log_there, log_gone, p_occluded, np.empty(c, dtype=np.int64))
     kernels.look(
-        kernels.SensorFrame(place, turn, _limits(profile.assumed), hit, chosen, np.nan_to_num(stamp_s - model.stamp_s)),
-        kernels.SensorLaw(*rates, chain.come_hz, chain.go_hz, profile.log_weight),
-        kernels.CliqueRows(model.first, model.landmark_m, model.outward, *changing),
+        kernels.SensorFrame(place, turn, _limits(model.profile.assumed)),
+        _law(model.profile),
+        kernels.LandmarkRows(model.landmark_m, model.outward, after.hits, after.expected),
+        kernels.CliqueRows(model.first, after.occluded, after.log_chain, after.pending),
+        kernels.Detections(hit, chosen, np.nan_to_num(stamp_s - model.stamp_s)),
         kernels.LookRows(seen.log_there, seen.log_gone, seen.p_occluded, seen.expected),
     )
     in_view = seen.expected > 0
@@ -292,6 +291,15 @@ def _flags(values: BoolArray, count: int, field: str) -> BoolArray:
     if flags.shape != (count,) or flags.dtype != np.bool_:
         raise InputError(f"{flags.dtype} of shape {flags.shape} instead of bool of ({count},)", field=field)
     return flags
+
+
+def _law(profile: Profile) -> SensorLaw:
+    """Return what the profile says as the kernels take it."""
+    from evermap.sensing.kernels import SensorLaw
+
+    chain = profile.occlusion
+    rates = profile.range_rate, profile.facing_rate, profile.p_false
+    return SensorLaw(*rates, chain.come_hz, chain.go_hz, profile.log_weight)
 
 
 def _limits(assumed: Assumed) -> FloatArray:

@@ -9,17 +9,54 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields, replace
+from enum import StrEnum
 
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.sensing.space import Fading, Field, InField, ViewGeometry, ViewingAngle
 from evermap.types import FloatArray
 
 RANGE_BINS = 16
 FACING_BINS = 16
 SMALLEST_RATE = 1e-3
 """Assumed detection of a landmark from behind: impossible for a solid body, but bodies have holes."""
+FACING_EDGE = 0.1
+"""Scale of the logistic edge of the assumed detection by incidence, in units of the cosine."""
+
+
+class Projection(StrEnum):
+    """How a sensor measures its vertical angle."""
+
+    SPHERICAL = "spherical"
+    """From the horizontal plane, as a spinning lidar: the field is an annulus."""
+    PINHOLE = "pinhole"
+    """In the plane of x and z, as a camera: the field is a pyramid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """What a sensor that looks along its x axis, with z up, can see (Bateman 2020 section 5.1.1).
+
+    Attributes:
+        range_max_m: nothing farther is detected.
+        half_azimuth_rad: to the left and to the right; pi is all around.
+        half_elevation_rad: up and down.
+        projection: what the vertical angle is measured from.
+    """
+
+    range_max_m: float
+    half_azimuth_rad: float
+    half_elevation_rad: float
+    projection: Projection
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.range_max_m < math.inf:
+            raise ConfigError(f"must be positive and finite, not {self.range_max_m!r}", field="range_max_m")
+        widest = math.pi if self.projection is Projection.SPHERICAL else math.pi / 2
+        for name, most in (("half_azimuth_rad", widest), ("half_elevation_rad", math.pi / 2)):
+            value = getattr(self, name)
+            if not 0.0 < value <= most:
+                raise ConfigError(f"must be above 0 and at most {most:.4f}, not {value!r}", field=name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,22 +105,25 @@ class Assumed:
         if not 0.0 < self.viewing_angle_rad <= math.pi:
             problem = f"must be above 0 and at most pi, not {self.viewing_angle_rad!r}"
             raise ConfigError(problem, field="viewing_angle_rad")
-        _ = self.in_field  # says what is wrong with the poses
+        if not 0.0 < self.sigma_position_m < math.inf:
+            problem = f"must be positive and finite, not {self.sigma_position_m!r}: no edge is infinitely sharp"
+            raise ConfigError(problem, field="sigma_position_m", hint="0.001")
+        if not 0.0 <= self.sigma_attitude_rad < math.inf:
+            raise ConfigError(
+                f"must be finite and not negative, not {self.sigma_attitude_rad!r}", field="sigma_attitude_rad"
+            )
 
     @property
-    def fades(self) -> Fading:
-        """Detection by range."""
-        return Fading(0.7 * self.field.range_max_m if self.fading_m is None else self.fading_m)
+    def range_rate(self) -> FloatArray:
+        """(16,) detection by range: `exp(-r / length)`."""
+        length_m = 0.7 * self.field.range_max_m if self.fading_m is None else self.fading_m
+        return np.exp(-range_middles(self.field.range_max_m) / length_m)
 
     @property
-    def faces(self) -> ViewingAngle:
-        """Detection by incidence."""
-        return ViewingAngle(self.viewing_angle_rad)
-
-    @property
-    def in_field(self) -> InField:
-        """Being in the field, softly."""
-        return InField(self.field, self.sigma_position_m, self.sigma_attitude_rad)
+    def facing_rate(self) -> FloatArray:
+        """(16,) detection by incidence: a logistic edge at the viewing angle."""
+        beyond = (facing_middles() - math.cos(self.viewing_angle_rad)) / FACING_EDGE
+        return np.maximum(1.0 / (1.0 + np.exp(-beyond)), SMALLEST_RATE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,18 +150,15 @@ class Profile:
     @classmethod
     def of(cls, assumed: Assumed) -> Profile:
         """Return the profile before anything was seen."""
-        near, far = np.zeros(FACING_BINS), range_middles(assumed.field.range_max_m)
-        by_range = assumed.fades.probability(_sight(far, np.ones(RANGE_BINS)))
-        by_facing = np.maximum(assumed.faces.probability(_sight(near, facing_middles())), SMALLEST_RATE)
         chains = len(assumed.occlusion_rates_hz) * len(assumed.occlusion_lengths_s)
         weight = np.append(assumed.p_never_occluded, np.full(chains, (1.0 - assumed.p_never_occluded) / chains))
-        expected_by_range, expected_by_facing = np.full(RANGE_BINS, assumed.hits), np.full(FACING_BINS, assumed.hits)
+        expected = np.full(RANGE_BINS, assumed.hits), np.full(FACING_BINS, assumed.hits)
         return cls(
             assumed=assumed,
-            range_hits=by_range * expected_by_range,
-            range_expected=expected_by_range,
-            facing_hits=by_facing * expected_by_facing,
-            facing_expected=expected_by_facing,
+            range_hits=assumed.range_rate * expected[0],
+            range_expected=expected[0],
+            facing_hits=assumed.facing_rate * expected[1],
+            facing_expected=expected[1],
             false_hits=assumed.p_false * assumed.p_false_looks,
             false_looks=assumed.p_false_looks,
             log_weight=np.log(weight),
@@ -198,9 +235,3 @@ def range_middles(range_max_m: float) -> FloatArray:
 def facing_middles() -> FloatArray:
     """Return (16,) middles of the bins of the cosine of incidence."""
     return np.asarray((np.arange(FACING_BINS) + 0.5) * (2.0 / FACING_BINS) - 1.0)
-
-
-def _sight(range_m: FloatArray, facing: FloatArray) -> ViewGeometry:
-    """Landmarks of which nothing matters but how far they are, and how they face."""
-    nowhere = np.zeros((len(range_m), 3))
-    return ViewGeometry(nowhere, range_m, facing, nowhere)

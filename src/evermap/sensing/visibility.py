@@ -6,7 +6,7 @@ field of view is said to end. A look with a detection is a *hit*, one without is
 depends on the line of sight (`sightlines`); a model without them takes every line for clear.
 
 `P(detect | there)` comes from a `DetectionModel`: `NominalField` here, what was learned of lines of sight in
-`sightlines`, sensors in space in `space`, and what is learned of these in `learned`.
+`sightlines`, and of sensors in space in `learned`.
 """
 
 from __future__ import annotations

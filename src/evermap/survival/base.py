@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError
 from evermap.show import Shown, draw
-from evermap.survival.logmath import log_one_minus_exp_of_minus_exp
+from evermap.survival.logmath import log_integral_of_smooth_hazard, log_one_minus_exp_of_minus_exp
 from evermap.types import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -170,6 +170,19 @@ class Lifetime(Shown, ABC):
             enough = self._log_integrated_hazard(zero, np.exp(middle)) >= log_target
             low, high = np.where(enough, low, middle), np.where(enough, middle, high)
         return np.where(np.isneginf(log_target), 0.0, np.where(reached, np.exp(high), np.inf))
+
+
+class SmoothLifetime(Lifetime):
+    """Base of models whose hazard is smooth in log t: `_log_cumulative` takes the place of an integral."""
+
+    __slots__ = ()
+
+    @abstractmethod
+    def _log_cumulative(self, t: FloatArray) -> FloatArray:
+        """Return `log H(t)`."""
+
+    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
+        return log_integral_of_smooth_hazard(a, b, self._log_cumulative, self._log_hazard)
 
 
 class SurvivalEstimate(Shown):

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -80,11 +80,6 @@ class Covariates(Shown):
                 row = int(np.argwhere(~np.isfinite(values))[0][0])
                 raise DataError(f"must be finite: row {row} is not", field=name)
 
-    @classmethod
-    def one(cls, **values: Any) -> Self:
-        """Make the covariates of a single thing: `Covariates.one(class_id=3, place_m=(1.0, 2.0))`."""
-        return cls(**values)
-
     def columns(self) -> dict[str, Any]:
         """Return those that are known, by name."""
         return {item.name: value for item in fields(self) if (value := getattr(self, item.name)) is not None}
@@ -126,7 +121,7 @@ class GpHazard(Shown):
         Raises:
             DataError: a missing or unknown covariate, or a class without samples.
         """
-        row = Covariates.one(**covariates)
+        row = Covariates(**covariates)
         wanted = {smooth.name for smooth in self._smooth} | ({"class_id"} if len(self.class_ids) else set())
         for name in sorted(wanted ^ row.columns().keys()):
             raise DataError("is needed" if name in wanted else "was not learned from", field=name)

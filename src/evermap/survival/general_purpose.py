@@ -10,11 +10,10 @@ from typing import Self
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.survival.base import Lifetime, Seed, check_positive
+from evermap.survival.base import Seed, SmoothLifetime, check_positive
 from evermap.survival.logmath import (
     entire_exponential_integral,
     gauss_legendre,
-    log_integral_of_smooth_hazard,
     log_one_minus_exp,
     scaled_e1,
 )
@@ -25,7 +24,7 @@ _NARROW = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class GeneralPurpose(Lifetime):
+class GeneralPurpose(SmoothLifetime):
     """`S(t) = (E1(low t) - E1(high t)) / log(high / low)`: an exponential whose rate is log-uniform.
 
     Three forms, each where it keeps all digits, with `D(t) = int_low^high exp(-(rate - low) t) / rate d rate`:
@@ -64,9 +63,6 @@ class GeneralPurpose(Lifetime):
     def _span(self) -> float:
         """Return `log(high / low)`."""
         return math.log1p((self.high - self.low) / self.low)
-
-    def _log_integrated_hazard(self, a: FloatArray, b: FloatArray) -> FloatArray:
-        return log_integral_of_smooth_hazard(a, b, self._log_cumulative, self._log_hazard)
 
     def _log_cumulative(self, t: FloatArray) -> FloatArray:
         died = self._died(t)
@@ -108,8 +104,3 @@ class GeneralPurpose(Lifetime):
         nodes, weights = gauss_legendre(24)
         rate = self.low * np.exp(min(self._span, _NARROW) * nodes)
         return np.asarray(function(rate) @ weights)
-
-
-def somewhere_between(shortest_s: float, longest_s: float) -> GeneralPurpose:
-    """Return the prior of a mean stay between the two, every order of magnitude equally probable."""
-    return GeneralPurpose.from_mean_stays(shortest_s, longest_s)

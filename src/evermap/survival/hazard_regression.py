@@ -26,6 +26,7 @@ from evermap.show import Shown
 from evermap.survival.base import SurvivalEstimate, check_open_share, check_times
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazards import PiecewiseConstantHazard
+from evermap.survival.logmath import log_one_minus_exp
 from evermap.types import BoolArray, FloatArray, IntArray
 
 STRETCHES = 24
@@ -210,7 +211,7 @@ class Exposures:
         ratio = np.exp(f)
         within = np.where(self.bounded, (self.within * ratio).sum(axis=1), np.inf)
         with np.errstate(divide="ignore"):
-            caught = np.where(within < 0.7, np.log(-np.expm1(-within)), np.log1p(-np.exp(-within)))
+            caught = log_one_minus_exp(within)
         return np.asarray((self.ends * f - self.before * ratio).sum(axis=1) + caught + self.log_baseline)
 
 

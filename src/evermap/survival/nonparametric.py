@@ -89,8 +89,15 @@ def npmle(data: CensoredLifetimes) -> Npmle:
     Raises:
         NumericalError: there is no maximum, which happens only with truncation, or it was not found.
     """
-    from evermap.survival.turnbull_kernels import best_between
-    from evermap.survival.turnbull_steps import Point, contract, from_samples, names, newton_step, rough_step
+    from evermap.survival.turnbull import (
+        Point,
+        best_between,
+        contract,
+        from_samples,
+        names,
+        newton_step,
+        rough_step,
+    )
 
     start, end, terms = from_samples(data)
     last_entry = int(np.flatnonzero(terms.entered)[-1])
@@ -99,8 +106,8 @@ def npmle(data: CensoredLifetimes) -> Npmle:
     while best.kkt_violation > GOOD and steps < STEPS and not (stale > 2 and best.kkt_violation < GOOD_ENOUGH):
         fine = fine or point.kkt_violation < ROUGH or steps >= ROUGH_STEPS
         if fine:
-            support = point.mass > 0.0
-            best_between(point.slope, SHARE * point.kkt_violation * terms.entered.sum(), support)
+            least = SHARE * point.kkt_violation * terms.entered.sum()
+            support = best_between(point.slope, least, point.mass > 0.0)
             mass = np.zeros(start.size)
             mass[support] = newton_step(Point(contract(terms, names(support)), point.mass[support])).mass
             point = Point(terms, mass)

@@ -23,13 +23,10 @@ from numpy.typing import ArrayLike
 from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share
 from evermap.survival.censored import CensoredLifetimes, log_sighting
-from evermap.survival.exponential import Exponential
-from evermap.survival.gamma import Gamma
+from evermap.survival.families import Exponential, Gamma, LogNormal, Weibull
 from evermap.survival.general_purpose import GeneralPurpose
-from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import never_leaves
-from evermap.survival.weibull import Weibull
 from evermap.types import FloatArray, IntArray
 
 _IMPOSSIBLE = 1e10

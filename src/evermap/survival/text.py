@@ -15,15 +15,11 @@ from typing import Any
 from evermap.errors import ConfigError, suggestion
 from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
-from evermap.survival.exponential import Exponential
-from evermap.survival.gamma import Gamma
-from evermap.survival.general_purpose import GeneralPurpose, somewhere_between
+from evermap.survival.families import Exponential, Gamma, LogNormal, Uniform, Weibull
+from evermap.survival.general_purpose import GeneralPurpose
 from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_by_day, gone_overnight
-from evermap.survival.lognormal import LogNormal
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import StepLifetime, never_leaves
-from evermap.survival.uniform import Uniform
-from evermap.survival.weibull import Weibull
 
 Values = Mapping[str, Any]
 Reader = Callable[[str], Any]
@@ -175,7 +171,7 @@ def _unknown(values: Values) -> GeneralPurpose:
     shortest_s, longest_s = values["mean stays"]
     if not shortest_s < longest_s:
         raise ConfigError("the shorter mean stay comes first", hint=FORMS["unknown"].example)
-    return somewhere_between(shortest_s, longest_s)
+    return GeneralPurpose.from_mean_stays(shortest_s, longest_s)
 
 
 def _daily(make: Callable[..., PeriodicHazard], hours: str) -> Callable[[Values], PeriodicHazard]:

@@ -12,8 +12,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evermap.errors import ConfigError
-from evermap.sensing.space import CAMERA, LIDAR, Field, Projection
+from evermap.sensing.profile import Field, Projection
 from evermap_studies.worlds.cliques import CliqueRun, CliqueWorld, named_world, simulate_cliques
+from evermap_studies.worlds.sensors import CAMERA, LIDAR
 
 SENSORS = {"lidar": LIDAR, "camera": CAMERA}
 WORLDS = ("nominal", "angle60", "range04", "occlusion", "false-alarms", "pose-noise")

@@ -44,7 +44,7 @@ def log_clique_run(
         detected: (F, K).
         belief: (F, C) posterior of persistence; nan before the birth.
         there: (F, C) whether each object truly exists.
-        field_outline_m: (N, P, 3) lines in the sensor's frame, as of `Field.outline`.
+        field_outline_m: (N, P, 3) lines in the sensor's frame, as of `worlds.sensors.outline`.
 
     Raises:
         MissingExtraError: rerun-sdk is not installed.

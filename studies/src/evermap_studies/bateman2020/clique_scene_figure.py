@@ -48,7 +48,7 @@ def draw_clique_scene(
         clique: (K,) which clique each landmark belongs to.
         step: row of `path_m` at which the sensor is shown.
         detected: (K,) landmarks detected in that step; a line goes to each.
-        field_outline_m: (N, P, 3) lines in the sensor's frame as of `Field.outline`: lower edge, upper edge, others.
+        field_outline_m: (N, P, 3) lines in the sensor's frame, see `worlds.sensors.outline`.
     """
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 

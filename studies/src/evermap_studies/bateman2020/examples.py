@@ -17,6 +17,7 @@ from evermap_studies.bateman2020.clique_scene_figure import draw_clique_scene
 from evermap_studies.bateman2020.filters import beliefs
 from evermap_studies.bateman2020.runs import Stack, simulate, stack
 from evermap_studies.bateman2020.settings import LEARNED, NOMINAL, SUPPRESSION, TUNED, Settings
+from evermap_studies.worlds.sensors import outline
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,7 +53,7 @@ def record_example(settings: Settings, path: Callable[[str], Path]) -> None:
             detected=run.detected,
             belief=_from_birth(belief, run),
             there=run.there(),
-            field_outline_m=run.world.field.outline(FIELD_M),
+            field_outline_m=outline(run.world.field, FIELD_M),
         )
 
 
@@ -78,7 +79,7 @@ def _draw_scene(run: CliqueRun) -> Figure:
             run.clique,
             step=step,
             detected=run.detected[step],
-            field_outline_m=run.world.field.outline(FIELD_M),
+            field_outline_m=outline(run.world.field, FIELD_M),
         )
         settle(figure)
     return figure

@@ -9,8 +9,9 @@ from importlib import resources
 from typing import Any
 
 from evermap.errors import ConfigError
-from evermap.sensing.space import CAMERA, LIDAR, Field
+from evermap.sensing.profile import Field
 from evermap_studies.worlds.cliques import CliqueWorld, named_world
+from evermap_studies.worlds.sensors import CAMERA, LIDAR
 
 SENSORS: dict[str, Field] = {"lidar": LIDAR, "camera": CAMERA}
 NOMINAL = "nominal"

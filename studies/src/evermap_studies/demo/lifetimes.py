@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from evermap.maps.learning import class_survival
-from evermap.survival.gamma import Gamma
+from evermap.survival import Gamma
 from evermap.types import FloatArray
 from evermap_studies.demo.study import Study
 from evermap_studies.sim.config import DAY_S, ObjectClass

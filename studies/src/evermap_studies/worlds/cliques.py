@@ -14,8 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.sensing.space import LIDAR, Field
+from evermap.sensing.profile import Field
 from evermap.types import BoolArray, FloatArray, IntArray
+from evermap_studies.worlds.sensors import LIDAR, contains
 
 HARMONICS = 3
 """Of the trajectory: enough to come by from several sides, few enough to be a path that something could drive."""
@@ -138,11 +139,11 @@ class CliqueRun:
     def expected(self) -> BoolArray:
         """(F, K) whether each landmark is in the field of the sensor, seen from the pose that the filters get."""
         seen = in_sensor_frame(self.landmark_m, self.pose_position_m, self.pose_rotation)
-        return self.world.field.contains(seen)
+        return contains(self.world.field, seen)
 
     def p_detect(self) -> FloatArray:
         """(F, K) true probability that each landmark is detected while its object is there and nobody hides it."""
-        in_field = self.world.field.contains(in_sensor_frame(self.landmark_m, self.position_m, self.rotation))
+        in_field = contains(self.world.field, in_sensor_frame(self.landmark_m, self.position_m, self.rotation))
         return _chance_there(self.world, self.position_m, self.landmark_m, self.normal, in_field)
 
 
@@ -168,7 +169,7 @@ def simulate_cliques(world: CliqueWorld, seed: int | np.random.SeedSequence) -> 
     normal = offset / np.linalg.norm(offset, axis=1, keepdims=True)
     landmark = centre[clique] + offset
 
-    in_field = world.field.contains(in_sensor_frame(landmark, position, rotation))
+    in_field = contains(world.field, in_sensor_frame(landmark, position, rotation))
     seen_at_all = np.stack([in_field[:, clique == c].any(axis=1) for c in range(world.objects)], axis=1)
     if not seen_at_all.any(axis=0).all():
         raise ConfigError(
@@ -264,7 +265,7 @@ def _place(
         others = zip(centres, sizes, strict=True)
         if any(np.linalg.norm(centre - other) < radius + float(size.max()) for other, size in others):
             continue
-        seen = world.field.contains(in_sensor_frame(centre[None], position[lap], rotation[lap]))
+        seen = contains(world.field, in_sensor_frame(centre[None], position[lap], rotation[lap]))
         if seen.mean() < world.share_in_field:
             continue
         centres.append(centre)
