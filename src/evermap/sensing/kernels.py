@@ -27,7 +27,7 @@ kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
-@kernel
+@inlined
 def normal_cdf(z: float) -> float:
     """Return `P(x < z)` of a standard normal."""
     if z > FAR_OUT:
@@ -37,7 +37,7 @@ def normal_cdf(z: float) -> float:
     return 0.5 * math.erfc(-z * 0.7071067811865476)
 
 
-@kernel
+@inlined
 def edge_distance(along: float, across: float, sine: float, cosine: float) -> float:
     """Return how far inside the edge of half an angle a point lies; behind the apex it is the apex that is nearest."""
     distance = along * sine - across * cosine
@@ -46,8 +46,8 @@ def edge_distance(along: float, across: float, sine: float, cosine: float) -> fl
     return distance
 
 
-@kernel
-def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -> float:
+@inlined
+def in_field(x: float, y: float, z: float, range_m: float, limits: tuple[float, ...]) -> float:
     """Return the probability that a point of the sensor's frame is in the field; `limits` as `learned` packs them."""
     range_max, sin_az, cos_az, sin_el, cos_el, spherical, all_around, sigma_m, sigma_rad = limits
     inside = normal_cdf((range_max - range_m) / sigma_m)
@@ -61,7 +61,7 @@ def in_field(x: float, y: float, z: float, range_m: float, limits: FloatArray) -
     return inside
 
 
-@kernel
+@inlined
 def face_of(x: float, y: float, z: float) -> int:
     """Return which of the six faces of a cube a direction goes through."""
     a, b, c = abs(x), abs(y), abs(z)
@@ -72,7 +72,7 @@ def face_of(x: float, y: float, z: float) -> int:
     return 4 if z > 0.0 else 5
 
 
-@kernel
+@inlined
 def between(value: float, count: int) -> tuple[int, float]:
     """Return the middle below `value`, in units of bins from the first one's lower edge, and how far it is to the
     next.
@@ -86,12 +86,21 @@ def between(value: float, count: int) -> tuple[int, float]:
     return low, shifted - low
 
 
-class SensorFrame(NamedTuple):
-    """One pose of the sensor: (3,) position and (3, 3) rotation in the world, limits as `learned` packs them."""
+@inlined
+def interpolated(rate: Any, low: Any, part: Any) -> Any:
+    """Return a rate between the middles of two bins."""
+    return rate[low] + part * (rate[low + 1] - rate[low])
 
-    position_m: FloatArray
-    rotation: FloatArray
-    limits: FloatArray
+
+class SensorFrame(NamedTuple):
+    """A pose of the sensor: position and rotation to the world, by rows, as numbers; limits as `learned` packs them.
+
+    Numbers, not arrays: those a compiler would load again for every landmark, since others are written to meanwhile.
+    """
+
+    position_m: tuple[float, ...]
+    rotation: tuple[float, ...]
+    limits: tuple[float, ...]
 
 
 class SensorLaw(NamedTuple):
@@ -147,43 +156,42 @@ class LookRows(NamedTuple):
 
 
 @inlined
-def expected(k: Any, frame: Any, law: Any, rows: Any) -> Any:
-    """Return how landmark k is seen: the probability to be in the field, 0 if it is out of it, and its factors.
-
-    Factors are the bin of its range and the part of the next one, the same of its incidence, the detection by each of
-    the two, and the direction that it is seen from.
-    """
+def sighted(frame: Any, point: Any) -> Any:
+    """Return the probability that a point is in the field (0 for none), its range, and the way to the sensor."""
     position_m, rotation, limits = frame
-    ranges, facings = len(law.range_rate), len(law.facing_rate)
-    dx = position_m[0] - rows.landmark_m[k, 0]
-    dy = position_m[1] - rows.landmark_m[k, 1]
-    dz = position_m[2] - rows.landmark_m[k, 2]
+    dx, dy, dz = position_m[0] - point[0], position_m[1] - point[1], position_m[2] - point[2]
     reach = limits[0] + FAR_OUT * limits[7]
     squared = dx * dx + dy * dy + dz * dz
-    if squared > reach * reach:
-        return 0.0, 0, 0.0, 0, 0.0, 0.0, 0.0, 0
     range_m = max(math.sqrt(squared), 1e-9)
-    x = -(rotation[0, 0] * dx + rotation[1, 0] * dy + rotation[2, 0] * dz)
-    y = -(rotation[0, 1] * dx + rotation[1, 1] * dy + rotation[2, 1] * dz)
-    z = -(rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz)
-    seen = in_field(x, y, z, range_m, limits)
-    if seen < OUT_OF_FIELD:
-        return 0.0, 0, 0.0, 0, 0.0, 0.0, 0.0, 0
-    low_r, part_r = between(range_m / limits[0] * ranges, ranges)
-    by_range = law.range_rate[low_r] + part_r * (law.range_rate[low_r + 1] - law.range_rate[low_r])
-    outward = rows.outward
-    cosine = (dx * outward[k, 0] + dy * outward[k, 1] + dz * outward[k, 2]) / range_m
-    low_f, part_f = between(0.5 * (cosine + 1.0) * facings, facings)
-    by_facing = law.facing_rate[low_f] + part_f * (law.facing_rate[low_f + 1] - law.facing_rate[low_f])
-    return seen, low_r, part_r, low_f, part_f, by_range, by_facing, face_of(dx, dy, dz)
+    inside = 0.0
+    if squared <= reach * reach:
+        x = -(rotation[0] * dx + rotation[3] * dy + rotation[6] * dz)
+        y = -(rotation[1] * dx + rotation[4] * dy + rotation[7] * dz)
+        z = -(rotation[2] * dx + rotation[5] * dy + rotation[8] * dz)
+        inside = in_field(x, y, z, range_m, limits)
+    return inside if inside >= OUT_OF_FIELD else 0.0, range_m, (dx, dy, dz)
+
+
+@inlined
+def cosine_between(way: Any, normal: Any, range_m: Any) -> Any:
+    """Return the cosine of incidence."""
+    return (way[0] * normal[0] + way[1] * normal[1] + way[2] * normal[2]) / range_m
 
 
 @kernel
 def p_detect(frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, out: FloatArray) -> None:
-    """Fill `out` (K,) with the probabilities to detect landmarks of which nothing hides any."""
+    """Fill `out` (K,) with the probabilities to detect landmarks that nothing hides."""
+    landmark_m, outward, hits, expected = rows
+    ranges, facings = len(law.range_rate), len(law.facing_rate)
     for k in range(out.size):
-        seen, _, _, _, _, by_range, by_facing, side = expected(k, frame, law, rows)
-        out[k] = seen * min(by_range * by_facing * (rows.hits[k, side] / rows.expected[k, side]), HIGHEST)
+        seen, range_m, way = sighted(frame, (landmark_m[k, 0], landmark_m[k, 1], landmark_m[k, 2]))
+        out[k] = 0.0
+        if seen > 0.0:
+            cosine = cosine_between(way, (outward[k, 0], outward[k, 1], outward[k, 2]), range_m)
+            by_range = interpolated(law.range_rate, *between(range_m / frame.limits[0] * ranges, ranges))
+            by_facing = interpolated(law.facing_rate, *between(0.5 * (cosine + 1.0) * facings, facings))
+            side = face_of(way[0], way[1], way[2])
+            out[k] = seen * min(by_range * by_facing * (hits[k, side] / expected[k, side]), HIGHEST)
 
 
 @kernel
@@ -191,11 +199,12 @@ def look(
     frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, cliques: CliqueRows, seen_now: Detections, out: LookRows
 ) -> None:
     """Fill `out`, and update what changes of `rows` and `cliques` in place."""
-    _, _, p_false, come_hz, go_hz, log_weight = law
+    range_rate, facing_rate, p_false, come_hz, go_hz, log_weight = law
+    landmark_m, outward, hits, expected = rows
     first, occluded, log_chain, pending = cliques
     detected, active, elapsed_s = seen_now
     log_there, log_gone, p_occluded, looked = out
-    chains, ranges, facings = len(come_hz), len(law.range_rate), len(law.facing_rate)
+    chains, ranges, facings = len(come_hz), len(range_rate), len(facing_rate)
     largest = np.diff(first).max()
     row, face, low_r, low_f = np.empty((4, largest), np.int64)
     # by range and incidence, the landmark's own factor by direction, and parts of the next bins
@@ -213,13 +222,17 @@ def look(
         n = 0
         log_ratio, log_absent, ratio, absent = 0.0, 0.0, 1.0, 1.0
         for k in range(first[c], first[c + 1]):
-            found = expected(k, frame, law, rows)
-            seen = found[0]
+            seen, range_m, way = sighted(frame, (landmark_m[k, 0], landmark_m[k, 1], landmark_m[k, 2]))
             if seen == 0.0:
                 continue
-            row[n] = k
-            inside[n], low_r[n], part_r[n], low_f[n], part_f[n], by_range[n], by_facing[n], face[n] = found
-            own[n] = rows.hits[k, face[n]] / rows.expected[k, face[n]]
+            cosine = cosine_between(way, (outward[k, 0], outward[k, 1], outward[k, 2]), range_m)
+            low_r[n], part_r[n] = between(range_m / frame.limits[0] * ranges, ranges)
+            low_f[n], part_f[n] = between(0.5 * (cosine + 1.0) * facings, facings)
+            by_range[n] = interpolated(range_rate, low_r[n], part_r[n])
+            by_facing[n] = interpolated(facing_rate, low_f[n], part_f[n])
+            side = face_of(way[0], way[1], way[2])
+            row[n], inside[n], face[n] = k, seen, side
+            own[n] = hits[k, side] / expected[k, side]
             p = seen * min(by_range[n] * by_facing[n] * own[n], HIGHEST)
             p_alarm = seen * p_false
             p_either = p_alarm + (1.0 - p_alarm) * p
@@ -279,11 +292,11 @@ def look(
                 hit = true
                 pending[c, at_false] += 1.0 - true
                 pending[c, at_false + 2] += 1.0
-                rows.hits[k, face[i]] += true
+                hits[k, face[i]] += true
             view = clear * seen
             pending[c, at_false + 1] += seen * (1.0 - clear * p)
             pending[c, at_false + 3] += seen
-            rows.expected[k, face[i]] += view * (by_range[i] * by_facing[i])
+            expected[k, face[i]] += view * (by_range[i] * by_facing[i])
             for_range, for_facing = view * by_facing[i] * own[i], view * by_range[i] * own[i]
             part = part_r[i]
             pending[c, low_range] += hit * (1.0 - part)

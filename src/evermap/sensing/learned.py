@@ -31,7 +31,7 @@ from evermap.sensing.profile import FACING_BINS, RANGE_BINS, Assumed, Profile, P
 from evermap.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
-    from evermap.sensing.kernels import SensorLaw
+    from evermap.sensing.kernels import SensorFrame, SensorLaw
 
 FACES = 6
 """Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
@@ -94,9 +94,8 @@ class LearnedDetection:
         law = _law(self.profile)
         rows = kernels.LandmarkRows(np.asarray(position_m, np.float64), self.outward, self.hits, self.expected)
         p = np.empty((len(pose), len(self.landmark_m)))
-        limits = _limits(self.profile.assumed)
         for out, one in zip(p, np.asarray(pose, dtype=np.float64), strict=True):
-            kernels.p_detect(kernels.SensorFrame(one[:3, 3].copy(), one[:3, :3].copy(), limits), law, rows, out)
+            kernels.p_detect(_frame(self.profile, one[:3, 3], one[:3, :3]), law, rows, out)
         return p * (1.0 - self.profile.occlusion.share)
 
 
@@ -209,7 +208,7 @@ def look(
     stamp, log_there, log_gone, p_occluded = np.empty((4, c))
     seen = CliqueLook(stamp, log_there, log_gone, p_occluded, np.empty(c, dtype=np.int64))
     kernels.look(
-        kernels.SensorFrame(place, turn, _limits(model.profile.assumed)),
+        _frame(model.profile, place, turn),
         _law(model.profile),
         kernels.LandmarkRows(model.landmark_m, model.outward, after.hits, after.expected),
         kernels.CliqueRows(model.first, after.occluded, after.log_chain, after.pending),
@@ -302,19 +301,20 @@ def _law(profile: Profile) -> SensorLaw:
     return SensorLaw(*rates, chain.come_hz, chain.go_hz, profile.log_weight)
 
 
-def _limits(assumed: Assumed) -> FloatArray:
-    """Return the field and its softness as the kernels take them."""
-    field = assumed.field
-    return np.array(
-        [
-            field.range_max_m,
-            math.sin(field.half_azimuth_rad),
-            math.cos(field.half_azimuth_rad),
-            math.sin(field.half_elevation_rad),
-            math.cos(field.half_elevation_rad),
-            float(field.projection is Projection.SPHERICAL),
-            float(field.half_azimuth_rad >= math.pi),
-            assumed.sigma_position_m,
-            assumed.sigma_attitude_rad,
-        ]
+def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame:
+    """Return a pose, the field and its softness as the kernels take them."""
+    from evermap.sensing.kernels import SensorFrame
+
+    field, assumed = profile.assumed.field, profile.assumed
+    limits = (
+        float(field.range_max_m),
+        math.sin(field.half_azimuth_rad),
+        math.cos(field.half_azimuth_rad),
+        math.sin(field.half_elevation_rad),
+        math.cos(field.half_elevation_rad),
+        float(field.projection is Projection.SPHERICAL),
+        float(field.half_azimuth_rad >= math.pi),
+        float(assumed.sigma_position_m),
+        float(assumed.sigma_attitude_rad),
     )
+    return SensorFrame(tuple(place.tolist()), tuple(turn.ravel().tolist()), limits)
