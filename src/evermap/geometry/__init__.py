@@ -1,1 +1,1 @@
-"""Planar motions and rigid alignment."""
+"""Rigid motions of the plane and of space behind one protocol, and rigid alignment."""

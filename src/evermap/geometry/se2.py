@@ -8,7 +8,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from evermap.geometry import jacobian
 from evermap.types import FloatArray, IntArray
+
+dim = 3
+size = 3
+point_dim = 2
+
+
+def identity(*shape: int) -> FloatArray:
+    """Return poses (*shape, 3) at the origin."""
+    return np.zeros((*shape, 3))
+
+
+def normalised(pose: ArrayLike) -> FloatArray:
+    """Return poses (..., 3) with angles in (-pi, pi]."""
+    pose = np.array(pose, dtype=np.float64)
+    pose[..., 2] = wrap(pose[..., 2])
+    return pose
 
 
 def wrap(angle_rad: ArrayLike) -> FloatArray:
@@ -84,6 +101,16 @@ def log(pose: ArrayLike) -> FloatArray:
     return np.stack([x, y, turn], axis=-1)
 
 
+def retract(pose: ArrayLike, twist: ArrayLike) -> FloatArray:
+    """Return `pose * exp(twist)`. Shapes (..., 3), broadcast."""
+    return compose(pose, exp(twist))
+
+
+def local(pose: ArrayLike, other: ArrayLike) -> FloatArray:
+    """Return the twist (..., 3) by which `retract` brings `pose` to `other`."""
+    return log(between(pose, other))
+
+
 def adjoint(pose: ArrayLike) -> FloatArray:
     """Return adjoint matrices (..., 3, 3): `pose * exp(xi) = exp(Ad xi) * pose`."""
     pose = np.asarray(pose, dtype=np.float64)
@@ -93,6 +120,32 @@ def adjoint(pose: ArrayLike) -> FloatArray:
     out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = s, c, -pose[..., 0]
     out[..., 2, 2] = 1.0
     return out
+
+
+def bracket(twist: ArrayLike) -> FloatArray:
+    """Return matrices (..., 3, 3) of the Lie bracket with twists; their exponential is `adjoint(exp(twist))`."""
+    twist = np.asarray(twist, dtype=np.float64)
+    out = np.zeros((*twist.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -twist[..., 2], twist[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = twist[..., 2], -twist[..., 0]
+    return out
+
+
+def right_jacobian(twist: ArrayLike) -> FloatArray:
+    """Return matrices (..., 3, 3): `exp(twist + d) = exp(twist) * exp(right_jacobian d)` for small `d`."""
+    twist = np.asarray(twist, dtype=np.float64)
+    return jacobian.right_jacobian(bracket(twist), twist[..., 2] ** 2)
+
+
+def right_jacobian_inverse(twist: ArrayLike) -> FloatArray:
+    """Return matrices (..., 3, 3): `log(exp(twist) * exp(d)) = twist + right_jacobian_inverse d` for small `d`."""
+    twist = np.asarray(twist, dtype=np.float64)
+    return jacobian.right_jacobian_inverse(bracket(twist), twist[..., 2] ** 2)
+
+
+def rotation_of(pose: ArrayLike) -> FloatArray:
+    """Return the rotation matrices (..., 2, 2) of poses (..., 3)."""
+    return rotation(np.asarray(pose, dtype=np.float64)[..., 2])
 
 
 def rotation(angle_rad: ArrayLike) -> FloatArray:

@@ -1,0 +1,77 @@
+"""The protocol of a group of rigid motions: what an estimator may know of SE(2) (`se2`) and of SE(3) (`se3`).
+
+The modules themselves are the groups: `PLANE.compose(a, b)` is `se2.compose(a, b)`. All arrays broadcast over leading
+axes. Twists hold the translation first, then the rotation, in the frame of the pose; poses are perturbed on the right.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from numpy.typing import ArrayLike
+
+from evermap.geometry import se2, se3
+from evermap.types import FloatArray
+
+
+class Group(Protocol):
+    """Rigid motions of one dimension; the laws are checked by `tests/geometry/test_group.py`."""
+
+    dim: int
+    """Degrees of freedom, numbers in a twist: 3 or 6."""
+    size: int
+    """Numbers that a pose is stored in: 3 for `(x, y, theta)`, 7 for `(x, y, z, qx, qy, qz, qw)`."""
+    point_dim: int
+    """Coordinates of a point: 2 or 3. The first of a pose, and the first of a twist, are the translation."""
+
+    def identity(self, *shape: int) -> FloatArray:
+        """Return poses (*shape, size) at the origin."""
+
+    def normalised(self, pose: ArrayLike) -> FloatArray:
+        """Return each pose (..., size) in the one form that all functions return."""
+
+    def compose(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
+        """Return `a * b`: the pose `b`, given in the frame `a`."""
+
+    def inverse(self, a: ArrayLike) -> FloatArray:
+        """Return the motion that undoes `a`."""
+
+    def between(self, a: ArrayLike, b: ArrayLike) -> FloatArray:
+        """Return `a^-1 * b`: the pose `b` seen from `a`."""
+
+    def transform(self, pose: ArrayLike, point: ArrayLike) -> FloatArray:
+        """Return points (..., point_dim) of the frame `pose` in the frame that `pose` is given in."""
+
+    def rotation_of(self, pose: ArrayLike) -> FloatArray:
+        """Return the rotation matrices (..., point_dim, point_dim) of poses."""
+
+    def exp(self, twist: ArrayLike) -> FloatArray:
+        """Return the motion along a constant twist (..., dim) for unit time."""
+
+    def log(self, pose: ArrayLike) -> FloatArray:
+        """Return the twist (..., dim) whose `exp` is `pose`, of smallest rotation."""
+
+    def retract(self, pose: ArrayLike, twist: ArrayLike) -> FloatArray:
+        """Return `pose * exp(twist)`."""
+
+    def local(self, pose: ArrayLike, other: ArrayLike) -> FloatArray:
+        """Return the twist by which `retract` brings `pose` to `other`."""
+
+    def adjoint(self, pose: ArrayLike) -> FloatArray:
+        """Return matrices (..., dim, dim): `pose * exp(xi) = exp(adjoint xi) * pose`."""
+
+    def bracket(self, twist: ArrayLike) -> FloatArray:
+        """Return Lie brackets with twists as matrices (..., dim, dim); their exponential is `adjoint(exp(twist))`."""
+
+    def right_jacobian(self, twist: ArrayLike) -> FloatArray:
+        """Return matrices (..., dim, dim): `exp(twist + d) = exp(twist) * exp(right_jacobian d)` for small `d`."""
+
+    def right_jacobian_inverse(self, twist: ArrayLike) -> FloatArray:
+        """Return matrices (..., dim, dim): `log(exp(twist) * exp(d)) = twist + right_jacobian_inverse d`, small `d`."""
+
+    def rigid_directions(self, point: ArrayLike) -> FloatArray:
+        """Return (k point_dim, dim) derivatives of points (k, point_dim), interleaved, moved together by `exp(xi)`."""
+
+
+PLANE: Group = se2
+SPACE: Group = se3

@@ -1,0 +1,82 @@
+"""Right Jacobians of the exponential map, in the plane and in space by the same formula.
+
+With `A` the bracket of a twist and `q` the square of its rotation, `A (A^2 + q)^2 = 0` in SE(3), and `A (A^2 + q) = 0`
+in SE(2). Any power series of `A` is therefore a polynomial of degree four, of which the terms with `A (A^2 + q)` vanish
+in the plane. Its coefficients follow from Hermite interpolation at the eigenvalues; in SE(3) the result is that of
+Barfoot and Furgale 2014 (Associating uncertainty with three-dimensional poses).
+"""
+
+from __future__ import annotations
+
+from math import factorial
+
+import numpy as np
+
+from evermap.types import FloatArray
+
+SERIES_BELOW = 1.0
+"""Squared rotation below which coefficients are sums of `TERMS` terms; the rest is below 1e-18 there."""
+TERMS = 10
+B_SERIES = [(-1) ** m / factorial(2 * m + 2) for m in reversed(range(TERMS))]
+C_SERIES = [(-1) ** m / factorial(2 * m + 3) for m in reversed(range(TERMS))]
+BY_B_SERIES, BY_C_SERIES = np.polyder(B_SERIES), np.polyder(C_SERIES)
+
+
+def coefficients(q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return `b = (1 - cos t) / t^2` and `c = (t - sin t) / t^3` of `q = t^2`, without cancellation.
+
+    The left Jacobian of a rotation vector is `1 + b W + c W^2`, `W` its cross product matrix.
+    """
+    small = q < SERIES_BELOW
+    safe = np.where(small, 1.0, q)
+    t = np.sqrt(safe)
+    b = np.where(small, np.polyval(B_SERIES, q), 2.0 * np.sin(t / 2) ** 2 / safe)
+    return b, np.where(small, np.polyval(C_SERIES, q), (t - np.sin(t)) / (safe * t))
+
+
+def slopes(q: FloatArray, b: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives by `q` of both `coefficients`."""
+    small = q < SERIES_BELOW
+    twice = np.where(small, 2.0, 2.0 * q)
+    by_b = np.where(small, np.polyval(BY_B_SERIES, q), (1.0 - 2.0 * b - q * c) / twice)
+    return by_b, np.where(small, np.polyval(BY_C_SERIES, q), (b - 3.0 * c) / twice)
+
+
+def inverse_coefficient(q: FloatArray) -> FloatArray:
+    """Return `d = (1 - (t / 2) cot(t / 2)) / t^2` of `q = t^2 < 4 pi^2`.
+
+    The inverse of the left Jacobian of a rotation vector is `1 - W / 2 + d W^2`.
+    """
+    b, c = coefficients(q)
+    return np.asarray(-slopes(q, b, c)[0] / b)
+
+
+def inverse_slope(q: FloatArray, d: FloatArray) -> FloatArray:
+    """Return the derivative by `q` of `inverse_coefficient`."""
+    small = q < 0.01
+    series = 1 / 720 + q * (1 / 15120 + q * (1 / 403200 + q / 11975040))
+    return np.where(small, series, (1.0 - 12.0 * d + 4.0 * q * d * d) / np.where(small, 1.0, 8.0 * q))
+
+
+def right_jacobian(bracket: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the right Jacobian (..., n, n) of twists with this bracket (..., n, n) and squared rotation (...)."""
+    b, c = coefficients(q)
+    b, c, by_b, by_c = (value[..., None, None] for value in (b, c, *slopes(q, b, c)))
+    square, rest = _square_and_rest(bracket, q)
+    one = np.eye(bracket.shape[-1])
+    return np.asarray(one - b * bracket + c * square + by_b * rest - by_c * (rest @ bracket))
+
+
+def right_jacobian_inverse(bracket: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the inverse of `right_jacobian`, for rotations of less than a full turn."""
+    d = inverse_coefficient(q)
+    d, by_d = d[..., None, None], inverse_slope(q, d)[..., None, None]
+    square, rest = _square_and_rest(bracket, q)
+    one = np.eye(bracket.shape[-1])
+    return np.asarray(one + 0.5 * bracket + d * square - by_d * (rest @ bracket))
+
+
+def _square_and_rest(bracket: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """`A^2` and `A (A^2 + q)`; the latter is zero in the plane."""
+    square = bracket @ bracket
+    return square, bracket @ square + q[..., None, None] * bracket

@@ -1,0 +1,248 @@
+"""The measurement equations in space with their derivatives, compiled: odometry, points, landmarks with a pose; steps.
+
+Poses are those of `geometry.se3`, `(x, y, z, qx, qy, qz, qw)` with unit quaternions, perturbed on the right by twists,
+whose translation comes first. Residuals are measured minus predicted for detections, in the sensor's axes, and
+`log(increment^-1 * between(pose, next))` for odometry. `mount` is the sensor's pose in the robot's frame.
+"""
+
+from __future__ import annotations
+
+import math
+
+from evermap.compiled import kept
+from evermap.types import FloatArray
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""(3, 3), row after row. Tuples live in registers: nothing is allocated."""
+
+kernel = kept(effort=1, error_model="numpy")
+
+
+@kernel
+def odometry_residual(
+    pose: FloatArray, following: FloatArray, increment: FloatArray, residual: FloatArray, j1: FloatArray, j2: FloatArray
+) -> None:
+    """Compute `log(increment^-1 * between(pose, following))` (6,), with (6, 6) derivatives by both poses."""
+    r_pose, r_increment = _matrix(_quaternion(pose)), _matrix(_quaternion(increment))
+    moved = _times(_conjugate(_quaternion(pose)), _quaternion(following))
+    x, y, z = _turned_back(r_pose, following[0] - pose[0], following[1] - pose[1], following[2] - pose[2])
+    ex, ey, ez = _turned_back(r_increment, x - increment[0], y - increment[1], z - increment[2])
+    a, b, c = _rotation_vector(_times(_conjugate(_quaternion(increment)), moved))
+    q = a * a + b * b + c * c
+    d, by_d = _inverse_coefficients(q)
+    along = a * ex + b * ey + c * ez
+    px = ex - 0.5 * (b * ez - c * ey) + d * (a * along - q * ex)
+    py = ey - 0.5 * (c * ex - a * ez) + d * (b * along - q * ey)
+    pz = ez - 0.5 * (a * ey - b * ex) + d * (c * along - q * ez)
+    residual[0], residual[1], residual[2], residual[3], residual[4], residual[5] = px, py, pz, a, b, c
+    # the inverse right Jacobian of the residual is that of its rotation, beside its derivative along the translation
+    turning, shift, turn = _inverse_jacobian(a, b, c), (px, py, pz), (a, b, c)
+    along = a * px + b * py + c * pz
+    for i in range(3):
+        for k in range(3):
+            j2[i, k] = j2[3 + i, 3 + k] = turning[3 * i + k]
+            j2[3 + i, k] = j1[3 + i, k] = 0.0
+            j2[i, 3 + k] = d * (turn[i] * shift[k] + shift[i] * turn[k]) + 2.0 * by_d * along * turn[i] * turn[k]
+        j2[i, 3 + i] -= 2.0 * along * (d + q * by_d)
+        second, third = (i + 1) % 3, (i + 2) % 3
+        j2[i, 3 + second] -= 0.5 * shift[third]
+        j2[i, 3 + third] += 0.5 * shift[second]
+    # by the first pose: the same, of minus the adjoint of the motion's inverse
+    r_moved = _matrix(moved)
+    for i in range(3):
+        f, g, h = _turned(r_moved, j2[i, 0], j2[i, 1], j2[i, 2])
+        u, v, w = _turned(r_moved, j2[i, 3], j2[i, 4], j2[i, 5])
+        j1[i, 0], j1[i, 1], j1[i, 2] = -f, -g, -h
+        j1[3 + i, 3], j1[3 + i, 4], j1[3 + i, 5] = -f, -g, -h
+        j1[i, 3], j1[i, 4], j1[i, 5] = g * z - h * y - u, h * x - f * z - v, f * y - g * x - w
+
+
+@kernel
+def point_residual(
+    pose: FloatArray,
+    landmark: FloatArray,
+    mount: FloatArray,
+    measured: FloatArray,
+    residual: FloatArray,
+    j_pose: FloatArray,
+    j_landmark: FloatArray,
+    j_mount: FloatArray,
+) -> None:
+    """Compute (x, y, z) in the sensor's frame, derivatives by pose (3, 6), point (3, 3) and mount (3, 6)."""
+    _position(pose, landmark, mount, measured, residual, j_pose, j_mount)
+    sensor = _matrix(_times(_quaternion(pose), _quaternion(mount)))
+    for i in range(3):
+        for k in range(3):
+            j_landmark[i, k] = -sensor[3 * k + i]
+
+
+@kernel
+def pose_residual(
+    pose: FloatArray,
+    landmark: FloatArray,
+    mount: FloatArray,
+    measured: FloatArray,
+    residual: FloatArray,
+    j_pose: FloatArray,
+    j_landmark: FloatArray,
+    j_mount: FloatArray,
+) -> None:
+    """Compute the residual (6,) of a landmark's pose (7,) as detected, with (6, 6) derivatives by all three poses.
+
+    The first three rows are those of its position. The others are the rotation vector, in the sensor's axes, that turns
+    the predicted orientation into the measured one.
+    """
+    _position(pose, landmark, mount, measured, residual, j_pose, j_mount)
+    seen = _times(_conjugate(_times(_quaternion(pose), _quaternion(mount))), _quaternion(landmark))
+    r_mount, r_seen = _matrix(_quaternion(mount)), _matrix(seen)
+    a, b, c = _rotation_vector(_times(_quaternion(measured), _conjugate(seen)))
+    residual[3], residual[4], residual[5] = a, b, c
+    turning = _inverse_jacobian(a, b, c)
+    for i in range(3):
+        u, v, w = turning[3 * i], turning[3 * i + 1], turning[3 * i + 2]
+        for k in range(3):
+            j_pose[3 + i, k] = j_mount[3 + i, k] = j_landmark[3 + i, k] = j_landmark[i, 3 + k] = 0.0
+            j_landmark[i, k] = -r_seen[3 * i + k]
+        j_mount[3 + i, 3], j_mount[3 + i, 4], j_mount[3 + i, 5] = u, v, w
+        j_pose[3 + i, 3], j_pose[3 + i, 4], j_pose[3 + i, 5] = _turned(r_mount, u, v, w)
+        f, g, h = _turned_back(r_seen, u, v, w)
+        j_landmark[3 + i, 3], j_landmark[3 + i, 4], j_landmark[3 + i, 5] = -f, -g, -h
+
+
+@kernel
+def compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Compute `a * b` as `se3.compose`; may be in place."""
+    x, y, z = _turned(_matrix(_quaternion(a)), b[0], b[1], b[2])
+    _put(out, a[0] + x, a[1] + y, a[2] + z, _times(_quaternion(a), _quaternion(b)))
+
+
+@kernel
+def retract(pose: FloatArray, twist: FloatArray, out: FloatArray) -> None:
+    """Compute `pose * exp(twist)` as `se3.retract`; may be in place."""
+    a, b, c, u, v, w = twist[3], twist[4], twist[5], twist[0], twist[1], twist[2]
+    q = a * a + b * b + c * c
+    if q < 0.05:
+        once = 1 / 2 - q * (1 / 24 - q * (1 / 720 - q * (1 / 40320 - q / 3628800)))
+        twice = 1 / 6 - q * (1 / 120 - q * (1 / 5040 - q * (1 / 362880 - q / 39916800)))
+    else:
+        angle = math.sqrt(q)
+        once, twice = (1.0 - math.cos(angle)) / q, (angle - math.sin(angle)) / (q * angle)
+    half = 0.5 * math.sqrt(q)
+    scale = 0.5 if half < 1e-8 else 0.5 * math.sin(half) / half
+    along = a * u + b * v + c * w
+    x = u + once * (b * w - c * v) + twice * (a * along - q * u)
+    y = v + once * (c * u - a * w) + twice * (b * along - q * v)
+    z = w + once * (a * v - b * u) + twice * (c * along - q * w)
+    x, y, z = _turned(_matrix(_quaternion(pose)), x, y, z)
+    turned = _times(_quaternion(pose), (scale * a, scale * b, scale * c, math.cos(half)))
+    _put(out, pose[0] + x, pose[1] + y, pose[2] + z, turned)
+
+
+@kernel
+def _put(out: FloatArray, x: float, y: float, z: float, a: Quaternion) -> None:
+    """Write a pose as `se3.normalised`."""
+    first = a[3]
+    for k in (2, 1, 0):
+        if first == 0.0:
+            first = a[k]
+    scale = math.copysign(1.0, first) / math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2] + a[3] * a[3])
+    out[0], out[1], out[2] = x, y, z
+    out[3], out[4], out[5], out[6] = scale * a[0], scale * a[1], scale * a[2], scale * a[3]
+
+
+@kernel
+def _position(
+    pose: FloatArray,
+    landmark: FloatArray,
+    mount: FloatArray,
+    measured: FloatArray,
+    residual: FloatArray,
+    j_pose: FloatArray,
+    j_mount: FloatArray,
+) -> None:
+    """First three rows of a detection, and of its derivatives by the robot's and the sensor's pose."""
+    r_pose, r_mount = _matrix(_quaternion(pose)), _matrix(_quaternion(mount))
+    x, y, z = _turned_back(r_pose, landmark[0] - pose[0], landmark[1] - pose[1], landmark[2] - pose[2])
+    for i in range(3):
+        f, g, h = r_mount[i], r_mount[3 + i], r_mount[6 + i]
+        j_pose[i, 0], j_pose[i, 1], j_pose[i, 2] = f, g, h
+        j_pose[i, 3], j_pose[i, 4], j_pose[i, 5] = y * h - z * g, z * f - x * h, x * g - y * f
+        for k in range(6):
+            j_mount[i, k] = 0.0
+        j_mount[i, i] = 1.0
+    x, y, z = _turned_back(r_mount, x - mount[0], y - mount[1], z - mount[2])
+    residual[0], residual[1], residual[2] = measured[0] - x, measured[1] - y, measured[2] - z
+    j_mount[0, 4], j_mount[0, 5] = z, -y
+    j_mount[1, 3], j_mount[1, 5] = -z, x
+    j_mount[2, 3], j_mount[2, 4] = y, -x
+
+
+@kernel
+def _quaternion(pose: FloatArray) -> Quaternion:
+    return pose[3], pose[4], pose[5], pose[6]
+
+
+@kernel
+def _conjugate(a: Quaternion) -> Quaternion:
+    return -a[0], -a[1], -a[2], a[3]
+
+
+@kernel
+def _times(a: Quaternion, b: Quaternion) -> Quaternion:
+    return (
+        a[3] * b[0] + a[0] * b[3] + a[1] * b[2] - a[2] * b[1],
+        a[3] * b[1] + a[1] * b[3] + a[2] * b[0] - a[0] * b[2],
+        a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0],
+        a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2],
+    )
+
+
+@kernel
+def _matrix(a: Quaternion) -> Matrix:
+    x, y, z, w = a
+    first = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+    second = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+    return first + second + (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y))
+
+
+@kernel
+def _turned(r: Matrix, x: float, y: float, z: float) -> Triple:
+    """`r v`."""
+    return r[0] * x + r[1] * y + r[2] * z, r[3] * x + r[4] * y + r[5] * z, r[6] * x + r[7] * y + r[8] * z
+
+
+@kernel
+def _turned_back(r: Matrix, x: float, y: float, z: float) -> Triple:
+    """`r' v`."""
+    return r[0] * x + r[3] * y + r[6] * z, r[1] * x + r[4] * y + r[7] * z, r[2] * x + r[5] * y + r[8] * z
+
+
+@kernel
+def _rotation_vector(a: Quaternion) -> Triple:
+    """Rotation vector of at most half a turn, of a quaternion of either sign."""
+    length = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    scale = 2.0 / a[3] if length < 1e-8 else math.copysign(2.0, a[3]) * math.atan2(length, abs(a[3])) / length
+    return scale * a[0], scale * a[1], scale * a[2]
+
+
+@kernel
+def _inverse_coefficients(q: float) -> tuple[float, float]:
+    """`inverse_coefficient` and `inverse_slope` of `geometry.jacobian`, of at most half a turn."""
+    if q < 0.05:
+        d = 1 / 12 + q * (1 / 720 + q * (1 / 30240 + q * (1 / 1209600 + q / 47900160)))
+        return d, 1 / 720 + q * (1 / 15120 + q * (1 / 403200 + q / 11975040))
+    half = 0.5 * math.sqrt(q)
+    d = (1.0 - half * math.cos(half) / math.sin(half)) / q
+    return d, (1.0 - 12.0 * d + 4.0 * q * d * d) / (8.0 * q)
+
+
+@kernel
+def _inverse_jacobian(a: float, b: float, c: float) -> Matrix:
+    """Inverse right Jacobian of a rotation vector: `1 + W / 2 + d W^2`."""
+    q = a * a + b * b + c * c
+    d, _ = _inverse_coefficients(q)
+    first = 1.0 + d * (a * a - q), d * a * b - 0.5 * c, d * a * c + 0.5 * b
+    second = d * a * b + 0.5 * c, 1.0 + d * (b * b - q), d * b * c - 0.5 * a
+    return first + second + (d * a * c - 0.5 * b, d * b * c + 0.5 * a, 1.0 + d * (c * c - q))
