@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from evermap.errors import ConfigError
 from evermap.io import Shift, parse_shift, shifted
-from evermap.metrics.changes import compare_changes
 from evermap.types import ChangeKind, Landmarks, MapChange
+from evermap_studies.changes import compare_changes
 
 MAP = Landmarks.at([3, 5, 8, 11], [[0, 0], [2, 0], [2, 2], [-4, 1]], sigma_m=[[0.1, 0.3]] * 4)
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_run import make_run
 
-from evermap.metrics.changes import compare_changes, rank_of_truth, time_of_change
 from evermap.types import Alternative, ChangeKind, MapChange
+from evermap_studies.changes import compare_changes, rank_of_truth, time_of_change
 
 NAN = math.nan
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from evermap.metrics.changes import ChangeCounts, count_changes
 from evermap.types import ChangeKind, MapChange
+from evermap_studies.changes import ChangeCounts, count_changes
 
 NAN = float("nan")
 

@@ -14,8 +14,8 @@ from matplotlib.text import Text
 from evermap.errors import ConfigError, InputError
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, Mixture, Uniform, Weibull, never_leaves
 from evermap.types import Clock
-from evermap.viz.belief_figure import plot_belief, stretches
 from evermap.viz.lifetime_figures import plot_lifetimes
+from evermap.viz.presence_figures import plot_belief, stretches
 from evermap.viz.time_axis import unit_for
 
 DAY_S = 86400.0

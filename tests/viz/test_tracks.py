@@ -10,7 +10,8 @@ import pytest
 from evermap.errors import MissingExtraError
 from evermap.viz.rerun_scene import log_tracks
 from evermap.viz.style import house_style, new_figure
-from evermap.viz.track_figures import ARROW_S, DYNAMIC, STATIC, TracksNow, draw_tracks
+from evermap.viz.track_figures import DYNAMIC, STATIC
+from evermap_studies.lifetimes.tracks_now import ARROW_S, TracksNow, draw_tracks
 
 POSITION = np.array([[0.0, 1.0, 0.0], [5.0, 2.0, 0.0], [9.0, -3.0, 1.0]])
 VELOCITY = np.array([[0.01, 0.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.0]])

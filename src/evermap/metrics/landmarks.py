@@ -102,36 +102,6 @@ def evaluate_landmarks(
     )
 
 
-@dataclass(frozen=True, slots=True)
-class IdentityScores:
-    """How well the landmarks of a run that numbered them itself match those of the recording.
-
-    Attributes:
-        purity: share of assigned detections that have the commonest identity of their landmark.
-        completeness: share of detections that are in the landmark which holds most of their identity.
-        n_landmarks, n_identities: numbers of distinct ids.
-    """
-
-    purity: float
-    completeness: float
-    n_landmarks: int
-    n_identities: int
-
-
-def identity_scores(landmark_id: IntArray, true_id: IntArray) -> IdentityScores:
-    """Score the landmark ids of detections (M,) against true ones; `UNKNOWN` where one was given to no landmark."""
-    table, landmarks, identities = _table(landmark_id, true_id)
-    if len(identities) == 0:
-        return IdentityScores(0.0, 0.0, 0, 0)
-    given = max(float(table.sum()), 1.0)
-    return IdentityScores(
-        float(table.max(axis=1, initial=0).sum() / given),
-        float(table.max(axis=0, initial=0).sum() / len(true_id)),
-        len(landmarks),
-        len(identities),
-    )
-
-
 def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recording: Recording) -> Landmarks:
     """Rename the landmarks of a map by the id that the recording gives to most of their detections, for scoring.
 

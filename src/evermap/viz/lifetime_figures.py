@@ -24,10 +24,8 @@ from evermap.viz.style import (
     INK,
     MUTED,
     class_looks,
-    house_style,
+    drawing,
     legend_name,
-    new_figure,
-    settle,
 )
 from evermap.viz.time_axis import DURATIONS, TimeUnit, label_durations, unit_for
 
@@ -73,8 +71,7 @@ def plot_lifetimes(
         raise ConfigError("no lifetime prior to draw", field="priors")
     time_s, logarithmic = _times(named.values(), until_s, log_time)
     unit = unit_for(float(time_s[-1]))
-    with house_style():
-        figure = new_figure(7.2, 5.0)
+    with drawing(7.2, 5.0, title=title) as figure:
         panels = figure.subplots(2, 2, sharex=True)
         styles = _styles(named)
         for name, prior in named.items():
@@ -83,9 +80,6 @@ def plot_lifetimes(
         for axes in panels[1]:
             _time_axis(axes, time_s, unit, logarithmic)
         figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
-        if title:
-            figure.suptitle(title, fontweight="bold")
-        settle(figure)
     return figure
 
 
@@ -221,8 +215,7 @@ def plot_survival(
     time_s, logarithmic = _times(priors, until_s, log_time)
     unit = unit_for(float(time_s[-1]))
     styles = _styles(estimates)
-    with house_style():
-        figure = new_figure(6.4, 3.8)
+    with drawing(6.4, 3.8, title=title) as figure:
         axes = figure.subplots()
         for name, one in estimates.items():
             _draw_estimate(axes, one, legend_name(name), time_s, unit, styles[name])
@@ -237,9 +230,6 @@ def plot_survival(
         else:
             axes.set(xlim=(0.0, time_s[-1] / unit.seconds), xlabel=f"time since first seen [{unit.name}]")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        if title:
-            figure.suptitle(title, fontweight="bold")
-        settle(figure)
     return figure
 
 
@@ -262,15 +252,11 @@ def plot_chunks(
     if not len(chunks) == len(hazards) > 0:
         raise ConfigError(f"{len(chunks)} chunks need as many hazards, at least one", field="hazards")
     median, lower, upper = np.array([one.quantile(0.5) for one in hazards]).T
-    with house_style():
-        figure = new_figure(7.2, 3.8)
+    with drawing(7.2, 3.8, title=title) as figure:
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         _map(left, chunks, size_m, median, "half have gone after", durations=True)
         _map(right, chunks, size_m, upper / lower, "upper over lower bound [1]", durations=False)
         left.set_ylabel("y [m]")
-        if title:
-            figure.suptitle(title, fontweight="bold")
-        settle(figure)
     return figure
 
 
@@ -386,8 +372,7 @@ def plot_samples(data: CensoredLifetimes, names: Sequence[str]) -> Figure:
     entry, right = data.entry_s / unit.seconds, np.minimum(data.right_s / unit.seconds, end)
     since = np.maximum(data.left_s / unit.seconds, entry)
     known = np.isfinite(data.right_s)
-    with house_style():
-        figure = new_figure(6.4, 0.7 + 0.32 * n)
+    with drawing(6.4, 0.7 + 0.32 * n) as figure:
         axes = figure.subplots()
         axes.hlines(row, 0.0, entry, color=MUTED, lw=1.5, ls=":", label="unknown to us if it had gone by then")
         axes.barh(row, since - entry, left=entry, height=0.34, color=ESTIMATE, label="seen to be there")
@@ -398,5 +383,4 @@ def plot_samples(data: CensoredLifetimes, names: Sequence[str]) -> Figure:
         axes.set(xlim=(0.0, 1.01 * end), xlabel=f"age [{unit.name}]")
         axes.grid(visible=False, axis="y")
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-        settle(figure)
     return figure

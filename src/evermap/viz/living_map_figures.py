@@ -20,12 +20,10 @@ from evermap.viz.style import (
     PAPER,
     SHADE,
     class_looks,
-    house_style,
+    drawing,
     label_points,
     legend_name,
     legend_of,
-    new_figure,
-    settle,
 )
 from evermap.viz.time_axis import TimeAxis
 
@@ -81,8 +79,7 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     low, high = everything.min(axis=0), everything.max(axis=0)
     size = np.maximum(high - low, 1.0)
     margin = 0.05 * float(size.max())
-    with house_style():
-        figure = new_figure(7.2, float(np.clip(6.4 * size[1] / size[0], 2.4, 7.5)) + 1.3)
+    with drawing(7.2, float(np.clip(6.4 * size[1] / size[0], 2.4, 7.5)) + 1.3) as figure:
         axes = figure.add_subplot()
         axes.set(
             xlim=(low[0] - margin, high[0] + margin),
@@ -97,7 +94,6 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
             names = [landmarks.names.get(name, str(name)) for name in landmarks.landmark_id.tolist()]
             label_points(axes, landmarks.position_m, names)
         _legend(figure, handles)
-        settle(figure)
     return figure
 
 
@@ -223,8 +219,7 @@ def plot_why(history: LandmarkHistory, *, title: str) -> Figure:
     margin = 0.02 * max(last - first, 1.0)
     axis = TimeAxis.over(first, last + margin, history.clock)
     sites = list(dict.fromkeys(name for name, *_ in history.stays))
-    with house_style():
-        figure = new_figure(7.2, 3.9 + 0.22 * len(sites))
+    with drawing(7.2, 3.9 + 0.22 * len(sites)) as figure:
         rows = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.6, 0.5 + 0.35 * max(len(sites), 1)])
         _draw_belief(rows[0], axis, history)
         _draw_evidence(rows[1], axis, history)
@@ -233,7 +228,6 @@ def plot_why(history: LandmarkHistory, *, title: str) -> Figure:
         rows[2].set_xlim(axis.coordinates(first - margin), axis.coordinates(last + margin))
         axis.label(rows[2])
         figure.legend(*legend_of(*rows), loc="outside lower center", ncols=3)
-        settle(figure)
     return figure
 
 

@@ -28,19 +28,16 @@ from evermap.viz.style import (
     LANDMARK,
     MUTED,
     PAPER,
-    class_looks,
+    drawing,
     house_style,
-    label_points,
-    legend_name,
-    new_figure,
-    settle,
 )
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MAX_LABELS = 40
+_PLAN: Any = {"aspect": "equal", "xlabel": "x [m]", "ylabel": "y [m]"}
+"""Axes of a plan view."""
 
 
 def plot_result(result: SlamResult, recording: Recording | None = None) -> Figure:
@@ -73,8 +70,8 @@ def plot_followed(followed: Any, resting_m: FloatArray) -> Figure:
         followed: `Tracker.followed()`.
         resting_m: (K, 3) places of the objects of its working set.
     """
-    with house_style():
-        figure, axes = _plan()
+    with drawing(6.0, 5.0) as figure:
+        axes = figure.add_subplot(**_PLAN)
         if len(resting_m):
             axes.plot(*resting_m[:, :2].T, "x", color=MUTED, ms=5, lw=0, label="at rest, out of view")
         for static, marker, label in ((True, "s", "at rest"), (False, "o", "moving")):
@@ -87,42 +84,22 @@ def plot_followed(followed: Any, resting_m: FloatArray) -> Figure:
             axes.plot([x, x + dx], [y, y + dy], color=ESTIMATE, lw=1.0)
         if axes.get_legend_handles_labels()[1]:
             axes.legend()
-        return figure
+    return figure
 
 
 def plot_landmarks(landmarks: Landmarks) -> Figure:
-    """Draw a map by class with 2-sigma ellipses; landmarks that may be gone are fainter."""
-    from matplotlib.collections import EllipseCollection
-
-    names = [landmarks.class_names[k] if 0 <= k < len(landmarks.class_names) else "" for k in landmarks.class_id]
-    with house_style():
-        figure, axes = _plan()
-        variance, axis = np.linalg.eigh(landmarks.covariance_m2)
-        size = 4.0 * np.sqrt(np.maximum(variance, 0.0))
-        angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
-        place: Any = {"offsets": landmarks.position_m, "offset_transform": axes.transData, "units": "xy"}
-        line: Any = {"facecolors": "none", "edgecolors": MUTED, "linewidths": 0.8}
-        axes.add_collection(EllipseCollection(size[:, 1], size[:, 0], angle, **place, **line))
-        for name, look in class_looks(names).items():
-            rows = np.array([one == name for one in names], dtype=np.bool_)
-            if not rows.any():
-                continue
-            x, y = landmarks.position_m[rows].T
-            colour: Any = [(look.colour, 0.25 + 0.75 * p) for p in landmarks.p_exists[rows]]
-            axes.scatter(x, y, s=18, lw=0, marker=look.marker, c=colour, label=legend_name(name or "no class"))
-        if landmarks.class_names:
-            figure.legend(loc="outside upper center", ncols=4)
-        if len(landmarks) <= _MAX_LABELS:
-            texts = (landmarks.names.get(identity, str(identity)) for identity in landmarks.landmark_id.tolist())
-            label_points(axes, landmarks.position_m, texts)
-        settle(figure)
-    return figure
+    """Draw a map by class with 2-sigma ellipses; what may be gone is fainter, what probably is, crossed out."""
+    if not len(landmarks):
+        with drawing(6.0, 5.0) as figure:
+            figure.add_subplot(**_PLAN)
+        return figure
+    return plot_living_map(MapView(landmarks, np.zeros(len(landmarks), dtype=np.bool_)), title="")
 
 
 def plot_trajectory(trajectory: Trajectory) -> Figure:
     """Draw a path and its first pose."""
-    with house_style():
-        figure, axes = _plan()
+    with drawing(6.0, 5.0) as figure:
+        axes = figure.add_subplot(**_PLAN)
         axes.plot(*trajectory.pose_world_robot[:, :2].T, color=ESTIMATE, lw=1.0)
         axes.plot(*trajectory.pose_world_robot[:1, :2].T, "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6)
     return figure
@@ -139,8 +116,7 @@ def plot_recording(recording: Recording) -> Figure:
         "forward [m/s]": (odometry.stamp_s - start_s, odometry.forward_mps),
         "turn [rad/s]": (odometry.stamp_s - start_s, odometry.angular_radps),
     }
-    with house_style():
-        figure = new_figure(10.0 if recording.truth is not None else 7.2, 5.4)
+    with drawing(10.0 if recording.truth is not None else 7.2, 5.4) as figure:
         grid = figure.add_gridspec(len(panels), 2 if recording.truth is not None else 1)
         top: Axes | None = None
         for k, (label, (time_s, values)) in enumerate(panels.items()):
@@ -150,7 +126,7 @@ def plot_recording(recording: Recording) -> Figure:
             axes.set_ylabel(label)
         axes.set_xlabel("time since the first frame [s]")
         if recording.truth is not None:
-            plan = figure.add_subplot(grid[:, 1], aspect="equal", xlabel="x [m]", ylabel="y [m]")
+            plan = figure.add_subplot(grid[:, 1], **_PLAN)
             plan.plot(*recording.truth.pose_world_robot[:, :2].T, color=INK, lw=0.8)
             if recording.true_landmarks is not None:
                 plan.plot(*recording.true_landmarks.position_m.T, "s", mfc="none", mec=INK, ms=5, mew=0.8)
@@ -165,11 +141,6 @@ def plot_lifetime(prior: LifetimePrior, **options: Any) -> Figure:
 def plot_estimate(estimate: Any, **options: Any) -> Figure:
     """Draw the survival function of an estimate; options as of `plot_survival`."""
     return plot_survival({type(estimate).__name__: estimate}, **options)
-
-
-def _plan() -> tuple[Figure, Axes]:
-    figure = new_figure(6.0, 5.0)
-    return figure, figure.add_subplot(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 
 def _rows_of_landmarks(detections: Detections) -> np.ndarray:

@@ -62,7 +62,7 @@ def render_report(
     if sections:  # the page is about more than this recording
         parts.append(f'<h2>{escape(recording.name)}</h2><p class="lead">{_lead(summary)}</p>')
     parts += [
-        headline_cards(summary),
+        cards_html(_cards(summary)),
         _interrupted(summary),
         _changes(result, summary),
         warnings_note(summary["warnings"]),
@@ -163,13 +163,13 @@ def _frames(summary: Mapping[str, Any]) -> str:
 
 
 def _calibration(result: SlamResult) -> str:
-    html = ""
-    calibration, noise = calibration_table(result), noise_table(result)
-    if calibration:
-        html += f"<h3>Calibration states</h3>{calibration}"
-    if noise:
-        html += f"<h3>Noise levels</h3>{noise}"
-    return html
+    """Calibration states and noise levels, which are named `sigma_...`, with uncertainty and prior."""
+    parts = {"Calibration states": False, "Noise levels": True}
+    chosen = {
+        title: [parameter for parameter in result.parameters if parameter.name.startswith("sigma_") is noise]
+        for title, noise in parts.items()
+    }
+    return "".join(f"<h3>{title}</h3>{_parameters(those)}" for title, those in chosen.items() if those)
 
 
 def _consistency(summary: Mapping[str, Any]) -> str:
@@ -226,12 +226,8 @@ def _footer(summary: Mapping[str, Any]) -> str:
     return text + ". All numbers of this page are in <code>summary.json</code>."
 
 
-def headline_cards(summary: Mapping[str, Any]) -> str:
-    """Return cards for the numbers this run has, each with a sentence that says what it means."""
-    return cards_html(_cards(summary))
-
-
 def _cards(summary: Mapping[str, Any]) -> list[str | None]:
+    """Cards for the numbers this run has, each with a sentence that says what it means."""
     metrics, timing = summary["metrics"], summary["timing"]
     odometry, pose = metrics["dead_reckoning_rmse_m"], metrics["pose_rmse_m"]
     heading, odometry_heading = metrics["heading_rmse_deg"], metrics["dead_reckoning_heading_rmse_deg"]
@@ -292,24 +288,7 @@ def _nis(metrics: Mapping[str, Any]) -> str:
 _MAX_LANDMARK_ROWS = 500
 
 
-def is_noise(parameter: ParameterEstimate) -> bool:
-    """Return whether a parameter is a noise level, named `sigma_...`, and not a calibration state."""
-    return parameter.name.startswith("sigma_")
-
-
-def calibration_table(result: SlamResult) -> str:
-    """Return calibration states with uncertainty and prior; '' if there is none."""
-    return _parameters([parameter for parameter in result.parameters if not is_noise(parameter)])
-
-
-def noise_table(result: SlamResult) -> str:
-    """Return noise levels as the recording determined them; '' if there is none."""
-    return _parameters([parameter for parameter in result.parameters if is_noise(parameter)])
-
-
 def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
-    if not parameters:
-        return ""
     rows = [
         (
             f"<code>{escape(p.name)}</code>",

@@ -185,6 +185,23 @@ def new_figure(width_in: float, height_in: float) -> Figure:
     return figure
 
 
+@contextmanager
+def drawing(width_in: float, height_in: float, *, title: str | None = None) -> Iterator[Figure]:
+    """Yield an empty figure to draw into, in the house style; at the end its layout is computed.
+
+    Args:
+        width_in: size in inches.
+        height_in: size in inches.
+        title: above all panels.
+    """
+    with house_style():
+        figure = new_figure(width_in, height_in)
+        yield figure
+        if title:
+            figure.suptitle(title, fontweight="bold")
+        settle(figure)
+
+
 def settle(figure: Figure) -> None:
     """Compute the layout once, so that saving in several formats does not repeat it, and move labels apart."""
     _write_powers(figure)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
 
-from evermap.metrics.landmarks import identity_scores
 from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise

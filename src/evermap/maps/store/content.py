@@ -11,10 +11,11 @@ import hashlib
 import json
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from evermap.errors import EvermapError
 from evermap.maps.lives import Life
-from evermap.maps.living import LivingMap
+from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.survival.base import LifetimePrior
 from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.types import UNKNOWN, FloatArray
@@ -196,135 +197,101 @@ def names_in(name: bytes, fetch: Fetch) -> set[bytes]:
     return {name, *(name_of(part) for _, _, _, names in columns for part in names)}
 
 
+_EQUALLY_LONG = {
+    "members": tuple(item.name for item in fields(Members)),
+    "sites": tuple(item.name for item in fields(Sites)),
+    "places": tuple(item.name for item in fields(Places)),
+    "stays": tuple(item.name for item in fields(Stays)),
+    "lives": ("class_id", "chunk", "life"),
+    "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
+    "views": ("cell", "heading", "stamp_s", "frames"),
+}
+_LEAST = {
+    "members.class_id": UNKNOWN, "stays.class_id": UNKNOWN, "lives.class_id": UNKNOWN, "lives.prior_class_id": UNKNOWN,
+    "members.clique_id": 0, "sites.clique_id": 0, "stays.clique_id": 0, "sites.site_id": 0, "stays.site_id": 0,
+    "places.n_hits": 0, "places.n_misses": 0,
+}  # fmt: skip
+"""Smallest numbers of columns."""
+_NEXT_FREE = {
+    "sites.site_id": "n_sites_ever", "stays.site_id": "n_sites_ever", "sites.clique_id": "n_cliques_ever",
+    "stays.clique_id": "n_cliques_ever", "members.clique_id": "n_cliques_ever",
+}  # fmt: skip
+"""Columns of ids, and the next one that is free."""
+_FINITE = (
+    "places.position_m", "stays.position_m", "covariance_m2", "log_size_variance", "lives.chunk_m",
+    "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
+    "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s", "sites.since_s", "sites.seen_s",
+)  # fmt: skip
+_NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
+_PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
+_COUNTS = ("sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown", "views.frames")
+
+
 def flaw(living: LivingMap) -> str:
     """Tell in what a map contradicts itself; '' if it is consistent.
 
     The rules are those that the rest of the package relies on: columns of equal length, sorted unique ids, references
     that lead somewhere, finite positions, probabilities in [0, 1].
     """
-    return _flaw_of_shapes(living) or _flaw_of_ids(living) or _flaw_of_values(living) or _flaw_of_signs(living)
+    rules = (_flaws_of_shapes, _flaws_of_ids, _flaws_of_values)  # each needs that those before found nothing
+    return next((problem for rule in rules for problem in rule(living)), "")
 
 
-def _flaw_of_shapes(living: LivingMap) -> str:
+def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     """Columns of one length."""
-    members, sites, places, stays = living.members, living.sites, living.places, living.stays
-    lives, lines = living.lives, living.sightlines
-    for table, rows in (("members", members), ("sites", sites), ("places", places), ("stays", stays)):
-        if len({len(getattr(rows, item.name)) for item in fields(rows)}) > 1:
-            return f"columns of different lengths in '{table}'"
-    if len({len(lives.class_id), len(lives.chunk), len(lives.life)}) > 1 or len(lives.prior_class_id) != len(
-        lives.prior
-    ):
-        return "columns of different lengths in 'lives'"
-    if len({len(getattr(lines, name)) for name in ("site_id", "landmark_id", "cell", "hits", "looks")}) > 1:
-        return "columns of different lengths in 'sightlines'"
-    if len({len(getattr(living.views, name)) for name in ("cell", "heading", "stamp_s", "frames")}) > 1:
-        return "columns of different lengths in 'views'"
+    for table, names in _EQUALLY_LONG.items():
+        if len({len(getattr(getattr(living, table), name)) for name in names}) > 1:
+            yield f"columns of different lengths in '{table}'"
+    if len(living.lives.prior_class_id) != len(living.lives.prior):
+        yield "columns of different lengths in 'lives'"
+    lines, places = living.sightlines, len(living.places)
     if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
-        return "'sightlines.hidden' of another length"
-    if living.covariance_m2.shape != (2 * len(places), 2 * len(places)):
-        return f"a covariance of shape {living.covariance_m2.shape} for {len(places)} places"
-    return ""
+        yield "'sightlines.hidden' of another length"
+    if living.covariance_m2.shape != (2 * places, 2 * places):
+        yield f"a covariance of shape {living.covariance_m2.shape} for {places} places"
 
 
-def _flaw_of_ids(living: LivingMap) -> str:
+def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
     """Sorted unique ids, references that lead somewhere."""
-    members, sites, places, stays, lives = living.members, living.sites, living.places, living.stays, living.lives
-    for column, ids in (("members.landmark_id", members.landmark_id), ("sites.site_id", sites.site_id)):
+    for column in ("members.landmark_id", "sites.site_id"):
+        ids = attrgetter(column)(living)
         if np.any(ids[1:] <= ids[:-1]):
-            return f"'{column}' is not sorted, or not unique"
-    site, name = places.site_id, places.landmark_id
+            yield f"'{column}' is not sorted, or not unique"
+    site, name = living.places.site_id, living.places.landmark_id
     if np.any((site[1:] < site[:-1]) | ((site[1:] == site[:-1]) & (name[1:] <= name[:-1]))):
-        return "'places' are not sorted by site and landmark, or not unique"
-    for column, ids, known in (
-        ("places.site_id", places.site_id, sites.site_id),
-        ("places.landmark_id", places.landmark_id, members.landmark_id),
-    ):
-        if not np.isin(ids, known).all():
-            return f"'{column}' names one that is not there"
-    for column, numbers, least in (
-        ("members.class_id", members.class_id, UNKNOWN),
-        ("stays.class_id", stays.class_id, UNKNOWN),
-        ("lives.class_id", lives.class_id, UNKNOWN),
-        ("lives.prior_class_id", lives.prior_class_id, UNKNOWN),
-        ("members.clique_id", members.clique_id, 0),
-        ("sites.clique_id", sites.clique_id, 0),
-        ("stays.clique_id", stays.clique_id, 0),
-        ("sites.site_id", sites.site_id, 0),
-        ("stays.site_id", stays.site_id, 0),
-        ("places.n_hits", places.n_hits, 0),
-        ("places.n_misses", places.n_misses, 0),
-    ):
-        if np.any(numbers < least):
-            return f"'{column}' has a number below {least}"
-    for column, ids, ever in (
-        ("sites.site_id", sites.site_id, living.n_sites_ever),
-        ("stays.site_id", stays.site_id, living.n_sites_ever),
-        ("sites.clique_id", sites.clique_id, living.n_cliques_ever),
-        ("stays.clique_id", stays.clique_id, living.n_cliques_ever),
-        ("members.clique_id", members.clique_id, living.n_cliques_ever),
-    ):
+        yield "'places' are not sorted by site and landmark, or not unique"
+    for column, known in (("places.site_id", living.sites.site_id), ("places.landmark_id", living.members.landmark_id)):
+        if not np.isin(attrgetter(column)(living), known).all():
+            yield f"'{column}' names one that is not there"
+    for column, least in _LEAST.items():
+        if np.any(attrgetter(column)(living) < least):
+            yield f"'{column}' has a number below {least}"
+    for column, free in _NEXT_FREE.items():
+        ids, ever = attrgetter(column)(living), getattr(living, free)
         if len(ids) and ids.max() >= ever:
-            return f"'{column}' has {ids.max()}, but the next free one is {ever}"
-    return ""
+            yield f"'{column}' has {ids.max()}, but the next free one is {ever}"
 
 
-def _flaw_of_values(living: LivingMap) -> str:
-    """Finite numbers."""
-    sites, places, stays, lives, lines = living.sites, living.places, living.stays, living.lives, living.sightlines
-    for column, values in (
-        ("places.position_m", places.position_m),
-        ("stays.position_m", stays.position_m),
-        ("covariance_m2", living.covariance_m2),
-        ("log_size_variance", np.array(living.log_size_variance)),
-        ("lives.chunk_m", np.array(lives.chunk_m)),
-        ("sightlines.cell_m", np.array(lines.cell_m)),
-        ("sightlines.hits", lines.hits),
-        ("sightlines.looks", lines.looks),
-        ("sightlines.hidden", lines.hidden),
-        ("sightlines.shown", lines.shown),
-        ("views.cell_m", np.array(living.views.cell_m)),
-        ("views.stamp_s", living.views.stamp_s),
-        ("views.frames", living.views.frames),
-        ("stays.first_s", stays.first_s),
-        ("stays.last_s", stays.last_s),
-        ("sites.since_s", sites.since_s),
-        ("sites.seen_s", sites.seen_s),
-    ):
-        if not np.isfinite(values).all():
-            return f"'{column}' is not finite"
-    for column, values in (
-        ("stays.elsewhere_s", stays.elsewhere_s),
-        ("stays.gone_s", stays.gone_s),
-        ("lives.looks_s", lives.looks_s),
-        ("stamp_s", np.array(living.stamp_s)),
-        ("session_start_s", np.array(living.session_start_s)),
-    ):
-        if np.isnan(values).any():
-            return f"'{column}' is not a number"
-    return ""
-
-
-def _flaw_of_signs(living: LivingMap) -> str:
-    """Sizes and variances that are positive, probabilities in [0, 1]."""
-    sites, stays, lives, lines = living.sites, living.stays, living.lives, living.sightlines
-    if lives.chunk_m <= 0.0 or lines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
-        return "a cell without size"
+def _flaws_of_values(living: LivingMap) -> Iterator[str]:
+    """Finite numbers, sizes and variances that are positive, probabilities in [0, 1]."""
+    for column in _FINITE:
+        if not np.isfinite(attrgetter(column)(living)).all():
+            yield f"'{column}' is not finite"
+    for column in _NUMBERS:
+        if np.isnan(attrgetter(column)(living)).any():
+            yield f"'{column}' is not a number"
+    if living.lives.chunk_m <= 0.0 or living.sightlines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
+        yield "a cell without size"
     if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):
-        return "a negative variance"
-    for column, values in (
-        ("sites.p_here", sites.p_here),
-        ("sites.p_kept", sites.p_kept),
-        ("stays.p_gone", stays.p_gone),
-    ):
+        yield "a negative variance"
+    for column in _PROBABILITIES:
+        values = attrgetter(column)(living)
         if not np.all((values >= 0.0) & (values <= 1.0 + 1e-6)):
-            return f"'{column}' is not a probability"
+            yield f"'{column}' is not a probability"
     if not living.log_size_information > 0.0:
-        return "'log_size_information' is not positive"
-    counts = (lines.hits, lines.looks, lines.hidden, lines.shown, living.views.frames)
-    if any(np.any(values < 0.0) for values in counts):
-        return "a negative count in 'sightlines' or 'views'"
-    return ""
+        yield "'log_size_information' is not positive"
+    if any(np.any(attrgetter(column)(living) < 0.0) for column in _COUNTS):
+        yield "a negative count in 'sightlines' or 'views'"
 
 
 _NOT_STORED = {"sightlines.rules"}

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 from evermap.maps.store.content import Chunk, DamagedError, json_object, name_of, text_chunk
@@ -44,6 +45,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "lost": dict,
 }
 """Values of a record, and their types in JSON; null for nan."""
+_MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,33 +96,12 @@ class Record:
 
     def revision(self, config: str) -> Revision:
         """Return as the history tells it."""
-        row = self.about
-        counts: dict[ChangeKind, int] = {}
-        for change in self.changes:
-            counts[change.kind] = counts.get(change.kind, 0) + 1
-        return Revision(
-            number=self.number,
-            parent=row["parent"],
-            restores=row["restores"],
-            created_at=row["created_at"],
-            evermap_version=row["evermap_version"],
-            provenance=Provenance(
-                kind=RevisionKind(row["kind"]),
-                recording=row["recording"],
-                source=row["source"],
-                command=row["command"],
-                config=config,
-                seed=row["seed"],
-                stamp_from_s=_or_nan(row["stamp_from_s"]),
-                stamp_to_s=_or_nan(row["stamp_to_s"]),
-                wall_s=_or_nan(row["wall_s"]),
-                note=row["note"],
-            ),
-            n_landmarks=row["n_landmarks"],
-            n_existing=row["n_existing"],
-            n_changes=counts,
-            n_grown=row["n_grown"],
-        )
+        row = {**self.about, "kind": RevisionKind(self.about["kind"]), "config": config}
+        row |= {name: _or_nan(row[name]) for name in _MAY_BE_NAN}
+        provenance = Provenance(**{item.name: row[item.name] for item in fields(Provenance)})
+        told = {item.name: row[item.name] for item in fields(Revision) if item.name in row}
+        counts = dict(Counter(change.kind for change in self.changes))
+        return Revision(provenance=provenance, n_changes=counts, **told)
 
     def chunk(self) -> Chunk:
         """Return as bytes."""
@@ -198,18 +179,9 @@ def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
 
 def about(provenance: Provenance, **counts: Any) -> dict[str, Any]:
     """Return the values of `Record.about`."""
-    return {
-        "kind": provenance.kind.value,
-        "recording": provenance.recording,
-        "source": provenance.source,
-        "command": provenance.command,
-        "seed": provenance.seed,
-        "stamp_from_s": _no_nan(provenance.stamp_from_s),
-        "stamp_to_s": _no_nan(provenance.stamp_to_s),
-        "wall_s": _no_nan(provenance.wall_s),
-        "note": provenance.note,
-        **counts,
-    }
+    values = {item.name: getattr(provenance, item.name) for item in fields(Provenance) if item.name != "config"}
+    values |= {name: _no_nan(values[name]) for name in _MAY_BE_NAN}
+    return {**values, "kind": provenance.kind.value, **counts}
 
 
 def _change_to_list(change: MapChange) -> list[Any]:

@@ -96,7 +96,7 @@ def _calibration(result: PersistResult) -> NamedFigure:
 
 
 def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str]) -> NamedFigure:
-    from evermap.viz.belief_figure import plot_belief, stretches
+    from evermap.viz.presence_figures import plot_belief, stretches
 
     index = np.array([feature])
     looks, look_rows = looks_at(result.looks, index)

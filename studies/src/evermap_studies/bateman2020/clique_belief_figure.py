@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.types import BoolArray, FloatArray, IntArray
-from evermap.viz.belief_figure import stretches
+from evermap.viz.presence_figures import stretches
 from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, SHADE
 
 if TYPE_CHECKING:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.metrics.changes import ChangeCounts, count_changes
 from evermap.metrics.summary import RATE_HZ
 from evermap.metrics.trajectory import align_points, evaluate_trajectory
 from evermap.types import ChangeKind, FloatArray, Landmarks
+from evermap_studies.changes import ChangeCounts, count_changes
 from evermap_studies.demo.study import snapshot_of
 from evermap_studies.lifelong.world import World
 from evermap_studies.worlds.scores import existence_score, statement_score

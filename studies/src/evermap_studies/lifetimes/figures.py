@@ -24,9 +24,9 @@ from evermap.viz.style import (
     new_figure,
     settle,
 )
-from evermap.viz.track_figures import TracksNow, draw_tracks
 from evermap_studies.lifetimes.moving import TrackedRun
 from evermap_studies.lifetimes.rooms import RoomStays
+from evermap_studies.lifetimes.tracks_now import TracksNow, draw_tracks
 from evermap_studies.lifetimes.truth import ESTIMATORS, NAIVE, Stays, Value, groups
 from evermap_studies.worlds.patrol_lifetimes import DAY_S, PatrolRun
 

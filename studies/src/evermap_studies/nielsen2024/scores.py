@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from evermap.metrics.changes import compare_changes, rank_of_truth, time_of_change
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import RATE_HZ, in_view
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.types import FloatArray, Landmarks, MapChange, Recording, SlamResult, Trajectory
+from evermap_studies.changes import compare_changes, rank_of_truth, time_of_change
 
 Row = dict[str, Any]
 

@@ -13,8 +13,8 @@ import numpy as np
 from evermap.existence.one_stay import PersistenceFilter
 from evermap.survival import CallableHazard, Exponential, GeneralPurpose, LifetimePrior, PeriodicHazard
 from evermap.types import BoolArray, FloatArray
-from evermap.viz.belief_figure import plot_belief
 from evermap.viz.lifetime_figures import plot_lifetimes
+from evermap.viz.presence_figures import plot_belief
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from identity_scores import identity_scores
 
-from evermap.metrics.landmarks import identity_scores
 from evermap.types import UNKNOWN
 
 
