@@ -17,20 +17,29 @@ _WARM_UP_POSES = 50
 
 
 def measure(race: str, contender: str, n_poses: int) -> dict[str, float]:
-    """Peak resident memory [MB] of a fresh process that runs one contender once, and what it had before the run."""
-    path = os.pathsep.join(
-        filter(None, [str(ROOT), str(ROOT / "src"), str(ROOT / "studies" / "src"), os.environ.get("PYTHONPATH", "")])
-    )
+    """Peak resident memory [MB] of a fresh process that runs one contender once, and what it had before the run.
+
+    Args:
+        race: one of `contenders.CONTENDERS`, or 'scale'.
+        contender: 'evermap' or 'gtsam'.
+        n_poses: size of the world; of 'scale', in landmarks.
+    """
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.memory", race, contender, str(n_poses)],
         capture_output=True,
         text=True,
         check=True,
         cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": path},
+        env=child_environment(),
     )
     measured: dict[str, float] = json.loads(done.stdout)
     return measured
+
+
+def child_environment() -> dict[str, str]:
+    """Return the environment of a child that imports this checkout."""
+    path = [str(ROOT), str(ROOT / "src"), str(ROOT / "studies" / "src"), os.environ.get("PYTHONPATH", "")]
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))}
 
 
 def peak_mb() -> float:
@@ -50,6 +59,13 @@ def peak_mb() -> float:
 
 def _run(race: str, contender: str, n_poses: int) -> dict[str, float]:
     """In the child: libraries are loaded and code is compiled by a small world first, so that they do not count."""
+    if race == "scale":
+        from benchmarks import scale
+
+        scale.once(contender, scale.WARM_UP)
+        before_mb = peak_mb()
+        scale.once(contender, n_poses)
+        return {"before_mb": before_mb, "peak_mb": peak_mb()}
     from benchmarks.contenders import CONTENDERS
     from benchmarks.world import circular_world
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, localize, npmle, persistence, selectors, tracking
+from benchmarks import cliques, localize, npmle, persistence, scale, scale_report, selectors, tracking
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -36,10 +36,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **npmle.METRICS,
     **tracking.METRICS,
     **localize.METRICS,
+    **scale.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "localize")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "localize", "scale")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -56,6 +57,7 @@ def run(
     n_frames: int = tracking.N_FRAMES,
     n_stored: int = tracking.N_STORED,
     n_steps: int = localize.N_FRAMES,
+    sizes: Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Measure everything and compare it with the baseline.
 
@@ -67,6 +69,7 @@ def run(
         n_lifetimes: censored samples of each kind.
         n_frames, n_stored: length of a scene for trackers, and objects in the working set.
         n_steps: frames of a drive in a known map.
+        sizes: landmarks of the warehouses whose cost is measured; None for those of the baseline.
 
     Returns:
         `metrics` (a dictionary each: metric, value, baseline, direction, tolerance, change, regression), `shown`
@@ -102,6 +105,9 @@ def run(
         measured |= ratios
     if only in (None, "localize"):
         ratios, shown["localize"] = localize.run(n_steps)
+        measured |= ratios
+    if only in (None, "scale"):
+        ratios, shown["scale"] = scale.run(sizes)
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
@@ -188,6 +194,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", tracking.as_markdown(shown["tracking"])]
     if "localize" in shown:
         lines += ["", localize.as_markdown(shown["localize"])]
+    if "scale" in shown:
+        lines += ["", scale_report.as_markdown(shown["scale"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

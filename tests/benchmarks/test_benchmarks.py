@@ -283,6 +283,7 @@ def test_a_small_run_writes_compares_and_reports(
 ) -> None:
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
+    monkeypatch.setattr(run.scale, "SIZES", (20, 40))
     measured = run.run(
         update_baseline=True,
         n_poses=80,

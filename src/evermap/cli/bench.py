@@ -22,7 +22,16 @@ def bench(
     ] = False,
     only: Annotated[
         str | None,
-        typer.Option(help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking or localize."),
+        typer.Option(
+            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, localize or scale."
+        ),
+    ] = None,
+    sizes: Annotated[
+        str | None,
+        typer.Option(help="Landmarks of the worlds of 'scale', with commas; with it DLR and maps are measured too."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder to write the table and the figure of 'scale' into, as its results.")
     ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
@@ -32,17 +41,31 @@ def bench(
     \b
     Example:
       evermap bench --only persistence
+      evermap bench --only scale --sizes 400,1000,4000 --out out/scale
     """
+    landmarks = None if sizes is None else _numbers(sizes)
+    if (landmarks is not None or out is not None) and only not in (None, "scale"):
+        raise InputError("--sizes and --out belong to 'scale'", field="--only", hint="--only scale")
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, below
     runner = load_benchmarks()
-    measured = runner.run(update_baseline=update_baseline, only=only)
+    measured = runner.run(update_baseline=update_baseline, only=only, sizes=landmarks)
+    if out is not None:
+        runner.scale_report.write(measured["shown"]["scale"], out)
     if as_json:
         print_json(measured)
     else:
         typer.echo(runner.as_text(measured))
     if measured["regressions"]:
         raise typer.Exit(1)
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    """Read '400,1000' as numbers of landmarks."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) >= 2 for part in parts):
+        raise InputError(f"'{text}' is no list of numbers from 2", field="--sizes", hint="--sizes 400,1000,4000")
+    return tuple(map(int, parts))
 
 
 def load_benchmarks(root: Path = Path(__file__).resolve().parents[3]) -> ModuleType:

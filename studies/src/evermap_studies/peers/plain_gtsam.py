@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -16,6 +17,13 @@ from evermap_studies.peers.factors import FIRST_POSE_SIGMA, Factors, PlainEstima
 _POSE, _LANDMARK = gtsam.symbol("x", 0), gtsam.symbol("l", 0)
 
 
+class Seconds(NamedTuple):
+    """Of a step: by the clock on the wall, and of all processors together."""
+
+    wall_s: float
+    cpu_s: float
+
+
 @dataclass(frozen=True, slots=True)
 class Batch:
     """A batch solution.
@@ -24,20 +32,20 @@ class Batch:
         estimate: the optimum.
         landmark_covariance: (L, 2, 2) marginals; empty where none were asked for.
         n_iterations: of Levenberg-Marquardt.
-        build_s, solve_s, marginals_s: seconds for the graph, the optimum and the marginals.
+        build, solve, marginals: what graph, optimum and marginals took.
     """
 
     estimate: PlainEstimate
     landmark_covariance: FloatArray
     n_iterations: int
-    build_s: float
-    solve_s: float
-    marginals_s: float
+    build: Seconds
+    solve: Seconds
+    marginals: Seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """iSAM2's final estimate, its causal poses (N, 3), and the (N,) seconds of every frame."""
+    """iSAM2's final estimate, its causal poses (N, 3), and the (N,) CPU seconds of every frame."""
 
     estimate: PlainEstimate
     online_pose: FloatArray
@@ -77,29 +85,28 @@ def levenberg_marquardt(
         tolerance: relative and absolute decrease of the error at which it stops (gtsam's default).
         marginals: whether they are wanted.
     """
-    began = time.perf_counter()
+    at = [_now()]
     graph, values = graph_of(factors), values_of(start)
-    built = time.perf_counter()
+    at.append(_now())
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(tolerance)
     parameters.setAbsoluteErrorTol(tolerance)
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters)
     optimum = optimizer.optimize()
-    solved = time.perf_counter()
+    at.append(_now())
     count = len(start.landmark) if marginals else 0
     covariance = np.empty((count, 2, 2))
     if marginals:
         found = gtsam.Marginals(graph, optimum)
         for row in range(count):
             covariance[row] = found.marginalCovariance(_LANDMARK + row)
-    ended = time.perf_counter()
+    at.append(_now())
+    took = [Seconds(*np.subtract(after, before)) for before, after in pairwise(at)]
     return Batch(
         _read(optimum, len(start.pose), len(start.landmark)),
         covariance,
         int(optimizer.iterations()),
-        built - began,
-        solved - built,
-        ended - solved,
+        *took,
     )
 
 
@@ -116,7 +123,7 @@ def isam2(factors: Factors, *, relinearize_skip: int = 10, relinearize_threshold
     online, step_s = np.zeros((len(factors.stamp_s), 3)), np.zeros(len(factors.stamp_s))
     at = gtsam.Pose2()
     for row in range(len(step_s)):
-        began = time.perf_counter()
+        began = time.thread_time()
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if row == 0:
             graph.add(_first_pose())
@@ -135,7 +142,7 @@ def isam2(factors: Factors, *, relinearize_skip: int = 10, relinearize_threshold
         isam.update(graph, values)
         at = isam.calculateEstimatePose2(_POSE + row)
         online[row] = at.x(), at.y(), at.theta()
-        step_s[row] = time.perf_counter() - began
+        step_s[row] = time.thread_time() - began
     return Stream(_read(isam.calculateEstimate(), len(step_s), len(factors.landmark_id)), online, step_s)
 
 
@@ -148,6 +155,10 @@ class _Noises:
 
     def __getitem__(self, detection: int) -> Any:
         return self._models[self._row[detection]]
+
+
+def _now() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
 
 
 def _first_pose() -> Any:

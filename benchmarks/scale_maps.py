@@ -1,0 +1,294 @@
+"""What a session, a step and a start cost in living maps of different size, each in a process of its own.
+
+A session of 200 landmarks of a warehouse is the same however large the rest of the warehouse is: what it costs to bring
+it into the map, and to localise in the map, should not depend on the rest either. Maps are filled directly, as sessions
+would have left them: every landmark a clique of its own at one site, seen a while ago. What the representation of maps
+makes too large for a machine is reported as not run, with what it would need.
+
+    python -m benchmarks.scale_maps bring_in 1000
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import evermap as em
+from benchmarks.memory import ROOT, child_environment, peak_mb
+from benchmarks.scale import Ticks, spent
+from evermap.geometry import se2
+from evermap.maps.living import Members, Places, Sites, Stays
+from evermap.maps.store import Provenance, RevisionKind
+from evermap.types import UNKNOWN, FloatArray, Recording, rows_of
+from evermap_studies.sim import BuildingConfig, WarehouseConfig, simulate_building, simulate_warehouse
+from evermap_studies.sim.warehouse import warehouse_landmarks
+
+SIZES = (1_000, 10_000, 100_000)
+"""Places of the maps."""
+LARGEST_GB = 1.0
+"""A dense covariance beyond this is not run: it is copied several times, and inverted."""
+SESSION = WarehouseConfig(n_landmarks=SIZES[0], landmarks_per_aisle=20, aisles_driven=10)
+"""The drive: ten aisles of twenty landmarks, and what it sees of the eleventh."""
+SMALL = WarehouseConfig(n_landmarks=60, landmarks_per_aisle=20, aisles_driven=1)
+"""Warms up: the same work, small."""
+LOCALISE_S = 120.0
+"""Of the drive, when localising."""
+START_FRAMES = 20
+"""Frames in which the start pose is found, and that no step is counted in."""
+SIGMA_MAP_M = 0.03
+MAP_POSE = np.array([30.0, -20.0, 0.7])
+"""Of the warehouse in the map's frame: where the robot starts is nowhere near the origin."""
+SEEN_S = 3_600.0
+"""Seconds before the session at which the map was seen last."""
+SESSIONS_PER_DAY = 27
+"""Of the building: 10,000 in a year."""
+BUILDING_SESSIONS = 40
+"""Of the building by default; the claim is about 10,000."""
+COMPLETE_AFTER = 10
+"""Sessions after which the map of the building knows all rooms."""
+
+
+def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
+    """Return a map of the warehouse as sessions would have left it, without lines of sight.
+
+    The places are `SIGMA_MAP_M` off, independently; the covariance says so.
+    """
+    landmark = warehouse_landmarks(config, seed=seed)
+    rng, count = np.random.default_rng([seed, 2]), len(landmark)
+    position = se2.transform(MAP_POSE, landmark) + SIGMA_MAP_M * rng.normal(size=landmark.shape)
+    name, no_class = np.arange(count), np.full(count, UNKNOWN)
+    seen, first = np.full(count, -SEEN_S), np.full(count, -10 * SEEN_S)
+    never = np.full(count, np.inf)
+    return em.LivingMap(
+        stamp_s=-SEEN_S,
+        session_start_s=-SEEN_S,
+        members=Members(name, no_class, name, np.zeros(count, np.bool_), np.zeros(count, np.bool_)),
+        sites=Sites(name, name, np.full(count, 0.99), np.full(count, 0.99), first, seen),
+        places=Places(name, name, position, np.full(count, 50), np.zeros(count, np.int64)),
+        stays=Stays(name, name, no_class, position, -never, first, seen, never, np.zeros(count)),
+        covariance_m2=SIGMA_MAP_M**2 * np.eye(2 * count),
+        n_cliques_ever=count,
+        n_sites_ever=count,
+    )
+
+
+def dense_gb(n_places: int) -> float:
+    """Return the size of the joint covariance of a map of so many places, as a map holds it."""
+    return 8.0 * (2 * n_places) ** 2 / 1e9
+
+
+def bring_in(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
+    """Measure a session that is entered into a stored map and committed; the file grows by the recording too."""
+    recording = simulate_warehouse(config)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.evermap"
+        with em.open_store(path, create=True) as store:
+            _begin(store, replace(config, n_landmarks=n_places))
+            before_mb, file_mb = peak_mb(), _size_mb(path)
+            done = spent(lambda: _entered(store, recording))
+            recording_mb = sum(item.n_bytes for item in store.attachments()) / 1e6
+        grown_mb = _size_mb(path) - file_mb
+    return {
+        "found": float(done.result.session.found),
+        "changes": float(len(done.result.session.changes)),
+        "wall_s": done.wall_s,
+        "cpu_s": done.cpu_s,
+        "grown_mb": peak_mb() - before_mb,
+        "peak_mb": peak_mb(),
+        "file_mb": file_mb,
+        "file_grown_mb": grown_mb,
+        "recording_mb": recording_mb,
+    }
+
+
+def localise(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
+    """Measure localisation from an unknown pose: the steps, and what all else takes, which is to find the start."""
+    living = living_map(replace(config, n_landmarks=n_places))
+    recording = _until(simulate_warehouse(config), LOCALISE_S)
+    before_mb, ticks = peak_mb(), Ticks()
+    done = spent(lambda: em.run_localization(recording, living, progress=ticks))
+    result, ms = done.result, 1e3 * ticks.frame_s[START_FRAMES:]
+    median_ms = float(np.median(ms))
+    assert recording.truth is not None
+    row = np.searchsorted(recording.truth.stamp_s, result.online.stamp_s - 1e-6)
+    truth = se2.compose(MAP_POSE, recording.truth.pose_world_robot[row])
+    return {
+        "start_s": done.cpu_s - 1e-3 * (float(ms.sum()) + START_FRAMES * median_ms),
+        "median_ms": median_ms,
+        "p99_ms": float(np.quantile(ms, 0.99)),
+        "longest_ms": float(ms.max()),
+        "off_m": float(np.median(np.linalg.norm(result.online.pose_world_robot[:, :2] - truth[:, :2], axis=1))),
+        "grown_mb": peak_mb() - before_mb,
+    }
+
+
+def opened(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
+    """Measure opening a stored map, until a localisation in it has gone on for three seconds."""
+    recording = _until(simulate_warehouse(config), 3.0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.evermap"
+        code = f"from benchmarks import scale_maps as s; s.write_map({str(path)!r}, {n_places}, {config!r})"
+        _child("-c", f"from evermap_studies.sim import WarehouseConfig; {code}")
+        before_mb = peak_mb()
+        loaded = spent(lambda: _loaded(path))
+        started = spent(lambda: em.run_localization(recording, loaded.result))
+        return {
+            "load_s": loaded.cpu_s,
+            "cpu_s": loaded.cpu_s + started.cpu_s,
+            "wall_s": loaded.wall_s + started.wall_s,
+            "grown_mb": peak_mb() - before_mb,
+            "file_mb": _size_mb(path),
+        }
+
+
+def write_map(path: str, n_places: int, config: WarehouseConfig = SESSION) -> None:
+    """Write the map of a warehouse of so many landmarks as the first revision of a new store."""
+    with em.open_store(path, create=True) as store:
+        _begin(store, replace(config, n_landmarks=n_places))
+
+
+def building(n_sessions: int = BUILDING_SESSIONS, patrol_s: float = 60.0) -> dict[str, Any]:
+    """Measure sessions of one building, one after the other: time, growth of the file and memory of each.
+
+    Args:
+        n_sessions: 27 a day; things move, come and go.
+        patrol_s: length of each; the first is a full lap of three times that.
+    """
+    config = BuildingConfig(
+        days=-(-n_sessions // SESSIONS_PER_DAY),
+        sessions_per_day=SESSIONS_PER_DAY,
+        patrol_lengths_s=(patrol_s, 3.0 * patrol_s),
+        change_rate=0.3,
+    )
+    recordings = [replace(session, truth=None) for session in simulate_building(config).sessions[:n_sessions]]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.evermap"
+        with em.open_store(path, create=True) as store:
+            for recording in recordings:
+                file_mb = _size_mb(path)
+                done = spent(lambda recording=recording: _entered(store, recording))
+                minutes = float(np.ptp(recording.frames.stamp_s)) / 60.0
+                grown_mb = _size_mb(path) - file_mb
+                rows.append((done.wall_s, done.cpu_s, done.cpu_s / minutes, grown_mb, resident_mb()))
+    return building_summary(np.array(rows))
+
+
+def building_summary(rows: FloatArray, complete_after: int = COMPLETE_AFTER, most: int = 100) -> dict[str, Any]:
+    """Compare the first sessions after the map is complete with the last ones.
+
+    Args:
+        rows: (S, 5) wall and CPU seconds, CPU seconds a minute of the drive, MB that the file grew by, MB resident.
+        complete_after: sessions that are left out.
+        most: sessions at either end, at most; fewer where they would overlap.
+    """
+    count = max(1, min(most, (len(rows) - complete_after) // 2))
+    first, last = rows[complete_after : complete_after + count].mean(axis=0), rows[-count:].mean(axis=0)
+    names = ("wall_s", "cpu_s", "cpu_s_per_minute", "file_mb", "resident_mb")
+    return {
+        "sessions": len(rows),
+        "compared": count,
+        "first": dict(zip(names, first.tolist(), strict=True)),
+        "last": dict(zip(names, last.tolist(), strict=True)),
+        "ratio": dict(zip(names, (last / first).tolist(), strict=True)),
+    }
+
+
+def resident_mb() -> float:
+    """Return the resident size of this process now [MB]; its peak where the system does not tell."""
+    status = Path("/proc/self/statm")
+    if not status.is_file():
+        return peak_mb()
+    return int(status.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+def measure(work: str, number: int, *, timeout_s: float | None = None) -> dict[str, Any]:
+    """Return a row, measured in a process of its own; `not_run` says why where it was not.
+
+    Args:
+        work: 'bring_in', 'localise', 'opened' or 'building'.
+        number: places of the map, or sessions.
+        timeout_s: after which it is given up.
+    """
+    size = {"sessions" if work == "building" else "places": number}
+    needs_gb = 0.0 if work == "building" else dense_gb(number)
+    if needs_gb > LARGEST_GB:
+        return size | {"not_run": f"dense covariance needs {needs_gb:.3g} GB"}
+    try:
+        found: dict[str, Any] = json.loads(
+            _child("-m", "benchmarks.scale_maps", work, str(number), timeout_s=timeout_s)
+        )
+    except subprocess.TimeoutExpired:
+        return size | {"not_run": f"not done after {timeout_s:.0f} s"}
+    return size | found
+
+
+def run(sizes: Sequence[int] = SIZES, n_sessions: int = BUILDING_SESSIONS) -> dict[str, Any]:
+    """Return all rows."""
+    rows: dict[str, Any] = {work: [measure(work, n) for n in sizes] for work in ("bring_in", "localise", "opened")}
+    return rows | {"building": measure("building", n_sessions)}
+
+
+def _entered(store: Any, recording: Recording) -> em.Entered:
+    entered = em.enter_session(store, recording)
+    entered.commit(store)
+    return entered
+
+
+def _loaded(path: Path) -> em.LivingMap:
+    with em.open_store(path) as store:
+        return store.load()
+
+
+def _begin(store: Any, config: WarehouseConfig) -> None:
+    store.commit(living_map(config), Provenance(RevisionKind.EDIT, note="filled by a benchmark"), parent=0)
+
+
+def _until(recording: Recording, seconds: float) -> Recording:
+    """The first seconds of a recording."""
+    frames = int(np.searchsorted(recording.frames.stamp_s, recording.frames.stamp_s[0] + seconds))
+    return replace(
+        recording,
+        frames=rows_of(recording.frames, np.arange(frames)),
+        detections=rows_of(recording.detections, recording.detections.frame < frames),
+    )
+
+
+def _size_mb(path: Path) -> float:
+    """Of a store with what is still in its log."""
+    return sum(part.stat().st_size for part in path.parent.glob(f"{path.name}*")) / 1e6
+
+
+def _child(*arguments: str, timeout_s: float | None = None) -> str:
+    """Standard output of this Python in the checkout."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        cwd=ROOT,
+        env=child_environment(),
+        timeout=timeout_s,
+    )
+    return done.stdout
+
+
+def _main(work: str, number: int) -> None:
+    """In the child: the same work on a small map first, so that nothing is compiled while the clock runs."""
+    in_map = {"bring_in": bring_in, "localise": localise, "opened": opened}
+    if work in in_map:
+        in_map[work](SMALL.n_landmarks, SMALL)
+    print(json.dumps(in_map[work](number) if work in in_map else building(number)))
+
+
+if __name__ == "__main__":
+    _main(sys.argv[1], int(sys.argv[2]))
