@@ -8,10 +8,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 OUT ?= out/demo
-# Tests run in this many processes, a file of tests in one of them. Their matrices are small: more threads of BLAS than
-# cores only wait for each other.
+# Tests run in this many processes; one that is done takes tests from the others. Each begins with its own half of the
+# folders, so that hardly a kernel is compiled twice. Matrices are small: more threads of BLAS than cores only wait for
+# each other.
 PROCESSES ?= 2
-PYTEST = OPENBLAS_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist loadfile
+PYTEST = OPENBLAS_NUM_THREADS=1 $(VENV)/bin/python -m pytest --numprocesses $(PROCESSES) --dist worksteal
 PIP_INSTALL = $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check
 RUNTIME = $(VENV)/.stamp-runtime
 DEVELOPMENT = $(VENV)/.stamp-development

@@ -27,6 +27,12 @@ def test_a_clockwork_is_told_from_chance() -> None:
     choice = choose(clockwork, ["two-state", "run-length"])
     assert choice.kind == "run-length"
     assert choice.scores["run-length"] > choice.scores["two-state"] + 10.0
+
+
+@pytest.mark.slow
+def test_chance_is_not_taken_for_a_clockwork() -> None:
+    rng = np.random.default_rng(1)
+    rng.normal(size=40)
     chance = looks_of(list(rng.exponential(np.tile([60.0, 300.0], 20))), 6.0, 3)
     scores = choose(chance, ["two-state", "run-length"]).scores
     assert scores["run-length"] < scores["two-state"] + 3.0
@@ -34,7 +40,7 @@ def test_a_clockwork_is_told_from_chance() -> None:
 
 def test_score_is_the_density_of_the_last_fifth_given_the_rest() -> None:
     looks = looks_of([200.0, 100.0] * 5, 10.0, 4)
-    choice = choose(looks, ["two-state", "run-length"])
+    choice = choose(looks, ["two-state", "phase-type"])
     cut = looks.stamp_s[-1] - choice.held_out_s
     assert choice.held_out_s == pytest.approx(0.2 * np.ptp(looks.stamp_s))
     rows = slice(0, int(np.searchsorted(looks.stamp_s, cut)))

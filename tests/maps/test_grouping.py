@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.integrate import quad
@@ -11,7 +13,7 @@ from scipy.stats import multivariate_normal
 from evermap.geometry import se2
 from evermap.maps.bodies import USUAL, Displacements, Fate, group, log_evidence_of_motion, regrouped
 from evermap.types import FloatArray, IntArray
-from evermap_studies.sim import BuildingConfig, simulate_building
+from evermap_studies.sim import BuildingConfig, BuildingSimulation, simulate_building
 
 REACH_M = 1.6
 SIGMA_M = 0.02
@@ -145,9 +147,14 @@ def test_bodies_of_a_simulated_building() -> None:
     assert classless[0] / classless[2] >= 0.4
 
 
+@cache
+def four_weeks(seed: int) -> BuildingSimulation:
+    return simulate_building(BuildingConfig(days=28, sessions_per_day=2, patrol_s=5.0), seed)
+
+
 def pairs_in_building(seed: int, *, moves: bool = True, classes: bool = True) -> FloatArray:
     """(sessions, 3) pairs of known landmarks: rightly in one clique, in one clique, on one object."""
-    building = simulate_building(BuildingConfig(days=28, sessions_per_day=2, patrol_s=5.0), seed)
+    building = four_weeks(seed)
     owner = {name: item for item in building.objects for name in item.landmark_ids}
     count = len(owner)
     true = np.array([owner[name].object_id for name in range(count)])

@@ -28,7 +28,7 @@ def seen_in_four_weeks(seed: int, warmup_days: float = 60.0) -> Stays:
     return as_seen(histories(DEFAULT_CLASSES, END_S, np.random.default_rng(seed), warmup_days * DAY_S), LOOKS_S)
 
 
-@pytest.mark.parametrize("warmup_days", [0.0, 60.0])
+@pytest.mark.parametrize("warmup_days", [0.0, pytest.param(60.0, marks=pytest.mark.slow)])
 def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float) -> None:
     """Between the ages by which 10 % and 90 % are gone: there is nothing to be seen of rarer things in four weeks."""
     covered = []

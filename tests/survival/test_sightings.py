@@ -70,7 +70,10 @@ def test_true_lifetimes_come_out_though_many_are_never_seen(scale_s: float, shap
     assert (naive.parameters[0] - math.log(scale_s)) / naive.standard_errors[0] > 5.0
 
 
-@pytest.mark.parametrize(("scale_s", "shape"), [(2.0, 1.0), (3.0, 2.0), (1.0, 2.0)])
+MORE = [pytest.param(2.0, 1.0, marks=pytest.mark.slow), pytest.param(3.0, 2.0, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("scale_s", "shape"), [(1.0, 2.0), *MORE])
 def test_likelihood_of_the_stays_finds_the_truth_too(scale_s: float, shape: float) -> None:
     """Over twenty runs errors are as large as standard errors say."""
     off = []

@@ -284,7 +284,7 @@ def _expect(data: _Data, model: PhaseType, start: FloatArray) -> _Expected:
 
     rates = model.rates_by_bin
     features, n = data.looks.n_features, model.n_phases
-    begin = np.array(np.broadcast_to(start, (features, n)))
+    begin = np.array(np.broadcast_to(start, (features, n)), order="C")  # any other would be compiled for once more
     integrals = np.zeros_like(rates)
     smoothed, last = np.empty((features, n)), np.empty((features, n))
     evidence, bad = kernels.expect_all(

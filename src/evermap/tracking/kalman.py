@@ -14,8 +14,8 @@ import numpy as np
 from evermap.compiled import kept
 from evermap.types import FloatArray
 
-kernel = kept(error_model="numpy")
-inlined = kept(error_model="numpy", forceinline=True)
+kernel = kept(effort=1, error_model="numpy")
+inlined = kept(effort=1, error_model="numpy", forceinline=True)
 
 Vector = tuple[float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]

@@ -102,7 +102,8 @@ def live(
     targets = Targets(t.mean, t.covariance, t.class_p, t.appearance, t.inverse_odds, p_detect)
     pairs = candidates(targets, n, frame, likelihood)
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
-    n_events, n_spells, n_gone = 0, 0, 0
+    n_events, n_gone = 0, 0
+    n_spells = int(0)  # noqa: RUF046, UP018 (of a literal, `settle` and `end_spell` would be compiled once more)
     for i in range(n):
         predicted = aged(t.inverse_odds[i], death_odds)
         if chosen[i] != NOBODY:
@@ -201,7 +202,7 @@ def resume(
     Returns:
         How many spells there are.
     """
-    n_spells = 0
+    n_spells = int(0)  # noqa: RUF046, UP018 (as in `live`)
     for k in range(detection.shape[0]):
         i, j = n + k, detection[k]
         if moved[k]:

@@ -178,7 +178,7 @@ def copy_row(t: Tracklets, into: int, row: int) -> None:
 @kernel
 def sweep(t: Tracklets, n: int) -> int:
     """Remove tracklets that are no longer active, by moving the last ones into the gaps; how many are left."""
-    i = 0
+    i = int(0)  # noqa: RUF046, UP018 (of a literal, `copy_row` would be compiled once more)
     while i < n:
         if t.state[i] >= WORKING_SET:
             n -= 1

@@ -83,7 +83,7 @@ class Tracker(Shown):
             warm_up=int(s.warm_up),
             lost_after=int(s.lost_after),
             max_missed=int(s.max_missed),
-            class_speed_mps=s.class_speeds(n_classes),
+            class_speed_mps=s.class_speeds(n_classes).copy(),  # a read-only array would have all kernels compiled twice
             rest_for_s=float(s.rest_for_s),
             appearance_memory=float(s.appearance_memory),
             sigma_velocity_mps=float(s.sigma_velocity_mps),

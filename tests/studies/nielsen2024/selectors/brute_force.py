@@ -22,8 +22,23 @@ CHAINS = {
 }
 
 
-def log_prior(chain, stamp_s, sequence, n_modes):
+def log_changes(chain, stamp_s):
+    """Log probability (T, T) that a stay which began at look `b` lasts from look `n - 1` to `n`, and that it ends."""
+    count = len(stamp_s)
+    stay, leave = np.full((count, count), np.nan), np.full((count, count), np.nan)
+    for began, n in itertools.combinations(range(count), 2):
+        if chain.lifetime is None:
+            stay[began, n], leave[began, n] = math.log1p(-chain.switch_probability), math.log(chain.switch_probability)
+        else:
+            held, until = stamp_s[n - 1] - stamp_s[began], stamp_s[n] - stamp_s[began]
+            stay[began, n] = chain.lifetime.log_conditional_survival(held, until)
+            leave[began, n] = chain.lifetime.log_conditional_death(held, until)
+    return stay.tolist(), leave.tolist()
+
+
+def log_prior(chain, changes, sequence, n_modes):
     """Of one sequence; `n_modes` counts the columns that exist, 'gone' among them as the last."""
+    stay, leave = changes
     gone = n_modes - 1 if chain.gone else None
     if sequence[0] == gone:
         return -math.inf
@@ -37,21 +52,10 @@ def log_prior(chain, stamp_s, sequence, n_modes):
             continue
         if n_modes == 1:
             continue
-        held, until = stamp_s[n - 1] - stamp_s[began], stamp_s[n] - stamp_s[began]
         if after == before:
-            stay = (
-                math.log1p(-chain.switch_probability)
-                if chain.lifetime is None
-                else float(chain.lifetime.log_conditional_survival(held, until))
-            )
-            value += stay
+            value += stay[began][n]
         else:
-            leave = (
-                math.log(chain.switch_probability)
-                if chain.lifetime is None
-                else float(chain.lifetime.log_conditional_death(held, until))
-            )
-            value += leave - math.log(n_modes - 1)
+            value += leave[began][n] - math.log(n_modes - 1)
             began = n
     return value
 
@@ -62,14 +66,11 @@ def every_sequence(chain, stamp_s, log_likelihood):
     exists = np.isfinite(log_likelihood).any(axis=0)
     n_modes = int(exists.sum())
     assert exists[:n_modes].all(), "columns that do not exist come last"
-    sequences = np.array(list(itertools.product(range(n_modes), repeat=count)))
-    joint = np.array(
-        [
-            log_prior(chain, stamp_s, sequence, n_modes) + sum(log_likelihood[n, k] for n, k in enumerate(sequence))
-            for sequence in sequences
-        ]
-    )
-    return sequences, joint
+    sequences = list(itertools.product(range(n_modes), repeat=count))
+    changes = log_changes(chain, stamp_s)
+    prior = np.array([log_prior(chain, changes, sequence, n_modes) for sequence in sequences])
+    sequences = np.array(sequences)
+    return sequences, prior + log_likelihood[np.arange(count), sequences].sum(axis=1)
 
 
 def log_sum(values):
