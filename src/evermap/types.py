@@ -13,6 +13,7 @@ Conventions that hold everywhere:
 
 from __future__ import annotations
 
+import math
 import unicodedata
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -40,36 +41,39 @@ UNKNOWN: int = -1
 """Id of a landmark or class that is not known."""
 
 
-def _shape(item: Any, n: str, *columns: str, **more: tuple[int, ...]) -> None:
-    """Make the columns of a frozen dataclass arrays of N rows each, N being those of column `n`.
-
-    Args:
-        item: the dataclass.
-        n: the column that counts.
-        columns: names of the others that hold one number a row.
-        more: names of those that hold more, with their shape after the first axis.
+class _Columns(ShownTable):
+    """Mixin of dataclasses whose arrays are columns of N rows each, N being those of the first one.
 
     Raises:
         InputError: no numbers, fractions where whole numbers are needed, or another length.
     """
-    shapes = dict.fromkeys((n, *columns), ()) | more
-    count = -1
-    for name, rest in shapes.items():
-        given = getattr(item, name)
-        whole = name in _WHOLE
-        array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, type(item).__name__, name))
-        if array.dtype != (np.int64 if whole else np.float64):
-            array = _as_kind(array, type(item).__name__, name, whole=whole)
-        if count < 0:
-            count = len(array) if array.ndim else -1
-        if array.shape != (count, *rest):
-            wanted = f"({count}, {', '.join(map(str, rest))})" if rest else f"({max(count, 0)},), as {n}"
-            raise InputError(f"{type(item).__name__} of shape {array.shape} instead of {wanted}", field=name)
-        if array is not given:
-            object.__setattr__(item, name, array)
+
+    __slots__ = ()
+
+    def __len__(self) -> int:
+        return len(getattr(self, next(iter(self.__dataclass_fields__))))
+
+    def __post_init__(self) -> None:
+        first, count = "", -1
+        for name, item in self.__dataclass_fields__.items():
+            if item.type not in _KINDS:
+                continue
+            given, owner, kind, rest = getattr(self, name), type(self).__name__, _KINDS[item.type], _WIDE.get(name, ())
+            array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, owner, name))
+            if array.dtype != kind:
+                array = _as_kind(array, owner, name, whole=kind is np.int64)
+            if not first:
+                first, count = name, len(array) if array.ndim else -1
+            if array.shape != (count, *rest):
+                wanted = f"({count}, {', '.join(map(str, rest))})" if rest else f"({max(count, 0)},), as {first}"
+                raise InputError(f"{owner} of shape {array.shape} instead of {wanted}", field=name)
+            if array is not given:
+                object.__setattr__(self, name, array)
 
 
-_WHOLE = {"frame", "landmark_id", "class_id", "source_line", "robot_id", "n_hits", "n_misses", "detection"}
+_KINDS: dict[Any, Any] = {"FloatArray": np.float64, "IntArray": np.int64}
+_WIDE = {"pose_world_robot": (3,), "covariance": (3, 3), "position_m": (2,), "covariance_m2": (2, 2)}
+"""Columns that hold more than a number a row, and what of their shape follows the first axis."""
 
 
 def _numbers(given: Any, owner: str, name: str) -> Any:
@@ -112,7 +116,7 @@ class Clock(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry(ShownTable):
+class Odometry(_Columns):
     """Body velocities; row `i` holds from `stamp_s[i]` until `stamp_s[i + 1]` (zero-order hold).
 
     Attributes:
@@ -128,18 +132,12 @@ class Odometry(ShownTable):
     angular_radps: FloatArray
     clock: Clock = Clock.RECORDING
 
-    def __post_init__(self) -> None:
-        _shape(self, "stamp_s", "forward_mps", "lateral_mps", "angular_radps")
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
-
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
 
 
 @dataclass(frozen=True, slots=True)
-class Frames(ShownTable):
+class Frames(_Columns):
     """Every instant at which the sensor looked, also when it saw nothing.
 
     Attributes:
@@ -151,18 +149,12 @@ class Frames(ShownTable):
     complete: bool = True
     clock: Clock = Clock.RECORDING
 
-    def __post_init__(self) -> None:
-        _shape(self, "stamp_s")
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
-
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), **span(self.stamp_s), "complete": self.complete, "clock": self.clock.value}
 
 
 @dataclass(frozen=True, slots=True)
-class Detections(ShownTable):
+class Detections(_Columns):
     """Hits: one row a detection, sorted by frame.
 
     Attributes:
@@ -184,29 +176,13 @@ class Detections(ShownTable):
     sigma_bearing_rad: FloatArray
     source_line: IntArray
 
-    def __post_init__(self) -> None:
-        _shape(
-            self,
-            "frame",
-            "landmark_id",
-            "range_m",
-            "bearing_rad",
-            "class_id",
-            "sigma_range_m",
-            "sigma_bearing_rad",
-            "source_line",
-        )
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
     def _facts(self) -> dict[str, Any]:
         known = self.landmark_id[self.landmark_id != UNKNOWN]
         return {"rows": len(self), "landmarks": len(np.unique(known)), "range_m": extent(self.range_m)}
 
 
 @dataclass(frozen=True, slots=True)
-class Misses(ShownTable):
+class Misses(_Columns):
     """Misses: landmarks that were expected in a frame and not detected; one row a (frame, landmark).
 
     Attributes:
@@ -218,9 +194,6 @@ class Misses(ShownTable):
     frame: IntArray
     landmark_id: IntArray
     p_detect: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.frame)
 
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), "landmarks": len(np.unique(self.landmark_id))}
@@ -256,7 +229,7 @@ class Sensor:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotSightings(ShownTable):
+class RobotSightings(_Columns):
     """Sightings of other robots: read and reported, not used as landmarks. One row a sighting."""
 
     stamp_s: FloatArray
@@ -265,18 +238,12 @@ class RobotSightings(ShownTable):
     bearing_rad: FloatArray
     clock: Clock = Clock.RECORDING
 
-    def __post_init__(self) -> None:
-        _shape(self, "stamp_s", "robot_id", "range_m", "bearing_rad")
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
-
     def _facts(self) -> dict[str, Any]:
         return {"rows": len(self), "robots": len(np.unique(self.robot_id)), **span(self.stamp_s)}
 
 
 @dataclass(frozen=True, slots=True)
-class Trajectory(ShownTable):
+class Trajectory(_Columns):
     """Stamped planar poses.
 
     Attributes:
@@ -291,12 +258,6 @@ class Trajectory(ShownTable):
     covariance: FloatArray
     frame: str = "first_pose"
     clock: Clock = Clock.RECORDING
-
-    def __post_init__(self) -> None:
-        _shape(self, "stamp_s", pose_world_robot=(3,), covariance=(3, 3))
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
 
     @property
     def length_m(self) -> float:
@@ -314,7 +275,7 @@ class Trajectory(ShownTable):
 
 
 @dataclass(frozen=True, slots=True)
-class Landmarks(ShownTable):
+class Landmarks(_Columns):
     """Map records, one row a landmark, sorted by id. Estimates, a prior map and surveyed truth share this form.
 
     Attributes:
@@ -342,23 +303,6 @@ class Landmarks(ShownTable):
     frame: str = "first_pose"
     clock: Clock = Clock.RECORDING
     names: Mapping[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        _shape(
-            self,
-            "landmark_id",
-            "class_id",
-            "p_exists",
-            "n_hits",
-            "n_misses",
-            "first_seen_s",
-            "last_seen_s",
-            position_m=(2,),
-            covariance_m2=(2, 2),
-        )
-
-    def __len__(self) -> int:
-        return len(self.landmark_id)
 
     def _facts(self) -> dict[str, Any]:
         return {
@@ -496,7 +440,7 @@ class ParameterEstimate(Shown):
 
 
 @dataclass(frozen=True, slots=True)
-class Innovations(ShownTable):
+class Innovations(_Columns):
     """What each detection said before it was used: one row a detection that had a prediction.
 
     Attributes:
@@ -512,9 +456,6 @@ class Innovations(ShownTable):
     landmark_id: IntArray
     nis: FloatArray
     p_inlier: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
 
 
 class ChangeKind(StrEnum):
@@ -637,6 +578,12 @@ class SlamResult(Shown):
         """Draw path and map; with its recording also the truth and what was seen. Returns a matplotlib figure."""
         figure: Figure = draw("plot_result", self, recording)
         return figure
+
+
+def json_number(value: Any) -> float | None:
+    """Return a number as JSON has it: a finite float; None for nan, infinity and None."""
+    number = math.nan if value is None else float(value)
+    return number if math.isfinite(number) else None
 
 
 _Table = TypeVar("_Table", bound="DataclassInstance")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.map_edits import delete, pin, revert, undelete, unpin, verify
-from evermap.cli.terminal import check_picture, echo, print_json, print_rows, say, write_picture
+from evermap.cli.map_edits import AsJson, MapFile, delete, pin, revert, undelete, unpin, verify
+from evermap.cli.terminal import check_picture, echo, print_json, print_table, say, write_picture
 from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,15 +22,13 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 _AtRevision = Annotated[
     int | None, typer.Option("--revision", metavar="N", help="Look at this one.", show_default="newest")
 ]
-_AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 
 
 @app.command("log")
-def log(file: _File, as_json: _AsJson = False) -> None:
+def log(file: MapFile, as_json: AsJson = False) -> None:
     """List the revisions.
 
     Every session, edit and revert, with what it changed.
@@ -56,17 +54,17 @@ def log(file: _File, as_json: _AsJson = False) -> None:
         )
         return
     head = ("revision", "written (UTC)", "kind", "of", "starts", "landmarks", "changes", "took")
-    print_rows(file, head, [revision_row(item, clock) for item in revisions], numbers=(0, 7))
+    print_table(file, [revision_row(item, clock) for item in revisions], head, numbers=(0, 7))
 
 
 @app.command("show")
 def show(
-    file: _File,
+    file: MapFile,
     revision: _AtRevision = None,
     ahead: Annotated[str, typer.Option(help="How far to look ahead, as 12h or 3d.")] = "1d",
     everything: Annotated[bool, typer.Option("--all", help="List what is believed gone, too.")] = False,
     figure: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the map.", show_default="none")] = None,
-    as_json: _AsJson = False,
+    as_json: AsJson = False,
 ) -> None:
     """List the landmarks.
 
@@ -80,6 +78,7 @@ def show(
     from evermap.maps.store import open_store
     from evermap.stamps import stamp_text
     from evermap.survival.durations import parse_duration_s
+    from evermap.types import json_number
 
     ahead_s = parse_duration_s(ahead)
     if figure is not None:
@@ -91,7 +90,7 @@ def show(
     if figure is not None:
         write_picture(figure, living.plot(title=f"{Path(file).name}, revision {number}"))
     if as_json:
-        about = {"map": file, "revision": number, "stamp_s": _finite(living.stamp_s), "clock": living.clock.value}
+        about = {"map": file, "revision": number, "stamp_s": json_number(living.stamp_s), "clock": living.clock.value}
         print_json({**about, "ahead_s": ahead_s, "landmarks": content, "priors": prior_dicts(living)})
         return
     listed = [
@@ -99,7 +98,7 @@ def show(
     ]
     head = ("landmark", "class", "P(exists)", f"in {ahead}", "place [m]", "+-", "since", "last seen", "sites", "")
     title = f"{file}, revision {number}, seen until {stamp_text(living.stamp_s, living.clock)}"
-    print_rows(title, head, [landmark_row(item, living.clock) for item in listed], numbers=(0, 2, 3, 5, 8))
+    print_table(title, [landmark_row(item, living.clock) for item in listed], head, numbers=(0, 2, 3, 5, 8))
     for said in prior_dicts(living):
         of = f"of class {said['class']}" if said["class"] else "of all other classes"
         away = f", absences {said['absence']}" if said["absence"] else ""
@@ -110,10 +109,10 @@ def show(
 
 @app.command("diff")
 def diff(
-    file: _File,
+    file: MapFile,
     a: Annotated[int, typer.Argument(metavar="A", help="The earlier revision; 0 is the empty map.")],
     b: Annotated[int | None, typer.Argument(metavar="B", help="The later one.", show_default="newest")] = None,
-    as_json: _AsJson = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell what changed between two revisions.
 
@@ -148,7 +147,7 @@ def diff(
 
 @app.command("export")
 def export(
-    file: _File,
+    file: MapFile,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -163,7 +162,7 @@ def export(
     p_least: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Leave out what exists with a smaller probability.")
     ] = 0.5,
-    as_json: _AsJson = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
 
@@ -203,13 +202,13 @@ def export(
 
 @app.command("why")
 def why(
-    file: _File,
+    file: MapFile,
     landmark: Annotated[str, typer.Argument(metavar="LANDMARK", help="Its id, or its name.")],
     revision: _AtRevision = None,
     figure: Annotated[
         Path | None, typer.Option(metavar="FILE.png", help="Draw its belief over time.", show_default="none")
     ] = None,
-    as_json: _AsJson = False,
+    as_json: AsJson = False,
 ) -> None:
     """Tell why a landmark is believed to be there, or gone.
 
@@ -266,12 +265,6 @@ def _writer(out: Path) -> Any:
     raise ConfigError(
         f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson or .csv"
     )
-
-
-def _finite(value: float) -> float | None:
-    from evermap.cli.map_content import number
-
-    return number(value)
 
 
 for command in (verify, revert, pin, unpin, delete, undelete):

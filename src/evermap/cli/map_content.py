@@ -9,19 +9,15 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evermap.cli.terminal import echo, print_rows, write_picture
+from evermap.cli.terminal import echo, print_table, write_picture
+from evermap.runs.summary import change_dict
 from evermap.stamps import between_text, stamp_text
-from evermap.types import UNKNOWN, Clock, FloatArray, MapChange
+from evermap.types import UNKNOWN, Clock, FloatArray, MapChange, json_number
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
     from evermap.maps.store import Revision
     from evermap.maps.why import Answer
-
-
-def number(value: float | None) -> float | None:
-    """Return values of JSON: null for nan and infinity."""
-    return None if value is None or not math.isfinite(value) else float(value)
 
 
 def revision_dict(item: Revision) -> dict[str, Any]:
@@ -39,9 +35,9 @@ def revision_dict(item: Revision) -> dict[str, Any]:
         "config": origin.config,
         "seed": origin.seed,
         "evermap_version": item.evermap_version,
-        "stamp_from_s": number(origin.stamp_from_s),
-        "stamp_to_s": number(origin.stamp_to_s),
-        "wall_s": number(origin.wall_s),
+        "stamp_from_s": json_number(origin.stamp_from_s),
+        "stamp_to_s": json_number(origin.stamp_to_s),
+        "wall_s": json_number(origin.wall_s),
         "note": origin.note,
         "landmarks": item.n_landmarks,
         "existing": item.n_existing,
@@ -101,12 +97,12 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
                 "class": class_name(living, int(members.class_id[row])),
                 "clique": int(members.clique_id[row]),
                 "p_exists": float(p_exists[row]),
-                "p_ahead": number(float(p_ahead[row])),
+                "p_ahead": json_number(float(p_ahead[row])),
                 "x_m": float(living.places.position_m[place[row], 0]) if placed else None,
                 "y_m": float(living.places.position_m[place[row], 1]) if placed else None,
                 "sigma_m": float(np.sqrt(np.trace(living.covariance_m2[k : k + 2, k : k + 2]) / 2)) if placed else None,
-                "since_s": number(float(living.sites.since_s[at[row]])) if placed else None,
-                "seen_s": number(float(living.sites.seen_s[at[row]])) if placed else None,
+                "since_s": json_number(float(living.sites.since_s[at[row]])) if placed else None,
+                "seen_s": json_number(float(living.sites.seen_s[at[row]])) if placed else None,
                 "sites": int(np.sum(living.sites.clique_id == members.clique_id[row])),
                 "hits": int(living.places.n_hits[place[row]]) if placed else 0,
                 "misses": int(living.places.n_misses[place[row]]) if placed else 0,
@@ -155,8 +151,6 @@ def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
 
 def answer_dict(answer: Answer) -> dict[str, Any]:
     """Return everything behind a 'why', with every look."""
-    from evermap.runs.summary import change_dict
-
     seen, stays = answer.evidence, answer.stays
     return {
         "landmark": answer.landmark_id,
@@ -165,7 +159,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
         "clique": answer.clique_id,
         "companions": list(answer.companions),
         "p_exists": answer.p_exists,
-        "stamp_s": number(answer.stamp_s),
+        "stamp_s": json_number(answer.stamp_s),
         "pinned": answer.pinned,
         "deleted": answer.deleted,
         "headline": answer.headline,
@@ -179,9 +173,9 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
                 "looks": visit.n_looks,
                 "hits": visit.n_hits,
                 "misses": visit.n_misses,
-                "expected_hits": number(visit.expected),
-                "log_odds": number(visit.log_odds),
-                "p_exists": number(visit.p_exists),
+                "expected_hits": json_number(visit.expected),
+                "log_odds": json_number(visit.log_odds),
+                "p_exists": json_number(visit.p_exists),
             }
             for visit in answer.visits
         ],
@@ -189,7 +183,7 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
             {
                 "site": int(stays.site_id[k]),
                 **{
-                    name: number(float(getattr(stays, name)[k]))
+                    name: json_number(float(getattr(stays, name)[k]))
                     for name in ("elsewhere_s", "first_s", "last_s", "gone_s")
                 },
             }
@@ -201,9 +195,9 @@ def answer_dict(answer: Answer) -> dict[str, Any]:
             "stamp_s": seen.stamp_s.tolist(),
             "hits": seen.n_hits.tolist(),
             "misses": seen.n_misses.tolist(),
-            "expected_hits": [number(value) for value in seen.expected.tolist()],
-            "log_odds": [number(value) for value in seen.log_odds.tolist()],
-            "p_exists": [number(value) for value in seen.p_exists.tolist()],
+            "expected_hits": [json_number(value) for value in seen.expected.tolist()],
+            "log_odds": [json_number(value) for value in seen.log_odds.tolist()],
+            "p_exists": [json_number(value) for value in seen.p_exists.tolist()],
         },
     }
 
@@ -221,7 +215,6 @@ def _or_nan(value: float | None) -> float:
 
 def print_why(answer: Answer) -> None:
     """Print the answer, what it rests on, and what every session saw."""
-    from evermap.cli.map_content import change_line
     from evermap.maps.why import probability_text
 
     echo(answer.headline)
@@ -246,7 +239,7 @@ def print_why(answer: Answer) -> None:
             ]
             for visit in answer.visits
         ]
-        print_rows("what the sessions saw", head, rows, numbers=(0, 4, 5, 6, 7, 8, 9))
+        print_table("what the sessions saw", rows, head, numbers=(0, 4, 5, 6, 7, 8, 9))
 
 
 def draw_why(path: Path, answer: Answer) -> None:

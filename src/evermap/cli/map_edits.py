@@ -9,17 +9,17 @@ import typer
 from evermap.cli.terminal import command_line, print_json, say
 from evermap.errors import InputError
 
-_File = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
-_AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
+MapFile = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
 _Ids = Annotated[list[str], typer.Argument(metavar="LANDMARK...", help="Ids of landmarks, or their names.")]
 _Note = Annotated[str, typer.Option(help="A word for the log.")]
 
 
 def revert(
-    file: _File,
+    file: MapFile,
     revision: Annotated[int, typer.Argument(metavar="N", help="Whose content to bring back; 0 is the empty map.")],
     note: _Note = "",
-    as_json: _AsJson = False,
+    as_json: AsJson = False,
 ) -> None:
     """Go back to an older revision.
 
@@ -44,7 +44,7 @@ def revert(
     say(f"revision {now} has the content of revision {revision}{back}")
 
 
-def verify(file: _File, as_json: _AsJson = False) -> None:
+def verify(file: MapFile, as_json: AsJson = False) -> None:
     """Check every byte of a map against its checksums.
 
     Exit code 2 if anything is damaged, with the revisions that are intact and how to go back to them.
@@ -79,7 +79,7 @@ def verify(file: _File, as_json: _AsJson = False) -> None:
         say(f"{file}: all {len(found.intact)} revisions are intact ({found.n_chunks} parts were checked){earlier}")
 
 
-def pin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+def pin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
     """Keep these landmarks in the map, whatever is missed.
 
     \b
@@ -89,7 +89,7 @@ def pin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False
     _edit(file, landmarks, "pinned", note, as_json, pinned=True)
 
 
-def unpin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+def unpin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
     """Let the evidence decide about these landmarks again.
 
     \b
@@ -99,7 +99,7 @@ def unpin(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = Fal
     _edit(file, landmarks, "unpinned", note, as_json, pinned=False)
 
 
-def delete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+def delete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
     """Leave these landmarks out from now on.
 
     Their detections are ignored until that is taken back.
@@ -111,7 +111,7 @@ def delete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = Fa
     _edit(file, landmarks, "deleted", note, as_json, deleted=True)
 
 
-def undelete(file: _File, landmarks: _Ids, note: _Note = "", as_json: _AsJson = False) -> None:
+def undelete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
     """Use these landmarks again.
 
     \b

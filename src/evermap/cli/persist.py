@@ -153,8 +153,7 @@ def persist(
              "model": None if model is None else str(model), "query": query, "step_s": step_s, "p_miss": p_miss,
              "horizon_s": duration_s(horizon_s, "horizon_s"), "p_false": p_false, "confidence": confidence,
              "figures": figures}  # fmt: skip
-    values = {f"persist.{name}": value for name, value in given.items()}
-    chosen = configured(config, settings, values, within="persist", show=show_config).persist
+    chosen = configured(config, settings, given, within="persist", show=show_config).persist
     if prior and not chosen.stays_once:
         raise ConfigError("a lifetime is for features that stay once", field="prior", hint="without --recurrent")
     if input is None:

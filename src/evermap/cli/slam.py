@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict, Unpack
 
 import typer
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from evermap.config import Config
     from evermap.maps.store import MapStore
     from evermap.runs.sessions import Entered
-    from evermap.types import Landmarks, Recording
+    from evermap.runs.summary import RunInfo
+    from evermap.types import Landmarks, Recording, SlamResult
 
 # (section, key, label, format); a number that the run does not have is left out
 _ROWS = (
@@ -139,7 +140,7 @@ def slam(
     if init is not None:
         _write_template(init)
         return
-    given = {"slam.sensor_model": sensor_model, "slam.method": method, "slam.unknown_ids": unknown_ids or None}
+    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": unknown_ids or None}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     if input is None:
         raise ConfigError(
@@ -161,7 +162,7 @@ def slam(
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)
-    how: dict[str, Any] = {"as_json": as_json, "force": force, "inputs": inputs}
+    how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
     if map_file is not None:
         run_in_map(recording, chosen, MapOptions(map_file, prior or [], localize, realtime), out, **how)
         return
@@ -176,35 +177,67 @@ def run_and_write(
     *,
     prior: Landmarks | None = None,
     realtime: bool = False,
-    as_json: bool = False,
-    force: bool = False,
-    inputs: Sequence[str | Path | None] = (),
+    **how: Unpack[_How],
 ) -> None:
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
     from evermap.pipeline import run_slam
-    from evermap.runs.folder import RunInfo, write_run
     from evermap.slam.changes.joint import may_search
     from evermap.slam.warmup import warm_up as compile_kernels
-    from evermap.viz.change_words import explanations
 
     in_map = prior is not None
     warm_up(lambda: compile_kernels(search=may_search(len(recording.frames.stamp_s), in_map=in_map)))
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)
-    elapsed_s = time.perf_counter() - start
-    info = RunInfo(
+    _write(out, recording, result, config, _info(config, time.perf_counter() - start, realtime=realtime), **how)
+    if result.interrupted:
+        raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
+
+
+class _How(TypedDict):
+    """How a run is written: see `write_run`; `as_json` prints its summary as JSON."""
+
+    as_json: bool
+    force: bool
+    inputs: Sequence[str | Path | None]
+
+
+def _info(config: Config, elapsed_s: float, *, realtime: bool, grown: int | None = None) -> RunInfo:
+    """What the result cannot say of a run."""
+    from evermap.runs.summary import RunInfo
+
+    return RunInfo(
         command=command_line(),
         seeds={"slam": config.slam.seed},
         processing_s=None if realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
+        grown=grown,
     )
-    summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
+
+
+def _write(
+    out: Path, recording: Recording, result: SlamResult, config: Config, info: RunInfo, **how: Unpack[_How]
+) -> None:
+    """Write the folder; print its summary as JSON, or the main numbers, the files to look at and what was found."""
+    from evermap.runs.folder import write_run
+    from evermap.viz.change_words import explanations, grew
+
+    summary = write_run(out, recording, result, config, info=info, force=how["force"], inputs=how["inputs"])
     for remark in summary["warnings"]:
         warn(remark)
-    show_run(summary, out, as_json=as_json, findings=explanations(result))
-    if result.interrupted:
-        raise KeyboardInterrupt(f"the part of the recording that was processed is in {out}")
+    if how["as_json"]:
+        print_json(summary)
+        return
+    rows = [
+        (label, form.format(summary[section][key]))
+        for section, key, label, form in _ROWS
+        if summary[section].get(key) is not None
+    ]
+    files = (out / name for name in ("report.html", "summary.json"))
+    rows += [(file.stem, str(file)) for file in files if file.is_file()]
+    print_table(recording.name or "run", rows)
+    for finding in [*explanations(result), *grew(info.grown)]:
+        echo(finding)
 
 
 def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:
@@ -252,23 +285,6 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> La
     )
 
 
-def show_run(summary: Mapping[str, Any], out: Path, *, as_json: bool, findings: Sequence[str] = ()) -> None:
-    """Print the summary as JSON, or its main numbers, the files to look at and what was found, in words."""
-    if as_json:
-        print_json(summary)
-        return
-    rows = [
-        (label, form.format(summary[section][key]))
-        for section, key, label, form in _ROWS
-        if summary.get(section, {}).get(key) is not None
-    ]
-    files = (out / name for name in ("report.html", "summary.json"))
-    rows += [(file.stem, str(file)) for file in files if file.is_file()]
-    print_table(str(summary.get("recording", {}).get("name", "run")), rows)
-    for finding in findings:
-        echo(finding)
-
-
 class MapOptions(NamedTuple):
     """What the command line says of a living map.
 
@@ -285,22 +301,11 @@ class MapOptions(NamedTuple):
     realtime: bool
 
 
-def run_in_map(
-    recording: Recording,
-    config: Config,
-    options: MapOptions,
-    out: Path,
-    *,
-    as_json: bool,
-    force: bool,
-    inputs: Sequence[str | Path | None],
-) -> None:
+def run_in_map(recording: Recording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
-    from evermap.runs.folder import RunInfo, write_run
     from evermap.runs.sessions import at_time, enter_session, priors_of
-    from evermap.viz.change_words import explanations, grew
 
     map_file, priors, localize, realtime = options
     if realtime and not localize:
@@ -324,17 +329,8 @@ def run_in_map(
                 entered = enter_session(store, recording, config, priors=said, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
         elapsed_s = time.perf_counter() - start
-        info = RunInfo(
-            command=command_line(),
-            seeds={"slam": config.slam.seed},
-            processing_s=None if realtime else elapsed_s,
-            total_s=elapsed_s,
-            grown=None if entered is None else len(entered.grown),
-        )
-        summary = write_run(out, recording, result, config, info=info, force=force, inputs=inputs)
-        for remark in summary["warnings"]:
-            warn(remark)
-        show_run(summary, out, as_json=as_json, findings=[*explanations(result), *grew(info.grown)])
+        grown = None if entered is None else len(entered.grown)
+        _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, grown=grown), **how)
         if result.interrupted:
             raise KeyboardInterrupt(
                 f"the part of the recording that was processed is in {out}; the map stays as it was"

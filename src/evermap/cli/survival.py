@@ -155,8 +155,8 @@ def fit(
     as_json: AsJson = False,
 ) -> None:
     """Estimate lifetimes of which only bounds are known."""
-    values = {"survival.by": by, "survival.estimator": estimator, "survival.chunk_m": chunk_m}
-    chosen = configured(config, settings, values, within="survival", show=show_config).survival
+    given = {"by": by, "estimator": estimator, "chunk_m": chunk_m}
+    chosen = configured(config, settings, given, within="survival", show=show_config).survival
     from evermap.runs.folder import check_output_file
     from evermap.runs.track.lifetimes import BY_CHUNK, check_estimator, estimates, groups_of, parse_by, read_lifetimes
 
@@ -215,8 +215,7 @@ def learn(
 ) -> None:
     """Learn how long things stay and stay away."""
     given = {"recurrent": recurrent, "per": per, "p_miss": p_miss, "p_false": p_false}
-    values = {f"persist.{name}": value for name, value in given.items()}
-    chosen = configured(config, settings, values, within="persist", show=show_config).persist
+    chosen = configured(config, settings, given, within="persist", show=show_config).persist
     if recurrent is None and chosen.stays_once:  # there is nothing to learn of one stay
         chosen = chosen.model_copy(update={"recurrent": "auto"})
     if figure is not None:

@@ -63,47 +63,34 @@ def print_json(summary: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(summary, indent=2, allow_nan=False))
 
 
-def print_table(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print two columns: framed on a terminal, aligned text when piped."""
-    if not sys.stdout.isatty():
-        width = max((len(name) for name, _ in rows), default=0)
-        for line in [title, *(f"  {name:<{width}}  {value}" for name, value in rows)]:
-            echo(line)
-        return
-    from rich.table import Table
-
-    table = Table(title=printable(title), title_justify="left", show_header=False)
-    for name, value in rows:
-        table.add_row(printable(name), printable(value))
-    _console().print(table)
-
-
-def print_rows(title: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Sequence[int] = ()) -> None:
-    """Print a table with a head: framed on a terminal, aligned text when piped.
+def print_table(
+    title: str, rows: Sequence[Sequence[str]], head: Sequence[str] = (), *, numbers: Sequence[int] = ()
+) -> None:
+    """Print a table: framed on a terminal, aligned text when piped.
 
     Args:
         title: above it.
-        head: names of the columns.
         rows: cells.
+        head: names of the columns; none for lines that say what they are.
         numbers: columns to align right.
     """
-    rows = [[printable(cell) for cell in line] for line in rows]
+    cells = [[printable(cell) for cell in line] for line in rows]
     if not sys.stdout.isatty():
-        lines = [list(head), *rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
+        lines = [list(head), *cells] if head else cells
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
         echo(title)
         for line in lines:
-            cells = (
+            aligned = (
                 c.rjust(w) if k in numbers else c.ljust(w) for k, (c, w) in enumerate(zip(line, widths, strict=True))
             )
-            typer.echo("  " + "  ".join(cells).rstrip())
+            typer.echo("  " + "  ".join(aligned).rstrip())
         return
     from rich.table import Table
 
-    table = Table(title=printable(title), title_justify="left")
+    table = Table(title=printable(title), title_justify="left", show_header=bool(head))
     for k, name in enumerate(head):
         table.add_column(name, justify="right" if k in numbers else "left", no_wrap=k in numbers)
-    for line in rows:
+    for line in cells:
         table.add_row(*line)
     _console().print(table)
 

@@ -119,8 +119,7 @@ def track(
     common, by_class = priors_by_class(prior)
     given = {"range_m": range_m, "prior": common, "class_priors": by_class, "speeds_mps": _speeds(speed),
              "min_score": min_score, "gap_s": gap_s}  # fmt: skip
-    values = {f"track.{name}": value for name, value in given.items()}
-    chosen = configured(config, settings, values, within="track", show=show_config).track
+    chosen = configured(config, settings, given, within="track", show=show_config).track
     if input is None:
         raise ConfigError("a table is needed", field="input", hint="--init detections.csv writes an example")
     out = out or default_out(input)

@@ -69,7 +69,7 @@ def load_config(
     Args:
         path: TOML file with the tables of `Config`; None for the defaults.
         overrides: `section.key=value` each; the value in TOML notation, or a bare word for a string.
-        values: further overrides by dotted key, as values; None leaves a key as it is.
+        values: further overrides by key, as values; None leaves a key as it is.
         within: section that keys without a dot are taken to be of.
 
     Raises:
@@ -121,16 +121,17 @@ def _overridden(config: Config, overrides: Iterable[str], values: Mapping[str, A
         key, equals, text = override.partition("=")
         if not equals or not all(name.strip() for name in key.split(".")):
             raise ConfigError(f"invalid setting '{override}'", hint="section.key=value, for example slam.seed=1")
-        short = within and "." not in key and key.strip() not in Config.model_fields
-        _set(content, f"{within}.{key}" if short else key, _toml_value(text.strip()))
+        _set(content, key, _toml_value(text.strip()), within)
     for key, value in values.items():
         if value is not None:
-            _set(content, key, value)
+            _set(content, key, value, within)
     return _validate(content, None)
 
 
-def _set(content: dict[str, Any], key: str, value: Any) -> None:
-    """Write a value into nested dicts by its dotted key."""
+def _set(content: dict[str, Any], key: str, value: Any, within: str) -> None:
+    """Write a value into nested dicts by its dotted key; one without a dot is of the section `within`."""
+    if within and "." not in key and key.strip() not in Config.model_fields:
+        key = f"{within}.{key}"
     names = [name.strip() for name in key.split(".")]
     table: Any = content
     for name in names[:-1]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.show import Shown
-from evermap.types import BoolArray, FloatArray, Recording, SlamResult
+from evermap.types import BoolArray, FloatArray, Recording, SlamResult, json_number
 
 RATE_HZ = 2.0
 IN_VIEW_S = 1.0
@@ -87,31 +86,31 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
     landmarks, own, nis = evaluation.landmarks, evaluation.landmarks_own, evaluation.nis
     anchored, view = evaluation.landmarks_anchored, evaluation.in_view
     return {
-        "pose_rmse_m": _number(poses and poses.rmse_m),
-        "pose_mean_m": _number(poses and poses.mean_m),
-        "pose_median_m": _number(poses and poses.median_m),
-        "pose_max_m": _number(poses and poses.max_m),
-        "heading_rmse_deg": _number(poses and poses.heading_rmse_deg),
+        "pose_rmse_m": json_number(poses and poses.rmse_m),
+        "pose_mean_m": json_number(poses and poses.mean_m),
+        "pose_median_m": json_number(poses and poses.median_m),
+        "pose_max_m": json_number(poses and poses.max_m),
+        "heading_rmse_deg": json_number(poses and poses.heading_rmse_deg),
         **_view(poses, view),
-        "drift_m_per_m": _number(poses and poses.drift_m_per_m),
-        "online_pose_rmse_m": _number(online and online.rmse_m),
-        "online_heading_rmse_deg": _number(online and online.heading_rmse_deg),
-        "dead_reckoning_rmse_m": _number(odometry and odometry.rmse_m),
-        "dead_reckoning_heading_rmse_deg": _number(odometry and odometry.heading_rmse_deg),
-        "landmark_rmse_m": _number(landmarks and landmarks.rmse_m),
-        "landmark_max_m": _number(landmarks and landmarks.max_m),
-        "landmark_rmse_own_alignment_m": _number(own and own.rmse_m),
+        "drift_m_per_m": json_number(poses and poses.drift_m_per_m),
+        "online_pose_rmse_m": json_number(online and online.rmse_m),
+        "online_heading_rmse_deg": json_number(online and online.heading_rmse_deg),
+        "dead_reckoning_rmse_m": json_number(odometry and odometry.rmse_m),
+        "dead_reckoning_heading_rmse_deg": json_number(odometry and odometry.heading_rmse_deg),
+        "landmark_rmse_m": json_number(landmarks and landmarks.rmse_m),
+        "landmark_max_m": json_number(landmarks and landmarks.max_m),
+        "landmark_rmse_own_alignment_m": json_number(own and own.rmse_m),
         "landmarks_scored": int(own.scored.sum()) if own else None,
         "landmark_min_sightings": MIN_SIGHTINGS,
-        "nis_mean": _number(nis.mean),
-        "nis_mean_all": _number(nis.mean_all),
-        "nis_median": _number(nis.median),
-        "nis_mean_band": [_number(edge) for edge in nis.mean_band] if nis.mean_band else None,
-        "nis_in_band_share": _number(nis.in_band_share),
-        "nis_in_two_sided_band_share": _number(nis.in_two_sided_band_share),
-        "nis_lag1_autocorrelation": _number(nis.lag1),
+        "nis_mean": json_number(nis.mean),
+        "nis_mean_all": json_number(nis.mean_all),
+        "nis_median": json_number(nis.median),
+        "nis_mean_band": [json_number(edge) for edge in nis.mean_band] if nis.mean_band else None,
+        "nis_in_band_share": json_number(nis.in_band_share),
+        "nis_in_two_sided_band_share": json_number(nis.in_two_sided_band_share),
+        "nis_lag1_autocorrelation": json_number(nis.lag1),
         "nis_count": nis.count,
-        "outlier_share": _number(nis.outlier_share),
+        "outlier_share": json_number(nis.outlier_share),
         "pose_nees_mean": _mean(poses.nees if poses else None),
         "pose_nees_in_band_share": share_in_band(poses.nees) if poses else None,
         "pose_nees_anchored_mean": _mean(poses.anchored_nees if poses else None),
@@ -148,8 +147,8 @@ def _alignment(evaluation: Evaluation) -> dict[str, Any]:
             "method": poses.alignment,
             "pose_truth_estimate": _pose(poses.pose_truth_estimate),
             "scored_stamps": len(poses.stamp_s),
-            "scored_from_s": _number(poses.stamp_s[0]),
-            "scored_to_s": _number(poses.stamp_s[-1]),
+            "scored_from_s": json_number(poses.stamp_s[0]),
+            "scored_to_s": json_number(poses.stamp_s[-1]),
         }
     if odometry:
         out["pose_truth_dead_reckoning"] = _pose(odometry.pose_truth_estimate)
@@ -163,21 +162,13 @@ def _alignment(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _pose(pose: FloatArray) -> dict[str, float | None]:
-    return {"x_m": _number(pose[0]), "y_m": _number(pose[1]), "theta_rad": _number(pose[2])}
+    return {"x_m": json_number(pose[0]), "y_m": json_number(pose[1]), "theta_rad": json_number(pose[2])}
 
 
 def _mean(values: FloatArray | None) -> float | None:
     if values is None or not np.any(np.isfinite(values)):
         return None
     return float(np.mean(values[np.isfinite(values)]))
-
-
-def _number(value: Any) -> float | None:
-    """Return a JSON number: a finite float, or None."""
-    if value is None:
-        return None
-    number = float(value)
-    return number if math.isfinite(number) else None
 
 
 def _view(poses: PoseErrors | None, view: BoolArray | None) -> dict[str, float | None]:

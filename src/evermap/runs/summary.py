@@ -6,10 +6,9 @@ Everything outside of `timing` and `versions` is a function of the inputs and th
 from __future__ import annotations
 
 import json
-import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult
+from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult, json_number
 
 SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
@@ -75,7 +74,7 @@ def summary_head(
     if "total_s" not in times:
         times["total_s"] = sum(seconds for name, seconds in times.items() if name.endswith("_s") and seconds)
     if "peak_memory_mb" not in times:
-        times["peak_memory_mb"] = _number(peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb)
+        times["peak_memory_mb"] = json_number(peak_memory_mb() if info.peak_memory_mb is None else info.peak_memory_mb)
     times.setdefault("written_at", datetime.now(UTC).isoformat(timespec="seconds"))
     return {
         "schema_version": SUMMARY_SCHEMA_VERSION,
@@ -147,16 +146,16 @@ def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: f
     return {
         "landmarks": [int(identity) for identity in change.landmark_ids],
         "kind": change.kind.value,
-        "stamp_from_s": _number(change.stamp_from_s),
-        "stamp_to_s": _number(change.stamp_to_s),
-        "displacement_m": [_number(metres) for metres in change.displacement_m],
-        "rotation_rad": _number(change.rotation_rad),
-        "probability": _number(change.probability),
+        "stamp_from_s": json_number(change.stamp_from_s),
+        "stamp_to_s": json_number(change.stamp_to_s),
+        "displacement_m": [json_number(metres) for metres in change.displacement_m],
+        "rotation_rad": json_number(change.rotation_rad),
+        "probability": json_number(change.probability),
         "hits": change.n_hits,
         "misses": change.n_misses,
         "names": list(change.names) or None,
-        "stamp_s": _number(stamp_s),
-        "decided_s": _number(decided_s),
+        "stamp_s": json_number(stamp_s),
+        "decided_s": json_number(decided_s),
     }
 
 
@@ -178,10 +177,10 @@ def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict
         "real_time_factor": lasted_s / processing_s if processing_s > 0 and lasted_s > 0 else None,
         "processing_s": processing_s,
         "total_s": info.total_s,
-        "step_p50_ms": _number(p50),
-        "step_p99_ms": _number(p99),
-        "step_max_ms": _number(step_ms.max()) if len(step_ms) else None,
-        "peak_memory_mb": _number(memory_mb),
+        "step_p50_ms": json_number(p50),
+        "step_p99_ms": json_number(p99),
+        "step_max_ms": json_number(step_ms.max()) if len(step_ms) else None,
+        "peak_memory_mb": json_number(memory_mb),
         "written_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
@@ -243,26 +242,10 @@ def _counts(recording: Recording, result: SlamResult) -> dict[str, Any]:
 def _alternative(alternative: Alternative) -> dict[str, Any]:
     return {
         "changes": [change_dict(change) for change in alternative.changes],
-        "probability": _number(alternative.probability),
+        "probability": json_number(alternative.probability),
     }
 
 
 def _parameter(parameter: ParameterEstimate) -> dict[str, Any]:
-    return {
-        "name": parameter.name,
-        "value": _number(parameter.value),
-        "sigma": _number(parameter.sigma),
-        "prior_mean": _number(parameter.prior_mean),
-        "prior_sigma": _number(parameter.prior_sigma),
-        "unit": parameter.unit,
-        "fixed": bool(parameter.fixed),
-        "meaning": parameter.meaning,
-    }
-
-
-def _number(value: Any) -> float | None:
-    """A JSON number: a finite float, or None."""
-    if value is None:
-        return None
-    number = float(value)
-    return number if math.isfinite(number) else None
+    numbers = {name: json_number(getattr(parameter, name)) for name in ("value", "sigma", "prior_mean", "prior_sigma")}
+    return {**asdict(parameter), **numbers, "fixed": bool(parameter.fixed)}

@@ -17,7 +17,7 @@ from evermap.runs.persist.draw import clock_of, draw_run
 from evermap.runs.persist.report import render_report
 from evermap.runs.persist.run import PersistResult
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
-from evermap.types import ChangeKind, Clock, MapChange, landmark_id_of
+from evermap.types import ChangeKind, Clock, MapChange, json_number, landmark_id_of
 from evermap.viz.style import NamedFigure, save_png, save_svg
 
 
@@ -100,9 +100,9 @@ def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, f
             for name, values in (("p_miss", table.p_miss), ("p_false", table.p_false))
         },
         "never_leave_share": _never_leave(result),
-        "expected_present_now": _number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
-        "merged_mass": _number(result.merged_mass),
-        "metrics": None if result.scores is None else {k: _number(v) for k, v in asdict(result.scores).items()},
+        "expected_present_now": json_number(float(np.nansum(result.forecasts.p_exists[:, 0]))),
+        "merged_mass": json_number(result.merged_mass),
+        "metrics": None if result.scores is None else {k: json_number(v) for k, v in asdict(result.scores).items()},
         "reliability": None if result.reliability is None else _reliability(result),
     }
 
@@ -164,7 +164,7 @@ def _learning(result: PersistResult) -> dict[str, Any] | None:
         name or "all": {
             "kind": choice.kind,
             "held_out_s": choice.held_out_s,
-            "scores": {kind: _number(score) for kind, score in choice.scores.items()},
+            "scores": {kind: json_number(score) for kind, score in choice.scores.items()},
         }
         for name, choice in zip(result.models.names, learned.choices, strict=True)
     }
@@ -183,10 +183,6 @@ def _reliability(result: PersistResult) -> dict[str, list[Any]]:
     return {
         "edge": bins.edge.tolist(),
         "count": bins.count.tolist(),
-        "belief": [_number(value) for value in bins.belief.tolist()],
-        "present": [_number(value) for value in bins.present.tolist()],
+        "belief": [json_number(value) for value in bins.belief.tolist()],
+        "present": [json_number(value) for value in bins.present.tolist()],
     }
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else value
