@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks import persistence, rosen
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.existence.single import Belief
 from evermap.sensing import learned
 from evermap.sensing.learned import CliqueLook, LearnedDetection
 from evermap.sensing.profile import Assumed
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
+from evermap_studies.bateman2020 import joint
 from evermap_studies.worlds.sensors import LIDAR
 
 N_CLIQUES = 50_000
@@ -90,7 +91,7 @@ class WithLearning:
 
     def filter(self) -> None:
         seen = self._seen
-        self.belief = single.observe(self.belief, seen.stamp_s, seen.log_there, seen.log_gone)
+        self.belief = self.belief.observe(seen.stamp_s, seen.log_there, seen.log_gone)
 
     def confirm(self) -> None:
         self.model = learned.confirm(self.model, self._seen, self.belief.probability)

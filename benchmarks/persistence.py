@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks import rosen
-from evermap.existence import run_length as run_length_filter
 from evermap.existence import single
-from evermap.existence.batch import Looked, RowLooks, RowState, look_exponential, look_general_purpose, look_two_state
+from evermap.existence.batch import ConstantRate, LeaveAndReturn, Looked, RowLooks, RowState, UnknownRate, look
 from evermap.existence.one_stay import PersistenceFilter
+from evermap.existence.run_length import RunLength, RunLengthBelief
 from evermap.survival import Exponential, GeneralPurpose, LogNormal
 from evermap.types import FloatArray
 
@@ -112,20 +112,19 @@ def fleet(n: int, *, exponential: bool, seed: int = 0) -> Fleet:
 
 def exponential(n: int) -> Case:
     features = fleet(n, exponential=True)
-    return _batch_case("exponential", 10.0, features, look_exponential, (features.low_hz,))
+    return _batch_case("exponential", 10.0, features, ConstantRate(features.low_hz))
 
 
 def general_purpose(n: int) -> Case:
     features = fleet(n, exponential=False)
-    parameters = (features.low_hz, features.high_hz)
-    return _batch_case("general purpose", 30.0, features, look_general_purpose, parameters)
+    return _batch_case("general purpose", 30.0, features, UnknownRate(features.low_hz, features.high_hz))
 
 
 def general_purpose_now(n: int) -> Case:
     """The belief at the look itself, where the update has it already."""
     features = fleet(n, exponential=False)
-    parameters = (features.low_hz, features.high_hz)
-    return _batch_case("general purpose, belief at the look", 30.0, features, look_general_purpose, parameters, 0.0)
+    rates = UnknownRate(features.low_hz, features.high_hz)
+    return _batch_case("general purpose, belief at the look", 30.0, features, rates, 0.0)
 
 
 def one_exponential(n: int) -> Case:
@@ -146,35 +145,35 @@ def stream(n: int) -> Case:
     state = single.init(features, (Exponential(1e-5), GeneralPurpose(1e-7, 1e-2)), prior_of_row=which)
     feature, stamp = random.integers(0, features, n), random.uniform(0.0, 86400.0, n)
     looks = (random.random(n) < 0.5, random.uniform(0.05, 0.5, n), random.uniform(0.01, 0.3, n))
-    return Case("`run` on a stream", n, np.inf, lambda: single.run(state, feature, stamp, *looks))
+    return Case("`run` on a stream", n, np.inf, lambda: state.run(feature, stamp, *looks))
 
 
 def two_state(n: int) -> Case:
     """Features that come and go, stays and absences exponential."""
     features = fleet(n, exponential=True)
     random = np.random.default_rng(2)
-    parameters = (features.low_hz, 10 ** random.uniform(-6, -4, n))
+    rates = LeaveAndReturn(features.low_hz, 10 ** random.uniform(-6, -4, n))
     before, sight = RowState(features.inverse_odds, features.before.stamp_s), RowLooks(*features.looks)
     out = Looked(np.empty(n), np.empty(n))
 
     def ours(threads: bool) -> FloatArray:
-        return look_two_state(before, *parameters, sight, horizon_s=HORIZON_S, out=out, threads=threads).probability
+        return look(before, rates, sight, horizon_s=HORIZON_S, out=out, threads=threads).probability
 
-    moved = sum(column.itemsize for column in (*before, *parameters, *sight, *out))
+    moved = sum(column.itemsize for column in (*before, *rates, *sight, *out))
     return Case("leaves and returns, exponential", n, 40.0, lambda: ours(False), lambda: ours(True), moved)
 
 
 def run_length(n: int) -> Case:
     """Features that come and go, stays and absences log-normal, 64 hypotheses each, looked at every ten seconds."""
-    model = run_length_filter.RunLength(LogNormal(6.0, 0.5), LogNormal(7.0, 0.5), step_s=10.0, hypotheses=64)
+    model = RunLength(LogNormal(6.0, 0.5), LogNormal(7.0, 0.5), step_s=10.0, hypotheses=64)
     count = max(n // 100, 1)
     random = np.random.default_rng(3)
     rates = (random.uniform(0.05, 0.5, count), random.uniform(0.01, 0.3, count))
-    state = run_length_filter.init(model, random.uniform(0.0, 10.0, count))
+    state = RunLengthBelief.first(model, random.uniform(0.0, 10.0, count))
     for _ in range(100):  # until the lists are full
-        state = run_length_filter.update(state, state.stamp_s + 10.0, random.random(count) < 0.5, *rates)
+        state = state.update(state.stamp_s + 10.0, random.random(count) < 0.5, *rates)
     seen = random.random(count) < 0.5
-    work = lambda: run_length_filter.update(state, state.stamp_s + 10.0, seen, *rates).probability  # noqa: E731
+    work = lambda: state.update(state.stamp_s + 10.0, seen, *rates).probability  # noqa: E731
     return Case("leaves and returns, 64 hypotheses of run length", count, 1000.0, work)
 
 
@@ -252,8 +251,7 @@ def _batch_case(
     name: str,
     limit_ns: float,
     features: Fleet,
-    look: Callable[..., Any],
-    parameters: tuple[FloatArray, ...],
+    rates: ConstantRate | UnknownRate,
     horizon_s: float = HORIZON_S,
 ) -> Case:
     n = len(features.low_hz)
@@ -266,7 +264,7 @@ def _batch_case(
         return belief
 
     def ours(threads: bool) -> FloatArray:
-        return look(before, *parameters, sight, horizon_s=horizon_s, out=out, threads=threads).probability
+        return look(before, rates, sight, horizon_s=horizon_s, out=out, threads=threads).probability
 
     return Case(
         name,
@@ -274,7 +272,7 @@ def _batch_case(
         limit_ns,
         lambda: ours(False),
         lambda: ours(True),
-        moved_bytes=sum(column.itemsize for column in (*before, *parameters, *sight, *out)),
+        moved_bytes=sum(column.itemsize for column in (*before, *rates, *sight, *out)),
         peers={
             "numba": by_numba,
             "numpy": lambda: rosen.step_numpy(state, looks, features.log_survival, horizon_s)[1],
@@ -351,19 +349,18 @@ def _torch(n: int, seconds: float) -> dict[str, dict[str, float]]:
     if not torch.cuda.is_available():
         return {}
     times = {}
-    for look, exponential_lifetimes in ((look_exponential, True), (look_general_purpose, False)):
-        features = fleet(n, exponential=exponential_lifetimes)
-        parameters = (features.low_hz,) if exponential_lifetimes else (features.low_hz, features.high_hz)
+    for name, rates_of in (("exponential", ConstantRate), ("general_purpose", UnknownRate)):
+        features = fleet(n, exponential=rates_of is ConstantRate)
+        parameters = [getattr(features, "low_hz" if column == "rate_hz" else column) for column in rates_of._fields]
         for kind in (torch.float32, torch.float64):
             columns: list[Any] = [
                 torch.tensor(column, dtype=None if column.dtype == np.bool_ else kind, device="cuda")
                 for column in (features.inverse_odds, features.before.stamp_s, *parameters, *features.looks)
             ]
 
-            def work(look: Callable[..., Any] = look, columns: list[Any] = columns) -> None:
-                look(RowState(*columns[:2]), *columns[2:-4], RowLooks(*columns[-4:]), horizon_s=HORIZON_S)
+            def work(rates_of: Any = rates_of, columns: list[Any] = columns) -> None:
+                look(RowState(*columns[:2]), rates_of(*columns[2:-4]), RowLooks(*columns[-4:]), horizon_s=HORIZON_S)
                 torch.cuda.synchronize()
 
-            name = f"{look.__name__.removeprefix('look_')}_{str(kind).removeprefix('torch.')}"
-            times[name] = best_ns({"": work}, seconds)[""] / n
+            times[f"{name}_{str(kind).removeprefix('torch.')}"] = best_ns({"": work}, seconds)[""] / n
     return {torch.cuda.get_device_name(): times}

@@ -142,7 +142,7 @@ def problems(session: Session) -> Iterator[str]:
             if name.rsplit(".", maxsplit=1)[-1] not in UNKNOWABLE and not np.isfinite(column).all():
                 yield f"{name} is not finite"
             if name.rsplit(".", maxsplit=1)[-1].startswith("p_") and np.any((column < 0.0) | (column > 1.0 + 1e-9)):
-                yield f"{name} is no probability"
+                yield f"{name} is not a probability"
     for name, covariance in (
         ("living.covariance_m2", session.living.covariance_m2[None]),
         ("trajectory.covariance", session.slam.trajectory.covariance),
@@ -151,7 +151,7 @@ def problems(session: Session) -> Iterator[str]:
         yield from _no_covariance(name, covariance)
     total = session.living.p_exists()
     if np.any((total < 0.0) | (total > 1.0 + 1e-9)):
-        yield "p_exists is no probability"
+        yield "p_exists is not a probability"
     if not np.all(np.diff(session.slam.trajectory.stamp_s) > 0.0):
         yield "stamps of the trajectory do not increase"
 

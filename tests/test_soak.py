@@ -139,7 +139,7 @@ def test_defects_are_seen(soak: ModuleType, known: Session) -> None:
     gone = living.places.position_m.copy()
     gone[0, 0] = np.nan
     for wrong, said in (
-        (replace(living, sites=replace(living.sites, p_here=p_here)), "no probability"),
+        (replace(living, sites=replace(living.sites, p_here=p_here)), "not a probability"),
         (replace(living, covariance_m2=skew), "not symmetric"),
         (replace(living, covariance_m2=negative), "not positive semidefinite"),
         (replace(living, places=replace(living.places, position_m=gone)), "not finite"),

@@ -104,7 +104,7 @@ def test_filters_of_cliques_in_the_race_believe_the_same(run: ModuleType) -> Non
     for n in range(12):
         np.testing.assert_allclose(theirs(), ours(), rtol=1e-9)
         detected = scene.detected[n % len(scene.detected)]
-        alone = single.update(alone, n + 1.0, detected, run.cliques.P_MISS, run.cliques.P_FALSE)
+        alone = alone.update(n + 1.0, detected, run.cliques.P_MISS, run.cliques.P_FALSE)
         np.testing.assert_allclose(one_by_one(), alone.probability, atol=1e-9)
     assert np.ptp(ours()) > 5.0
 

@@ -11,25 +11,25 @@ from evermap.existence.sites import SiteBeliefs, SiteSensor
 _OWN = ("horizon_s", "out", "threads")
 
 
-def _look(kind: str, names: tuple[str, ...], *columns: Any, **named: Any) -> Looked:
+def _look(kind: type[Any], *columns: Any, **named: Any) -> Looked:
+    names = kind._fields
     order = ("inverse_odds", "stamp_s", *names, "time_s", "detected", "p_miss", "p_false")
     given = dict(zip(order, columns, strict=False)) | {name: named.pop(name) for name in [*named] if name not in _OWN}
-    rates = [given[name] for name in names]
+    rates = kind(*(given[name] for name in names))
     sight = RowLooks(*(given[name] for name in order[-4:]))
-    answer: Looked = getattr(batch, kind)(RowState(given["inverse_odds"], given["stamp_s"]), *rates, sight, **named)
-    return answer
+    return batch.look(RowState(given["inverse_odds"], given["stamp_s"]), rates, sight, **named)
 
 
 def look_exponential(*columns: Any, **named: Any) -> Looked:
-    return _look("look_exponential", ("rate_hz",), *columns, **named)
+    return _look(batch.ConstantRate, *columns, **named)
 
 
 def look_general_purpose(*columns: Any, **named: Any) -> Looked:
-    return _look("look_general_purpose", ("low_hz", "high_hz"), *columns, **named)
+    return _look(batch.UnknownRate, *columns, **named)
 
 
 def look_two_state(*columns: Any, **named: Any) -> Looked:
-    return _look("look_two_state", ("leave_hz", "return_hz"), *columns, **named)
+    return _look(batch.LeaveAndReturn, *columns, **named)
 
 
 def follow_sites(p_here: Any, clique_of_site: Any, dynamics: Any, looks: Any, lines: Any, **named: Any) -> SiteBeliefs:

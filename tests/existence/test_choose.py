@@ -61,7 +61,7 @@ def test_looks_before_an_instant_keep_their_features() -> None:
 
 def test_refusals() -> None:
     looks = looks_of([10.0, 10.0], 1.0, 5)
-    with pytest.raises(ConfigError, match="no kind of model"):
+    with pytest.raises(ConfigError, match="unknown kind of model"):
         choose(looks, ["oracle"])
     nothing = np.zeros(0)
     with pytest.raises(DataError, match="no look"):

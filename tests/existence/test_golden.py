@@ -29,14 +29,14 @@ def test_streams(rosen_traces: list[dict[str, Any]], name: str) -> None:
         times = np.array(sequence["times"]) - birth
         prior: LifetimePrior = PRIORS[name](reference["params"])
         state = single.init(1, prior, evidence=True)
-        predicted = [single.predict(state, t - birth)[0] for t in sequence["pre_times"]]
+        predicted = [state.predict(t - birth)[0] for t in sequence["pre_times"]]
         np.testing.assert_allclose(predicted, reference["prior_pred"], atol=TOLERANCE)
         feature = np.zeros(len(times), dtype=np.int64)
-        state, posterior = single.run(state, feature, times, sequence["y"], sequence["P_M"], sequence["P_F"])
+        state, posterior = state.run(feature, times, sequence["y"], sequence["P_M"], sequence["P_F"])
         np.testing.assert_allclose(posterior, reference["posterior"], atol=TOLERANCE)
         assert state.log_evidence is not None
         np.testing.assert_allclose(state.log_evidence[0], reference["log_evidence"][-1], rtol=TOLERANCE, atol=TOLERANCE)
-        future = [single.predict(state, t - birth)[0] for t in reference["future_times"]]
+        future = [state.predict(t - birth)[0] for t in reference["future_times"]]
         np.testing.assert_allclose(future, reference["future"], atol=TOLERANCE)
 
 

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import InputError, NumericalError
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.survival import Exponential, LifetimePrior, Uniform
+from evermap_studies.bateman2020 import joint
 from evermap_studies.bateman2020.clique_range import nearest_per_clique, range_degraded_miss
 
 from .cliques import PRIORS, Looks, looks, summed
@@ -54,7 +55,7 @@ def test_a_clique_is_the_sum_over_all_times_of_its_death(
     state = cliques_after(prior, seen)
     assert state.log_evidence is not None
     query = float(seen.stamp_s[-1]) + ahead
-    for c, belief in enumerate(single.predict(state, query)):
+    for c, belief in enumerate(state.predict(query)):
         expected, evidence = summed(survival, seen, np.flatnonzero(seen.clique == c), query)
         assert belief == pytest.approx(expected, rel=1e-9, abs=1e-14)
         assert state.log_evidence[c] == pytest.approx(evidence, rel=1e-10, abs=1e-12)
@@ -69,7 +70,7 @@ def test_a_landmark_alone_is_the_sum_over_all_times_of_its_death(
     state = landmarks_after(prior, seen)
     assert state.log_evidence is not None
     query = float(seen.stamp_s[-1]) + ahead
-    for k, belief in enumerate(single.predict(state, query)):
+    for k, belief in enumerate(state.predict(query)):
         expected, evidence = summed(survival, seen, [k], query)
         assert belief == pytest.approx(expected, rel=1e-9, abs=1e-14)
         assert state.log_evidence[k] == pytest.approx(evidence, rel=1e-10, abs=1e-12)
@@ -118,7 +119,7 @@ def test_what_was_not_expected_is_neither_used_nor_checked() -> None:
     after = joint.jcf(before, [5.0, np.nan, 5.0], detected, p_miss, 0.1, expected, clique)
     np.testing.assert_array_equal(after.inverse_odds[1:], before.inverse_odds[1:])  # no look; none expected
     np.testing.assert_array_equal(after.stamp_s, [5.0, 2.0, 2.0])
-    one = single.update(before, 5.0, 0, 0.4, 0.1, rows=[0])
+    one = before.update(5.0, 0, 0.4, 0.1, rows=[0])
     assert after.inverse_odds[0] == pytest.approx(one.inverse_odds[0], rel=1e-13)
     alone = joint.iff(single.init(4, Exponential(0.1)), [5.0, 5.0, 5.0, np.nan], detected, p_miss, 0.1, expected)
     np.testing.assert_array_equal(alone.stamp_s, [0.0, 5.0, 0.0, 0.0])
@@ -134,9 +135,9 @@ def test_observe_is_update(prior: LifetimePrior, survival: Callable[[Any], Any],
     for n in range(len(seen)):
         time, detected, p_miss, p_false, _ = seen.step(n)
         there, gone = np.where(detected, 1 - p_miss, p_miss), np.where(detected, p_false, 1 - p_false)
-        by_detector = single.update(by_detector, time, detected, p_miss, p_false)
-        by_logs = single.observe(by_logs, time, np.log(there), np.log(gone))
-        by_ratio = single.observe(by_ratio, time, np.log(there / gone))
+        by_detector = by_detector.update(time, detected, p_miss, p_false)
+        by_logs = by_logs.observe(time, np.log(there), np.log(gone))
+        by_ratio = by_ratio.observe(time, np.log(there / gone))
         total_gone += float(np.log(gone)[0])
     assert_same(by_logs, by_detector)
     assert by_ratio.log_evidence is not None
@@ -152,11 +153,11 @@ def test_certainties_are_those_of_the_single_filter(before: str, detected: int, 
     """Error rates of 0 and 1, on features that are certainly there, probably there, and certainly gone."""
     state = single.init(1, Exponential(0.1), evidence=True)
     if before != "born":
-        state = single.update(state, 1.0, int(before == "doubtful"), 0.1 if before == "doubtful" else 0.0, 0.2)
+        state = state.update(1.0, int(before == "doubtful"), 0.1 if before == "doubtful" else 0.0, 0.2)
     time = state.stamp_s  # at once, so that who was just born is certainly there
     one = (detected, miss, false)
     try:
-        expected = single.update(state, time, *one)
+        expected = state.update(time, *one)
     except NumericalError:
         with pytest.raises(NumericalError, match=r"row 0.*impossible"):
             joint.jcf(state, time, *one, True, np.array([0]))
@@ -165,7 +166,7 @@ def test_certainties_are_those_of_the_single_filter(before: str, detected: int, 
 
 
 def test_members_that_prove_opposite_things() -> None:
-    state = single.update(single.init(1, Exponential(0.1)), 1.0, 1, 0.1, 0.1)
+    state = single.init(1, Exponential(0.1)).update(1.0, 1, 0.1, 0.1)
     with pytest.raises(NumericalError, match=r"row 0.*impossible"):
         joint.jcf(state, 2.0, [1, 0], [0.1, 0.0], [0.0, 0.1], True, np.array([0, 0]))
 
@@ -199,9 +200,9 @@ def test_a_thousand_members_do_not_shake_a_certainty() -> None:
     ("detected", "p_miss", "p_false", "doubt"), [(1, 0.1, 1e-200, 1e-300), (0, 1e-200, 0.1, 1e300)]
 )
 def test_a_doubt_stays_finite_by_every_road(detected: int, p_miss: float, p_false: float, doubt: float) -> None:
-    state = single.update(single.init(1, Exponential(0.1)), 1.0, 1, 0.1, 0.1)
+    state = single.init(1, Exponential(0.1)).update(1.0, 1, 0.1, 0.1)
     look = (2.0, detected, p_miss, p_false)
-    assert single.update(single.update(state, *look), *look).inverse_odds[0] == doubt
+    assert state.update(*look).update(*look).inverse_odds[0] == doubt
     assert joint.jcf(state, *look, True, np.array([0, 0])).inverse_odds[0] == doubt
 
 
@@ -223,8 +224,8 @@ GOOD: dict[str, Any] = {
     "expected": np.array([True, False, True]),
 }
 BAD = {
-    "miss": ({"p_miss": [0.1, 0.1, 1.5]}, "field 'p_miss': landmark 2: 1.5 is no probability"),
-    "false": ({"p_false": [0.1, 0.1, np.nan]}, "field 'p_false': landmark 2: nan is no probability"),
+    "miss": ({"p_miss": [0.1, 0.1, 1.5]}, "field 'p_miss': landmark 2: 1.5 is not a probability"),
+    "false": ({"p_false": [0.1, 0.1, np.nan]}, "field 'p_false': landmark 2: nan is not a probability"),
     "detected": ({"detected": [1, 1, 0.5]}, "field 'detected': landmark 2: 0.5 is neither"),
     "length": ({"detected": [1, 1]}, r"field 'detected': shape \(2,\) instead of \(3,\)"),
     "expected": ({"expected": np.ones(3)}, r"field 'expected': float64 of shape \(3,\) instead of bool of \(3,\)"),
@@ -244,13 +245,13 @@ def test_bad_input_is_named(change: dict[str, Any], words: str) -> None:
 
 def test_bad_input_of_observe_and_iff() -> None:
     state = single.init(2, Exponential(0.1))
-    with pytest.raises(InputError, match="field 'log_there': row 1: nan is no log-likelihood"):
-        single.observe(state, 1.0, [0.0, np.nan])
-    with pytest.raises(InputError, match="field 'log_gone': row 1: nan is no log-likelihood"):
-        single.observe(state, [np.nan, 1.0], 0.0, [np.nan, np.nan])
+    with pytest.raises(InputError, match="field 'log_there': row 1: nan is not a log-likelihood"):
+        state.observe(1.0, [0.0, np.nan])
+    with pytest.raises(InputError, match="field 'log_gone': row 1: nan is not a log-likelihood"):
+        state.observe([np.nan, 1.0], 0.0, [np.nan, np.nan])
     with pytest.raises(InputError, match=r"row 0: time -1\.0 s lies before its birth"):
-        single.observe(state, -1.0, 0.0)
-    with pytest.raises(InputError, match=r"field 'p_miss': row 1: 2\.0 is no probability"):
+        state.observe(-1.0, 0.0)
+    with pytest.raises(InputError, match=r"field 'p_miss': row 1: 2\.0 is not a probability"):
         joint.iff(state, 1.0, 1, [2.0, 2.0], 0.1, np.array([False, True]))
     with pytest.raises(InputError, match="field 'expected': float64"):
         joint.iff(state, 1.0, 1, 0.1, 0.1, 1.0)

@@ -13,10 +13,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import ConfigError, InputError
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.survival import Exponential, LifetimePrior, Weibull
 from evermap.types import FloatArray, IntArray
-from evermap_studies.bateman2020 import jff
+from evermap_studies.bateman2020 import jff, joint
 
 from .cliques import DIGITS, PRIORS, Looks, deaths, given_death, looks, summed
 
@@ -75,7 +75,7 @@ def test_the_limits_are_the_joint_and_the_independent_filter(seen: Looks, ahead:
         shared = joint.jcf(shared, *seen.step(n), seen.clique)
         alone = joint.iff(alone, *seen.step(n))
     query = float(seen.stamp_s[-1]) + ahead
-    expected = np.where(seen.clique == 0, single.predict(shared, query)[seen.clique], single.predict(alone, query))
+    expected = np.where(seen.clique == 0, shared.predict(query)[seen.clique], alone.predict(query))
     state = mixture_after(prior, seen, np.array([1.0, 0.0]))
     np.testing.assert_array_equal(state.p_shared, [1.0, 0.0])
     np.testing.assert_array_equal(jff.predict(state, query), expected)
@@ -178,7 +178,7 @@ def test_who_has_no_neighbour_is_believed_alone() -> None:
 
 def test_bad_input_is_named() -> None:
     clique, point = np.array([0, 1]), np.zeros((2, 3))
-    with pytest.raises(InputError, match=r"field 'weight': clique 1: 1\.5 is no probability"):
+    with pytest.raises(InputError, match=r"field 'weight': clique 1: 1\.5 is not a probability"):
         jff.init(clique, 2, Exponential(1.0), weight=np.array([0.5, 1.5]))
     with pytest.raises(InputError, match="field 'clique': entry 1: row 1 of 1 does not exist"):
         jff.init(clique, 1, Exponential(1.0), weight=0.5)

@@ -88,11 +88,11 @@ def test_kernels_are_the_generic_filter(threads: bool, horizon_s: float) -> None
         for _ in range(30):
             time = stamp + random.choice([0.0, 1e-3, 1.0, 100.0], n)
             seen, miss, false = random.random(n) < 0.5, random.random(n), random.random(n)
-            state = single.update(state, time, seen, miss, false)
+            state = state.update(time, seen, miss, false)
             answer = look(odds, stamp, *parameters, time, seen, miss, false, horizon_s=horizon_s, threads=threads)
             odds, stamp = answer.inverse_odds, time
             np.testing.assert_allclose(odds, state.inverse_odds, rtol=1e-9)
-            np.testing.assert_allclose(answer.probability, single.predict(state, time + horizon_s), rtol=1e-9)
+            np.testing.assert_allclose(answer.probability, state.predict(time + horizon_s), rtol=1e-9)
 
 
 def test_threads_change_no_digit() -> None:

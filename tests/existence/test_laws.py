@@ -20,7 +20,7 @@ few = settings(max_examples=40)
 def filtered(prior: LifetimePrior, stream: Stream) -> tuple[single.Belief, np.ndarray]:
     state = single.init(1, prior, evidence=True)
     feature = np.zeros(len(stream), dtype=np.int64)
-    return single.run(state, feature, stream.time, stream.detected, stream.p_miss, stream.p_false)
+    return state.run(feature, stream.time, stream.detected, stream.p_miss, stream.p_false)
 
 
 def summed(prior: LifetimePrior, stream: Stream, query: float) -> tuple[float, float]:
@@ -43,7 +43,7 @@ def test_the_filter_is_the_sum_over_all_times_of_death(prior: LifetimePrior, str
     belief, evidence = summed(prior, stream, query)
     state, _ = filtered(prior, stream)
     assert state.log_evidence is not None
-    assert single.predict(state, query)[0] == pytest.approx(belief, rel=1e-9, abs=1e-13)
+    assert state.predict(query)[0] == pytest.approx(belief, rel=1e-9, abs=1e-13)
     assert state.log_evidence[0] == pytest.approx(evidence, rel=1e-9, abs=1e-11)
 
 
@@ -57,9 +57,9 @@ def test_splits_and_roads_do_not_matter(prior: LifetimePrior, stream: Stream, sp
     looks, feature = single.init(1, prior, evidence=True), PersistenceFilter(prior)
     for part in (slice(None, split), slice(split, None)):
         columns = (stream.time[part], stream.detected[part], stream.p_miss[part], stream.p_false[part])
-        halves, _ = single.run(halves, np.zeros(len(columns[0]), dtype=np.int64), *columns)
+        halves, _ = halves.run(np.zeros(len(columns[0]), dtype=np.int64), *columns)
         for time, detected, p_miss, p_false in zip(*columns, strict=True):
-            looks = single.update(looks, time, detected, p_miss, p_false)
+            looks = looks.update(time, detected, p_miss, p_false)
             feature.update(float(time), bool(detected), float(p_miss), float(p_false))
     np.testing.assert_array_equal(halves.inverse_odds, whole.inverse_odds)
     np.testing.assert_allclose(looks.inverse_odds, whole.inverse_odds, rtol=1e-11)
@@ -67,7 +67,7 @@ def test_splits_and_roads_do_not_matter(prior: LifetimePrior, stream: Stream, sp
     np.testing.assert_allclose(feature.log_evidence, whole.log_evidence, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(posterior[-1], looks.probability[0], rtol=1e-12)
     ahead = float(stream.time[-1]) + 0.5
-    assert feature.predict(ahead) == pytest.approx(single.predict(looks, ahead)[0], rel=1e-10)
+    assert feature.predict(ahead) == pytest.approx(looks.predict(ahead)[0], rel=1e-10)
 
 
 @few
@@ -104,10 +104,10 @@ class Later:
 @pytest.mark.parametrize("prior", [PRIORS["exponential"], PRIORS["general purpose"], PRIORS["weibull"]])
 def test_a_feature_known_to_be_there_starts_anew(prior: LifetimePrior, stream: Stream, age: float) -> None:
     """Certainty at `age` followed by a stream is the stream under the prior of those that reached `age`."""
-    known = single.update(single.init(1, prior), age, 1, 0.5, 0.0)  # no false alarms: a detection is proof
+    known = single.init(1, prior).update(age, 1, 0.5, 0.0)  # no false alarms: a detection is proof
     assert known.inverse_odds[0] == 0.0
     zeros = np.zeros(len(stream), dtype=np.int64)
-    _, shifted = single.run(known, zeros, stream.time + age, stream.detected, stream.p_miss, stream.p_false)
+    _, shifted = known.run(zeros, stream.time + age, stream.detected, stream.p_miss, stream.p_false)
     _, anew = filtered(Later(prior, age), stream)  # type: ignore[arg-type]
     np.testing.assert_allclose(shifted, anew, rtol=1e-9, atol=1e-13)
     if isinstance(prior, Exponential):
@@ -137,7 +137,7 @@ def test_grouping_order_and_permutation_of_features(data: st.DataObject) -> None
         mine = order[feature[order] == k]
         order[feature[order] == k] = np.sort(mine)
     state = single.init(5, priors, prior_of_row=index, evidence=True)
-    state, posterior = single.run(state, feature[order], *(c[order] for c in columns))
+    state, posterior = state.run(feature[order], *(c[order] for c in columns))
     for k, stream in enumerate(own):
         alone, expected = filtered(priors[index[k]], stream)
         np.testing.assert_allclose(state.inverse_odds[k], alone.inverse_odds[0], rtol=1e-12)
@@ -146,25 +146,25 @@ def test_grouping_order_and_permutation_of_features(data: st.DataObject) -> None
 
 
 def test_rows_not_looked_at_stay_and_inputs_are_not_touched() -> None:
-    before = single.update(single.init(3, PRIORS["exponential"]), 5.0, 1, 0.1, 0.1)
+    before = single.init(3, PRIORS["exponential"]).update(5.0, 1, 0.1, 0.1)
     copy = before.inverse_odds.copy()
-    by_index = single.update(before, 7.0, 0, 0.1, 0.1, rows=[2, 0])
-    by_mask = single.update(before, [7.0, np.nan, 7.0], [0, np.nan, 0], 0.1, 0.1)
+    by_index = before.update(7.0, 0, 0.1, 0.1, rows=[2, 0])
+    by_mask = before.update([7.0, np.nan, 7.0], [0, np.nan, 0], 0.1, 0.1)
     np.testing.assert_array_equal(by_index.inverse_odds, by_mask.inverse_odds)
     np.testing.assert_array_equal(by_index.stamp_s, [7.0, 5.0, 7.0])
     assert by_index.inverse_odds[1] == before.inverse_odds[1]
     np.testing.assert_array_equal(before.inverse_odds, copy)
-    np.testing.assert_array_equal(single.predict(before, 9.0, rows=[1]), single.predict(before, 9.0)[1:2])
+    np.testing.assert_array_equal(before.predict(9.0, rows=[1]), before.predict(9.0)[1:2])
 
 
 def test_doubt_stays_finite_and_certainty_stays_certain() -> None:
     """Ten thousand hits in a row do not make a certainty, and misses still count afterwards."""
     state = single.init(1, Exponential(1e-3))
-    state = single.run(state, np.zeros(10_000, dtype=np.int64), np.full(10_000, 1.0), np.ones(10_000), 0.1, 0.01)[0]
+    state = state.run(np.zeros(10_000, dtype=np.int64), np.full(10_000, 1.0), np.ones(10_000), 0.1, 0.01)[0]
     assert state.inverse_odds[0] == 1e-300
-    state = single.run(state, np.zeros(400, dtype=np.int64), np.full(400, 1.0), np.zeros(400), 0.1, 0.01)[0]
+    state = state.run(np.zeros(400, dtype=np.int64), np.full(400, 1.0), np.zeros(400), 0.1, 0.01)[0]
     assert state.probability[0] < 1e-6
-    gone = single.update(single.init(1, Uniform(10.0)), 11.0, 1, 0.1, 0.1)
+    gone = single.init(1, Uniform(10.0)).update(11.0, 1, 0.1, 0.1)
     assert np.isinf(gone.inverse_odds[0])
-    assert single.predict(gone, 20.0)[0] == 0.0
-    assert single.predict(gone, 11.0)[0] == 0.0
+    assert gone.predict(20.0)[0] == 0.0
+    assert gone.predict(11.0)[0] == 0.0

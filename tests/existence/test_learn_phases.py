@@ -247,7 +247,7 @@ def test_forgetting_follows_a_change_of_habits() -> None:
 
 def test_refusals() -> None:
     looks, _ = simulated(0, 100.0, 1.0)
-    with pytest.raises(ConfigError, match="is no structure"):
+    with pytest.raises(ConfigError, match="unknown structure"):
         learn(looks, phases="four-state")
     with pytest.raises(ConfigError, match="invalid half life"):
         learn(looks, half_life_s=0.0)

@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import expm
 
 from evermap.errors import ConfigError, InputError, NumericalError
-from evermap.existence import phase_belief
 from evermap.existence.lifetimes import exponential_mixture_of
 from evermap.existence.one_stay import PersistenceFilter
-from evermap.existence.phase_belief import time_to_leave, time_to_return
+from evermap.existence.phase_belief import PhaseBelief
 from evermap.existence.phase_kernels import leap, transition
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks
@@ -118,11 +117,11 @@ def test_filter_is_a_sum_over_all_paths(rhythm: bool) -> None:
 
 
 @pytest.mark.parametrize("rhythm", [False, True])
-def test_asking_more_changes_no_answer_and_threads_none(rhythm: bool) -> None:
+def test_asking_more_changes_no_answer(rhythm: bool) -> None:
     model, looks = random_chain(1, rhythm=rhythm), random_looks(2, span_s=9000.0)
     few, many = 1e6 + np.array([-100.0, 300.0, 20000.0]), 1e6 + np.linspace(-100.0, 20000.0, 202)
     coarse = model.track(looks, Instants.same_for_all(3, few))
-    fine = model.track(looks, Instants.same_for_all(3, many), threads=True)
+    fine = model.track(looks, Instants.same_for_all(3, many))
     np.testing.assert_allclose(
         fine.p_present.reshape(3, -1)[:, [0, 4, 201]], coarse.p_present.reshape(3, -1), rtol=1e-9
     )
@@ -218,20 +217,20 @@ def test_an_unknown_rate_is_a_mixture_of_a_few() -> None:
         exponential_mixture_of(Weibull(10.0, 2.0))
 
 
-def believed(model: PhaseType, *phases: Any, stamp_s: float = 0.0) -> phase_belief.PhaseBelief:
+def believed(model: PhaseType, *phases: Any, stamp_s: float = 0.0) -> PhaseBelief:
     n = len(phases)
-    return phase_belief.PhaseBelief(model, np.array(phases, dtype=float), np.full(n, stamp_s), np.zeros(n))
+    return PhaseBelief(model, np.array(phases, dtype=float), np.full(n, stamp_s), np.zeros(n))
 
 
 def test_mean_times_without_a_rhythm() -> None:
     model = PhaseType.two_state(1 / 300.0, 1 / 50.0)
-    np.testing.assert_allclose(time_to_leave(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0])), [300, 300, np.nan])
-    np.testing.assert_allclose(time_to_return(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0])), [np.nan, 50, 50])
+    np.testing.assert_allclose(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0]).time_to_leave(), [300, 300, np.nan])
+    np.testing.assert_allclose(believed(model, [0.0, 1.0], [0.9, 0.1], [1.0, 0.0]).time_to_return(), [np.nan, 50, 50])
     three = PhaseType.from_mixtures(Exponential(0.1), Mixture.of([Exponential(0.1), Exponential(0.01)], [0.5, 0.5]))
-    np.testing.assert_allclose(time_to_return(believed(three, [0.1, 0.3, 0.6])), [0.25 * 10.0 + 0.75 * 100.0])
+    np.testing.assert_allclose(believed(three, [0.1, 0.3, 0.6]).time_to_return(), [0.25 * 10.0 + 0.75 * 100.0])
     gone = PhaseType.two_state(0.1, 0.0, p_present=1.0)
-    np.testing.assert_allclose(time_to_return(believed(gone, [0.5, 0.5])), [np.inf])
-    np.testing.assert_allclose(time_to_leave(believed(gone, [0.5, 0.5])), [10.0])
+    np.testing.assert_allclose(believed(gone, [0.5, 0.5]).time_to_return(), [np.inf])
+    np.testing.assert_allclose(believed(gone, [0.5, 0.5]).time_to_leave(), [10.0])
 
 
 def test_mean_times_with_a_rhythm_are_integrals_of_survival() -> None:
@@ -242,7 +241,7 @@ def test_mean_times_with_a_rhythm_are_integrals_of_survival() -> None:
     held = PhaseType(model.present, stays, np.array([2 / 3, 0, 1 / 3, 0]), model.rhythms, model.rhythm_of)
     t = at + np.arange(0.0, 6 * WEEK_S, 60.0)
     absent = 1.0 - held.track(NO_LOOKS, Instants.same_for_all(1, t)).p_present
-    found = time_to_return(believed(model, weights, stamp_s=at))
+    found = believed(model, weights, stamp_s=at).time_to_return()
     np.testing.assert_allclose(found, [np.trapezoid(absent, t)], rtol=1e-4)
 
 
@@ -251,20 +250,18 @@ def test_step_by_step_is_the_whole(rhythm: bool) -> None:
     model, looks = random_chain(11, rhythm=rhythm), random_looks(12, n=30, n_features=2)
     track = model.track(looks, Instants.same_for_all(2, [1e6 + 450.0]))
     firsts = looks.stamp_s[looks.first[:-1]]
-    state = phase_belief.init(2, model, firsts)
+    state = PhaseBelief.first(model, firsts)
     for f in range(2):
         one = looks.of(f)
         for k in range(len(one.stamp_s)):
-            state = phase_belief.update(
-                state, one.stamp_s[k], one.detected[k], one.p_miss[k], one.p_false[k], rows=np.array([f])
-            )
-    np.testing.assert_allclose(phase_belief.predict(state, 1e6 + 450.0), track.p_present, rtol=1e-11)
-    at_once = phase_belief.after(model, looks)
+            state = state.update(one.stamp_s[k], one.detected[k], one.p_miss[k], one.p_false[k], rows=np.array([f]))
+    np.testing.assert_allclose(state.predict(1e6 + 450.0), track.p_present, rtol=1e-11)
+    at_once = PhaseBelief.after(model, looks)
     np.testing.assert_allclose(at_once.phases, state.phases, rtol=1e-11)
     np.testing.assert_array_equal(at_once.stamp_s, state.stamp_s)
     np.testing.assert_allclose(state.log_evidence, track.log_evidence, rtol=1e-11)
     with pytest.raises(InputError, match=r"row 0: time 3\.0 s lies before"):
-        phase_belief.predict(state, 3.0)
+        state.predict(3.0)
 
 
 def test_a_given_start_holds_until_the_first_look() -> None:

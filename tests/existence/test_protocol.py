@@ -14,12 +14,11 @@ from hypothesis import strategies as st
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.models import model_of
 from evermap.existence.one_stay import OneStay, PersistenceFilter
-from evermap.existence.phase_belief import after as phases_after
+from evermap.existence.phase_belief import PhaseBelief
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks, PresenceModel, Track
 from evermap.existence.rhythm import BINS, WEEK_S, Rhythm
-from evermap.existence.run_length import RunLength
-from evermap.existence.run_length import after as run_length_after
+from evermap.existence.run_length import RunLength, RunLengthBelief
 from evermap.existence.sites import SiteDynamics, SiteLooks
 from evermap.sensing.sightlines import Lines
 from evermap.survival import Exponential, Gamma, LogNormal, Mixture, Weibull, never_leaves
@@ -250,6 +249,10 @@ def test_beliefs_and_tables_show_themselves_shortly() -> None:
     run_length, phases = STORED["run lengths"], STORED["two phases"]
     assert isinstance(run_length, RunLength)
     assert isinstance(phases, PhaseType)
-    beliefs = (run_length_after(run_length, many), phases_after(phases, many), PersistenceFilter(Exponential(1.0)))
+    beliefs = (
+        RunLengthBelief.after(run_length, many),
+        PhaseBelief.after(phases, many),
+        PersistenceFilter(Exponential(1.0)),
+    )
     for one in (many, run_length.track(many), *beliefs):
         assert len(repr(one)) < 1000

@@ -16,7 +16,7 @@ from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.existence.lifetimes import edges
 from evermap.existence.protocol import Instants, Looks, PresenceModel
 from evermap.existence.rhythm import BINS, Rhythm, bin_of_week
-from evermap.existence.run_length import RunLength, init, predict, update
+from evermap.existence.run_length import RunLength, RunLengthBelief
 from evermap.existence.run_length_smoothing import Lattice, lattice
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Uniform, never_leaves
 from evermap.types import FloatArray
@@ -326,7 +326,7 @@ def test_it_is_a_model_of_presence_and_is_kept_as_plain_values() -> None:
 
 @pytest.mark.parametrize("step_s", [0.0, -1.0, np.inf, np.nan])
 def test_a_step_that_is_none_is_refused(step_s: float) -> None:
-    with pytest.raises(ConfigError, match="is no step of time"):
+    with pytest.raises(ConfigError, match="is not a step of time"):
         RunLength(STAY, ABSENCE, step_s)
 
 
@@ -340,17 +340,17 @@ def test_an_impossible_look_is_named() -> None:
     looks = Looks.from_rows([0, 1, 1], [0.0, 0.0, 50.0], [1, 1, 1], 0.1, 0.0)
     with pytest.raises(NumericalError, match=r"feature 1 at 50\.0 s: this observation is impossible"):
         gone.track(looks)
-    state = init(gone, [0.0, 0.0, 0.0])
+    state = RunLengthBelief.first(gone, [0.0, 0.0, 0.0])
     with pytest.raises(NumericalError, match="row 2: this observation is impossible"):
-        update(state, 50.0, 1, 0.1, 0.0, rows=[2])
+        state.update(50.0, 1, 0.1, 0.0, rows=[2])
 
 
 BAD_LOOKS: dict[str, tuple[tuple[Any, ...], str]] = {
-    "p_miss": ((1.0, 1, [0.1, 1.1], 0.1), "p_miss.*row 1: 1.1 is no probability"),
-    "p_false": ((1.0, 1, 0.1, [np.nan, 0.1]), "p_false.*row 0: nan is no probability"),
+    "p_miss": ((1.0, 1, [0.1, 1.1], 0.1), "p_miss.*row 1: 1.1 is not a probability"),
+    "p_false": ((1.0, 1, 0.1, [np.nan, 0.1]), "p_false.*row 0: nan is not a probability"),
     "detected": ((1.0, [1, 2], 0.1, 0.1), "detected.*row 1: 2.0 is neither a detection nor a miss"),
     "back in time": (([1.0, -1.0], 1, 0.1, 0.1), "stamp_s.*row 1: time -1.0 s lies before"),
-    "no time": (([np.nan, 1.0], 1, 0.1, 0.1), "stamp_s.*row 0: time nan is no instant"),
+    "no time": (([np.nan, 1.0], 1, 0.1, 0.1), "stamp_s.*row 0: time nan is not finite"),
     "shape": ((1.0, [1, 1, 1], 0.1, 0.1), r"detected.*shape \(3,\) instead of \(2,\)"),
 }
 
@@ -358,23 +358,23 @@ BAD_LOOKS: dict[str, tuple[tuple[Any, ...], str]] = {
 @pytest.mark.parametrize("name", BAD_LOOKS)
 def test_bad_looks_are_refused_and_change_nothing(name: str) -> None:
     arguments, message = BAD_LOOKS[name]
-    state = init(RunLength(STAY, ABSENCE, 1.0), [0.0, 0.0])
+    state = RunLengthBelief.first(RunLength(STAY, ABSENCE, 1.0), [0.0, 0.0])
     before = state.weight.copy()
     with pytest.raises(InputError, match=message):
-        update(state, *arguments)
+        state.update(*arguments)
     np.testing.assert_array_equal(state.weight, before)
 
 
 def test_rows_that_do_not_exist_or_come_twice_are_refused() -> None:
-    state = init(RunLength(STAY, ABSENCE, 1.0), [0.0, 0.0])
+    state = RunLengthBelief.first(RunLength(STAY, ABSENCE, 1.0), [0.0, 0.0])
     with pytest.raises(InputError, match="row 2 of 2 does not exist"):
-        update(state, 1.0, 1, 0.1, 0.1, rows=[0, 2])
+        state.update(1.0, 1, 0.1, 0.1, rows=[0, 2])
     with pytest.raises(DataError, match="row 1 is observed twice"):
-        update(state, 1.0, 1, 0.1, 0.1, rows=[1, 1])
+        state.update(1.0, 1, 0.1, 0.1, rows=[1, 1])
     with pytest.raises(InputError, match="lies before its"):
-        predict(update(state, 5.0, 1, 0.1, 0.1), 4.0)
+        state.update(5.0, 1, 0.1, 0.1).predict(4.0)
 
 
 def test_the_first_instant_must_be_finite() -> None:
-    with pytest.raises(InputError, match="row 1: time nan is no instant"):
-        init(RunLength(Exponential(1.0), ABSENCE, 1.0), [0.0, np.nan])
+    with pytest.raises(InputError, match="row 1: time nan is not finite"):
+        RunLengthBelief.first(RunLength(Exponential(1.0), ABSENCE, 1.0), [0.0, np.nan])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from evermap.existence.one_stay import PersistenceFilter
 from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BINS, WEEK_S, Rhythm
-from evermap.existence.run_length import RunLength, RunLengthBelief, after, init, predict, update
+from evermap.existence.run_length import RunLength, RunLengthBelief
 from evermap.survival import (
     Exponential,
     Gamma,
@@ -161,25 +161,25 @@ def test_exponential_lifetimes_approach_the_two_state_chain_as_the_step_shrinks(
 def test_look_by_look_is_the_whole_at_once(name: str) -> None:
     model, looks = MODELS[name], looks_of(1)
     track = model.track(looks)
-    state = init(model, looks.stamp_s[looks.first[:-1]])
+    state = RunLengthBelief.first(model, looks.stamp_s[looks.first[:-1]])
     found = np.empty(len(looks.stamp_s))
     for row in np.argsort(looks.stamp_s, kind="stable"):  # features in turn, as a robot meets them
         feature = np.searchsorted(looks.first, row, side="right") - 1
-        predict(state, looks.stamp_s[row] + 3.0, rows=[feature])
+        state.predict(looks.stamp_s[row] + 3.0, rows=[feature])
         args = (looks.stamp_s[row], looks.detected[row], looks.p_miss[row], looks.p_false[row])
-        state = update(state, *args, rows=[feature])
+        state = state.update(*args, rows=[feature])
         found[row] = state.probability[feature]
     last = np.append((np.diff(looks.stamp_s) > 0.0) | (np.diff(looks.stamp_s) < 0.0), True)
     np.testing.assert_allclose(found[last], track.p_present[last], rtol=1e-11)
     np.testing.assert_allclose(state.log_evidence, track.log_evidence, rtol=1e-12)
     np.testing.assert_allclose(state.merged_mass, track.merged_mass, rtol=1e-9)
-    whole = after(model, looks)
+    whole = RunLengthBelief.after(model, looks)
     np.testing.assert_array_equal(whole.weight, state.weight)
     np.testing.assert_array_equal(whole.start_s, state.start_s)
     np.testing.assert_array_equal(whole.stamp_s, state.stamp_s)
     ahead = looks.stamp_s.max() + np.array([0.0, 0.3, 7.9, 300.0])
     forecasts = model.track(looks, Instants.same_for_all(5, ahead)).p_present.reshape(5, 4)
-    np.testing.assert_allclose(np.stack([predict(state, t) for t in ahead], axis=1), forecasts, rtol=1e-9)
+    np.testing.assert_allclose(np.stack([state.predict(t) for t in ahead], axis=1), forecasts, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -267,7 +267,7 @@ def test_beliefs_are_probabilities(seed: int, stay: LifetimePrior, absence: Life
     assert ((track.p_present >= 0.0) & (track.p_present <= 1.0)).all()
     assert np.isfinite(track.log_evidence).all()
     assert (track.log_evidence <= 1e-9).all()
-    state: RunLengthBelief = after(model, looks)
+    state: RunLengthBelief = RunLengthBelief.after(model, looks)
     np.testing.assert_allclose(
         [[state.weight[f, s, : state.count[f, s]].sum() for s in (0, 1)] for f in range(3)],
         np.stack([1.0 - state.probability, state.probability], axis=1),

@@ -13,11 +13,12 @@ from scipy.linalg import expm
 from scipy.special import betaln
 
 from evermap.errors import InputError
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.existence.sites import SiteBeliefs, SiteDynamics, SiteLooks
 from evermap.sensing.sightlines import Lines
 from evermap.survival import Exponential, GeneralPurpose, Weibull
 from evermap.types import FloatArray
+from evermap_studies.bateman2020 import joint
 
 from .rows import follow_sites
 
@@ -161,7 +162,7 @@ def test_one_site_and_no_return_is_the_persistence_filter(prior: Any) -> None:
     clique, stamp = rng.integers(0, n, m), np.sort(rng.uniform(0.0, 5e3, m))
     hit = rng.random(m) < 0.4
     rate = rng.uniform(0.1, 0.99, m)
-    state, posterior = single.run(single.init(n, prior), clique, stamp - since[clique], hit, 1 - rate, p_false)
+    state, posterior = single.init(n, prior).run(clique, stamp - since[clique], hit, 1 - rate, p_false)
     found = follow_sites(
         np.ones(n), np.arange(n), alone(prior, since),
         SiteLooks(stamp, clique, clique, np.arange(m), hit), certain(rate),
@@ -170,7 +171,7 @@ def test_one_site_and_no_return_is_the_persistence_filter(prior: Any) -> None:
     order = np.lexsort((stamp, clique))
     np.testing.assert_array_equal(found.trace.clique, clique[order])
     np.testing.assert_allclose(found.trace.p_exists, posterior[order], rtol=1e-12)
-    np.testing.assert_allclose(found.p_here, single.predict(state, 6e3 - since), rtol=1e-12)
+    np.testing.assert_allclose(found.p_here, state.predict(6e3 - since), rtol=1e-12)
     np.testing.assert_array_equal(found.p_stayed, found.p_here)
 
 
@@ -188,7 +189,7 @@ def test_many_landmarks_on_one_site_are_the_joint_clique_filter() -> None:
         np.ones(3), np.arange(3), alone(prior, np.zeros(3)), looks(rows), certain(1 - p_miss),
         start_s=0.0, until_s=39.0, p_false=p_false, p_occluded=0.0,
     )  # fmt: skip
-    np.testing.assert_allclose(found.p_here, single.predict(state, 39.0), rtol=1e-12)
+    np.testing.assert_allclose(found.p_here, state.predict(39.0), rtol=1e-12)
 
 
 def test_constant_hazard_and_hops_are_the_chain_of_modes() -> None:

@@ -49,10 +49,10 @@ def damaged(**fields: object) -> str:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("no json", "is no JSON"),
+        ("no json", "is not JSON"),
         ("[1]", "holds no model"),
         ('{"schema_version": 99}', "version 99"),
-        ('{"schema_version": 1, "kind": "crystal ball"}', "'crystal ball' is no kind of model"),
+        ('{"schema_version": 1, "kind": "crystal ball"}', "unknown kind of model 'crystal ball'"),
         ('{"schema_version": 1, "kind": "phase-type", "present": [true, false]}', "'rates_hz': is missing"),
         (damaged(rates_hz=[[0, -1], [1, 0]]), "rates are finite, not negative"),
         (damaged(present=3), "not what a phase-type model holds"),

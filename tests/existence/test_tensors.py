@@ -89,7 +89,7 @@ def test_what_is_refused() -> None:
     early = torch.tensor([2.0, 0.5, 2.0])
     with pytest.raises(InputError, match=r"row 1: time 0\.5 s lies before"):
         look_exponential(ones, ones, ones, early, seen, 0.5 * ones, 0.5 * ones)
-    with pytest.raises(InputError, match=r"'p_miss': row 0: 2\.0 is no probability"):
+    with pytest.raises(InputError, match=r"'p_miss': row 0: 2\.0 is not a probability"):
         look_general_purpose(ones, ones, ones, 2 * ones, ones, seen, 2 * ones, 0.5 * ones)
     with pytest.raises(NumericalError, match=r"row 0.*impossible"):
         look_exponential(ones, ones, ones, ones, seen, ones, 0 * ones)
@@ -97,7 +97,7 @@ def test_what_is_refused() -> None:
         look_general_purpose(ones, ones, 2 * ones, ones, ones, seen, 0.5 * ones, 0.5 * ones)
     with pytest.raises(InputError, match="'rate_hz': row 0"):
         look_exponential(ones, ones, -ones, ones, seen, 0.5 * ones, 0.5 * ones)
-    with pytest.raises(InputError, match=r"'p_miss'.*no tensor on cpu"):
+    with pytest.raises(InputError, match=r"'p_miss'.*not a tensor on cpu"):
         look_exponential(ones, ones, ones, ones, seen, np.ones(3), 0.5 * ones)
     with pytest.raises(InputError, match=r"'detected'.*float32"):
         look_exponential(ones, ones, ones, ones, ones, 0.5 * ones, 0.5 * ones)

@@ -120,7 +120,7 @@ def test_landmarks_at_a_time_and_within_a_box() -> None:
     assert found.landmark_id.tolist() == now.landmark_id[inside & (now.p_exists >= 0.3)].tolist()
     with pytest.raises(InputError, match="before the map's newest look"):
         living.landmarks(at=living.stamp_s - 1.0)
-    with pytest.raises(InputError, match="no box"):
+    with pytest.raises(InputError, match="not a box"):
         living.landmarks(within=(1.0, 0.0, 0.0, 1.0))
 
 

@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 from scipy.special import log_softmax
 
 from evermap.errors import DataError, InputError
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.sensing import learned
 from evermap.sensing.learned import LearnedDetection
 from evermap.sensing.profile import Assumed, Field, Profile, Projection
 from evermap.survival import Exponential
+from evermap_studies.bateman2020 import joint
 from evermap_studies.worlds.sensors import CAMERA, LIDAR, sight
 
 from .plain_learned import FACES, PlainModel, chance_in_field
@@ -112,7 +113,7 @@ def test_where_nobody_stands_in_the_way_it_is_the_joint_clique_filter():
 
         model, seen = learned.look(model, stamp_s, position, turn, detected)
         np.testing.assert_array_equal(seen.p_occluded[seen.expected > 0], 0.0)
-        ours = single.observe(ours, seen.stamp_s, seen.log_there, seen.log_gone)
+        ours = ours.observe(seen.stamp_s, seen.log_there, seen.log_gone)
         theirs = joint.jcf(theirs, stamp_s, detected, p_miss, alarm, inside > 0.0, clique)
         np.testing.assert_allclose(ours.log_odds, theirs.log_odds, rtol=1e-5, atol=1e-6)
     assert np.ptp(ours.log_odds) > 5.0

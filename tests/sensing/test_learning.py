@@ -202,7 +202,7 @@ def test_beliefs_are_right_as_often_as_they_say():
         visible = (there & ~hidden[n])[clique]
         detected = (rng.random(len(clique)) < p_detect * visible) | (rng.random(len(clique)) < alarm)
         model, seen = learned.look(model, stamp_s, position, turn, detected)
-        belief = single.observe(belief, seen.stamp_s, seen.log_there, seen.log_gone)
+        belief = belief.observe(seen.stamp_s, seen.log_there, seen.log_gone)
     looked = seen.expected > 0
     assert looked.sum() > 0.9 * count
     well_calibrated(belief.probability[looked], there[looked])

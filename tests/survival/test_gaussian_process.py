@@ -208,7 +208,7 @@ def test_without_covariates_and_a_filter_takes_it() -> None:
     hazard = gp_fit(visited(truth.sample(9, 1500), 1e4, 9)).at()
     prior = hazard.prior()
     np.testing.assert_allclose(np.exp(prior.log_survival(truth.quantile([0.2, 0.5, 0.8]))), [0.8, 0.5, 0.2], atol=0.05)
-    belief = single.predict(single.init(1, prior), 2e4)
+    belief = single.init(1, prior).predict(2e4)
     assert belief[0] == pytest.approx(math.exp(prior.log_survival(2e4)))
 
 

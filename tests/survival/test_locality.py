@@ -205,7 +205,7 @@ def test_places_without_data_are_told_with_doubt(town: Town) -> None:
         width[name] = upper - lower
     assert width["far"] > 1.5 * width["full"]
     prior = pooled.at(middle(0, 0), 1).prior()
-    belief = single.predict(single.init(1, prior), t)
+    belief = single.init(1, prior).predict(t)
     assert belief[0] == pytest.approx(math.exp(prior.log_survival(t)))
 
 

@@ -185,7 +185,7 @@ def test_a_family_of_ones_own() -> None:
 
 def test_a_filter_takes_what_was_fitted() -> None:
     prior = fit("weibull", intervals(Weibull(4.0, 1.3), 10, 1.0)).prior
-    belief = single.predict(single.init(1, prior), 2.0)
+    belief = single.init(1, prior).predict(2.0)
     assert belief[0] == pytest.approx(math.exp(prior.log_survival(2.0)))
 
 

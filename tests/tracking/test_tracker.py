@@ -127,7 +127,7 @@ def test_a_thousand_at_once_grow_the_arrays() -> None:
         ({"view": View(np.zeros(3), 9.0, lambda p: p)}, "field 'p_detect': shape (1, 3) instead of (1,)"),
         (
             {"view": View(np.zeros(3), 9.0, lambda p: 2.0 * np.ones(len(p)))},
-            "field 'p_detect': position 0: 2.0 is no probability",
+            "field 'p_detect': position 0: 2.0 is not a probability",
         ),
     ],
 )

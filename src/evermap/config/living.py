@@ -77,6 +77,10 @@ class DecisionConfig(Section):
         default=0.6,
         description="what is missed is gone if it is for the upper bound of this lifetime interval, too",
     )
+    same_place_m: Positive = Field(
+        default=0.3, description="bodies this close to where another one stood have taken its place [m]"
+    )
+    same_spot_m: Positive = Field(default=0.1, description="bodies this close to where they stood have not moved [m]")
     new_clique_p: Share = Field(default=0.9, description="belief in a new body before its sightings are counted")
     surely_away: Probability = Field(default=0.02, description="belief below which a clique may be forgotten")
     forgotten_p: Probability = Field(default=0.05, description="probability of a return below which it is forgotten")
@@ -107,6 +111,14 @@ class LifetimeConfig(Section):
     strength: Positive = Field(default=2.0, description="events that the average over classes counts for in each")
     least_ended: Count = Field(default=5, description="ends in a chunk before it has lifetimes of its own")
     sure: Share = Field(default=0.999, description="ends of stays that are more probable count as certain")
+    firmness: tuple[Positive, ...] = Field(
+        default=(1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0),
+        min_length=1,
+        description="ends that the lifetimes of a class may count for in those of a chunk; how many is learned",
+    )
+    prior_quantiles: Count = Field(default=64, description="lengths of stays that stand for a prior that a user gives")
+    prior_shortest_s: Positive = Field(default=60.0, description="shorter ones of these count as this long [s]")
+    prior_longest_s: Positive = Field(default=1.5e9, description="of longer ones of these no more is known [s]")
 
 
 class SightConfig(Section):

@@ -50,20 +50,59 @@ class Looked(NamedTuple):
     probability: Any
 
 
-def look_exponential(
+class ConstantRate(NamedTuple):
+    """Exponential lifetimes (MATH.md section 2).
+
+    Attributes:
+        rate_hz: (N,) hazard of each feature in 1/s; 0 never leaves.
+    """
+
+    rate_hz: Any
+
+
+class UnknownRate(NamedTuple):
+    """Lifetimes of unknown rate between `low_hz` and `high_hz` (N,), in 1/s (Rosen 2016 eqs. 26-29)."""
+
+    low_hz: Any
+    high_hz: Any
+
+
+class LeaveAndReturn(NamedTuple):
+    """Exponential stays and absences of features that leave and return, rates (N,) in 1/s (MATH.md section 4).
+
+    At birth the inverse odds are 0; of a feature that may have come and gone for long they are `leave_hz / return_hz`.
+    With `return_hz = 0` this is `ConstantRate`.
+    """
+
+    leave_hz: Any
+    return_hz: Any
+
+
+Rates = ConstantRate | UnknownRate | LeaveAndReturn
+_KINDS: dict[type, str] = {
+    ConstantRate: "exponential",
+    UnknownRate: "general_purpose",
+    LeaveAndReturn: "two_state",
+}
+"""Names of the formulas and kernels."""
+Parts = tuple[RowState, Rates, RowLooks]
+"""All columns of a look."""
+
+
+def look(
     before: RowState,
-    rate_hz: Any,
+    rates: Rates,
     sight: RowLooks,
     *,
     horizon_s: float = 0.0,
     out: Looked | None = None,
     threads: bool = False,
 ) -> Looked:
-    """Predict to the look, take it in, predict `horizon_s` further: exponential lifetimes (MATH.md section 2).
+    """Predict to the look, take it in, predict `horizon_s` further.
 
     Args:
         before: the features before the look.
-        rate_hz: (N,) hazard of each feature in 1/s; 0 never leaves.
+        rates: how they leave, and return.
         sight: the look.
         horizon_s: how far after the look the probability is wanted.
         out: arrays to fill; not for tensors.
@@ -73,69 +112,11 @@ def look_exponential(
         InputError: shapes, times running back, numbers out of range; the row is named.
         NumericalError: an observation that is impossible under both states.
     """
-    return _look(_Columns("exponential", before, {"rate_hz": rate_hz}, sight), horizon_s, out, threads)
-
-
-def look_general_purpose(
-    before: RowState,
-    low_hz: Any,
-    high_hz: Any,
-    sight: RowLooks,
-    *,
-    horizon_s: float = 0.0,
-    out: Looked | None = None,
-    threads: bool = False,
-) -> Looked:
-    """Look as `look_exponential` does, for lifetimes of unknown rate between `low_hz` and `high_hz` (Rosen 2016 eqs.
-    26-29).
-    """
-    rates = {"low_hz": low_hz, "high_hz": high_hz}
-    return _look(_Columns("general_purpose", before, rates, sight), horizon_s, out, threads)
-
-
-def look_two_state(
-    before: RowState,
-    leave_hz: Any,
-    return_hz: Any,
-    sight: RowLooks,
-    *,
-    horizon_s: float = 0.0,
-    out: Looked | None = None,
-    threads: bool = False,
-) -> Looked:
-    """Look as `look_exponential` does, for features that leave and return: exponential stays and absences (MATH.md
-    section 4).
-
-    At birth the inverse odds are 0; of a feature that may have come and gone for long they are
-    `leave_hz / return_hz`. With `return_hz = 0` this is `look_exponential`.
-    """
-    rates = {"leave_hz": leave_hz, "return_hz": return_hz}
-    return _look(_Columns("two_state", before, rates, sight), horizon_s, out, threads)
-
-
-class _Columns(NamedTuple):
-    """All columns of a look, and the kind of lifetimes."""
-
-    kind: str
-    before: RowState
-    rates: dict[str, Any]
-    sight: RowLooks
-
-    def by_name(self) -> dict[str, Any]:
-        return {**self.before._asdict(), **self.rates, **self.sight._asdict()}
-
-    def of(self, columns: dict[str, Any]) -> _Columns:
-        """Return the same with other columns."""
-        before, sight = ([columns[name] for name in kind._fields] for kind in (RowState, RowLooks))
-        return _Columns(self.kind, RowState(*before), {name: columns[name] for name in self.rates}, RowLooks(*sight))
-
-
-def _look(given: _Columns, horizon_s: float, out: Looked | None, threads: bool) -> Looked:
-    """The look under the lifetimes of this kind, by the kernels or by torch, whichever the columns are of."""
     if not 0.0 <= horizon_s < np.inf:
         raise InputError(f"{horizon_s} s is not a time after the look", field="horizon_s", hint="a finite number >= 0")
-    columns, torch = given.by_name(), sys.modules.get("torch")  # who has tensors has loaded it
-    if torch is not None and isinstance(given.before.inverse_odds, torch.Tensor):
+    given: Parts = (before, rates, sight)
+    columns, torch = _by_name(given), sys.modules.get("torch")  # who has tensors has loaded it
+    if torch is not None and isinstance(before.inverse_odds, torch.Tensor):
         if out is not None:
             raise InputError("is for arrays only", field="out", hint="leave it out: torch keeps memory for reuse")
         _check_tensors(columns, torch)
@@ -148,20 +129,23 @@ def _look(given: _Columns, horizon_s: float, out: Looked | None, threads: bool) 
 
     columns = _contiguous(columns)
     answer = _space(columns, out)
-    if _apply(getattr(kernels, given.kind), given.of(columns), float(horizon_s), answer, threads):
+    given = tuple(type(part)(*(columns[name] for name in part._fields)) for part in given)  # type: ignore[assignment]
+    if _apply(getattr(kernels, _KINDS[type(rates)]), given, float(horizon_s), answer, threads):
         _refuse(columns, answer.inverse_odds)
     return answer
 
 
-def _apply(kernel: Callable[..., bool], given: _Columns, horizon_s: float, answer: Looked, threads: bool) -> bool:
+def _by_name(given: Parts) -> dict[str, Any]:
+    return {name: column for part in given for name, column in part._asdict().items()}
+
+
+def _apply(kernel: Callable[..., bool], given: Parts, horizon_s: float, answer: Looked, threads: bool) -> bool:
     """Run a kernel over all rows, at once or chunk by chunk on all cores; True if it refused a row."""
     n = len(answer.probability)
 
     def chunk(rows: slice) -> bool:
-        before, rates, sight, after = (
-            [column[rows] for column in part] for part in (given.before, given.rates.values(), given.sight, answer)
-        )
-        return kernel(RowState(*before), tuple(rates), RowLooks(*sight), horizon_s, Looked(*after))
+        before, rates, sight, after = (type(part)(*(column[rows] for column in part)) for part in (*given, answer))
+        return kernel(before, rates, sight, horizon_s, after)
 
     if not threads or n <= CHUNK_ROWS:
         return chunk(slice(None))
@@ -209,7 +193,7 @@ def _check_tensors(columns: dict[str, Any], torch: Any) -> None:
     first = columns["inverse_odds"]
     for name, column in columns.items():
         if not isinstance(column, torch.Tensor) or column.device != first.device:
-            raise InputError(f"is no tensor on {first.device}", field=name, hint="all columns on one device")
+            raise InputError(f"is not a tensor on {first.device}", field=name, hint="all columns on one device")
         if column.ndim != 1 or column.shape != first.shape:
             raise InputError(f"shape {tuple(column.shape)} instead of ({first.numel()},)", field=name)
         if column.dtype not in ((torch.bool,) if name == "detected" else (torch.float32, torch.float64)):
@@ -234,7 +218,7 @@ def _refuse(columns: dict[str, Any], after: FloatArray) -> None:
     odds = columns["inverse_odds"]
     if not (odds >= 0.0).all():
         row = int(np.argmin(odds >= 0.0))
-        raise InputError(f"row {row}: {odds[row]} are no inverse odds", field="inverse_odds", hint="a number >= 0")
+        raise InputError(f"row {row}: {odds[row]} are not inverse odds", field="inverse_odds", hint="a number >= 0")
     checks.check_possible(after)
     raise NumericalError("a row was refused for no reason that can be found")
 
@@ -243,10 +227,11 @@ Tensor = Any
 """A `torch.Tensor`; torch need not be installed where types are checked."""
 
 
-def _look_at_tensors(given: _Columns, horizon_s: float) -> tuple[Tensor, Tensor, bool]:
+def _look_at_tensors(given: Parts, horizon_s: float) -> tuple[Tensor, Tensor, bool]:
     """Inverse odds, probability, and whether a row was refused."""
-    kind, sight, rates, like = given.kind, given.sight, given.rates.values(), given.before.inverse_odds
-    columns = [*given.before, *rates, *sight]
+    before, rates, sight = given
+    kind, like = _KINDS[type(rates)], before.inverse_odds
+    columns = [*before, *rates, *sight]
     if kind == "general_purpose":
         columns = [column if column.dtype == sight.detected.dtype else column.double() for column in columns]
     formulas = _formulas(columns[0].element_size() == 8)

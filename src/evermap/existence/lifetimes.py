@@ -29,8 +29,8 @@ DOUBLINGS = 24
 """Of age, in a table of phases: from a thousandth of the fastest change to some thousands of the slowest phase."""
 WIDE = 1.01
 """Ratio of highest to lowest rate above which the kernel of the unknown-rate prior keeps ten digits."""
-CERTAIN = 700.0
-"""Integrated hazard that nobody survives."""
+CERTAIN = 800.0
+"""Integrated hazard that nobody survives: e^-800 is 0."""
 
 
 class Lifetimes(NamedTuple):
@@ -193,8 +193,6 @@ PER_DOUBLING = 64
 DOUBLINGS_BELOW = 3
 """The first bin is a step divided by eight or more."""
 DOUBLINGS_ABOVE = 25
-CERTAIN = 800.0
-"""Integrated hazard of a bin that nobody leaves alive: e^-800 is 0."""
 
 
 class HazardTable(NamedTuple):

@@ -98,7 +98,7 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     names = list(KINDS) if kinds is None else list(kinds)
     for name in names:
         if name not in KINDS:
-            raise ConfigError(f"'{name}' is no kind of model", field="kind", hint=f"one of {', '.join(KINDS)}")
+            raise ConfigError(f"unknown kind of model '{name}'", field="kind", hint=f"one of {', '.join(KINDS)}")
     if kinds is None and last - first < WEEKS_FOR_A_RHYTHM * WEEK_S:
         names = [name for name in names if "rhythm" not in name]
     if len(names) == 1:
@@ -239,11 +239,11 @@ def read_model_file(path: str | Path) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
     except UnicodeDecodeError as error:
-        raise InputError("is no text", path=path) from error
+        raise InputError("is not text", path=path) from error
     except json.JSONDecodeError as error:
-        raise InputError(f"is no JSON: {error.msg}", path=path, line=error.lineno) from error
+        raise InputError(f"is not JSON: {error.msg}", path=path, line=error.lineno) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"is no JSON of a model: {error}", path=path) from error
+        raise InputError(f"is not JSON of a model: {error}", path=path) from error
     if not isinstance(data, dict):
         raise InputError("holds no model of presence", path=path)
     version = data.get("schema_version")
@@ -266,7 +266,7 @@ def model_of(data: Any) -> PresenceModel:
     """
     kind = data.get("kind") if isinstance(data, dict) else None
     if not isinstance(kind, str) or kind not in CLASSES:
-        raise InputError(f"{kind!r} is no kind of model", field="kind", hint=", ".join(sorted(CLASSES)))
+        raise InputError(f"unknown kind of model {kind!r}", field="kind", hint=", ".join(sorted(CLASSES)))
     module, name = CLASSES[kind]
     try:
         return cast("PresenceModel", getattr(import_module(module), name).from_dict(data))

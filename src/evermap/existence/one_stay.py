@@ -109,9 +109,9 @@ class PersistenceFilter(Shown):
         """What was wrong with an update that is refused."""
         for value, field in ((p_miss, "p_miss"), (p_false, "p_false")):
             if not 0.0 <= value <= 1.0:
-                return InputError(f"{value} is no probability", field=field, hint="a number between 0 and 1")
+                return InputError(f"{value} is not a probability", field=field, hint="a number between 0 and 1")
         if not isfinite(stamp_s):
-            return InputError(f"time {stamp_s} is no instant", field="stamp_s", hint="a finite time")
+            return InputError(f"time {stamp_s} is not finite", field="stamp_s", hint="a finite time")
         past = f"the last observation at {self._stamp} s" if self._stamp else "the feature's birth at 0"
         return InputError(f"time {stamp_s} s lies before {past}", field="stamp_s", hint="sort by time")
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import prange
 
-from evermap.existence.elementary import inlined, kernel, parallel_kernel
+from evermap.existence.elementary import inlined, kernel
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -290,29 +289,6 @@ def track_all(
     p_present, evidence, bads = np.empty(len(asked_s)), np.zeros(features), np.full(features, -1)
     beliefs = np.empty((features, chain.present.size))
     for f in range(features):
-        a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
-        own = PhaseLooks(stamp_s[a:b], there[a:b], gone[a:b])
-        evidence[f], bad = track_feature(chain, beginning, own, asked_s[c:d], p_present[c:d], beliefs[f])
-        bads[f] = a + bad if bad >= 0 else -1
-    return p_present, evidence, beliefs, bads
-
-
-@parallel_kernel
-def track_all_parallel(
-    chain: Any,
-    beginning: Beginning,
-    first_look: IntArray,
-    looks: PhaseLooks,
-    first_asked: IntArray,
-    asked_s: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
-    """Return `track_all`, the features spread over all threads."""
-    # arrays of its own, taken out of tuples: what is written to others, a parallel loop takes for dead
-    stamp_s, there, gone = looks
-    features = len(first_look) - 1
-    p_present, evidence, bads = np.empty(len(asked_s)), np.zeros(features), np.full(features, -1)
-    beliefs = np.empty((features, chain.present.size))
-    for f in prange(features):
         a, b, c, d = first_look[f], first_look[f + 1], first_asked[f], first_asked[f + 1]
         own = PhaseLooks(stamp_s[a:b], there[a:b], gone[a:b])
         evidence[f], bad = track_feature(chain, beginning, own, asked_s[c:d], p_present[c:d], beliefs[f])

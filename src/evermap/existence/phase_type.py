@@ -62,7 +62,7 @@ def structure_of(name: str) -> Structure:
         return hyperexponential(1, 2, name)
     if parts := re.fullmatch(r"([1-6])\+([1-6])", name):
         return hyperexponential(int(parts[1]), int(parts[2]))
-    raise ConfigError(f"'{name}' is no structure", field="phases", hint="auto, two-state, three-phase, or 2+2 to 6+6")
+    raise ConfigError(f"unknown structure '{name}'", field="phases", hint="auto, two-state, three-phase, or 2+2 to 6+6")
 
 
 _ENDLESS = 100
@@ -171,34 +171,26 @@ class PhaseType(Shown):
         """Number of phases."""
         return len(self.present)
 
-    def track(self, looks: Looks, instants: Instants | None = None, *, threads: bool = False) -> Track:
+    def track(self, looks: Looks, instants: Instants | None = None) -> Track:
         """Filter every feature's looks in one compiled pass; see `PresenceModel.track`.
-
-        Args:
-            looks: what was seen and missed.
-            instants: when presence is asked for; at the looks where None.
-            threads: spread the features over all threads.
 
         Raises:
             NumericalError: a look that is impossible, whether the feature is there or not.
         """
         asked = Instants.of_looks(looks) if instants is None else instants
-        p_present, evidence, _ = self.filtered(looks, asked, threads=threads)
+        p_present, evidence, _ = self.filtered(looks, asked)
         return Track(p_present, evidence, np.zeros(looks.n_features))
 
-    def filtered(
-        self, looks: Looks, asked: Instants, *, threads: bool = False
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return presence at the instants, (F,) evidence, and (F, n) phases at the last look or instant of each
-        feature.
-        """
+    def filtered(self, looks: Looks, asked: Instants) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return presence at the instants, (F,) evidence, and (F, n) phases at each feature's last look or instant."""
         from evermap.existence import phase_kernels
 
         there, gone = looks.likelihoods()
-        run = phase_kernels.track_all_parallel if threads else phase_kernels.track_all
         beginning = phase_kernels.Beginning(self._starts, self.start is not None)
         columns = phase_kernels.PhaseLooks(looks.stamp_s, there, gone)
-        p_present, evidence, last, bad = run(self.chain, beginning, looks.first, columns, asked.first, asked.stamp_s)
+        p_present, evidence, last, bad = phase_kernels.track_all(
+            self.chain, beginning, looks.first, columns, asked.first, asked.stamp_s
+        )
         for row in bad[bad >= 0][:1]:
             raise looks.impossible(int(row))
         return p_present, evidence, last

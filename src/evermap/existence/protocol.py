@@ -52,6 +52,19 @@ def as_rows(values: Any, n: int, field: str) -> FloatArray:
     return np.full(n, float(array))
 
 
+def as_instants(stamp_s: Any, last_s: float = -np.inf) -> FloatArray:
+    """Return (T,) instants, finite, in order, and none before `last_s`.
+
+    Raises:
+        InputError: others.
+    """
+    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
+    if (np.diff(time) < 0.0).any():
+        raise InputError("the instants asked for are not in order of time", field="stamp_s", hint="sort them")
+    check_times(time, np.full(len(time), last_s), noun="instant")
+    return time
+
+
 def _first(wrong: BoolArray, rows: IntArray | None) -> tuple[int, int] | None:
     """Position of the first offender in the arrays, and the row it stands for."""
     where = np.flatnonzero(wrong)
@@ -66,14 +79,14 @@ def check_probability(values: FloatArray, field: str, rows: IntArray | None = No
     if first := _first(~((values >= 0.0) & (values <= 1.0)), rows):
         position, row = first
         raise InputError(
-            f"{noun} {row}: {values[position]} is no probability", field=field, hint="a number between 0 and 1"
+            f"{noun} {row}: {values[position]} is not a probability", field=field, hint="a number between 0 and 1"
         )
 
 
 def check_log_likelihood(values: FloatArray, field: str, rows: IntArray | None = None) -> None:
     """Raise `InputError` unless all of `values` are numbers; an infinity is a certainty."""
     if first := _first(np.isnan(values), rows):
-        raise InputError(f"row {first[1]}: nan is no log-likelihood", field=field, hint="a number, or an infinity")
+        raise InputError(f"row {first[1]}: nan is not a log-likelihood", field=field, hint="a number, or an infinity")
 
 
 def check_detected(values: FloatArray, rows: IntArray | None = None, noun: str = "row") -> None:
@@ -89,7 +102,7 @@ def check_times(time_s: FloatArray, last_s: FloatArray, rows: IntArray | None = 
     """Raise `InputError` unless every time is finite and not before the row's last observation."""
     if first := _first(~np.isfinite(time_s), rows):
         position, row = first
-        raise InputError(f"{noun} {row}: time {time_s[position]} is no instant", field="stamp_s", hint="a finite time")
+        raise InputError(f"{noun} {row}: time {time_s[position]} is not finite", field="stamp_s", hint="a finite time")
     if first := _first(time_s < last_s, rows):
         position, row = first
         past = "its birth" if last_s[position] == 0.0 else f"its last observation at {last_s[position]} s"
@@ -120,24 +133,6 @@ def check_looks(
     check_detected(detected, rows)
     check_probability(p_miss, "p_miss", rows)
     check_probability(p_false, "p_false", rows)
-
-
-def as_looks(
-    stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, last_s: FloatArray, rows: IntArray | None = None
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return looks at as many rows as `last_s` has: their times, and their likelihoods if the feature is there and if
-    not.
-
-    Raises:
-        InputError: shapes, or numbers that `check_looks` refuses.
-    """
-    n = len(last_s)
-    time, hit, miss, false = (
-        as_rows(column, n, field)
-        for column, field in ((stamp_s, "stamp_s"), (detected, "detected"), (p_miss, "p_miss"), (p_false, "p_false"))
-    )
-    check_looks(time, hit, miss, false, last_s, rows)
-    return time, *likelihoods(hit, miss, false)
 
 
 def likelihoods(detected: FloatArray, p_miss: FloatArray, p_false: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -234,17 +229,11 @@ class Looks(Shown):
             InputError: shapes, an index, a time or a probability that cannot be; the row is named, counted from 0.
         """
         index, order, first = _grouped(feature, n_features)
-        m = len(index)
-        columns = []
-        for name, values in (("stamp_s", stamp_s), ("detected", detected), ("p_miss", p_miss), ("p_false", p_false)):
-            columns.append(_column(values, m, name))
-        time, hit, miss, false = columns
-        _require(np.isfinite(time), time, "stamp_s", "is no instant", "a finite time")
-        _require((hit == 0.0) | (hit == 1.0), hit, "detected", "is neither a detection nor a miss", "1 or 0")
-        for name, values in (("p_miss", miss), ("p_false", false)):
-            _require((values >= 0.0) & (values <= 1.0), values, name, "is no probability", "a number between 0 and 1")
+        columns = {"stamp_s": stamp_s, "detected": detected, "p_miss": p_miss, "p_false": p_false}
+        time, hit, miss, false = (as_rows(values, len(index), name) for name, values in columns.items())
+        check_looks(time, hit, miss, false, np.full(len(index), -np.inf))
         order = order[np.lexsort((time[order], index[order]))]
-        return cls(first, *(np.ascontiguousarray(column[order]) for column in columns))
+        return cls(first, *(np.ascontiguousarray(column[order]) for column in (time, hit, miss, false)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,10 +260,7 @@ class Instants(Shown):
         Raises:
             InputError: times that are not finite or not in order.
         """
-        time = np.array(stamp_s, dtype=np.float64).reshape(-1)
-        _require(np.isfinite(time), time, "stamp_s", "is no instant", "a finite time")
-        if (np.diff(time) < 0.0).any():
-            raise InputError("the instants asked for are not in order of time", field="stamp_s", hint="sort them")
+        time = as_instants(stamp_s)
         return cls(np.arange(n_features + 1) * len(time), np.tile(time, n_features))
 
 
@@ -333,21 +319,3 @@ def _grouped(feature: Any, n_features: int | None) -> tuple[IntArray, IntArray, 
         raise InputError(f"row {wrong[0]}: feature {index[wrong[0]]} of {count} does not exist", field="feature")
     first = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))]).astype(np.int64)
     return index, np.argsort(index, kind="stable"), first
-
-
-def _column(values: Any, m: int, name: str) -> FloatArray:
-    """A column of M numbers; a scalar serves all rows."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError("not numbers", field=name) from error
-    if array.ndim and array.shape != (m,):
-        raise InputError(f"shape {array.shape} instead of ({m},)", field=name)
-    return np.broadcast_to(array, (m,))
-
-
-def _require(fine: Any, values: FloatArray, field: str, problem: str, hint: str) -> None:
-    """Raise an error that names the first row which is not fine."""
-    if not fine.all():
-        row = int(np.argmin(fine))
-        raise InputError(f"row {row}: {values[row]} {problem}", field=field, hint=hint)

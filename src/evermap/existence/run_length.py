@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from evermap.errors import ConfigError, InputError, NumericalError
+from evermap.errors import ConfigError, NumericalError
 from evermap.existence import protocol as checks
+from evermap.existence.belief import RecurrentBeliefs
 from evermap.existence.lifetimes import HazardTable, Lifetimes, bins_of, edges, proportional, tabulate
 from evermap.existence.protocol import Instants, Looks, Track, impossible
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
@@ -58,7 +59,7 @@ class RunLength(Shown):
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_s < np.inf:
-            raise ConfigError(f"{self.step_s} s is no step of time", field="step_s", hint="a positive number")
+            raise ConfigError(f"{self.step_s} s is not a step of time", field="step_s", hint="a positive number")
         if self.hypotheses < 8:
             raise ConfigError(f"{self.hypotheses} hypotheses are too few", field="hypotheses", hint="8 or more")
         if self.hypotheses > _MOST_HYPOTHESES:
@@ -205,7 +206,7 @@ def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class RunLengthBelief(Shown):
+class RunLengthBelief(RecurrentBeliefs):
     """Beliefs about N features, one row each; state `s` is 0 absent, 1 present.
 
     Attributes:
@@ -226,9 +227,6 @@ class RunLengthBelief(Shown):
     log_evidence: FloatArray
     merged_mass: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.stamp_s)
-
     @property
     def rows(self) -> BeliefRows:
         """The same as the kernels want it."""
@@ -243,168 +241,88 @@ class RunLengthBelief(Shown):
         held = np.arange(self.weight.shape[2]) < self.count[:, PRESENT, None]
         return np.asarray(self.weight[:, PRESENT].sum(axis=1, where=held).clip(0.0, 1.0), dtype=np.float64)
 
+    @classmethod
+    def _first(cls, model: RunLength, time: FloatArray) -> Self:
+        from evermap.existence.run_length_kernels import RunHypotheses, begin_rows
 
-def init(model: RunLength, stamp_s: Any) -> RunLengthBelief:
-    """Return beliefs about features that are heard of for the first time.
+        n = len(time)
+        start, weight = np.zeros((2, n, 2, model.slots))
+        count = np.zeros((n, 2), dtype=np.int64)
+        begin_rows(RunHypotheses(start, weight, count), time, model.first)
+        return cls(model, start, weight, count, time, np.zeros(n), np.zeros(n))
 
-    Args:
-        model: how they come and go.
-        stamp_s: (N,) when, on one clock.
+    @classmethod
+    def _after(cls, model: RunLength, looks: Looks, ends_s: FloatArray) -> Self:
+        from evermap.existence.run_length_kernels import LookColumns, look_rows
 
-    Raises:
-        InputError: an instant that is not finite.
-    """
-    from evermap.existence.run_length_kernels import RunHypotheses, begin_rows
+        state = cls._first(model, ends_s[0])
+        rows = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+        there, gone = looks.likelihoods()
+        bad = look_rows(rows, state.rows, LookColumns(looks.stamp_s, gone, there), model.law)
+        if bad >= 0:
+            raise looks.impossible(bad)
+        return state
 
-    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
-    n = len(time)
-    checks.check_times(time, np.full(n, -np.inf))
-    start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, 2, model.slots))
-    count = np.zeros((n, 2), dtype=np.int64)
-    begin_rows(RunHypotheses(start, weight, count), time, model.first)
-    return RunLengthBelief(model, start, weight, count, time, np.zeros(n), np.zeros(n))
+    def _presence(self, index: IntArray, time: FloatArray) -> FloatArray:
+        from evermap.existence.run_length_kernels import predict_rows
 
+        belief = np.empty(len(index))
+        predict_rows(index, self.rows, time, self.model.law, belief)
+        return belief
 
-def predict(state: RunLengthBelief, stamp_s: Any, *, rows: Any = None) -> FloatArray:
-    """Return the probability that each feature is present at `stamp_s`; the state stays as it is.
+    def _looked(self, index: IntArray, time: FloatArray, there: FloatArray, gone: FloatArray) -> Self:
+        from evermap.existence.run_length_kernels import LookColumns, look_rows
 
-    Args:
-        state: beliefs about N features.
-        stamp_s: scalar, (N,) or (len(rows),) instants, none before the row's last.
-        rows: row numbers asked about; all where None.
+        names = ("start_s", "weight", "count", "stamp_s", "log_evidence", "merged_mass")
+        after = replace(self, **{name: getattr(self, name).copy() for name in names})
+        bad = look_rows(index, after.rows, LookColumns(time, gone, there), self.model.law)
+        if bad >= 0:
+            raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
+        return after
 
-    Raises:
-        InputError: an instant that is not finite or lies before the last look.
-    """
-    from evermap.existence.run_length_kernels import predict_rows
+    def _mean_time(self, present: bool) -> FloatArray:
+        """The mean residual life `int S(a + t) dt / S(a)` over what is believed of the age `a`.
 
-    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state), twice=True)
-    time = checks.as_rows(stamp_s, len(index), "stamp_s")
-    checks.check_times(time, state.stamp_s[index], index)
-    belief = np.empty(len(index))
-    predict_rows(index, state.rows, time, state.model.law, belief)
-    return belief
+        With a rhythm, a numerical integral over the coming weeks.
+        """
+        which, law = int(present), self.model.law
+        if law.factor.shape[1] > 1:
+            from evermap.existence.run_length_kernels import remaining_rows
 
+            left = np.empty(len(self))
+            remaining_rows(self.rows, which, law, WEEKS, left)
+            return left
+        held = np.arange(self.weight.shape[2]) < self.count[:, which, None]
+        weight = np.where(held, self.weight[:, which], 0.0)
+        age = np.where(held, self.stamp_s[:, None] - self.start_s[:, which], 0.0)
+        life = residual_life(self.model.tables[which], age)
+        total = weight.sum(axis=1)
+        mean = (weight * np.where(weight > 0.0, life, 0.0)).sum(axis=1) / np.where(total > 0.0, total, 1.0)
+        return np.where(total > 0.0, mean, np.nan)
 
-def update(
-    state: RunLengthBelief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, *, rows: Any = None
-) -> RunLengthBelief:
-    """Return beliefs after one look at each feature.
+    def p_lasts(self, stamp_s: Any, *, present: bool = True) -> FloatArray:
+        """Return the probability that what is there now is still there, without a break, at instants ahead.
 
-    Args:
-        state: beliefs about N features.
-        stamp_s: scalar, (N,) or (len(rows),) instants of the looks.
-        detected: 1 or 0, of the same shape.
-        p_miss: `P(no detection | there)`, of the same shape.
-        p_false: `P(detection | not there)`, of the same shape.
-        rows: the rows looked at, each once; all where None.
+        Args:
+            stamp_s: (T,) instants in order, none before any row's last.
+            present: False asks of what is away now whether it has not returned.
 
-    Raises:
-        InputError: a probability outside [0, 1], time running back, or a row that does not exist.
-        DataError: a row twice.
-        NumericalError: a look that is impossible under both states.
-    """
-    from evermap.existence.run_length_kernels import LookColumns, look_rows
+        Returns:
+            (N, T) probabilities; NaN where the feature is certainly not in this state.
 
-    index = np.arange(len(state)) if rows is None else checks.check_rows(rows, len(state))
-    time, there, gone = checks.as_looks(stamp_s, detected, p_miss, p_false, state.stamp_s[index], index)
-    after = replace(
-        state,
-        start_s=state.start_s.copy(),
-        weight=state.weight.copy(),
-        count=state.count.copy(),
-        stamp_s=state.stamp_s.copy(),
-        log_evidence=state.log_evidence.copy(),
-        merged_mass=state.merged_mass.copy(),
-    )
-    bad = look_rows(index, after.rows, LookColumns(time, gone, there), state.model.law, np.empty(len(index)))
-    if bad >= 0:
-        raise NumericalError(impossible(f"row {index[bad]}"), hint="P_M and P_F strictly between 0 and 1")
-    return after
+        Raises:
+            InputError: an instant that is not finite, out of order, or before a row's last.
+        """
+        from evermap.existence.run_length_kernels import lasting_rows
+
+        time = checks.as_instants(stamp_s, self.stamp_s.max(initial=-np.inf))
+        out = np.empty((len(self), len(time)))
+        lasting_rows(self.rows, int(present), time, self.model.law, out)
+        return out
 
 
 WEEKS = 8
 """How far ahead a rhythm is followed; what lasts longer goes on as in the last of these weeks."""
-
-
-def after(model: RunLength, looks: Looks) -> RunLengthBelief:
-    """Return beliefs after all looks, one row a feature; what was never looked at is heard of at the last look of all.
-
-    Args:
-        model: how features come and go.
-        looks: at F features.
-
-    Raises:
-        InputError: no look at all.
-        NumericalError: a look that is impossible under both states.
-    """
-    from evermap.existence.run_length_kernels import LookColumns, look_rows
-
-    if not len(looks.stamp_s):
-        raise InputError("there is no look", field="looks", hint="init(), which needs none")
-    number = np.diff(looks.first)
-    looked = number > 0
-    began = np.full(looks.n_features, looks.stamp_s.max())
-    began[looked] = looks.stamp_s[looks.first[:-1][looked]]
-    state = init(model, began)
-    rows = np.repeat(np.arange(looks.n_features), number)
-    there, gone = looks.likelihoods()
-    bad = look_rows(rows, state.rows, LookColumns(looks.stamp_s, gone, there), model.law, np.empty(len(rows)))
-    if bad >= 0:
-        raise looks.impossible(bad)
-    return state
-
-
-def time_to_leave(state: RunLengthBelief) -> FloatArray:
-    """Return the expected time until each feature leaves, if it is there.
-
-    Returns:
-        (N,) seconds from `state.stamp_s` on: the mean residual life `int S(a + t) dt / S(a)` over what is believed of
-        the age `a`; `inf` where some stay for ever, NaN where the feature is certainly away. With a rhythm, a numerical
-        integral over the coming weeks.
-    """
-    return _time_to_change(state, PRESENT)
-
-
-def time_to_return(state: RunLengthBelief) -> FloatArray:
-    """Return the expected time until each feature returns, if it is away; as `time_to_leave`.
-
-    Returns:
-        (N,) seconds from `state.stamp_s` on; `inf` where some never return, NaN where the feature is certainly there.
-    """
-    return _time_to_change(state, ABSENT)
-
-
-def p_stays(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
-    """Return the probability that a feature which is there now is still there, without a break, at instants ahead.
-
-    Args:
-        state: beliefs about N features.
-        stamp_s: (T,) instants in order, none before any row's last.
-
-    Returns:
-        (N, T) probabilities; NaN where the feature is certainly away.
-
-    Raises:
-        InputError: an instant that is not finite, out of order, or before a row's last.
-    """
-    return _lasts(state, stamp_s, PRESENT)
-
-
-def p_stays_away(state: RunLengthBelief, stamp_s: Any) -> FloatArray:
-    """Return the probability that a feature which is away now has not returned at instants ahead; as `p_stays`.
-
-    Args:
-        state: beliefs about N features.
-        stamp_s: (T,) instants in order, none before any row's last.
-
-    Returns:
-        (N, T) probabilities; NaN where the feature is certainly there.
-
-    Raises:
-        InputError: an instant that is not finite, out of order, or before a row's last.
-    """
-    return _lasts(state, stamp_s, ABSENT)
 
 
 def residual_life(table: HazardTable, age_s: FloatArray) -> FloatArray:
@@ -437,34 +355,3 @@ def _through_bin(hazard: Any, width: Any, beyond: Any) -> Any:
     x = hazard * width
     spent = width * np.where(x > 1e-9, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
     return spent + np.exp(-x) * beyond
-
-
-def _time_to_change(state: RunLengthBelief, which: int) -> FloatArray:
-    """Expected time that the present state lasts, given that it is `which`."""
-    law = state.model.law
-    if law.factor.shape[1] > 1:
-        from evermap.existence.run_length_kernels import remaining_rows
-
-        left = np.empty(len(state))
-        remaining_rows(state.rows, which, law, WEEKS, left)
-        return left
-    held = np.arange(state.weight.shape[2]) < state.count[:, which, None]
-    weight = np.where(held, state.weight[:, which], 0.0)
-    age = np.where(held, state.stamp_s[:, None] - state.start_s[:, which], 0.0)
-    life = residual_life(state.model.tables[which], age)
-    total = weight.sum(axis=1)
-    mean = (weight * np.where(weight > 0.0, life, 0.0)).sum(axis=1) / np.where(total > 0.0, total, 1.0)
-    return np.where(total > 0.0, mean, np.nan)
-
-
-def _lasts(state: RunLengthBelief, stamp_s: Any, which: int) -> FloatArray:
-    """Probability that nothing changes before instants ahead, given that the present state is `which`."""
-    from evermap.existence.run_length_kernels import lasting_rows
-
-    time = np.array(stamp_s, dtype=np.float64).reshape(-1)
-    if (np.diff(time) < 0.0).any():
-        raise InputError("the instants asked for are not in order of time", field="stamp_s", hint="sort them")
-    checks.check_times(time, np.full(len(time), state.stamp_s.max(initial=-np.inf)), noun="instant")
-    out = np.empty((len(state), len(time)))
-    lasting_rows(state.rows, which, time, state.model.law, out)
-    return out

@@ -370,7 +370,7 @@ def track(
 
 
 @kernel
-def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law, belief: FloatArray) -> int:
+def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law) -> int:
     """Return one look at each of many features, in place; the first row that is impossible under both states, or -1."""
     everyone, now_s, evidence, moved = state
     stamp_s, absent, present = looks
@@ -385,7 +385,6 @@ def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law, b
         now_s[f] = now
         moved[f] += mass
         evidence[f] += np.log(likelihood)
-        belief[i] = min(_sum(held.weight, 1, held.number[1]), 1.0)
     return -1
 
 

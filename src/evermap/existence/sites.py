@@ -178,7 +178,9 @@ def _check_sites(
             raise InputError(f"clique {row}: {total[row]} is more than 1 in sum", field=field)
     for field, stamps in (("since_s", dynamics.since_s), ("away_since_s", dynamics.away_since_s), ("start_s", start_s)):
         if not np.isfinite(stamps).all():
-            raise InputError(f"row {int(np.argmin(np.isfinite(stamps)))}: no instant", field=field, hint="finite times")
+            raise InputError(
+                f"row {int(np.argmin(np.isfinite(stamps)))}: not a finite time", field=field, hint="finite times"
+            )
     wrong = np.flatnonzero(clique_of_site[looks.site] != looks.clique)
     if wrong.size:
         raise InputError(f"row {wrong[0]}: site {looks.site[wrong[0]]} is of another clique", field="site")
@@ -193,18 +195,18 @@ def _check_sensor(sensor: SiteSensor) -> None:
     lines, p_false, p_occluded, occluded_s, _ = sensor
     checks.check_probability(np.asarray(lines.p_free, dtype=np.float64), "p_free")
     if not 0.0 < p_false < 1.0:
-        raise InputError(f"{p_false} is no probability between 0 and 1", field="p_false")
+        raise InputError(f"{p_false} is not a probability between 0 and 1, both excluded", field="p_false")
     if not 0.0 <= lines.p_blocked < 1.0:
-        raise InputError(f"{lines.p_blocked} is no probability below 1", field="p_blocked")
+        raise InputError(f"{lines.p_blocked} is not a probability below 1", field="p_blocked")
     if not 0.0 <= p_occluded < 1.0:
-        raise InputError(f"{p_occluded} is no probability below 1", field="p_occluded")
+        raise InputError(f"{p_occluded} is not a probability below 1", field="p_occluded")
     if not 0.0 <= occluded_s < np.inf:
-        raise InputError(f"{occluded_s} s is no time", field="occluded_s")
+        raise InputError(f"{occluded_s} s is not a duration", field="occluded_s")
     for field, counts in (("hits", lines.hits), ("misses", lines.misses)):
         good = np.isfinite(counts) & (np.asarray(counts) > 0.0)
         if not good.all():
             row = int(np.argmin(good))
-            raise InputError(f"row {row}: {counts[row]} is no pseudo count", field=field, hint="a number above 0")
+            raise InputError(f"row {row}: {counts[row]} is not a pseudo count", field=field, hint="a number above 0")
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,16 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from evermap.config import DecisionConfig
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.store.protocol import MapStore
 from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
-SAME_PLACE_M = 0.3
-"""Cliques that stand this close to where another stood have taken its place."""
-SAME_SPOT_M = 0.1
-"""Cliques that stand this close to where they stood have not moved."""
+USUAL = DecisionConfig()
 ToldBySession = tuple[Sequence[MapChange], bool]
 """Changes that a session told, and whether they are undone."""
 _COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
@@ -114,7 +112,9 @@ def told_between(store: MapStore, a: int, b: int) -> list[ToldBySession]:
     return [*back, *((store.changes(number), False) for number in new[common:])]
 
 
-def net(sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap) -> tuple[MapChange, ...]:
+def net(
+    sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap, settings: DecisionConfig = USUAL
+) -> tuple[MapChange, ...]:
     """Return the net effect of what sessions told one after the other.
 
     What one session told is returned as it is, and so is a change of landmarks of which no other is told. Of several
@@ -126,6 +126,7 @@ def net(sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap) -> tuple[
         sessions: the changes that each told, and whether they are undone.
         a: the map before them; its ids mean the same as those of `b`.
         b: the map after them.
+        settings: what is the same place.
     """
     if len(sessions) == 1 and not sessions[0][1]:
         return tuple(sessions[0][0])
@@ -149,10 +150,10 @@ def net(sessions: Sequence[ToldBySession], a: LivingMap, b: LivingMap) -> tuple[
         if forth and len(path) == 1 and len(names) == len(only.landmark_ids):
             found.append(only)
             continue
-        change = _composed(path, tuple(names), a, b)
+        change = _composed(path, tuple(names), (a, b), settings.same_spot_m)
         if change is not None and (forth or _possible(change.kind, before, after)):
             found.append(change)
-    return with_swaps(found, a, b) if len({one.session for one in told}) > 1 else tuple(found)
+    return with_swaps(found, a, b, settings) if len({one.session for one in told}) > 1 else tuple(found)
 
 
 def grown(known: IntArray, b: LivingMap, changes: Iterable[MapChange]) -> IntArray:
@@ -178,7 +179,9 @@ def motion_of(was_m: FloatArray, now_m: FloatArray) -> tuple[FloatArray, float]:
     return shift, float(rigid(was_m, now_m)[2]) if len(was_m) > 1 else 0.0
 
 
-def with_swaps(found: Sequence[MapChange], before: LivingMap, after: LivingMap) -> tuple[MapChange, ...]:
+def with_swaps(
+    found: Sequence[MapChange], before: LivingMap, after: LivingMap, settings: DecisionConfig = USUAL
+) -> tuple[MapChange, ...]:
     """Return changes in which two moves to each other's place are one exchange, or of identities."""
     then, now = before.landmarks(), after.landmarks()
 
@@ -194,7 +197,7 @@ def with_swaps(found: Sequence[MapChange], before: LivingMap, after: LivingMap) 
         for b in moved:
             if a < b and a not in swapped and b not in swapped:
                 across = max(np.linalg.norm(is_at[a] - was[b]), np.linalg.norm(is_at[b] - was[a]))
-                if across < SAME_PLACE_M:
+                if across < settings.same_place_m:
                     swapped[a] = b
     partners = set(swapped.values())
     return tuple(
@@ -216,7 +219,9 @@ def _exchanged(change: MapChange, other: MapChange) -> MapChange:
     )
 
 
-def _composed(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> MapChange | None:
+def _composed(
+    path: Sequence[Told], names: tuple[int, ...], maps: tuple[LivingMap, LivingMap], same_spot_m: float
+) -> MapChange | None:
     """The net effect of changes of the same landmarks; None for none."""
     first, last = path[0], path[-1]
     came, goes = [k for k, one in enumerate(path) if one.comes], last.goes
@@ -226,13 +231,13 @@ def _composed(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: Liv
     if goes:
         kind, rests_on = ChangeKind.VANISHED, path[-1:]
     else:
-        shift, turn = _shift(path, names, a, b)
+        shift, turn = _shift(path, names, *maps)
         if first.comes:
             new = first.change.kind is ChangeKind.APPEARED
             kind = ChangeKind.APPEARED if new else ChangeKind.RETURNED
             shift, turn = (np.full(2, np.nan), 0.0) if new else (shift, turn)
             rests_on = path[came[-1] :]
-        elif np.hypot(*shift) < SAME_SPOT_M:
+        elif np.hypot(*shift) < same_spot_m:
             return None
         else:
             kind, rests_on = ChangeKind.MOVED, path

@@ -170,13 +170,6 @@ def _newest(kind: IntArray, first_s: FloatArray, most: int) -> BoolArray:
     return newest
 
 
-QUANTILES = 64
-"""Lengths of stays that stand for a prior that a user gives."""
-_SHORTEST_S, _LONGEST_S = 60.0, 1.5e9
-_FIRMNESS = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0])
-"""Ends that the lifetimes of a class may count for in those of a chunk; how many is learned."""
-
-
 def learned_lives(stays: Stays, before: Lives, now_s: float, settings: LifetimeConfig = USUAL) -> Lives:
     """Learn lifetimes by class and place from all stays of a map until now.
 
@@ -218,12 +211,12 @@ class ClassLives:
             nothing = stay_posterior(np.zeros((0, len(LOG_MEAN), len(LOG_SHAPE))))
             return cls(replace(before, looks_s=looks_s), np.zeros(0, dtype=np.int64), nothing)
         history = History.of(stays, looks_s, settings)
-        learned = _learned(history, before, settings.sure)
+        learned = _learned(history, before, settings)
         entries: list[tuple[int, tuple[int, int], Life]] = []
         for row, class_id in enumerate(history.class_ids.tolist()):
             life = learned.life(row)
             entries.append((class_id, (EVERYWHERE, EVERYWHERE), life))
-            own_lives = _of_chunks(history, row, life, before.chunk_m, settings.least_ended)
+            own_lives = _of_chunks(history, row, life, before.chunk_m, settings)
             entries += [(class_id, chunk, own) for chunk, own in own_lives]
         if UNKNOWN not in history.class_ids:
             said, of_all = before.prior_of(UNKNOWN), learned.life(-1)
@@ -294,7 +287,7 @@ class _Learned:
         )
 
 
-def _learned(history: History, before: Lives, sure: float) -> _Learned:
+def _learned(history: History, before: Lives, settings: LifetimeConfig) -> _Learned:
     stays, n_classes = history.stays, len(history.class_ids)
     ended = np.isfinite(stays.gone_s)
     said = [before.prior_of(class_id) for class_id in history.class_ids.tolist()]
@@ -304,7 +297,9 @@ def _learned(history: History, before: Lives, sure: float) -> _Learned:
     )
     log_likelihood *= stays.p_gone[away, None, None]
     log_likelihood = _by_class(log_likelihood, history.kind[away], n_classes)
-    of_absence = [life.n_stays * absence_said(life.absence) if life and life.tells_absence else None for life in said]
+    of_absence = [
+        life.n_stays * absence_said(life.absence, settings) if life and life.tells_absence else None for life in said
+    ]
     absence = absence_posterior(log_likelihood, _stacked(of_absence))
     p_hop = history.shares(history.hopped, ended)
     back_by_hop = p_hop * history.shares(history.there_again, history.hopped_twice)
@@ -316,29 +311,29 @@ def _learned(history: History, before: Lives, sure: float) -> _Learned:
     kind = history.kind[history.recent]
     seen = history.sightings(back_by_hop[kind], back_rate[kind])
     log_likelihood = stay_log_likelihood(seen)
-    doubted = ended[history.recent] & (stays.p_gone[history.recent] < sure)
+    doubted = ended[history.recent] & (stays.p_gone[history.recent] < settings.sure)
     if doubted.any():  # expected log likelihood: perhaps it goes on
         p_gone = stays.p_gone[history.recent][doubted, None, None]
         going_on = rows_of(seen, doubted)
         going_on = replace(going_on, gone_s=np.full(len(going_on.gone_s), np.inf))
         log_likelihood[doubted] = p_gone * log_likelihood[doubted] + (1.0 - p_gone) * stay_log_likelihood(going_on)
     log_likelihood = _by_class(log_likelihood, kind, n_classes)
-    of_stay = [life.n_stays * stay_said(life.stay) if life else None for life in said]
+    of_stay = [life.n_stays * stay_said(life.stay, settings) if life else None for life in said]
     stay = stay_posterior(log_likelihood, _stacked(of_stay))
     p_known = history.shares(history.to_known, history.had_choice)
     counts = (history.counts(mask).astype(np.int64) for mask in (history.recent, history.recent & ended))
     return _Learned(stay, absence, p_hop, p_known, *counts)
 
 
-def stay_said(prior: LifetimePrior) -> FloatArray:
+def stay_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
     """Return the (M, A) mean log likelihood of one stay that lasts as a user says, where `stay_posterior` lives.
 
     `n` times this is what `n` stays say whose lengths spread as the prior does (a power prior, Ibrahim and Chen 2000);
-    of those beyond `_LONGEST_S` only that is known.
+    of those beyond `settings.prior_longest_s` only that is known.
     """
     from scipy.special import gammaln
 
-    age_s, ended = _spread(prior)
+    age_s, ended = _spread(prior, settings)
     log_shape = finer(LOG_SHAPE)
     shape = np.exp(log_shape)
     log_scale = finer(LOG_MEAN)[:, None] - gammaln(1.0 + 1.0 / shape)
@@ -347,9 +342,9 @@ def stay_said(prior: LifetimePrior) -> FloatArray:
     return np.asarray((np.where(ended[:, None, None], log_density, 0.0) - np.exp(log_ratio)).mean(axis=0))
 
 
-def absence_said(prior: LifetimePrior) -> FloatArray:
+def absence_said(prior: LifetimePrior, settings: LifetimeConfig = USUAL) -> FloatArray:
     """Return the (M, A) same of one absence, where `absence_posterior` lives."""
-    age_s, ended = _spread(prior)
+    age_s, ended = _spread(prior, settings)
     age_s, ended = age_s[:, None, None], ended[:, None, None]
     share, log_mean = 1.0 / (1.0 + np.exp(-finer(LOGIT_RETURN))), finer(LOG_MEAN)[:, None]
     gone = age_s * np.exp(-log_mean)
@@ -364,10 +359,11 @@ def _stacked(parts: list[FloatArray | None]) -> FloatArray | float:
     return 0.0 if shape is None else np.stack([np.zeros(shape) if part is None else part for part in parts])
 
 
-def _spread(prior: LifetimePrior) -> tuple[FloatArray, BoolArray]:
-    """(Q,) ages by which equal shares of lifetimes end, and whether they do before `_LONGEST_S`."""
-    age_s = np.asarray(prior.quantile((np.arange(QUANTILES) + 0.5) / QUANTILES), dtype=np.float64)
-    return np.clip(age_s, _SHORTEST_S, _LONGEST_S), np.asarray(age_s < _LONGEST_S)
+def _spread(prior: LifetimePrior, settings: LifetimeConfig) -> tuple[FloatArray, BoolArray]:
+    """(Q,) ages by which equal shares of lifetimes end, and whether they do before the longest that counts."""
+    n, longest_s = settings.prior_quantiles, settings.prior_longest_s
+    age_s = np.asarray(prior.quantile((np.arange(n) + 0.5) / n), dtype=np.float64)
+    return np.clip(age_s, settings.prior_shortest_s, longest_s), np.asarray(age_s < longest_s)
 
 
 def with_priors(living: LivingMap, said: Mapping[str, Lifetimes], class_names: Sequence[str], worth: int) -> LivingMap:
@@ -410,7 +406,7 @@ def lifetimes_by_class(living: LivingMap) -> dict[str, Lifetimes]:
 
 
 def _of_chunks(
-    history: History, row: int, life: Life, chunk_m: float, least_ended: int
+    history: History, row: int, life: Life, chunk_m: float, settings: LifetimeConfig
 ) -> list[tuple[tuple[int, int], Life]]:
     """Chunks in which stays of a class end sooner or later than everywhere, as far as they say so.
 
@@ -433,7 +429,7 @@ def _of_chunks(
     n_ended = np.bincount(which.ravel(), ended * stays.p_gone)
     n_expected = np.bincount(which.ravel(), expected)
     n_expected *= max(n_ended.sum(), 1.0) / n_expected.sum()  # ends that nobody saw are missing everywhere
-    firm = _FIRMNESS[:, None]
+    firm = np.array(settings.firmness)[:, None]
     log_weight = np.sum(
         gammaln(firm + n_ended) - gammaln(firm) + firm * np.log(firm) - (firm + n_ended) * np.log(firm + n_expected),
         axis=1,
@@ -441,7 +437,7 @@ def _of_chunks(
     weight = np.exp(log_weight - log_weight.max())
     factor = (weight / weight.sum()) @ ((firm + n_ended) / (firm + n_expected))
     own: list[tuple[tuple[int, int], Life]] = []
-    for k in np.flatnonzero(n_ended >= least_ended):
+    for k in np.flatnonzero(n_ended >= settings.least_ended):
         assert isinstance(life.stay, PiecewiseConstantHazard)
         rates = tuple(float(factor[k]) * rate for rate in life.stay.rates)
         stay = PiecewiseConstantHazard(life.stay.edges_s, rates)

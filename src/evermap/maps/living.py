@@ -21,7 +21,7 @@ import numpy as np
 from evermap.errors import InputError
 from evermap.geometry import se2
 from evermap.maps.lives import Lives
-from evermap.sensing.sightlines import SightLines, Views
+from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, ShownTable, draw
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of
 
@@ -35,10 +35,21 @@ MOST_DIGITS = 18
 """Of ids of landmarks, which are 64 bits wide."""
 
 
+_DTYPES: dict[str, type] = {"IntArray": np.int64, "FloatArray": np.float64, "BoolArray": np.bool_}
+
+
 class _Rows(ShownTable):
     """Columns of equal length that are taken and joined together."""
 
     __slots__ = ()
+
+    def __len__(self) -> int:
+        return len(getattr(self, fields(self)[0].name))
+
+    @classmethod
+    def empty(cls) -> Self:
+        """Return a table of no rows."""
+        return cls(*(np.zeros((0, 2) if f.name == "position_m" else 0, _DTYPES[str(f.type)]) for f in fields(cls)))
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
         """Some of the rows, by number or by a mask."""
@@ -68,14 +79,6 @@ class Members(_Rows):
     pinned: BoolArray
     deleted: BoolArray
 
-    def __len__(self) -> int:
-        return len(self.landmark_id)
-
-    @classmethod
-    def empty(cls) -> Members:
-        """Return members of no landmark."""
-        return cls(*np.zeros((3, 0), dtype=np.int64), *np.zeros((2, 0), dtype=np.bool_))
-
 
 @dataclass(frozen=True, slots=True)
 class Sites(_Rows):
@@ -97,14 +100,6 @@ class Sites(_Rows):
     since_s: FloatArray
     seen_s: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.site_id)
-
-    @classmethod
-    def empty(cls) -> Sites:
-        """Return a table of no site."""
-        return cls(*np.zeros((2, 0), dtype=np.int64), *np.zeros((4, 0)))
-
 
 @dataclass(frozen=True, slots=True)
 class Places(_Rows):
@@ -121,15 +116,6 @@ class Places(_Rows):
     position_m: FloatArray
     n_hits: IntArray
     n_misses: IntArray
-
-    def __len__(self) -> int:
-        return len(self.site_id)
-
-    @classmethod
-    def empty(cls) -> Places:
-        """Return a table of no place."""
-        none = np.zeros(0, dtype=np.int64)
-        return cls(none, none, np.zeros((0, 2)), none, none)
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,15 +141,6 @@ class Stays(_Rows):
     gone_s: FloatArray
     p_gone: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.clique_id)
-
-    @classmethod
-    def empty(cls) -> Stays:
-        """Return a table of no stay."""
-        names, stamp_s = np.zeros(0, dtype=np.int64), np.zeros(0)
-        return cls(names, names, names, np.zeros((0, 2)), stamp_s, stamp_s, stamp_s, stamp_s, stamp_s)
-
 
 @dataclass(frozen=True, slots=True)
 class Evidence(_Rows):
@@ -185,15 +162,6 @@ class Evidence(_Rows):
     expected: FloatArray
     log_odds: FloatArray
     p_exists: FloatArray
-
-    def __len__(self) -> int:
-        return len(self.clique_id)
-
-    @classmethod
-    def empty(cls) -> Evidence:
-        """Return evidence of no look."""
-        names, numbers = np.zeros(0, dtype=np.int64), np.zeros(0)
-        return cls(names, numbers, names, names, numbers, numbers, numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -334,13 +302,7 @@ class LivingMap(Shown):
 
     def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
         """Return (K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
-        known = {
-            (int(site), int(name)): k
-            for k, (site, name) in enumerate(zip(self.places.site_id, self.places.landmark_id, strict=True))
-        }
-        return np.array(
-            [known.get((int(s), int(n)), -1) for s, n in zip(site_id, landmark_id, strict=True)], dtype=np.int64
-        )
+        return pair_rows((self.places.site_id, self.places.landmark_id), (site_id, landmark_id))
 
     def landmarks(
         self,
@@ -365,17 +327,24 @@ class LivingMap(Shown):
         if within is not None:
             box = np.asarray(within, dtype=np.float64)
             if box.shape != (4,) or not (box[:2] <= box[2:]).all():
-                raise InputError(f"{within!r} is no box", field="within", hint="(x_min, y_min, x_max, y_max) in metres")
+                raise InputError(
+                    f"{within!r} is not a box", field="within", hint="(x_min, y_min, x_max, y_max) in metres"
+                )
             position = self.places.position_m[row[kept]]
             kept = kept[((position >= box[:2]) & (position <= box[2:])).all(axis=1)]
         row = row[kept]
+        return self._records(row, self.place_covariance_m2(row), p_exists[kept])
+
+    def _records(self, row: IntArray, covariance_m2: FloatArray, p_exists: FloatArray) -> Landmarks:
+        """Places (K,) as plain records."""
         site = np.searchsorted(self.sites.site_id, self.places.site_id[row])
+        name = self.places.landmark_id[row]
         return Landmarks(
-            landmark_id=self.members.landmark_id[kept],
+            landmark_id=name,
             position_m=self.places.position_m[row],
-            covariance_m2=self.place_covariance_m2(row),
-            class_id=self.members.class_id[kept],
-            p_exists=p_exists[kept],
+            covariance_m2=covariance_m2,
+            class_id=self.members.class_id[np.searchsorted(self.members.landmark_id, name)],
+            p_exists=p_exists,
             n_hits=self.places.n_hits[row],
             n_misses=self.places.n_misses[row],
             first_seen_s=self.sites.since_s[site],
@@ -404,21 +373,7 @@ class LivingMap(Shown):
         member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)
         rows = np.arange(len(self.places))
         blocks = self.covariance_m2.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
-        return Landmarks(
-            landmark_id=self.places.landmark_id,
-            position_m=self.places.position_m,
-            covariance_m2=blocks,
-            class_id=self.members.class_id[member],
-            p_exists=np.where(self.members.deleted[member], 0.0, p_site[site]),
-            n_hits=self.places.n_hits,
-            n_misses=self.places.n_misses,
-            first_seen_s=self.sites.since_s[site],
-            last_seen_s=self.sites.seen_s[site],
-            class_names=self.class_names,
-            frame="prior_map",
-            clock=self.clock,
-            names=self.landmark_names,
-        )
+        return self._records(rows, blocks, np.where(self.members.deleted[member], 0.0, p_site[site]))
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
         """Return the map with an operator's word on one landmark; None leaves it as it is.

@@ -157,6 +157,7 @@ def _enter_late(
     progress: Progress | None,
 ) -> Entered:
     """A session that belongs before some of the steps of the history: these are taken once more, after it."""
+    from evermap.config import Config
     from evermap.maps.diff import net
     from evermap.maps.store.measured import RECORDING
     from evermap.pipeline import run_session
@@ -187,7 +188,8 @@ def _enter_late(
         living, changes = _again(store, step, living)
         told.append((changes, False))
     names = tuple(step.revision.provenance.recording for step in replayed if step.recording is not None)
-    found = tuple(change.named(living.landmark_names) for change in net(told, newest, living))
+    decisions = (config or Config()).living.decisions
+    found = tuple(change.named(living.landmark_names) for change in net(told, newest, living, decisions))
     return Entered(session, newest, living, found, names, head, {RECORDING: data})
 
 

@@ -13,7 +13,7 @@ must not learn from things that have gone, so a clique's share pends until the c
 Use, a frame:
 
     model, seen = learned.look(model, stamp_s, position_m, rotation, detected)
-    belief = single.observe(belief, seen.stamp_s, seen.log_there, seen.log_gone)
+    belief = belief.observe(seen.stamp_s, seen.log_there, seen.log_gone)
     model = learned.confirm(model, seen, belief.probability)
 """
 

@@ -181,13 +181,7 @@ class SightLines:
 
     def _rows(self, places: tuple[IntArray, IntArray]) -> IntArray:
         """(K,) row of the place of each line, -1 where the map has it no more."""
-        site, landmark = (np.concatenate([known, own]) for known, own in zip(
-            places, (self.site_id, self.landmark_id), strict=True))  # fmt: skip
-        _, number = np.unique(np.stack([site, landmark], axis=1), axis=0, return_inverse=True)
-        number = number.ravel()
-        row = np.full(int(number.max(initial=-1)) + 1, -1, dtype=np.int64)
-        row[number[: len(places[0])]] = np.arange(len(places[0]))
-        return np.asarray(row[number[len(places[0]) :]])
+        return pair_rows(places, (self.site_id, self.landmark_id))
 
     def _around(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray
@@ -225,6 +219,16 @@ class SightLines:
             share = float((np.sum(p_clear) + 2.0) / (len(p_clear) + 4.0))
             free = np.clip((own[0] + worth * nominal) / (own[1] + worth), *rates)
         return np.asarray(free, dtype=np.float64), share
+
+
+def pair_rows(known: tuple[IntArray, IntArray], asked: tuple[IntArray, IntArray]) -> IntArray:
+    """Return (N,) rows of pairs among (P,) known ones, all different; -1 where there is none."""
+    both = (np.concatenate([np.asarray(one, dtype=np.int64), other]) for one, other in zip(known, asked, strict=True))
+    _, number = np.unique(np.column_stack(list(both)), axis=0, return_inverse=True)
+    number, count = number.ravel(), len(known[0])
+    row = np.full(int(number.max(initial=-1)) + 1, -1, dtype=np.int64)
+    row[number[:count]] = np.arange(count)
+    return np.asarray(row[number[count:]])
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:

@@ -7,7 +7,7 @@ found moved or gone at `gone_s`. What that says of lifetimes is in `survival.cen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Self
 
 import numpy as np
@@ -23,6 +23,10 @@ class InSpace(ShownTable):
     """Mixin of tables of objects: positions and velocities are three columns each, states are words."""
 
     __slots__ = ()
+    track_id: IntArray
+
+    def __len__(self) -> int:
+        return len(self.track_id)
 
     def _columns(self) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -43,8 +47,7 @@ class InSpace(ShownTable):
         return found
 
     def _facts(self) -> dict[str, Any]:
-        rows: Any = self
-        return {"rows": len(rows), "objects": len(np.unique(rows.track_id))}
+        return {"rows": len(self), "objects": len(np.unique(self.track_id))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +60,23 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Followed(InSpace):
+class _Objects(InSpace):
+    """Objects, one row each: what `Followed` and `Tracks` have in common."""
+
+    stamp_s: Any
+    track_id: IntArray
+    state: IntArray
+    position_m: FloatArray
+    velocity_mps: FloatArray
+    position_covariance_m2: FloatArray
+    velocity_covariance_m2ps2: FloatArray
+    class_p: FloatArray
+    p_exists: FloatArray
+    static: BoolArray
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Followed(_Objects):
     """The active tracklets at one instant, one row each, in no order. Copies.
 
     Attributes:
@@ -68,54 +87,20 @@ class Followed(InSpace):
         position_covariance_m2, velocity_covariance_m2ps2: (N, 3, 3).
         class_p: (N, C) posterior over classes.
         p_exists: (N,) probability of being a real object that is there.
-        n_missed: (N,) frames in a row without a detection.
         static: (N,) whether it has been where it is for long enough to be static.
+        n_missed: (N,) frames in a row without a detection.
     """
 
-    stamp_s: float
-    track_id: IntArray
-    state: IntArray
-    position_m: FloatArray
-    velocity_mps: FloatArray
-    position_covariance_m2: FloatArray
-    velocity_covariance_m2ps2: FloatArray
-    class_p: FloatArray
-    p_exists: FloatArray
     n_missed: IntArray
-    static: BoolArray
-
-    def __len__(self) -> int:
-        return len(self.track_id)
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Tracks(InSpace):
-    """Objects over time, one row an object and frame, sorted by track and time.
+class Tracks(_Objects):
+    """Objects over time, one row an object and frame, sorted by track and time; columns as of `Followed`, filtered.
 
     Attributes:
         stamp_s: (R,) frames.
-        track_id: (R,).
-        state: (R,) a `TrackState`.
-        position_m, velocity_mps: (R, 3) in the world, filtered.
-        position_covariance_m2, velocity_covariance_m2ps2: (R, 3, 3).
-        class_p: (R, C) posterior over classes.
-        p_exists: (R,) probability of being a real object that is there.
-        static: (R,) whether it had been where it was for long enough to be static.
     """
-
-    stamp_s: FloatArray
-    track_id: IntArray
-    state: IntArray
-    position_m: FloatArray
-    velocity_mps: FloatArray
-    position_covariance_m2: FloatArray
-    velocity_covariance_m2ps2: FloatArray
-    class_p: FloatArray
-    p_exists: FloatArray
-    static: BoolArray
-
-    def __len__(self) -> int:
-        return len(self.stamp_s)
 
 
 class Recorder:
@@ -143,9 +128,7 @@ class Recorder:
             raise DataError("no frame was tracked")
         counts = [len(f) for f in frames]
         frame = np.repeat(np.arange(len(frames)), counts)
-        columns = {
-            name: np.concatenate([getattr(f, name) for f in frames]) for name in Followed.__slots__ if name != "stamp_s"
-        }
+        columns = {item.name: np.concatenate([getattr(f, item.name) for f in frames]) for item in fields(Followed)[1:]}
         ids = columns["track_id"]
         confirmed = np.isin(ids, np.unique(ids[columns["state"] != TrackState.BIRTH]))
         order = np.lexsort((frame, ids))
@@ -188,9 +171,6 @@ class StaticSpells(InSpace):
     last_s: FloatArray
     gone_s: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.track_id)
-
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
         """Some of them, by number or by a mask."""
         return type(self)(*(getattr(self, name)[rows] for name in self.__slots__))
@@ -213,34 +193,24 @@ class SpellLog:
     def add_stored(self, stored: Stored, rows: IntArray, gone_s: float) -> None:
         """Note rows of the working set whose objects are gone."""
         if len(rows):
-            self._parts.append(_of_stored(stored, rows, gone_s))
+            self._parts.append(_spells(stored, rows, stored.class_id, stored.position, gone_s))
 
     def with_open(self, t: Tracklets, n: int, working_set: WorkingSet) -> StaticSpells:
         """Return ended tracklets, and those that go on: of the first `n` tracklets, and of the working set."""
         rows = np.flatnonzero((t.static[:n] == 1) & (t.state[:n] != TrackState.BIRTH))
-        going_on = StaticSpells(
-            track_id=t.track_id[rows],
-            class_id=t.class_p[rows].argmax(axis=1),
-            position_m=t.rest_mean[rows],
-            elsewhere_s=t.elsewhere_s[rows],
-            first_s=t.rest_since_s[rows],
-            last_s=t.rest_seen_s[rows],
-            gone_s=np.full(len(rows), np.inf),
-        )
-        stored = working_set.rows[working_set.stored.static[working_set.rows] == 1]
-        parts = [*self._parts, going_on, _of_stored(working_set.stored, stored, np.inf)]
+        going_on = _spells(t, rows, t.class_p[:n].argmax(axis=1), t.rest_mean, np.inf)
+        w = working_set.stored
+        stored = working_set.rows[w.static[working_set.rows] == 1]
+        parts = [*self._parts, going_on, _spells(w, stored, w.class_id, w.position, np.inf)]
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in StaticSpells.__slots__}
         order = np.lexsort((columns["first_s"], columns["track_id"]))
         return StaticSpells(**columns)[order]
 
 
-def _of_stored(stored: Stored, rows: IntArray, gone_s: float) -> StaticSpells:
-    return StaticSpells(
-        track_id=stored.track_id[rows],
-        class_id=stored.class_id[rows].astype(np.int64),
-        position_m=stored.position[rows],
-        elsewhere_s=stored.elsewhere_s[rows],
-        first_s=stored.rest_since_s[rows],
-        last_s=stored.rest_seen_s[rows],
-        gone_s=np.full(len(rows), gone_s),
-    )
+def _spells(
+    of: Tracklets | Stored, rows: IntArray, class_id: Any, position_m: FloatArray, gone_s: float
+) -> StaticSpells:
+    """The spells of some rows."""
+    names = of.track_id[rows], class_id[rows].astype(np.int64), position_m[rows]
+    times = of.elsewhere_s[rows], of.rest_since_s[rows], of.rest_seen_s[rows], np.full(len(rows), gone_s)
+    return StaticSpells(*names, *times)

@@ -20,7 +20,7 @@ from evermap.tracking.kalman import distance_and_log_det, inlined, kernel, sum_o
 from evermap.tracking.tracklets import Rules, SpellTable, Tracklets, TrackState
 from evermap.types import FloatArray, IntArray
 
-BIRTH, WORKING_SET = int(TrackState.BIRTH), int(TrackState.WORKING_SET)
+BIRTH = int(TrackState.BIRTH)
 FAST = 2.33
 """Standard deviations above the threshold from which a speed is above it: one error in a hundred."""
 DISPLACED = 30.66
@@ -160,30 +160,3 @@ def start_all(
     for k in range(free.shape[0]):
         start(t, n + k, next_id + k, frame, free[k], confusion, rules)
         track_of_detection[free[k]] = next_id + k
-
-
-@kernel
-def copy_row(t: Tracklets, into: int, row: int) -> None:
-    """Overwrite row `into` by `row`."""
-    t.track_id[into], t.state[into] = t.track_id[row], t.state[row]
-    t.mean[into], t.covariance[into] = t.mean[row], t.covariance[row]
-    t.class_p[into], t.appearance[into] = t.class_p[row], t.appearance[row]
-    t.inverse_odds[into], t.n_hits[into], t.n_missed[into] = t.inverse_odds[row], t.n_hits[row], t.n_missed[row]
-    t.first_s[into], t.rest_seen_s[into] = t.first_s[row], t.rest_seen_s[row]
-    t.rest_mean[into], t.rest_covariance[into] = t.rest_mean[row], t.rest_covariance[row]
-    t.rest_since_s[into], t.elsewhere_s[into] = t.rest_since_s[row], t.elsewhere_s[row]
-    t.static[into], t.slow[into] = t.static[row], t.slow[row]
-
-
-@kernel
-def sweep(t: Tracklets, n: int) -> int:
-    """Remove tracklets that are no longer active, by moving the last ones into the gaps; how many are left."""
-    i = int(0)  # noqa: RUF046, UP018 (of a literal, `copy_row` would be compiled once more)
-    while i < n:
-        if t.state[i] >= WORKING_SET:
-            n -= 1
-            if i < n:
-                copy_row(t, i, n)
-        else:
-            i += 1
-    return n

@@ -17,9 +17,9 @@ from evermap.show import Shown, draw
 from evermap.survival import GeneralPurpose, LifetimePrior
 from evermap.tracking.frame import Frame, appearances, classes, covariances, positions
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
-from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, TrackState, grown, room_for
+from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, TrackState, grown, room_for, sweep
 from evermap.tracking.views import View, ViewMemory
-from evermap.tracking.working_set import WorkingSet
+from evermap.tracking.working_set import KEPT, WorkingSet
 from evermap.types import UNKNOWN, FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -228,7 +228,7 @@ class Tracker(Shown):
             leaving = np.flatnonzero(t.state[:n] == TrackState.WORKING_SET)
             if len(leaving):
                 self.working_set.insert(t, leaving, frame.stamp_s)
-            self._n = self._rows.sweep(t, n)
+            self._n = sweep(t, n)
         return track_of_detection
 
     def _find_again(self, frame: Frame, view: View | None, track_of_detection: IntArray, events: list[Event]) -> None:
@@ -282,18 +282,11 @@ class Tracker(Shown):
         t, w = self._tracklets, self.working_set
         into = slice(self._n, self._n + len(rows))
         gain = np.exp(-np.clip(log_ratio, -60.0, 60.0)) / np.maximum(p_detect, self._association.NEVER_SURE)
-        t.track_id[into] = w.stored.track_id[rows]
+        for name in KEPT:
+            getattr(t, name)[into] = getattr(w.stored, name)[rows]
         t.class_p[into] = w.class_p(rows)
-        t.appearance[into] = w.stored.appearance[rows]
         t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._life.LEAST)
-        t.n_hits[into] = w.stored.n_hits[rows]
-        t.first_s[into] = w.stored.first_s[rows]
-        t.rest_seen_s[into] = w.stored.rest_seen_s[rows]
-        t.rest_mean[into] = w.stored.position[rows]
-        t.rest_covariance[into] = covariance
-        t.rest_since_s[into] = w.stored.rest_since_s[rows]
-        t.elsewhere_s[into] = w.stored.elsewhere_s[rows]
-        t.static[into] = w.stored.static[rows]
+        t.rest_mean[into], t.rest_covariance[into] = w.stored.position[rows], covariance
 
     def _begin(self, frame: Frame, track_of_detection: IntArray) -> None:
         """A new tracklet for every detection that nobody had, in the order of their places."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -98,37 +98,29 @@ class Tracklets(NamedTuple):
 def room_for(n: int, order: int, n_classes: int, n_appearance: int) -> Tracklets:
     """Return room for `n` tracklets, with `order` derivatives of the position, itself included."""
     d = 3 * order
-
-    def numbers(*shape: int) -> FloatArray:
-        return np.zeros((n, *shape))
-
-    def counts() -> IntArray:
-        return np.zeros(n, dtype=np.int64)
-
-    return Tracklets(
-        track_id=counts(),
-        state=counts(),
-        mean=numbers(d),
-        covariance=numbers(d, d),
-        class_p=numbers(n_classes),
-        appearance=numbers(n_appearance),
-        inverse_odds=numbers(),
-        n_hits=counts(),
-        n_missed=counts(),
-        first_s=numbers(),
-        rest_seen_s=numbers(),
-        rest_mean=numbers(3),
-        rest_covariance=numbers(3, 3),
-        rest_since_s=numbers(),
-        elsewhere_s=numbers(),
-        static=counts(),
-        slow=counts(),
-    )
+    shape = {"mean": (d,), "covariance": (d, d), "class_p": (n_classes,), "appearance": (n_appearance,)}
+    shape |= {"rest_mean": (3,), "rest_covariance": (3, 3)}
+    whole = {"track_id", "state", "n_hits", "n_missed", "static", "slow"}
+    columns: dict[str, Any] = {
+        name: np.zeros((n, *shape.get(name, ())), np.int64 if name in whole else np.float64)
+        for name in Tracklets._fields
+    }
+    return Tracklets(**columns)
 
 
 def grown(tracklets: Tracklets, n: int) -> Tracklets:
     """Return the same tracklets with room for `n`."""
     return Tracklets(*(np.concatenate([a, np.zeros((n - len(a), *a.shape[1:]), dtype=a.dtype)]) for a in tracklets))
+
+
+def sweep(tracklets: Tracklets, n: int) -> int:
+    """Remove those of the first `n` that are no longer active, by moving the last ones there; how many are left."""
+    active = tracklets.state[:n] < TrackState.WORKING_SET
+    left = int(np.count_nonzero(active))
+    gaps, movers = np.flatnonzero(~active[:left]), left + np.flatnonzero(active[left:])[::-1]
+    for column in tracklets:
+        column[gaps] = column[movers]
+    return left
 
 
 class EventTable(NamedTuple):

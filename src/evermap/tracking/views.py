@@ -61,7 +61,7 @@ class View:
             raise InputError(f"shape {p.shape} instead of ({len(position_m)},)", field="p_detect")
         if not np.all((p >= 0.0) & (p <= 1.0)):
             row = int(np.flatnonzero(~((p >= 0.0) & (p <= 1.0)))[0])
-            raise InputError(f"position {row}: {p[row]} is no probability", field="p_detect")
+            raise InputError(f"position {row}: {p[row]} is not a probability", field="p_detect")
         return p
 
 

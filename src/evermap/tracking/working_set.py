@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,27 +52,19 @@ class Stored(NamedTuple):
 
 def empty_rows(n: int, n_appearance: int) -> Stored:
     """Return room for `n` objects with appearances of a length."""
+    sizes: dict[str, tuple[Any, ...]] = {
+        "track_id": (np.int64,), "position": (np.float64, 3), "covariance": (np.float32, 6), "class_id": (np.int16,),
+        "class_p": (np.float32,), "appearance": (np.float16, n_appearance), "n_hits": (np.int32,), "static": (np.int8,),
+        "following": (np.int32,),
+    }  # fmt: skip
+    columns = {name: sizes.get(name, (np.float64,)) for name in Stored._fields}
+    rows = Stored(**{name: np.zeros((n, *shape), dtype) for name, (dtype, *shape) in columns.items()})
+    rows.following[:] = -1
+    return rows
 
-    def numbers(*shape: int) -> FloatArray:
-        return np.zeros((n, *shape))
 
-    return Stored(
-        track_id=np.zeros(n, dtype=np.int64),
-        position=numbers(3),
-        covariance=np.zeros((n, 6), dtype=np.float32),
-        class_id=np.zeros(n, dtype=np.int16),
-        class_p=np.zeros(n, dtype=np.float32),
-        appearance=np.zeros((n, n_appearance), dtype=np.float16),
-        inverse_odds=numbers(),
-        n_hits=np.zeros(n, dtype=np.int32),
-        first_s=numbers(),
-        rest_seen_s=numbers(),
-        rest_since_s=numbers(),
-        elsewhere_s=numbers(),
-        static=np.zeros(n, dtype=np.int8),
-        judged_s=numbers(),
-        following=np.full(n, -1, dtype=np.int32),
-    )
+KEPT = ("track_id", "appearance", "n_hits", "first_s", "rest_seen_s", "rest_since_s", "elsewhere_s", "static")
+"""Columns that an object keeps as it goes into the working set and comes back."""
 
 
 class WorkingSet:
@@ -128,19 +120,12 @@ class WorkingSet:
         top = t.class_p[rows].argmax(axis=1)
         self.insert_arrays(
             empty_rows(0, 0)._replace(
-                track_id=t.track_id[rows],
+                **{name: getattr(t, name)[rows] for name in KEPT},
                 position=t.rest_mean[rows],
                 covariance=t.rest_covariance[rows][:, UPPER[0], UPPER[1]].astype(np.float32),
-                class_id=top.astype(np.int16),
-                class_p=t.class_p[rows, top].astype(np.float32),
-                appearance=t.appearance[rows].astype(np.float16),
+                class_id=top,
+                class_p=t.class_p[rows, top],
                 inverse_odds=t.inverse_odds[rows],
-                n_hits=t.n_hits[rows].astype(np.int32),
-                first_s=t.first_s[rows],
-                rest_seen_s=t.rest_seen_s[rows],
-                rest_since_s=t.rest_since_s[rows],
-                elsewhere_s=t.elsewhere_s[rows],
-                static=t.static[rows].astype(np.int8),
                 judged_s=np.full(len(rows), stamp_s),
             )
         )

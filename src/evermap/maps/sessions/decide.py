@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from evermap.config import DecisionConfig
-from evermap.maps.diff import SAME_SPOT_M, motion_of, with_swaps
+from evermap.maps.diff import motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
 from evermap.maps.sessions.gaussian import of_places
@@ -82,7 +82,7 @@ def decided(
         sites=replace(after.sites, p_kept=session.p_kept),
         sightlines=after.sightlines.after_session(hidden, shown),
     )
-    return after, with_swaps(session.found, before, after)
+    return after, with_swaps(session.found, before, after, settings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +96,7 @@ class _Session:
         hits, misses: (S,) by site; was_hit: (C,) whether it was seen at any of its sites.
         newest: row of the last stay by clique.
         last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
+        same_spot_m: how close to where it stood a clique has not moved.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
         begun: clique, site, not there before, first and last sighting of new stays.
         found: changes.
@@ -112,6 +113,7 @@ class _Session:
     log_evidence: FloatArray
     least: FloatArray
     least_evidence: float
+    same_spot_m: float
     hits: IntArray
     misses: IntArray
     was_hit: BoolArray
@@ -164,6 +166,7 @@ class _Session:
             log_evidence=log_evidence,
             least=least,
             least_evidence=settings.least_evidence,
+            same_spot_m=settings.same_spot_m,
             hits=hits,
             misses=misses,
             was_hit=np.bincount(row, hits, minlength=count) > 0,
@@ -277,7 +280,7 @@ class _Session:
         left_s = self._ends(old, stay, 1.0)
         since = self._begins(int(self.cliques[row]), site, left_s)
         self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
-        if np.hypot(*_motion(self.after, old, site)[0]) >= SAME_SPOT_M:
+        if np.hypot(*_motion(self.after, old, site)[0]) >= self.same_spot_m:
             n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 

@@ -77,10 +77,10 @@ def _outlook(model: PresenceModel, looks: Looks, now_s: float) -> FloatArray:
         born = ~np.isnan(birth_s)
         answer[0, born] = model.median_remaining_s(now_s - birth_s[born])
     elif isinstance(model, RunLength):
-        from evermap.existence.run_length import after, time_to_leave, time_to_return
+        from evermap.existence.run_length import RunLengthBelief
 
-        state = after(model, _heard_of(looks, now_s))
-        answer[1:] = time_to_leave(state), time_to_return(state)
+        state = RunLengthBelief.after(model, _heard_of(looks, now_s))
+        answer[1:] = state.time_to_leave(), state.time_to_return()
     return answer
 
 

@@ -12,12 +12,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from evermap.existence import joint, single
+from evermap.existence import single
 from evermap.existence.single import Belief
 from evermap.sensing.profile import Profile
 from evermap.survival import Exponential
 from evermap.types import BoolArray, FloatArray, IntArray
-from evermap_studies.bateman2020 import jff
+from evermap_studies.bateman2020 import jff, joint
 from evermap_studies.bateman2020.clique_range import nearest_per_clique, range_degraded_miss
 from evermap_studies.bateman2020.learned import learned_beliefs
 from evermap_studies.bateman2020.runs import Stack
@@ -97,7 +97,7 @@ def _independent(
         return joint.iff(state, stamp_s[clique], hits[step], assumed.p_miss, assumed.p_false, True)
 
     def predict(state: Belief, age_s: FloatArray) -> FloatArray:
-        return single.predict(state, age_s[clique])
+        return state.predict(age_s[clique])
 
     return _follow(single.init(len(rows), prior), look, predict, stack, looks)
 
@@ -144,7 +144,7 @@ def _joint(
         missed = p_miss[step] if np.ndim(p_miss) else p_miss
         return joint.jcf(state, stamp_s, stack.detected[step], missed, p_false, expected[step], stack.clique)
 
-    return _follow(single.init(stack.cliques, prior), look, single.predict, stack, looks)
+    return _follow(single.init(stack.cliques, prior), look, Belief.predict, stack, looks)
 
 
 def _all_knowing(stack: Stack, prior: Exponential) -> FloatArray:
@@ -170,9 +170,9 @@ def _all_knowing(stack: Stack, prior: Exponential) -> FloatArray:
             mixed = np.logaddexp(np.log1p(-before) + log_there[step], np.log(before) + log_gone[step])
         after = before * np.exp(log_gone[step] - mixed)
         hidden = np.where(np.isnan(stamp_s), before, after)
-        return single.observe(state, stamp_s, mixed, log_gone[step])
+        return state.observe(stamp_s, mixed, log_gone[step])
 
-    return _follow(single.init(stack.cliques, prior), look, single.predict, stack, looks)
+    return _follow(single.init(stack.cliques, prior), look, Belief.predict, stack, looks)
 
 
 def _degraded(stack: Stack, assumed: FilterSettings) -> FloatArray:

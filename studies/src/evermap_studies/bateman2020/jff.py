@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import ConfigError, InputError
-from evermap.existence import joint, single
 from evermap.existence import protocol as checks
+from evermap.existence import single
 from evermap.existence.single import Belief
 from evermap.survival import LifetimePrior
 from evermap.types import FloatArray, IntArray
+from evermap_studies.bateman2020 import joint
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -112,8 +113,8 @@ def predict(state: MixtureBelief, stamp_s: Any) -> FloatArray:
         InputError: a time that is not finite or lies before the last look.
     """
     time = checks.as_rows(stamp_s, len(state.shared), "stamp_s")
-    together = single.predict(state.shared, time)[state.clique]
-    alone = single.predict(state.alone, time[state.clique])
+    together = state.shared.predict(time)[state.clique]
+    alone = state.alone.predict(time[state.clique])
     p_shared = state.p_shared[state.clique]
     return np.asarray(p_shared * together + (1.0 - p_shared) * alone, dtype=np.float64)
 

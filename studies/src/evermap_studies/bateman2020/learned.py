@@ -33,8 +33,8 @@ def learned_beliefs(run: CliqueRun, prior: Exponential, profile: Profile | None 
         born = run.first <= step
         pose = run.pose_position_m[step], run.pose_rotation[step]
         model, seen = learned.look(model, float(step), *pose, run.detected[step], active=born)
-        belief = single.observe(belief, seen.stamp_s - run.first, seen.log_there, seen.log_gone)
-        p_there[step] = single.predict(belief, np.maximum(step - run.first, 0.0))
+        belief = belief.observe(seen.stamp_s - run.first, seen.log_there, seen.log_gone)
+        p_there[step] = belief.predict(np.maximum(step - run.first, 0.0))
         model = learned.confirm(model, seen, p_there[step])
     return p_there, model.profile
 

@@ -80,16 +80,14 @@ class Estimate:
 
 def filtered(data: Revisits, cut: Stretches, prior: LifetimePrior, p_miss: float, p_false: float) -> Estimate:
     """The persistence filter with a lifetime prior: its posterior at every look, its prediction in between."""
-    _, posterior = single.run(
-        single.init(len(data), prior), data.sequence, data.stamp_s, data.detected, p_miss, p_false
-    )
+    _, posterior = single.init(len(data), prior).run(data.sequence, data.stamp_s, data.detected, p_miss, p_false)
     scale = cut.spread(1.0, posterior / _unseen(prior, data.stamp_s))
     return Estimate(scale, _unseen(prior, cut.grid_s))
 
 
 def _unseen(prior: LifetimePrior, stamp_s: FloatArray) -> FloatArray:
     """Belief in features at which nobody has looked since birth: their survival."""
-    return single.predict(single.init(len(stamp_s), prior), stamp_s)
+    return single.init(len(stamp_s), prior).predict(stamp_s)
 
 
 def empirical(data: Revisits, cut: Stretches, *, as_coded: bool) -> Estimate:

@@ -82,7 +82,7 @@ def test_one_mode_and_gone_are_the_persistence_filter(prior):
     looks = ModeLooks(np.cumsum([0, *counts]), since_s + offset, np.log(np.column_stack([there, gone])))
 
     beliefs = smoothed(looks, ModeChain(lifetime=prior, gone=True))
-    after, probability = single.run(single.init(3, prior, evidence=True), features, since_s, detected, p_miss, p_false)
+    after, probability = single.init(3, prior, evidence=True).run(features, since_s, detected, p_miss, p_false)
     np.testing.assert_allclose(np.exp(beliefs.log_filtered[:, 0]), probability, rtol=1e-9)
     np.testing.assert_allclose(np.exp(beliefs.log_filtered[:, 1]), 1.0 - probability, atol=1e-9)
     np.testing.assert_allclose(beliefs.log_evidence, after.log_evidence, rtol=1e-9)

@@ -14,13 +14,12 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.existence import protocol as checks
-from evermap.existence import single
 from evermap.existence.single import Belief
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
 def iff(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, expected: Any) -> Belief:
-    """Return the independent feature filter: `single.update` of expected landmarks (Rosen 2016, Algorithm 1).
+    """Return the independent feature filter: `Belief.update` of expected landmarks (Rosen 2016, Algorithm 1).
 
     Args:
         state: beliefs of K landmarks.
@@ -31,11 +30,11 @@ def iff(state: Belief, stamp_s: Any, detected: Any, p_miss: Any, p_false: Any, e
         expected: scalar or (K,) bool.
 
     Raises:
-        InputError, NumericalError: as `single.update`; messages name the landmark's row.
+        InputError, NumericalError: as `Belief.update`; messages name the landmark's row.
     """
     time = checks.as_rows(stamp_s, len(state), "stamp_s")
     looked = as_mask(expected, len(state))
-    return single.update(state, np.where(looked, time, np.nan), detected, p_miss, p_false)
+    return state.update(np.where(looked, time, np.nan), detected, p_miss, p_false)
 
 
 def jcf(
@@ -75,7 +74,7 @@ def jcf(
     member = member[looked]
     seen = np.bincount(member, minlength=n) > 0
     log_there, log_gone = (_sum(likelihood, member, n) for likelihood in checks.likelihoods(hit, miss, false))
-    return single.observe(state, np.where(seen, time, np.nan), log_there, log_gone)
+    return state.observe(np.where(seen, time, np.nan), log_there, log_gone)
 
 
 def as_mask(values: Any, n: int) -> BoolArray:
