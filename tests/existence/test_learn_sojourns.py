@@ -98,6 +98,7 @@ def test_a_family_that_is_known_is_learned_from_noisy_looks(name: str) -> None:
     assert learned.log_evidence < best + 12.0
 
 
+@pytest.mark.slow
 def test_two_peaks_are_learned_from_noisy_looks() -> None:
     stay = Mixture.of([LogNormal(np.log(30.0), 0.08), LogNormal(np.log(120.0), 0.08)], [0.5, 0.5])
     looks = looks_at(*truth(stay, Exponential(1.0 / 60.0), 3))

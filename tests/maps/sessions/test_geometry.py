@@ -90,6 +90,11 @@ def test_the_order_in_which_places_are_named_does_not_matter(seed: int, places: 
     np.testing.assert_allclose(rejoined, of_places(joint, back), atol=1e-9)
 
 
+def test_a_map_of_nothing_is_anchored_as_it_is() -> None:
+    """Of a first session that takes all it saw for mistakes."""
+    assert anchored(np.zeros((0, 2)), np.zeros((0, 0))).shape == (0, 0)
+
+
 @given(seeds, st.integers(2, 8))
 def test_an_anchored_map_neither_moves_nor_turns_as_a_whole(seed: int, places: int) -> None:
     random = np.random.default_rng(seed)

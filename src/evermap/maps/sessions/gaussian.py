@@ -73,6 +73,8 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     Later sessions would turn the whole map as they learn how the robot stood when all began, which is of no interest.
     This is the S-transformation of geodesy (Baarda 1973) to inner constraints.
     """
+    if len(position_m) == 0:  # all that was seen was taken for mistakes
+        return covariance_m2
     motion = se2.rigid_directions(position_m - position_m.mean(axis=0))
     onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
     return np.asarray(onto @ covariance_m2 @ onto.T)
