@@ -18,7 +18,7 @@ from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
 from evermap.errors import InputError
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 
 BASELINE = Path(__file__).resolve().parent / "baseline.json"
 N_POSES = 2000

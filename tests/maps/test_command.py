@@ -108,6 +108,19 @@ def test_show_foretells_less_the_longer_ahead(site: Path) -> None:
         assert late[name]["p_ahead"] < soon[name]["p_ahead"]
 
 
+def test_show_tells_lifetimes_of_every_class_and_chunk(site: Path) -> None:
+    from evermap.survival.text import parse_prior
+
+    lives = MAPS[-1].lives
+    told = said("show", site)["lifetimes"]
+    assert len(told) == len(lives.life) > 0
+    for one, chunk, life in zip(told, lives.chunk.tolist(), lives.life, strict=True):
+        assert one["chunk"] in (None, chunk)
+        assert (one["stays"], one["stays_that_ended"]) == (life.n_stays, life.n_ended)
+        assert parse_prior(one["stay"]).quantile(0.5) == pytest.approx(life.stay.quantile(0.5), rel=1e-6)
+        assert one["half_gone_s"] is None or one["half_gone_s"] > 0.0
+
+
 def test_landmarks_at_a_time_and_within_a_box() -> None:
     living = MAPS[2]
     now, later = living.landmarks(), living.landmarks(at=living.stamp_s + 30 * 86400.0)

@@ -74,7 +74,7 @@ def show(
     Example:
       evermap map show site.evermap --ahead 3d --figure map.png
     """
-    from evermap.cli.map_content import landmark_dicts, landmark_row, prior_dicts
+    from evermap.cli.map_content import landmark_dicts, landmark_row, life_dicts, prior_dicts
     from evermap.maps.store import open_store
     from evermap.stamps import stamp_text
     from evermap.survival.durations import parse_duration_s
@@ -91,7 +91,8 @@ def show(
         write_picture(figure, living.plot(title=f"{Path(file).name}, revision {number}"))
     if as_json:
         about = {"map": file, "revision": number, "stamp_s": json_number(living.stamp_s), "clock": living.clock.value}
-        print_json({**about, "ahead_s": ahead_s, "landmarks": content, "priors": prior_dicts(living)})
+        told = {"priors": prior_dicts(living), "lifetimes": life_dicts(living)}
+        print_json({**about, "ahead_s": ahead_s, "landmarks": content, **told})
         return
     listed = [
         item for item in content if everything or item["pinned"] or (item["p_exists"] >= 0.5 and not item["deleted"])

@@ -149,6 +149,26 @@ def prior_dicts(living: LivingMap) -> list[dict[str, Any]]:
     ]
 
 
+def life_dicts(living: LivingMap) -> list[dict[str, Any]]:
+    """Return what was learned of how long things stay, by class ('' for all) and chunk (None for the whole floor)."""
+    from evermap.maps.lives import EVERYWHERE
+    from evermap.survival.text import prior_text
+
+    lives = living.lives
+    return [
+        {
+            "class": class_name(living, class_id),
+            "chunk": None if EVERYWHERE in chunk else chunk,
+            "chunk_m": lives.chunk_m,
+            "stay": prior_text(life.stay),
+            "half_gone_s": json_number(life.stay.quantile(0.5)),
+            "stays": life.n_stays,
+            "stays_that_ended": life.n_ended,
+        }
+        for class_id, chunk, life in zip(lives.class_id.tolist(), lives.chunk.tolist(), lives.life, strict=True)
+    ]
+
+
 def answer_dict(answer: Answer) -> dict[str, Any]:
     """Return everything behind a 'why', with every look."""
     seen, stays = answer.evidence, answer.stays

@@ -180,7 +180,7 @@ def check_picture(path: Path, field: str, *, inputs: Sequence[str | Path] = ()) 
 
 def write_picture(path: Path, figure: Figure) -> None:
     """Write a figure, whole or not at all."""
-    from evermap.io.atomic import write_atomic
+    from evermap.io.files import write_atomic
     from evermap.viz.style import save_png, save_svg
 
     content = io.BytesIO()

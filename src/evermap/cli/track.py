@@ -165,8 +165,9 @@ def _run(
     from evermap.runs.folder import check_replaceable
     from evermap.runs.summary import RunInfo
     from evermap.runs.track.detections import read_confusion, read_detections
-    from evermap.runs.track.run import run_track, write_track
+    from evermap.runs.track.run import run_track
     from evermap.runs.track.run import warm_up as compile_kernels
+    from evermap.runs.track.write import write_track
 
     check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
     start = time.perf_counter()

@@ -20,7 +20,7 @@ from evermap.errors import ConfigError, DataError, EvermapError, InputError
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.rhythm import WEEK_S
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.show import Shown
 from evermap.survival import never_leaves
 

@@ -11,7 +11,7 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se2
 from evermap.io.table import Table
 from evermap.io.text import counted
-from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording
+from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording, rows_of
 from evermap.valid import STAMP_S, validate
 
 ODOMETRY_GAP_S: float = 10.0
@@ -101,23 +101,9 @@ def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
         f"{counted(int(np.sum(~keep)), 'frame')} with {counted(int(np.sum(~seen)), 'detection')} left out: "
         f"more than {ODOMETRY_GAP_S:g} s before or after the odometry"
     )
-    kept = select_detections(detections, seen)
+    kept = rows_of(detections, seen)
     kept = replace(kept, frame=np.asarray(new_frame[kept.frame], dtype=np.int64))
     return replace(recording, frames=replace(frames, stamp_s=frames.stamp_s[keep]), detections=kept)
-
-
-def select_detections(detections: Detections, rows: BoolArray | IntArray) -> Detections:
-    """Return the given rows of the detections, in that order."""
-    return Detections(
-        frame=detections.frame[rows],
-        landmark_id=detections.landmark_id[rows],
-        range_m=detections.range_m[rows],
-        bearing_rad=detections.bearing_rad[rows],
-        class_id=detections.class_id[rows],
-        sigma_range_m=detections.sigma_range_m[rows],
-        sigma_bearing_rad=detections.sigma_bearing_rad[rows],
-        source_line=detections.source_line[rows],
-    )
 
 
 def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:

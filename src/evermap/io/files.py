@@ -1,16 +1,25 @@
-"""A folder and a zip of it look the same to a reader: a `FileSet` of named byte strings."""
+"""Files as they are read and written.
+
+A folder and a zip of it look the same to a reader: a `FileSet` of named byte strings. What is written is there whole or
+not at all: bytes go to a temporary sibling first and then take the name in one step.
+"""
 
 from __future__ import annotations
 
+import secrets
+import shutil
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from evermap.errors import InputError
+from evermap.interrupts import temporary
 from evermap.io.text import reason
+from evermap.types import Recording
 
 # What `zipfile` raises on damaged or encrypted archives, as found by corrupting them at random.
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
@@ -144,3 +153,81 @@ def _zip_sets(path: Path) -> list[FileSet]:
         folder = "" if str(inner.parent) == "." else str(inner.parent)
         folders.setdefault(folder, {})[inner.name] = name
     return [FileSet(path, folder, members, zipped=True) for folder, members in folders.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """One format of recordings.
+
+    Attributes:
+        name: short name, e.g. 'mrclam'.
+        looks_for: the files by which the format is known, for messages.
+        holds: whether files look like this format, by their names.
+        read: returns the recording of a path and a robot; None for the format's default robot.
+        robots: robots in files that can be asked for; none where the format does not number them.
+    """
+
+    name: str
+    looks_for: str
+    holds: Callable[[FileSet], bool]
+    read: Callable[[str | Path, int | None], Recording]
+    robots: Callable[[FileSet], tuple[int, ...]] = lambda _: ()
+
+    def matches(self, path: str | Path) -> bool:
+        """Return whether the files of this format are there, at the top or one folder down."""
+        return find_file_set(path, self.holds) is not None
+
+
+def write_atomic(path: str | Path, content: bytes | str) -> Path:
+    """Write `content` (text as UTF-8) to `path`, so that no reader ever sees half of it. Returns the path.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to; an older file of that name is untouched.
+    """
+    path = Path(path)
+    data = content.encode() if isinstance(content, str) else content
+    partial = _sibling(path)
+    try:
+        with temporary(lambda: partial.unlink(missing_ok=True)):
+            with partial.open("xb") as stream:
+                stream.write(data)
+            partial.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", path=path) from error
+    return path
+
+
+@contextmanager
+def staged_folder(folder: str | Path) -> Iterator[Path]:
+    """Yield A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.
+
+    Args:
+        folder: must not exist, or be empty.
+
+    Raises:
+        InputError: the folder holds something, or cannot be written.
+    """
+    folder = Path(folder).resolve()
+    _check_free(folder)
+    staging = _sibling(folder)
+    try:
+        with temporary(lambda: shutil.rmtree(staging, ignore_errors=True)):
+            staging.mkdir(parents=True)
+            yield staging
+            staging.replace(folder)  # the system refuses if it is not empty by now
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", path=folder) from error
+
+
+def _sibling(path: Path) -> Path:
+    return path.parent / f".{path.name}.{secrets.token_hex(4)}"
+
+
+def _check_free(folder: Path) -> None:
+    if not folder.exists():
+        return
+    if not folder.is_dir():
+        raise InputError("is a file, not a folder", path=folder, hint="name a new folder")
+    held = sorted(child.name for child in folder.iterdir())
+    if held:
+        raise InputError(f"the folder is not empty, it holds {held[0]}", path=folder, hint="name a new folder")

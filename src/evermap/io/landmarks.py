@@ -12,10 +12,10 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.io.text import decode_text, reason
-from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks
+from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
 from evermap.valid import STAMP_S, X_M, Y_M, Quantity
 
 MAP_SCHEMA_VERSION = 1
@@ -128,7 +128,7 @@ def landmarks_from_table(
         clock=clock,
         names=names,
     )
-    return sort_landmarks(landmarks, order)
+    return rows_of(landmarks, order)
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
@@ -254,13 +254,6 @@ def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
             hint = "one of " + ", ".join(class_names)
             raise table.error(f"class '{label}' is not among the class names", row=row, field="class_id", hint=hint)
     return np.array([number_of[label] for label in labels], dtype=np.int64)
-
-
-def sort_landmarks(landmarks: Landmarks, order: IntArray) -> Landmarks:
-    """Return the given rows of a map, in that order."""
-    rows = ("landmark_id", "position_m", "covariance_m2", "class_id", "p_exists", "n_hits", "n_misses",
-            "first_seen_s", "last_seen_s")  # fmt: skip
-    return replace(landmarks, **{name: getattr(landmarks, name)[order] for name in rows})
 
 
 def _covariance(table: Table, sigma_m: float) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, finish_recording, last_of_equal, repeats, wrap_far
-from evermap.io.files import FileSet, find_file_set
+from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rows import Rows, parse_rows
 from evermap.io.text import counted
 from evermap.types import (
@@ -85,7 +85,7 @@ def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
     """
     files = find_file_set(path, _is_mrclam)
     if files is None:
-        raise InputError("no MRCLAM recording here", path=path, hint=MrclamReader.looks_for)
+        raise InputError("no MRCLAM recording here", path=path, hint=MRCLAM.looks_for)
     robot = _choose_robot(files, robot)
     warnings: list[str] = []
     odometry = _read_odometry(files, robot, warnings)
@@ -106,26 +106,6 @@ def read_mrclam(path: str | Path, robot: int | None = None) -> Recording:
     return finish_recording(recording, warnings=warnings)
 
 
-class MrclamReader:
-    """Reader of MRCLAM zips and folders."""
-
-    name = "mrclam"
-    looks_for = "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat"
-
-    def matches(self, path: Path) -> bool:
-        """Return whether a file of a robot is there, at the top or one folder down."""
-        return find_file_set(path, _is_mrclam) is not None
-
-    def read(self, path: Path, robot: int | None) -> Recording:
-        """See `read_mrclam`."""
-        return read_mrclam(path, robot)
-
-    def robots(self, path: Path) -> tuple[int, ...]:
-        """Return numbers of the robots that have both odometry and measurements."""
-        files = find_file_set(path, _is_mrclam)
-        return () if files is None else _complete_robots(files)
-
-
 def _is_mrclam(files: FileSet) -> bool:
     return any(_NAME.fullmatch(name) for name in files.members)
 
@@ -133,6 +113,15 @@ def _is_mrclam(files: FileSet) -> bool:
 def _complete_robots(files: FileSet) -> tuple[int, ...]:
     kinds = Counter(int(match[1]) for name in files.members if (match := _NAME.fullmatch(name)))
     return tuple(sorted(robot for robot, count in kinds.items() if count == 2))
+
+
+MRCLAM = Reader(
+    "mrclam",
+    "MRCLAM zip or folder with Robot<N>_Odometry.dat, Robot<N>_Measurement.dat and Barcodes.dat",
+    _is_mrclam,
+    read_mrclam,
+    _complete_robots,
+)
 
 
 def _choose_robot(files: FileSet, robot: int | None) -> int:

@@ -12,7 +12,7 @@ from evermap import valid as q
 from evermap.errors import DataError, InputError, similar
 from evermap.geometry import se2
 from evermap.io.assemble import finish_recording, forward_stamps, last_of_equal, wrap_far
-from evermap.io.files import FileSet, find_file_set
+from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import Table, parse_csv, parse_parquet
@@ -53,9 +53,9 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         InputError: a file or value is malformed, with its line; or stamps contradict each other.
         DataError: nothing to estimate from, for example no landmark was ever seen.
     """
-    files = find_file_set(path, is_native)
+    files = find_file_set(path, _is_native)
     if files is None:
-        raise InputError("no native recording here", path=path, hint=NativeReader.looks_for)
+        raise InputError("no native recording here", path=path, hint=NATIVE.looks_for)
     if robot is not None:
         problem = f"there is no robot {robot}: a native recording is of one robot"
         raise InputError(problem, path=path, hint="leave the robot out")
@@ -103,28 +103,12 @@ def _needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Ta
     return table
 
 
-class NativeReader:
-    """Reader of native folders and zips of them."""
-
-    name = "native"
-    looks_for = "folder or zip with odometry.csv and detections.csv (or .parquet)"
-
-    def matches(self, path: Path) -> bool:
-        """Return whether odometry or detections are there, at the top or one folder down."""
-        return find_file_set(path, is_native) is not None
-
-    def read(self, path: Path, robot: int | None) -> Recording:
-        """See `read_native`."""
-        return read_native(path, robot)
-
-    def robots(self, path: Path) -> tuple[int, ...]:  # noqa: ARG002 (the protocol's signature)
-        """Return (): a native recording is of one robot, without a number."""
-        return ()
-
-
-def is_native(files: FileSet) -> bool:
+def _is_native(files: FileSet) -> bool:
     """Return whether a file set holds odometry or detections under their native names."""
     return any(f"{name}{ending}" in files for name in ("odometry", "detections") for ending in ENDINGS)
+
+
+NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
 
 
 def _read_settings(files: FileSet, warnings: list[str]) -> Settings:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from evermap.errors import ConfigError
-from evermap.io.atomic import staged_folder
+from evermap.io.files import staged_folder
 from evermap.io.landmarks import labels_of, survey_columns
 from evermap.io.native import SENSOR_FILE
 from evermap.io.sensor_toml import Settings, sensor_toml
@@ -53,10 +53,7 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
     odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
     tables: dict[str, dict[str, Any]] = {
         "odometry": {
-            "stamp_s": odometry.stamp_s,
-            "forward_mps": odometry.forward_mps,
-            "lateral_mps": odometry.lateral_mps,
-            "angular_radps": odometry.angular_radps,
+            name: getattr(odometry, name) for name in ("stamp_s", "forward_mps", "lateral_mps", "angular_radps")
         },
         "detections": {
             "stamp_s": recording.frames.stamp_s[detections.frame],
@@ -73,13 +70,8 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
         if not np.all(np.isnan(sigma)):
             tables["detections"][name] = sigma
     if recording.truth is not None:
-        pose = recording.truth.pose_world_robot
-        tables["truth"] = {
-            "stamp_s": recording.truth.stamp_s,
-            "x_m": pose[:, 0],
-            "y_m": pose[:, 1],
-            "theta_rad": pose[:, 2],
-        }
+        pose = zip(("x_m", "y_m", "theta_rad"), recording.truth.pose_world_robot.T, strict=True)
+        tables["truth"] = {"stamp_s": recording.truth.stamp_s, **dict(pose)}
     if recording.true_landmarks is not None:
         landmarks = recording.true_landmarks
         tables["landmarks"] = survey_columns(landmarks)
@@ -89,13 +81,8 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
         if np.any(landmarks.class_id != UNKNOWN):
             tables["landmarks"]["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or names)
     if recording.robot_sightings is not None:
-        sightings = recording.robot_sightings
-        tables["robot_sightings"] = {
-            "stamp_s": sightings.stamp_s,
-            "robot_id": sightings.robot_id,
-            "range_m": sightings.range_m,
-            "bearing_rad": sightings.bearing_rad,
-        }
+        shown = ("stamp_s", "robot_id", "range_m", "bearing_rad")
+        tables["robot_sightings"] = {name: getattr(recording.robot_sightings, name) for name in shown}
     if len(recording.objects):
         landmark_id = _called(recording.objects[:, 0], recording.landmark_names)
         tables["objects"] = {"landmark_id": landmark_id, "object_id": recording.objects[:, 1]}

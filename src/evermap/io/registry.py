@@ -3,43 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 from evermap.errors import InputError
-from evermap.io.files import file_sets
-from evermap.io.mrclam import MrclamReader
-from evermap.io.native import NativeReader
+from evermap.io.files import Reader, file_sets, find_file_set
+from evermap.io.mrclam import MRCLAM
+from evermap.io.native import NATIVE
 from evermap.types import Recording
 
-
-class Reader(Protocol):
-    """One format of recordings.
-
-    Attributes:
-        name: short name, e.g. 'mrclam'.
-        looks_for: the files by which the format is known, for messages.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def looks_for(self) -> str: ...
-
-    def matches(self, path: Path) -> bool:
-        """Return whether the path looks like this format. Reads names, not contents."""
-        ...
-
-    def read(self, path: Path, robot: int | None) -> Recording:
-        """Return the recording of one robot; None for the format's default."""
-        ...
-
-    def robots(self, path: Path) -> tuple[int, ...]:
-        """Return robots that can be asked for; empty where the format does not number them."""
-        ...
-
-
-READERS: tuple[Reader, ...] = (MrclamReader(), NativeReader())
+READERS: tuple[Reader, ...] = (MRCLAM, NATIVE)
 """All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
 
 
@@ -78,4 +49,6 @@ def read_recording(path: str | Path, robot: int | None = None) -> Recording:
 
 def list_robots(path: str | Path) -> tuple[int, ...]:
     """Return robots of a recording that can be read, in ascending order; empty where they have no numbers."""
-    return reader_for(path).robots(Path(path))
+    reader = reader_for(path)
+    files = find_file_set(path, reader.holds)
+    return () if files is None else reader.robots(files)

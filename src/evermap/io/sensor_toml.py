@@ -15,6 +15,7 @@ from evermap.types import Clock, Sensor
 
 FORMAT_VERSION = 1
 
+# sections and keys with their limits; those of all but the mount are fields of `Sensor`
 _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "limits": {
         "range_min_m": (0.0, 1e6),
@@ -54,12 +55,10 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
         raise InputError(f"not valid TOML: {reason(error)}", path=path, line=line) from None
     reader = _Reader(document, text, path)
     reader.expect(("recording", *_LIMITS), document, section=None)
-    values: dict[str, float] = {}
+    values: dict[str, dict[str, float]] = {}
     for section, keys in _LIMITS.items():
         content = reader.section(section, tuple(keys))
-        for key, (low, high) in keys.items():
-            if key in content:
-                values[f"{section}.{key}"] = reader.number(section, key, content[key], low, high)
+        values[section] = {key: reader.number(section, key, content[key], *keys[key]) for key in keys if key in content}
     return reader.recording(_sensor(values, reader))
 
 
@@ -74,15 +73,8 @@ def sensor_toml(settings: Settings) -> str:
             "frames_complete": settings.frames_complete,
             "class_names": settings.class_names or None,
         },
-        "limits": {
-            "range_min_m": sensor.range_min_m,
-            "range_max_m": sensor.range_max_m,
-            "bearing_min_rad": sensor.bearing_min_rad,
-            "bearing_max_rad": sensor.bearing_max_rad,
-        },
-        "noise": {"sigma_range_m": sensor.sigma_range_m, "sigma_bearing_rad": sensor.sigma_bearing_rad},
-        "mount": dict(zip(("x_m", "y_m", "theta_rad"), sensor.mount_robot_sensor, strict=True)),
-        "detection": {"p_detect": sensor.p_detect, "p_false": sensor.p_false},
+        **{name: {key: getattr(sensor, key, None) for key in keys} for name, keys in _LIMITS.items()},
+        "mount": dict(zip(_LIMITS["mount"], sensor.mount_robot_sensor, strict=True)),
     }
     blocks = []
     for name, content in sections.items():
@@ -92,22 +84,11 @@ def sensor_toml(settings: Settings) -> str:
     return "\n".join(blocks)
 
 
-def _sensor(values: dict[str, float], reader: _Reader) -> Sensor:
-    default = Sensor()
+def _sensor(values: dict[str, dict[str, float]], reader: _Reader) -> Sensor:
+    mount = values.pop("mount")
+    x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
     sensor = Sensor(
-        range_min_m=values.get("limits.range_min_m", default.range_min_m),
-        range_max_m=values.get("limits.range_max_m", default.range_max_m),
-        bearing_min_rad=values.get("limits.bearing_min_rad", default.bearing_min_rad),
-        bearing_max_rad=values.get("limits.bearing_max_rad", default.bearing_max_rad),
-        sigma_range_m=values.get("noise.sigma_range_m"),
-        sigma_bearing_rad=values.get("noise.sigma_bearing_rad"),
-        p_detect=values.get("detection.p_detect", default.p_detect),
-        p_false=values.get("detection.p_false", default.p_false),
-        mount_robot_sensor=(
-            values.get("mount.x_m", 0.0),
-            values.get("mount.y_m", 0.0),
-            values.get("mount.theta_rad", 0.0),
-        ),
+        **{k: v for part in values.values() for k, v in part.items()}, mount_robot_sensor=(x_m, y_m, theta_rad)
     )
     if sensor.range_min_m >= sensor.range_max_m:
         raise reader.error("limits", "range_max_m", "must be greater than range_min_m")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.io.atomic import staged_folder
+from evermap.io.files import staged_folder
 from evermap.io.table import csv_text
 from evermap.types import FloatArray
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, last_of_equal
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.io.rows import parse_rows
 from evermap.types import Clock, Trajectory
 from evermap.valid import STAMP_S, X_M, Y_M, Quantity

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
 from evermap import __version__
 from evermap.errors import ConfigError
 from evermap.interrupts import held, kept, temporary
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, changes_text, summary_dict, timing_dict
 from evermap.types import Innovations, Recording, SlamResult
 

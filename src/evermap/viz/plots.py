@@ -31,6 +31,8 @@ from evermap.viz.style import (
     drawing,
     house_style,
 )
+from evermap.viz.time_axis import guess_clock
+from evermap.viz.track_figures import Rests, plot_objects
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -94,6 +96,42 @@ def plot_landmarks(landmarks: Landmarks) -> Figure:
             figure.add_subplot(**_PLAN)
         return figure
     return plot_living_map(MapView(landmarks, np.zeros(len(landmarks), dtype=np.bool_)), title="")
+
+
+def plot_track_run(result: Any) -> Figure:
+    """Draw a `TrackResult`: paths and places of rest from above, and when objects rested."""
+    table, spells = result.table, result.spells
+    rests = Rests(
+        class_id=spells.class_id,
+        position_m=spells.position_m[:, :2],
+        elsewhere_s=spells.elsewhere_s,
+        first_s=spells.first_s,
+        last_s=spells.last_s,
+        gone_s=spells.gone_s,
+    )
+    return plot_objects(
+        table.class_names,
+        _paths(result),
+        rests,
+        start_s=float(table.stamp_s[0]),
+        end_s=float(table.stamp_s[-1]),
+        sensor_m=None if table.sensor_m is None else table.sensor_m[:, :2],
+        clock=guess_clock(table.stamp_s),
+    )
+
+
+def _paths(result: Any) -> list[tuple[int, FloatArray]]:
+    """Class and (K, 2) positions of each stretch in which an object was followed and did not rest."""
+    tracks = result.tracks
+    frame = np.searchsorted(result.table.stamp_s, tracks.stamp_s)
+    rows = np.flatnonzero(~tracks.static)
+    ends = np.flatnonzero((np.diff(tracks.track_id[rows]) != 0) | (np.diff(frame[rows]) != 1)) + 1
+    ids, class_of_track = np.unique(tracks.track_id), result.class_of_track()
+    return [
+        (int(class_of_track[np.searchsorted(ids, tracks.track_id[part[0]])]), tracks.position_m[part, :2])
+        for part in np.split(rows, ends)
+        if len(part) > 1
+    ]
 
 
 def plot_trajectory(trajectory: Trajectory) -> Figure:

@@ -100,14 +100,14 @@ def session_names(building: BuildingSimulation) -> list[str]:
 
 def _write_events(building: BuildingSimulation, path: Path) -> None:
     """One JSON object a line, in order of time."""
-    from evermap.io.atomic import write_atomic
+    from evermap.io.files import write_atomic
 
     write_atomic(path, "".join(json.dumps(asdict(event)) + "\n" for event in building.events))
 
 
 def _write_looks(building: BuildingSimulation, names: list[str], path: Path) -> None:
     """One row for every session and every place at which a landmark ever stood."""
-    from evermap.io.atomic import write_atomic
+    from evermap.io.files import write_atomic
     from evermap_studies.sim import looked_at
 
     looks = looked_at(building)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.io.table import csv_text
 
 _DAY_S, _HOUR_S = 86400.0, 3600.0

@@ -1,21 +1,25 @@
-"""`report.html` of a run: what is there now, what changed, and whether the probabilities mean what they say."""
+"""Figures and `report.html` of a run: what is there now, what changed, whether probabilities mean what they say."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
+from evermap.existence.protocol import Instants
+from evermap.runs.persist.models import looks_at
 from evermap.runs.persist.run import PersistResult
 from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
-from evermap.types import Clock
+from evermap.types import Clock, FloatArray, IntArray
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.style import NamedFigure
+from evermap.viz.time_axis import guess_clock
 
 _MOST_ROWS = 100
 
@@ -133,3 +137,132 @@ def _provenance(summary: Mapping[str, Any]) -> str:
     """Command, configuration and versions."""
     shown = {name: summary[name] for name in ("command", "config", "model", "learning", "versions", "timing")}
     return json.dumps(shown, indent=2, ensure_ascii=False)
+
+
+RASTER_ROWS = 60
+_RASTER_COLUMNS = 480
+_CURVE_POINTS = 400
+_PIXELS = 1200
+"""Columns of a figure: of more looks, each column shows the lowest and the highest belief, and one tick a kind."""
+
+
+def clock_of(result: PersistResult) -> Clock:
+    """Return the clock of the table's stamps; where the table does not say, guess."""
+    return result.table.clock or guess_clock(result.table.stamp_s)
+
+
+def draw_run(result: PersistResult, *, figures: int, clock: Clock | None = None) -> Iterator[NamedFigure]:
+    """Draw the figures one by one, so that a progress bar can follow.
+
+    Args:
+        result: of `run_persist`.
+        figures: how many features get a figure of their own.
+        clock: of the stamps; None guesses.
+    """
+    clock = clock or clock_of(result)
+    yield _overview(result, clock)
+    if result.scores is not None and result.reliability is not None:
+        yield _calibration(result)
+    taken: set[str] = set()
+    for feature in most_interesting(result, figures).tolist():
+        yield _feature(result, feature, clock, taken)
+
+
+def most_interesting(result: PersistResult, n: int) -> IntArray:
+    """Return the `n` features that changed most, of equals those looked at more often; in natural order."""
+    changes = result.changes.per_feature(result.table.n_features)
+    order = np.lexsort((-np.diff(result.looks.first), -changes))
+    return np.sort(order[:n])
+
+
+def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
+    from evermap.viz.presence_figures import plot_raster
+
+    features = most_interesting(result, RASTER_ROWS)
+    start_s, end_s = _span(result)
+    edge_s = np.linspace(start_s, end_s, _RASTER_COLUMNS + 1)
+    middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
+    looks, _ = looks_at(result.looks, features)
+    track = result.models.only(features).track(looks, Instants.same_for_all(len(features), middle_s))
+    row = {feature: k for k, feature in enumerate(features.tolist())}
+    changes = result.changes
+    marks = [
+        (row[feature], stamp_s, returned)
+        for feature, stamp_s, returned in zip(
+            changes.feature.tolist(), changes.stamp_s.tolist(), changes.returned.tolist(), strict=True
+        )
+        if feature in row
+    ]
+    names = [result.table.names[feature] for feature in features.tolist()]
+    figure = plot_raster(
+        names,
+        edge_s,
+        track.p_present.reshape(len(features), -1),
+        changes=marks,
+        forecast_from_s=result.table.now_s,
+        clock=clock,
+    )
+    total = result.table.n_features
+    which = "All features" if len(features) == total else f"The {len(features)} of {total:,} features that changed most"
+    caption = f"{which}: blue is there, orange is not, pale is undecided, hatched is not yet seen."
+    return NamedFigure("overview", figure, "Beliefs of all features", caption)
+
+
+def _calibration(result: PersistResult) -> NamedFigure:
+    from evermap.viz.presence_figures import plot_reliability
+
+    assert result.scores is not None and result.reliability is not None  # noqa: PT018
+    figure = plot_reliability(result.reliability, result.scores)
+    caption = (
+        "Of all instants at which the belief was about so high, how often was the feature there? On the dashed line"
+        " beliefs mean what they say. Below: how many there were."
+    )
+    return NamedFigure("calibration", figure, "Calibration", caption)
+
+
+def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str]) -> NamedFigure:
+    from evermap.viz.presence_figures import plot_belief, stretches
+
+    index = np.array([feature])
+    looks, look_rows = looks_at(result.looks, index)
+    start_s, end_s = _span(result)
+    pixel = np.floor((looks.stamp_s - start_s) / (end_s - start_s or 1.0) * _PIXELS)
+    turn_s = looks.stamp_s[_extremes(pixel, result.p_at_looks[look_rows])]
+    before_s = np.maximum(np.nextafter(turn_s, -np.inf), start_s)  # draws the jump of a look upright
+    time_s = np.unique(np.concatenate([np.linspace(start_s, end_s, _CURVE_POINTS), before_s, turn_s]))
+    track = result.models.only(index).track(looks, Instants.same_for_all(1, time_s))
+    truth = result.truth
+    there = None
+    if truth is not None and truth.first[feature + 1] > truth.first[feature]:
+        rows = slice(int(truth.first[feature]), int(truth.first[feature + 1]))
+        there = stretches(truth.stamp_s[rows], truth.present[rows])
+    name = result.table.names[feature]
+    shown = np.unique(pixel + 1j * looks.detected, return_index=True)[1]
+    figure = plot_belief(
+        time_s,
+        track.p_present,
+        looks=(looks.stamp_s[shown], looks.detected[shown]),
+        truth_s=there,
+        forecast_from_s=result.table.now_s,
+        title=f"feature {name if len(name) <= 60 else name[:59] + '…'}",
+        clock=clock,
+    )
+    slug = re.sub(r"[^A-Za-z0-9_.-]+", "-", name)[:60].strip("-.") or "feature"
+    while slug in taken:
+        slug += "-"
+    taken.add(slug)
+    caption = "Belief, detections (above) and misses (below); shaded where it truly was there, dashed the forecast."
+    return NamedFigure(f"feature-{slug}", figure, f"Feature {name}", caption)
+
+
+def _extremes(pixel: FloatArray, belief: FloatArray) -> IntArray:
+    """The looks with the lowest and the highest belief in each column of pixels; nan counts as highest."""
+    order = np.lexsort((belief, pixel))
+    edge = np.flatnonzero(np.diff(pixel[order], prepend=-np.inf, append=np.inf))
+    return np.unique(np.concatenate([order[edge[:-1]], order[edge[1:] - 1]]))
+
+
+def _span(result: PersistResult) -> tuple[float, float]:
+    """From the first row to the end of the forecast."""
+    stamps = result.table.stamp_s
+    return float(stamps.min()), max(float(stamps.max()), float(result.forecasts.stamp_s[-1]))

@@ -14,8 +14,7 @@ from evermap.existence.one_stay import OneStay
 from evermap.existence.protocol import Looks
 from evermap.io.text import counted, quote
 from evermap.metrics.belief import BeliefScores, Reliability, belief_scores, reliability
-from evermap.runs.persist.changes import Changes, find_changes
-from evermap.runs.persist.forecasts import Forecasts, forecast_stamps, forecasts_of
+from evermap.runs.persist.changes import Changes, Forecasts, find_changes, forecast_stamps, forecasts_of
 from evermap.runs.persist.models import ModelOfEach, ask, models_for
 from evermap.runs.persist.table import LookTable, Truth
 from evermap.types import FloatArray, IntArray, Progress

@@ -13,8 +13,7 @@ import numpy as np
 
 from evermap.io.columns import csv_bytes, named
 from evermap.runs.folder import RunFolder
-from evermap.runs.persist.draw import clock_of, draw_run
-from evermap.runs.persist.report import render_report
+from evermap.runs.persist.report import clock_of, draw_run, render_report
 from evermap.runs.persist.run import PersistResult
 from evermap.runs.summary import RunInfo, change_dict, changes_text, summary_head
 from evermap.types import ChangeKind, Clock, MapChange, json_number, landmark_id_of

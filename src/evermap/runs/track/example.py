@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.atomic import write_atomic
+from evermap.io.files import write_atomic
 from evermap.io.table import csv_text
 from evermap.types import FloatArray
 
