@@ -8,7 +8,7 @@ import pytest
 
 from evermap.geometry import se2
 from evermap.metrics.landmarks import evaluate_landmarks
-from evermap.metrics.summary import compare_with_truth, evaluate, in_view, metrics_dict
+from evermap.metrics.summary import compare_with_truth, in_view, metrics_dict
 from evermap.types import Innovations, Landmarks
 
 STABLE_KEYS = {
@@ -68,7 +68,7 @@ def test_own_alignment_removes_a_turn_of_the_map_and_never_helps_less():
 
 
 def test_summary_has_every_key_and_is_json(run):
-    summary = evaluate(*run)
+    summary = metrics_dict(compare_with_truth(*run))
     assert summary.keys() >= STABLE_KEYS
     assert all(summary[key] is not None for key in STABLE_KEYS)
     assert json.loads(json.dumps(summary, allow_nan=False)) == summary
@@ -77,15 +77,15 @@ def test_summary_has_every_key_and_is_json(run):
 
 def test_summary_without_truth_keeps_the_keys_and_says_null(run):
     recording, result = run
-    full = evaluate(recording, result)
-    blind = evaluate(dataclasses.replace(recording, truth=None, true_landmarks=None), result)
+    full = metrics_dict(compare_with_truth(recording, result))
+    blind = metrics_dict(compare_with_truth(dataclasses.replace(recording, truth=None, true_landmarks=None), result))
     assert blind.keys() == full.keys()
     assert blind["alignment"].keys() == full["alignment"].keys()
     for key in STABLE_KEYS - {"alignment", "nis_mean", "nis_in_band_share"}:
         assert blind[key] is None, key
     assert blind["nis_mean"] == full["nis_mean"]
 
-    landmarks_only = evaluate(dataclasses.replace(recording, truth=None), result)
+    landmarks_only = metrics_dict(compare_with_truth(dataclasses.replace(recording, truth=None), result))
     assert landmarks_only["landmark_rmse_m"] is None
     assert landmarks_only["landmark_rmse_own_alignment_m"] == full["landmark_rmse_own_alignment_m"]
 
@@ -94,7 +94,7 @@ def test_summary_of_a_run_without_innovations(run):
     recording, result = run
     empty = np.zeros(0)
     none = Innovations(empty, empty.astype(int), empty.astype(int), empty, empty)
-    summary = evaluate(recording, dataclasses.replace(result, innovations=none))
+    summary = metrics_dict(compare_with_truth(recording, dataclasses.replace(result, innovations=none)))
     assert summary["nis_mean"] is None
     assert summary["nis_in_band_share"] is None
     json.dumps(summary, allow_nan=False)

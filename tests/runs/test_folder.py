@@ -298,9 +298,7 @@ def test_summary_of_an_interrupted_run_counts_what_was_done(run):
     )
     part = dataclasses.replace(result, interrupted=True, step_s=result.step_s[:101], online=done)
     info = RunInfo(processing_s=1.0)
-    summary = summary_dict(
-        recording, part, {}, config={}, info=info, timing=timing_dict(recording, part, info), outputs=[]
-    )
+    summary = summary_dict(recording, part, {}, config={}, info=info, timing=timing_dict(recording, part, info))
     assert summary["interrupted"] is True
     assert summary["counts"]["frames_processed"] == 101
     expected = online.stamp_s[100] - online.stamp_s[0]

@@ -58,8 +58,8 @@ def page_of(recording, result, figures=(), sections=()):
         config={"slam": {"robust": True}},
         info=info,
         timing=timing_dict(recording, result, info),
-        outputs=["report.html", "summary.json"],
     )
+    summary["outputs"] = ["report.html", "summary.json"]
     return render_report(recording, result, evaluation, summary, figures, sections), summary
 
 

@@ -121,11 +121,6 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
     }
 
 
-def evaluate(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> dict[str, Any]:
-    """Return `metrics_dict(compare_with_truth(...))`, ready for JSON."""
-    return metrics_dict(compare_with_truth(recording, result, rate_hz=rate_hz))
-
-
 def _alignment(evaluation: Evaluation) -> dict[str, Any]:
     """Return how estimates were aligned with the truth, and how much truth was scored."""
     out: dict[str, Any] = {

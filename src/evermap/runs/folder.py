@@ -428,9 +428,7 @@ def write_run(
         if _choose(asked.get("scene"), wanted, "rerun", default=False):
             remarks += _write_scene(folder, recording, result, evaluation, must=asked.get("scene") is True)
         measured, settings = metrics_dict(evaluation), _plain(config)
-        summary = summary_dict(
-            recording, result, measured, config=settings, info=info, timing=timing, outputs=(), warnings=remarks
-        )
+        summary = summary_dict(recording, result, measured, config=settings, info=info, timing=timing, warnings=remarks)
         summary = folder.finish(summary, *(["report.html"] if tell else []))
         if tell:
             from evermap.viz.report import render_report

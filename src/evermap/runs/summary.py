@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import Alternative, MapChange, ParameterEstimate, Recording, SlamResult, json_number
+from evermap.types import MapChange, ParameterEstimate, Recording, SlamResult, json_number
 
 SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
@@ -99,10 +99,9 @@ def summary_dict(
     config: Any,
     info: RunInfo,
     timing: Mapping[str, Any],
-    outputs: Sequence[str],
     warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Return the content of `summary.json`. Pure; no key is ever missing.
+    """Return the content of `summary.json` but for `outputs`, which `RunFolder.finish` adds. Pure.
 
     Args:
         recording: what was processed.
@@ -111,7 +110,6 @@ def summary_dict(
         config: configuration as JSON values.
         info: command and seeds.
         timing: `timing_dict(...)`.
-        outputs: names of all files of the run folder.
         warnings: remarks beyond those of the recording and the result.
     """
     frame = result.trajectory.frame
@@ -128,9 +126,11 @@ def summary_dict(
         "metrics": dict(metrics),
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
         "changes": [change_dict(change) for change in result.changes],
-        "alternatives": [_alternative(alternative) for alternative in result.alternatives],
+        "alternatives": [
+            {"changes": [*map(change_dict, other.changes)], "probability": json_number(other.probability)}
+            for other in result.alternatives
+        ],
         "parameters": [_parameter(parameter) for parameter in result.parameters],
-        "outputs": list(outputs),
         "interrupted": bool(result.interrupted),
     }
 
@@ -236,13 +236,6 @@ def _counts(recording: Recording, result: SlamResult) -> dict[str, Any]:
         "true_landmarks": None if recording.true_landmarks is None else len(recording.true_landmarks),
         "truth_poses": None if recording.truth is None else len(recording.truth),
         "robot_sightings": 0 if sightings is None else len(sightings),
-    }
-
-
-def _alternative(alternative: Alternative) -> dict[str, Any]:
-    return {
-        "changes": [change_dict(change) for change in alternative.changes],
-        "probability": json_number(alternative.probability),
     }
 
 

@@ -27,7 +27,7 @@ from evermap.viz.style import (
     drawing,
     legend_name,
 )
-from evermap.viz.time_axis import DURATIONS, TimeUnit, label_durations, unit_for
+from evermap.viz.time_axis import DURATIONS, TimeUnit, label_ages, unit_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -76,9 +76,9 @@ def plot_lifetimes(
         styles = _styles(named)
         for name, prior in named.items():
             _draw_prior(panels, prior, _legend(name, prior), time_s, unit, styles[name])
-        _finish(panels, unit, logarithmic, time_s)
+        _finish(panels, unit, logarithmic)
         for axes in panels[1]:
-            _time_axis(axes, time_s, unit, logarithmic)
+            label_ages(axes, time_s, unit, logarithmic=logarithmic)
         figure.legend(*panels[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return figure
 
@@ -100,7 +100,7 @@ def _draw_prior(
         cumulative.axhline(-math.log(stay), color=style["color"], lw=0.8, ls=":")
 
 
-def _finish(panels: Any, unit: TimeUnit, logarithmic: bool, time_s: FloatArray) -> None:
+def _finish(panels: Any, unit: TimeUnit, logarithmic: bool) -> None:
     (hazard, cumulative), (survival, density) = panels
     for axes, title, label in (
         (hazard, "hazard", f"h(t) [1/{unit.name.removesuffix('s') or 's'}]"),
@@ -113,8 +113,6 @@ def _finish(panels: Any, unit: TimeUnit, logarithmic: bool, time_s: FloatArray) 
         if axes is not survival:
             _limit(axes, logarithmic)
     survival.set_ylim(0.0, 1.04)
-    if not logarithmic:
-        hazard.set_xlim(0.0, time_s[-1] / unit.seconds)
 
 
 def _limit(axes: Axes, logarithmic: bool) -> None:
@@ -132,13 +130,6 @@ def _limit(axes: Axes, logarithmic: bool) -> None:
         return
     typical = float(np.quantile(heights, 0.98))
     axes.set_ylim(0.0, 1.08 * (highest if highest < 5.0 * typical else 2.0 * typical))
-
-
-def _time_axis(axes: Axes, time_s: FloatArray, unit: TimeUnit, logarithmic: bool) -> None:
-    if logarithmic:
-        label_durations(axes, float(time_s[0]), float(time_s[-1]), unit)
-    else:
-        axes.set_xlabel(f"time since first seen [{unit.name}]")
 
 
 def _legend(name: str, prior: LifetimePrior) -> str:
@@ -225,10 +216,7 @@ def plot_survival(
                 time_s / unit.seconds, np.exp(truth.log_survival(time_s)), color=INK, lw=1.0, ls="--", label="truth"
             )
         axes.set(ylim=(0.0, 1.03), ylabel="P(T > t) [1]")
-        if logarithmic:
-            label_durations(axes, float(time_s[0]), float(time_s[-1]), unit)
-        else:
-            axes.set(xlim=(0.0, time_s[-1] / unit.seconds), xlabel=f"time since first seen [{unit.name}]")
+        label_ages(axes, time_s, unit, logarithmic=logarithmic)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return figure
 

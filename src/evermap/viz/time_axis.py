@@ -98,10 +98,14 @@ class TimeAxis:
         axes.set_xlabel(f"time [{self.zone}]")
 
 
-def label_durations(axes: Axes, low_s: float, high_s: float, unit: TimeUnit) -> None:
-    """Make a logarithmic axis in `unit` from `low_s` to `high_s`, with ticks such as `1 min` and `1 day`."""
+def label_ages(axes: Axes, age_s: FloatArray, unit: TimeUnit, *, logarithmic: bool) -> None:
+    """Make an axis over ages (N,), increasing, in `unit`; a logarithmic one has ticks such as `1 min`."""
     from matplotlib.ticker import NullFormatter, NullLocator
 
+    low_s, high_s = float(age_s[0]), float(age_s[-1])
+    if not logarithmic:
+        axes.set(xlim=(0.0, high_s / unit.seconds), xlabel=f"time since first seen [{unit.name}]")
+        return
     axes.set_xscale("log")
     axes.set_xlim(low_s / unit.seconds, high_s / unit.seconds)
     ticks = [(name, value / unit.seconds) for name, value in DURATIONS if low_s <= value <= high_s]

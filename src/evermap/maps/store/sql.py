@@ -166,9 +166,56 @@ class SqlStore(Shown):
         *,
         parent: int,
         attachments: Mapping[str, bytes | Attachment] | None = None,
+        restores: int | None = None,
+        lost: Mapping[int, bytes | None] | None = None,
     ) -> int:
-        """Return a new revision."""
-        return self._commit(living, provenance, changes, evidence, parent=parent, attachments=attachments)
+        """Return a new revision, whole or not at all; what takes time is done before the store is locked.
+
+        Args:
+            living: and what follows it as `MapStore.commit` takes them.
+            provenance: where it comes from.
+            changes: how it differs from its parent.
+            evidence: what the session saw.
+            parent: the revision that the map was made from.
+            attachments: bytes to keep with it.
+            restores: the revision that is brought back.
+            lost: revisions that damage has destroyed, see `Record`.
+        """
+        problem = content.flaw(living)
+        if problem:
+            raise NumericalError(f"not a map that can be kept: {problem}", path=self._where)
+        name, chunks = content.pack(living)
+        config = content.text_chunk(provenance.config)
+        chunks[config.name] = config
+        index = self._with_evidence(evidence, chunks)
+        attached = self._attach(attachments or {}, chunks)
+        number = parent + 1
+        told = _told(provenance, living, number=number, parent=parent, restores=restores)
+        stored = {key: chunk.stored() for key, chunk in chunks.items() if key not in self._checked}
+        with self._writing() as connection:
+            head, before = self._anchor(connection)
+            if head != parent:
+                problem = f"revision {head} came in after revision {parent} was read; nothing was written"
+                hint = "the same again, which continues from the newest"
+                raise StaleRevisionError(problem, path=self._where, hint=hint)
+            record = Record(
+                {**told, "n_grown": 0 if restores is not None else self._n_grown(connection, parent, living, changes)},
+                before,
+                name,
+                config.name,
+                index,
+                tuple(changes),
+                attached,
+                (living.n_cliques_ever, living.n_sites_ever),
+                lost or {},
+            ).chunk()
+            chunks[record.name] = record
+            self._put(connection, chunks, {**stored, record.name: record.stored()})
+            self._fetched(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
+            connection.execute(insert(schema.revision).values(number=number, record=record.name))
+            self._move_anchor(connection, number, record.name)
+        self._checked |= chunks.keys()
+        return number
 
     def revert(self, revision: int, provenance: Provenance | None = None) -> int:
         """Return a new revision with the content of an older one."""
@@ -207,7 +254,7 @@ class SqlStore(Shown):
         )
         origin = Provenance() if provenance is None else provenance
         origin = replace(origin, kind=RevisionKind.REVERT, note=origin.note or f"back to revision {revision}")
-        return self._commit(restored, origin, (), None, parent=head, restores=revision, lost=lost)
+        return self.commit(restored, origin, parent=head, restores=revision, lost=lost)
 
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         """Return changes of one revision."""
@@ -278,64 +325,6 @@ class SqlStore(Shown):
             if numbers:
                 connection.execute(insert(schema.revision), numbers)
             self._move_anchor(connection, head, records.get(head))
-
-    def _commit(
-        self,
-        living: LivingMap,
-        provenance: Provenance,
-        changes: Sequence[MapChange],
-        evidence: Evidence | None,
-        *,
-        parent: int,
-        restores: int | None = None,
-        attachments: Mapping[str, bytes | Attachment] | None = None,
-        lost: Mapping[int, bytes | None] | None = None,
-    ) -> int:
-        """Whole or not at all; what takes time is done before the store is locked."""
-        problem = content.flaw(living)
-        if problem:
-            raise NumericalError(f"not a map that can be kept: {problem}", path=self._where)
-        name, chunks = content.pack(living)
-        config = content.text_chunk(provenance.config)
-        chunks[config.name] = config
-        index = self._with_evidence(evidence, chunks)
-        attached = self._attach(attachments or {}, chunks)
-        number = parent + 1
-        told = about(
-            provenance,
-            number=number,
-            parent=parent,
-            restores=restores,
-            created_at=now_utc(),
-            evermap_version=__version__,
-            n_landmarks=len(living.members),
-            n_existing=int(np.sum((living.p_exists() >= 0.5) & ~living.members.deleted)),
-        )
-        stored = {key: chunk.stored() for key, chunk in chunks.items() if key not in self._checked}
-        with self._writing() as connection:
-            head, before = self._anchor(connection)
-            if head != parent:
-                problem = f"revision {head} came in after revision {parent} was read; nothing was written"
-                hint = "the same again, which continues from the newest"
-                raise StaleRevisionError(problem, path=self._where, hint=hint)
-            record = Record(
-                {**told, "n_grown": 0 if restores is not None else self._n_grown(connection, parent, living, changes)},
-                before,
-                name,
-                config.name,
-                index,
-                tuple(changes),
-                attached,
-                (living.n_cliques_ever, living.n_sites_ever),
-                lost or {},
-            ).chunk()
-            chunks[record.name] = record
-            self._put(connection, chunks, {**stored, record.name: record.stored()})
-            self._fetched(connection, {key for key, _ in attached.values()} - chunks.keys())  # those that are shared
-            connection.execute(insert(schema.revision).values(number=number, record=record.name))
-            self._move_anchor(connection, number, record.name)
-        self._checked |= chunks.keys()
-        return number
 
     def _with_evidence(self, evidence: Evidence | None, chunks: dict[bytes, Chunk]) -> bytes | None:
         """The name of the index of what a session saw, None for nothing; its chunks are added to `chunks`."""
@@ -603,6 +592,18 @@ def is_anchor(values: Sequence[Any]) -> bool:
 def now_utc() -> str:
     """Return ISO 8601, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _told(provenance: Provenance, living: LivingMap, **numbers: int | None) -> dict[str, Any]:
+    """What the record of a new revision tells of it."""
+    return about(
+        provenance,
+        **numbers,
+        created_at=now_utc(),
+        evermap_version=__version__,
+        n_landmarks=len(living.members),
+        n_existing=int(np.sum((living.p_exists() >= 0.5) & ~living.members.deleted)),
+    )
 
 
 def _batches(names: Iterable[bytes]) -> Iterator[list[bytes]]:
