@@ -16,8 +16,8 @@ from evermap.errors import ConfigError, MissingExtraError
 from evermap.io.landmarks import read_prior_map
 from evermap.io.tum import read_tum
 from evermap.runs import folder as runfolder
-from evermap.runs.folder import MANIFEST, RunFolder, RunInfo, check_output_file, check_replaceable, write_run
-from evermap.runs.summary import summary_dict, timing_dict
+from evermap.runs.folder import MANIFEST, RunFolder, check_output_file, check_replaceable, write_run
+from evermap.runs.summary import RunInfo, summary_dict, timing_dict
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "metrics"))
 

@@ -5,20 +5,23 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from evermap.tracking.record import StaticSpells
 from evermap.types import Clock
 from evermap.viz.style import ALERT, class_looks
-from evermap.viz.track_figures import MOST_SPELLS, Rests, plot_objects
+from evermap.viz.track_figures import MOST_SPELLS, plot_objects
 
 HOUR_S = 3600.0
 
 
-def rests(n: int) -> Rests:
+def rests(n: int) -> StaticSpells:
     """Spell k is seen from k to 2 k + 1 hours; the first has no known beginning, the last no known end."""
     hour = np.arange(n, dtype=np.float64)
     elsewhere, gone = hour - 0.5, 2.0 * hour + 1.5
     elsewhere[0], gone[-1] = -np.inf, np.inf
     place = np.stack([hour, -hour], axis=1)
-    return Rests(np.arange(n) % 2, place, *(HOUR_S * h for h in (elsewhere, hour, 2.0 * hour + 1.0, gone)))
+    return StaticSpells(
+        np.arange(n), np.arange(n) % 2, place, *(HOUR_S * h for h in (elsewhere, hour, 2.0 * hour + 1.0, gone))
+    )
 
 
 def test_a_bar_for_each_spell_thin_where_it_can_have_come_and_gone() -> None:

@@ -6,6 +6,7 @@ How `evermap map why` answers: lines, a table of the sessions, a figure.
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,23 +23,15 @@ if TYPE_CHECKING:
 
 def revision_dict(item: Revision) -> dict[str, Any]:
     """Return one line of the history."""
-    origin = item.provenance
+    origin = asdict(item.provenance) | {"kind": item.provenance.kind.value}
     return {
         "revision": item.number,
         "parent": item.parent,
         "restores": item.restores,
-        "kind": origin.kind.value,
         "created_at": item.created_at,
-        "recording": origin.recording,
-        "source": origin.source,
-        "command": origin.command,
-        "config": origin.config,
-        "seed": origin.seed,
         "evermap_version": item.evermap_version,
-        "stamp_from_s": json_number(origin.stamp_from_s),
-        "stamp_to_s": json_number(origin.stamp_to_s),
-        "wall_s": json_number(origin.wall_s),
-        "note": origin.note,
+        **origin,
+        **{name: json_number(origin[name]) for name in ("stamp_from_s", "stamp_to_s", "wall_s")},
         "landmarks": item.n_landmarks,
         "existing": item.n_existing,
         "changes": {kind.value: count for kind, count in item.n_changes.items()},

@@ -197,6 +197,17 @@ def write_atomic(path: str | Path, content: bytes | str) -> Path:
     return path
 
 
+def write_new(path: str | Path, content: bytes | str) -> Path:
+    """Write a file that is not there yet, as `write_atomic`. Returns the path.
+
+    Raises:
+        InputError: it exists, or cannot be written.
+    """
+    if Path(path).exists():
+        raise InputError("exists already", path=path, hint="another name")
+    return write_atomic(path, content)
+
+
 @contextmanager
 def staged_folder(folder: str | Path) -> Iterator[Path]:
     """Yield A temporary sibling to fill, which becomes `folder` at the end; nothing is left of it after an error.

@@ -509,14 +509,3 @@ def _write_scene(
             raise
         return [f"scene.rrd was left out: {error.one_line()}"]
     return []
-
-
-__all__ = [
-    "SUMMARY_SCHEMA_VERSION",
-    "RunFolder",
-    "RunInfo",
-    "check_output_file",
-    "check_replaceable",
-    "summary_dict",
-    "write_run",
-]

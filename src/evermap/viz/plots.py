@@ -32,7 +32,7 @@ from evermap.viz.style import (
     house_style,
 )
 from evermap.viz.time_axis import guess_clock
-from evermap.viz.track_figures import Rests, plot_objects
+from evermap.viz.track_figures import plot_objects
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,19 +100,11 @@ def plot_landmarks(landmarks: Landmarks) -> Figure:
 
 def plot_track_run(result: Any) -> Figure:
     """Draw a `TrackResult`: paths and places of rest from above, and when objects rested."""
-    table, spells = result.table, result.spells
-    rests = Rests(
-        class_id=spells.class_id,
-        position_m=spells.position_m[:, :2],
-        elsewhere_s=spells.elsewhere_s,
-        first_s=spells.first_s,
-        last_s=spells.last_s,
-        gone_s=spells.gone_s,
-    )
+    table = result.table
     return plot_objects(
         table.class_names,
         _paths(result),
-        rests,
+        result.spells,
         start_s=float(table.stamp_s[0]),
         end_s=float(table.stamp_s[-1]),
         sensor_m=None if table.sensor_m is None else table.sensor_m[:, :2],

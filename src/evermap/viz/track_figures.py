@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.types import Clock, FloatArray, IntArray
+from evermap.types import Clock, FloatArray
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -30,29 +29,10 @@ MOST_SPELLS = 80
 """Rows of the right half; of more spells, the longest."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rests:
-    """K spells at rest.
-
-    Attributes:
-        class_id: (K,) class.
-        position_m: (K, 2) where.
-        elsewhere_s, first_s, last_s, gone_s: (K,) last look without it, first and last with it, first without it;
-            not finite where there is none.
-    """
-
-    class_id: IntArray
-    position_m: FloatArray
-    elsewhere_s: FloatArray
-    first_s: FloatArray
-    last_s: FloatArray
-    gone_s: FloatArray
-
-
 def plot_objects(
     class_names: Sequence[str],
     paths: Sequence[tuple[int, FloatArray]],
-    rests: Rests,
+    rests: Any,
     *,
     start_s: float,
     end_s: float,
@@ -68,7 +48,7 @@ def plot_objects(
     Args:
         class_names: C classes, '' for one without a name.
         paths: class and (K, 2) positions of each stretch in which an object moved.
-        rests: the spells.
+        rests: the spells, `tracking.record.StaticSpells`.
         start_s: first frame.
         end_s: last frame.
         sensor_m: (F, 2) where the sensor was, in order; None where unknown.
@@ -85,12 +65,14 @@ def plot_objects(
                 above.plot(*path.T, color=look.colour, lw=0.9, alpha=0.7, zorder=2)
             mark: Any = {"ls": "none", "marker": look.marker, "ms": 6.0, "mec": look.colour}
             here = rests.class_id == k
-            above.plot(*rests.position_m[here & left].T, mfc="none", alpha=0.6, zorder=3, **mark)
-            above.plot(*rests.position_m[here & ~left].T, mfc=look.colour, zorder=4, **mark)
+            above.plot(*rests.position_m[here & left, :2].T, mfc="none", alpha=0.6, zorder=3, **mark)
+            above.plot(*rests.position_m[here & ~left, :2].T, mfc=look.colour, zorder=4, **mark)
             above.plot([], [], color=look.colour, mfc=look.colour, **(mark | {"ls": "-"}),
                        label=legend_name(name) or "objects")  # fmt: skip
         if left.any():
-            above.plot(*rests.position_m[left].T, "x", color=ALERT, ms=6.0, mew=1.1, zorder=3.5, label="has left again")
+            above.plot(
+                *rests.position_m[left, :2].T, "x", color=ALERT, ms=6.0, mew=1.1, zorder=3.5, label="has left again"
+            )
         above.set(xlabel="x [m]", ylabel="y [m]")
         above.set_aspect("equal", adjustable="datalim")
         above.set_title("paths, and places of rest")
@@ -99,7 +81,7 @@ def plot_objects(
     return figure
 
 
-def _draw_bars(axes: Axes, rests: Rests, colours: Sequence[str], axis: TimeAxis, end_s: float) -> None:
+def _draw_bars(axes: Axes, rests: Any, colours: Sequence[str], axis: TimeAxis, end_s: float) -> None:
     longest = np.argsort(rests.first_s - rests.last_s, kind="stable")[:MOST_SPELLS]
     order = longest[np.argsort(rests.first_s[longest], kind="stable")]
     at = axis.coordinates

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from evermap.errors import InputError
-from evermap.io.files import write_atomic
+from evermap.io.files import write_new
 from evermap.io.table import csv_text
 
 _DAY_S, _HOUR_S = 86400.0, 3600.0
@@ -39,10 +38,7 @@ def write_example(path: str | Path) -> Path:
     Raises:
         InputError: the file exists, or cannot be written.
     """
-    path = Path(path)
-    if path.exists():
-        raise InputError("exists already", path=path, hint="another name")
-    return write_atomic(path, csv_text(_columns(), comment=_COMMENT))
+    return write_new(path, csv_text(_columns(), comment=_COMMENT))
 
 
 def _columns() -> dict[str, Any]:

@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from evermap.errors import InputError
-from evermap.io.files import write_atomic
+from evermap.io.files import write_new
 from evermap.io.table import csv_text
 from evermap.types import FloatArray
 
@@ -46,9 +45,6 @@ def write_example(path: str | Path) -> Path:
     Raises:
         InputError: the file exists, or cannot be written.
     """
-    path = Path(path)
-    if path.exists():
-        raise InputError("exists already", path=path, hint="another name")
     columns: dict[str, list[str]] = {
         name: []
         for name in ("stamp_s", "class_id", "x_m", "y_m", "z_m", "sigma_m", "sensor_x_m", "sensor_y_m", "sensor_z_m")
@@ -56,7 +52,7 @@ def write_example(path: str | Path) -> Path:
     for cells in _rows(np.random.default_rng(12)):
         for column, cell in zip(columns.values(), cells, strict=True):
             column.append(cell)
-    return write_atomic(path, csv_text(columns, comment=_COMMENT))
+    return write_new(path, csv_text(columns, comment=_COMMENT))
 
 
 def _rows(random: np.random.Generator) -> Iterator[tuple[str, ...]]:

@@ -9,7 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from evermap.runs.folder import RunFolder, RunInfo, write_run
+from evermap.runs.folder import RunFolder, write_run
+from evermap.runs.summary import RunInfo
 from evermap.types import Progress
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scenario import Scenario

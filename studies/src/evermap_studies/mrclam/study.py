@@ -179,7 +179,8 @@ def _run_all(jobs: list[Job], folder: RunFolder, progress: Progress | None) -> _
 def _run_one(job: Job, setting: Setting, folder: RunFolder, ledger: _Ledger, progress: Progress | None) -> None:
     from evermap.metrics.summary import compare_with_truth
     from evermap.pipeline import run_slam
-    from evermap.runs.folder import RunInfo, write_run
+    from evermap.runs.folder import write_run
+    from evermap.runs.summary import RunInfo
 
     recording, config = job.recording, setting.config()
     prior = _survey(recording) if setting.given_map else None
