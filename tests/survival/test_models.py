@@ -61,7 +61,7 @@ def test_words() -> None:
 
 
 def test_gone_overnight_leaves_at_night_only() -> None:
-    prior = survival.gone_overnight(0.3, first_seen_hour=12.0, night_hours=(20.0, 6.0))
+    prior = survival.gone_daily(0.3, first_seen_hour=12.0, hours=(20.0, 6.0))
     hours = np.array([8.0, 18.0, 32.0, 42.0, 66.0])  # 20:00, 06:00, 20:00, 06:00, 06:00
     np.testing.assert_allclose(np.exp(prior.log_survival(hours * HOUR_S)), [1.0, 0.7, 0.7, 0.49, 0.343], rtol=1e-12)
     assert prior.hazard(1.0 * HOUR_S) == 0.0
@@ -69,7 +69,7 @@ def test_gone_overnight_leaves_at_night_only() -> None:
 
 
 def test_gone_by_day_leaves_by_day_only() -> None:
-    prior = survival.gone_by_day(0.5, first_seen_hour=13.0, day_hours=(8.0, 18.0))
+    prior = survival.gone_daily(0.5, first_seen_hour=13.0, hours=(8.0, 18.0))
     hours = np.array([5.0, 19.0, 29.0, 43.0])  # 18:00, 08:00, 18:00, 08:00
     half_a_day = math.sqrt(0.5)
     expected = [half_a_day, half_a_day, 0.5 * half_a_day, 0.5 * half_a_day]
@@ -142,8 +142,8 @@ def test_a_hazard_of_finite_integral_says_who_stays() -> None:
         (lambda: survival.CallableHazard(lambda t: 1.0 / t, 10.0), "hazard"),
         (lambda: survival.CallableHazard(lambda t: np.ones(3), 10.0), "hazard"),
         (lambda: survival.CallableHazard(lambda t: 0.1, 10.0, rate_after=-1.0), "rate_after"),
-        (lambda: survival.gone_overnight(1.0, first_seen_hour=3.0), "probability"),
-        (lambda: survival.gone_overnight(0.5, first_seen_hour=24.0), "first_seen_hour"),
+        (lambda: survival.gone_daily(1.0, first_seen_hour=3.0, hours=(20.0, 6.0)), "probability"),
+        (lambda: survival.gone_daily(0.5, first_seen_hour=24.0, hours=(20.0, 6.0)), "first_seen_hour"),
     ],
 )
 def test_refuses_what_is_no_lifetime(make: object, field: str) -> None:

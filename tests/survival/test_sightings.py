@@ -10,8 +10,9 @@ from scipy.stats import chi2
 
 from evermap.errors import ConfigError, DataError
 from evermap.survival import Exponential, LifetimePrior
-from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.parametric_fit import fit, fit_sightings
+from evermap_studies.lifetimes.truth import settled_samples
 
 
 def test_bounds_by_hand() -> None:

@@ -22,8 +22,7 @@ from evermap.survival import (
     StepLifetime,
     Uniform,
     Weibull,
-    gone_by_day,
-    gone_overnight,
+    gone_daily,
     never_leaves,
     parse_prior,
 )
@@ -46,9 +45,9 @@ DAY_S = 86400.0
         ("lognormal:median=2d,spread=1.5", LogNormal(math.log(2 * DAY_S), 1.5)),
         ("gamma:shape=2,scale=1y", Gamma(365.25 * DAY_S, 2.0)),
         ("never-leaves", never_leaves()),
-        ("gone-overnight:p=0.3,seen=10:30", gone_overnight(0.3, first_seen_hour=10.5)),
-        ("gone-overnight:p=0.3,seen=1,night=22..5:15", gone_overnight(0.3, first_seen_hour=1, night_hours=(22, 5.25))),
-        ("gone-by-day:p=.2,seen=9,day=7:30..19", gone_by_day(0.2, first_seen_hour=9, day_hours=(7.5, 19))),
+        ("gone-overnight:p=0.3,seen=10:30", gone_daily(0.3, first_seen_hour=10.5, hours=(20, 6))),
+        ("gone-overnight:p=0.3,seen=1,night=22..5:15", gone_daily(0.3, first_seen_hour=1, hours=(22, 5.25))),
+        ("gone-by-day:p=.2,seen=9,day=7:30..19", gone_daily(0.2, first_seen_hour=9, hours=(7.5, 19))),
         ("hazard:0s=1/d,3d=0.01/d", PiecewiseConstantHazard((0, 3 * DAY_S), (1 / DAY_S, 0.01 / DAY_S))),
         (
             "mass:0s..1h=0.3,2d=0.5,never=0.2",

@@ -19,6 +19,8 @@ kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
 side in threads."""
 inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 """Into the kernels that call it, which is what lets their loops be vectorised."""
+reordered = kept(error_model="numpy", fastmath={"contract", "reassoc", "nsz"}, forceinline=True)
+"""The same for sums of which the order does not matter."""
 parallel_kernel = kept(error_model="numpy", parallel=True)
 """With its `prange` loops spread over the threads."""
 

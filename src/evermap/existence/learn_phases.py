@@ -17,7 +17,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.phase_type import PhaseType, Structure, structure_of
-from evermap.existence.protocol import Looks
+from evermap.existence.protocol import Candidate, Looks
 from evermap.existence.rhythm import BINS, Rhythm
 from evermap.show import Shown
 from evermap.types import FloatArray
@@ -71,31 +71,11 @@ class Limits(NamedTuple):
         Raises:
             DataError: no feature has looks at two instants.
         """
-        feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
-        gaps = np.diff(looks.stamp_s)[np.diff(feature) == 0]
-        gaps = gaps[gaps > 0.0]
+        gaps = looks.gaps_s
         if not gaps.size:
             raise DataError("no feature has looks at two instants: nothing can be learned about its habits")
         gap, span = float(np.median(gaps)), float(np.ptp(looks.stamp_s))
         return cls(FASTEST / gap, 0.5 * float(np.sqrt(gap * span)))
-
-
-class PhaseCandidate(NamedTuple):
-    """One structure that was tried.
-
-    Attributes:
-        name: of the structure, with '+ rhythm' where rates follow the week.
-        log_evidence: `log p(looks)` at its best rates.
-        parameters: effective number of them.
-        score: Bayesian information criterion in units of log evidence; the greatest is chosen.
-        history: objective (log evidence and log prior) of each round, where it can only grow.
-    """
-
-    name: str
-    log_evidence: float
-    parameters: float
-    score: float
-    history: tuple[float, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +96,7 @@ class LearnedPhases(Shown):
 
     model: PhaseType
     log_evidence: float
-    candidates: tuple[PhaseCandidate, ...]
+    candidates: tuple[Candidate, ...]
     structure: Structure
     statistics: Statistics
     belief: FloatArray
@@ -196,7 +176,7 @@ def learn(
     data = _Data.of(looks, end_s, np.inf if half_life_s is None else half_life_s)
     span_s, limits = end_s - float(looks.stamp_s.min()), Limits.of(looks)
     with_rhythm = rhythm is True or (rhythm == "auto" and span_s >= SHORTEST_RHYTHM_S)
-    found: list[tuple[PhaseCandidate, _Fit, Structure]] = []
+    found: list[tuple[Candidate, _Fit, Structure]] = []
     random = np.random.default_rng(seed)
     for structure in structures:
         if progress:
@@ -410,9 +390,9 @@ def _with_rhythm(data: _Data, structure: Structure, flat: _Fit, limits: Limits) 
     return _Fit(model, start, parameters, ())
 
 
-def _candidate(looks: Looks, structure: Structure, fit: _Fit) -> PhaseCandidate:
+def _candidate(looks: Looks, structure: Structure, fit: _Fit) -> Candidate:
     """How well a fit does, its parameters counted against it."""
     evidence = float(fit.model.track(looks).log_evidence.sum())
     penalty = 0.5 * fit.parameters * float(np.log(max(len(looks.stamp_s), 2)))
     name = f"{structure.name} + rhythm" if fit.model.rhythms else structure.name
-    return PhaseCandidate(name, evidence, fit.parameters, evidence - penalty, fit.history)
+    return Candidate(name, evidence, fit.parameters, evidence - penalty, fit.history)

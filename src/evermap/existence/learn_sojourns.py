@@ -16,7 +16,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.lifetimes import edges
-from evermap.existence.protocol import Looks
+from evermap.existence.protocol import Candidate, Looks
 from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, fit, steady_level
 from evermap.existence.run_length import RunLength
 from evermap.existence.run_length_smoothing import Lattice, lattice
@@ -234,23 +234,6 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class SojournCandidate:
-    """A kind of model that was considered.
-
-    Attributes:
-        name: families of stay and absence.
-        log_evidence: `log p(looks)` of the best model of this kind.
-        freedom: effective number of parameters.
-        score: evidence less `freedom / 2 log(events)`; the highest is chosen.
-    """
-
-    name: str
-    log_evidence: float
-    freedom: float
-    score: float
-
-
-@dataclass(frozen=True, slots=True)
 class LearnedSojourns(Shown):
     """What was learned.
 
@@ -266,7 +249,7 @@ class LearnedSojourns(Shown):
 
     model: RunLength
     log_evidence: float
-    candidates: tuple[SojournCandidate, ...]
+    candidates: tuple[Candidate, ...]
     families: tuple[str, ...]
     half_life_s: float
     last_s: float
@@ -328,7 +311,10 @@ def learn(
         DataError: no feature with two looks at different times.
     """
     allowed = _allowed(families, rhythm=rhythm)
-    step = step_s or _usual_gap(looks)
+    gaps = looks.gaps_s
+    if not gaps.size:
+        raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
+    step = step_s or float(np.median(gaps))
     data = Data.of(looks, step, half_life_s, rhythm=False)
     tell = progress or (lambda _: None)
 
@@ -347,9 +333,10 @@ def learn(
         ascents = [*finals, *trials] if rhythm else [*ascents, *trials, *finals]
     tell(1.0)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
-    candidates: dict[str, SojournCandidate] = {}
+    candidates: dict[str, Candidate] = {}
     for ascent in ranked:  # the best of each kind
-        candidates.setdefault(ascent.name, _candidate(ascent))
+        numbers = ascent.expected.log_evidence, ascent.freedom, ascent.score
+        candidates.setdefault(ascent.name, Candidate(ascent.name, *numbers))
     return LearnedSojourns(
         ranked[0].model,
         ranked[0].expected.log_evidence,
@@ -382,11 +369,6 @@ def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> 
     return climb(data, simple.model, ("exponential",), _MOST_ROUNDS)
 
 
-def _candidate(ascent: Ascent) -> SojournCandidate:
-    """An ascent in numbers."""
-    return SojournCandidate(ascent.name, ascent.expected.log_evidence, ascent.freedom, ascent.score)
-
-
 def _added(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:
     """Counts of two recordings, the older faded."""
     return Sojourns(
@@ -395,12 +377,3 @@ def _added(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:
         fade * old.exposure_s + new.exposure_s,
         fade * old.open_ended + new.open_ended,
     )
-
-
-def _usual_gap(looks: Looks) -> float:
-    """Median time between looks at a feature."""
-    gaps = [np.diff(looks.of(f).stamp_s) for f in range(looks.n_features)]
-    positive = np.concatenate([g[g > 0.0] for g in gaps]) if gaps else np.empty(0)
-    if not positive.size:
-        raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
-    return float(np.median(positive))

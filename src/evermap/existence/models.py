@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -32,30 +33,16 @@ WEEKS_FOR_A_RHYTHM = 2.0
 WEEKS_TO_HOLD_OUT_ONE = 4.0
 
 
-def _phases(phases: str, *, rhythm: bool) -> Learner:
-    def learner(looks: Looks) -> PresenceModel:
-        from evermap.existence.learn_phases import learn
-
-        return learn(looks, phases=phases, rhythm=rhythm).model
-
-    return learner
-
-
-def _run_length(*, rhythm: bool) -> Learner:
-    def learner(looks: Looks) -> PresenceModel:
-        from evermap.existence.learn_sojourns import learn
-
-        return learn(looks, rhythm=rhythm).model
-
-    return learner
+def _learned(looks: Looks, *, module: str, **settings: Any) -> PresenceModel:
+    return cast("PresenceModel", import_module(f"evermap.existence.{module}").learn(looks, **settings).model)
 
 
 KINDS: Mapping[str, Learner] = {
-    "two-state": _phases("two-state", rhythm=False),
-    "phase-type": _phases("auto", rhythm=False),
-    "phase-type-rhythm": _phases("auto", rhythm=True),
-    "run-length": _run_length(rhythm=False),
-    "run-length-rhythm": _run_length(rhythm=True),
+    "two-state": partial(_learned, module="learn_phases", phases="two-state", rhythm=False),
+    "phase-type": partial(_learned, module="learn_phases", rhythm=False),
+    "phase-type-rhythm": partial(_learned, module="learn_phases", rhythm=True),
+    "run-length": partial(_learned, module="learn_sojourns", rhythm=False),
+    "run-length-rhythm": partial(_learned, module="learn_sojourns", rhythm=True),
 }
 """Kinds of recurrent models, each learned from looks alone; the simpler ones first."""
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from evermap.errors import InputError, NumericalError
 from evermap.existence.lifetimes import WIDE, Lifetimes, log_death_odds
-from evermap.existence.protocol import Instants, Looks, Track, as_prior, impossible, likelihoods
+from evermap.existence.protocol import Instants, Looks, Track, as_prior, feature_of, impossible, likelihoods
 from evermap.existence.recursion import LARGEST, LOG_LARGEST, aged, observed, odds_of
 from evermap.show import Shown
 from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, never_leaves, parse_prior
@@ -257,21 +257,16 @@ def _birth_rows(looks: Looks) -> IntArray:
     The detection of a detector that cannot see (`P_M = 1`) is false and proves no birth.
     """
     seen = np.flatnonzero((looks.detected == 1.0) & (looks.p_miss < 1.0))
-    feature = _feature_of(looks.first)[seen]
+    feature = looks.feature[seen]
     row = np.full(looks.n_features, len(looks.stamp_s), dtype=np.int64)
     row[feature[::-1]] = seen[::-1]  # of several assignments the last one holds: the first detection
     return row
 
 
-def _feature_of(first: IntArray) -> IntArray:
-    """(M,) feature of every row."""
-    return np.repeat(np.arange(len(first) - 1), np.diff(first))
-
-
 def _merged(looks: Looks, asked: Instants) -> tuple[IntArray, FloatArray, IntArray, IntArray]:
     """Looks and instants as one list by feature and time, looks first: feature, time, row in each table or -1."""
     n_looks, n_asked = len(looks.stamp_s), len(asked.stamp_s)
-    feature = np.concatenate([_feature_of(looks.first), _feature_of(asked.first)])
+    feature = np.concatenate([looks.feature, feature_of(asked.first)])
     time = np.concatenate([looks.stamp_s, asked.stamp_s])
     order = np.lexsort((time, feature))  # stable: of equal times the looks stay in front
     look = np.concatenate([np.arange(n_looks), np.full(n_asked, -1)])

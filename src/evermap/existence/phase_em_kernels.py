@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from evermap.existence.elementary import kernel
-from evermap.existence.phase_kernels import NEGLIGIBLE, PhaseLooks, advance, observe
+from evermap.existence.elementary import inlined, kernel
+from evermap.existence.phase_kernels import NEGLIGIBLE, PhaseLooks, advance, jump, observe
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -93,14 +93,9 @@ def piece_integral(
     fastest = exits.max()
     mean = fastest * span_s
     if mean <= 0.0:
-        probability = 0.0
-        for i in range(n):
-            probability += forward[i] * backward[i]
-        for i in range(n):
-            for j in range(n):
-                integral[i, j] = span_s * forward[i] * backward[j] / probability
-        for i in range(n):
-            backward[i] /= probability
+        probability = float((forward * backward).sum())
+        integral[:] = np.outer(span_s / probability * forward, backward)
+        backward /= probability
         return probability
     last = 0
     weight[0] = np.exp(-mean)
@@ -112,22 +107,14 @@ def piece_integral(
             reference = weight[last]
         elif weight[last] <= NEGLIGIBLE * reference:
             break
-    per_fastest = 1.0 / fastest
     for i in range(n):
         tails[last - 1, i] = weight[last] * backward[i]
     for m in range(last - 2, -1, -1):
-        for i in range(n):
-            total = tails[m + 1, i] * (fastest - exits[i])
-            for j in range(n):
-                total += rates[i, j] * tails[m + 1, j]
-            tails[m, i] = weight[m + 1] * backward[i] + total * per_fastest
-    probability = 0.0
+        _jump_back(tails[m + 1], rates, exits, (fastest, weight[m + 1]), backward, tails[m])
     row, following = rows[0], rows[1]
+    _jump_back(tails[0], rates, exits, (fastest, weight[0]), backward, following)
+    probability = 0.0
     for i in range(n):
-        total = tails[0, i] * (fastest - exits[i])
-        for j in range(n):
-            total += rates[i, j] * tails[0, j]
-        following[i] = weight[0] * backward[i] + total * per_fastest
         probability += forward[i] * following[i]
     for i in range(n):
         backward[i] = following[i] / probability
@@ -138,18 +125,25 @@ def piece_integral(
         for i in range(n):
             for j in range(n):
                 integral[i, j] += row[i] * tails[m, j]
-        for j in range(n):
-            total = row[j] * (fastest - exits[j])
-            for i in range(n):
-                total += row[i] * rates[i, j]
-            following[j] = total * per_fastest
-        for j in range(n):
-            row[j] = following[j]
-    scale = per_fastest / probability
+        jump(row, rates, exits, fastest, following)
+        row, following = following, row
+    scale = 1.0 / (fastest * probability)
     for i in range(n):
         for j in range(n):
             integral[i, j] *= scale
     return probability
+
+
+@inlined
+def _jump_back(column: Any, rates: Any, exits: Any, pace: Any, backward: Any, out: Any) -> None:
+    """Fill `out` with a column before one jump, `U column`, plus a part of `backward`."""
+    fastest, weight = pace
+    per_fastest = 1.0 / fastest
+    for i in range(column.size):
+        total = column[i] * (fastest - exits[i])
+        for j in range(column.size):
+            total += rates[i, j] * column[j]
+        out[i] = weight * backward[i] + total * per_fastest
 
 
 @kernel
@@ -211,17 +205,14 @@ def expect_feature(
             spans, bins = np.empty(2 * pieces), np.empty(2 * pieces, dtype=np.int64)
             pieces = _cut(from_s, look_s[k], exits, spans, bins)
         row = forward[k + 1]
-        for j in range(n):
-            row[j] = forward[k, j]
+        row[:] = forward[k]
         for p in range(pieces):
             advance(row, rates[bins[p]], exits[bins[p]], spans[p], spare)
         likelihood = observe(row, present, there[k], gone[k])
         if not likelihood > 0.0:
             return evidence, k
         evidence += np.log(likelihood)
-    for j in range(n):
-        last[j] = forward[m, j]
-
+    last[:] = forward[m]
     backward = np.ones(n)
     starts = np.empty((spans.size, n))
     integral = np.empty((n, n))
@@ -229,32 +220,20 @@ def expect_feature(
     for k in range(m - 1, -1, -1):
         from_s = look_s[k - 1] if k else begin_s
         pieces = _cut(from_s, look_s[k], exits, spans, bins)
-        total = 0.0
-        for j in range(n):
-            backward[j] *= there[k] if present[j] == 1.0 else gone[k]
-            total += backward[j]
-        for j in range(n):
-            backward[j] /= total
-        for p in range(pieces):
-            for j in range(n):
-                starts[p, j] = forward[k, j] if p == 0 else starts[p - 1, j]
-            if p:
-                advance(starts[p], rates[bins[p - 1]], exits[bins[p - 1]], spans[p - 1], spare)
+        observe(backward, present, there[k], gone[k])
+        starts[0] = forward[k]
+        for p in range(1, pieces):
+            starts[p] = starts[p - 1]
+            advance(starts[p], rates[bins[p - 1]], exits[bins[p - 1]], spans[p - 1], spare)
         at_s = look_s[k]
         for p in range(pieces - 1, -1, -1):
             b, span = bins[p], spans[p]
             piece_integral(starts[p], backward, rates[b], exits[b], span, work, integral)
             weight = 2.0 ** (-(end_s - (at_s - 0.5 * span)) / half_life_s)
             at_s -= span
-            for i in range(n):
-                for j in range(n):
-                    integrals[b, i, j] += weight * integral[i, j]
-    total = 0.0
-    for j in range(n):
-        smoothed[j] = begin[j] * backward[j]
-        total += smoothed[j]
-    for j in range(n):
-        smoothed[j] /= total
+            integrals[b] += weight * integral
+    smoothed[:] = begin * backward
+    smoothed /= smoothed.sum()
     return evidence, -1
 
 

@@ -80,6 +80,17 @@ def multiply(belief: FloatArray, matrix: FloatArray, spare: FloatArray) -> None:
         belief[j] = spare[j]
 
 
+@inlined
+def jump(row: Any, rates: Any, exits: Any, fastest: Any, out: Any) -> None:
+    """Fill `out` with a row after one jump of the uniformised chain, `row @ U`."""
+    per_fastest = 1.0 / fastest
+    for j in range(row.size):
+        total = row[j] * (fastest - exits[j])
+        for i in range(row.size):
+            total += row[i] * rates[i, j]
+        out[j] = total * per_fastest
+
+
 @kernel
 def advance(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: float, spare: FloatArray) -> None:
     """Compute `belief @ exp(Q span)`, in place, for constant rates and few jumps; `spare` is (3, n)."""
@@ -98,7 +109,6 @@ def advance(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: fl
     term, following = spare[0], spare[1]
     weight = np.exp(-mean)
     reference = weight
-    per_fastest = 1.0 / fastest
     for j in range(n):
         term[j] = belief[j]
         belief[j] *= weight
@@ -106,14 +116,10 @@ def advance(belief: FloatArray, rates: FloatArray, exits: FloatArray, span_s: fl
     while True:
         k += 1
         weight *= mean / k
+        jump(term, rates, exits, fastest, following)
+        term, following = following, term
         for j in range(n):
-            total = 0.0
-            for i in range(n):
-                total += term[i] * rates[i, j]
-            following[j] = (total + term[j] * (fastest - exits[j])) * per_fastest
-        for j in range(n):
-            term[j] = following[j]
-            belief[j] += weight * following[j]
+            belief[j] += weight * term[j]
         if k < n:
             reference = weight
         elif weight <= NEGLIGIBLE * reference:

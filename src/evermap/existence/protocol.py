@@ -6,7 +6,7 @@ Errors name the row and what to try.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -165,6 +165,11 @@ def check_rows(rows: Any, n: int, *, twice: bool = False, field: str = "rows") -
     return index
 
 
+def feature_of(first: IntArray) -> IntArray:
+    """Return the (M,) feature of every row, of which those of feature `f` are `first[f]` to `first[f + 1]`."""
+    return np.repeat(np.arange(len(first) - 1), np.diff(first))
+
+
 @dataclass(frozen=True, slots=True)
 class Looks(Shown):
     """Looks of a detector at F features, by feature and time.
@@ -187,6 +192,17 @@ class Looks(Shown):
     def n_features(self) -> int:
         """F."""
         return len(self.first) - 1
+
+    @property
+    def feature(self) -> IntArray:
+        """(M,) feature of every look."""
+        return feature_of(self.first)
+
+    @property
+    def gaps_s(self) -> FloatArray:
+        """Times above 0 between successive looks at a feature."""
+        gaps = np.diff(self.stamp_s)[np.diff(self.feature) == 0]
+        return np.asarray(gaps[gaps > 0.0])
 
     def of(self, feature: int) -> Looks:
         """Return the looks at one feature alone."""
@@ -279,6 +295,24 @@ class Track(Shown):
     p_present: FloatArray
     log_evidence: FloatArray
     merged_mass: FloatArray
+
+
+class Candidate(NamedTuple):
+    """A kind of model that learning has tried.
+
+    Attributes:
+        name: of the structure of phases, or of the families of stay and absence.
+        log_evidence: `log p(looks)` of the best model of this kind.
+        freedom: effective number of parameters.
+        score: log evidence less the price of the parameters (Schwarz 1978); the greatest is chosen.
+        history: objective (log evidence and log prior) of each round of EM, where it can only grow.
+    """
+
+    name: str
+    log_evidence: float
+    freedom: float
+    score: float
+    history: tuple[float, ...] = ()
 
 
 class PresenceFilter(Protocol):

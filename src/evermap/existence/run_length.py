@@ -256,9 +256,8 @@ class RunLengthBelief(RecurrentBeliefs):
         from evermap.existence.run_length_kernels import LookColumns, look_rows
 
         state = cls._first(model, ends_s[0])
-        rows = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
         there, gone = looks.likelihoods()
-        bad = look_rows(rows, state.rows, LookColumns(looks.stamp_s, gone, there), model.law)
+        bad = look_rows(looks.feature, state.rows, LookColumns(looks.stamp_s, gone, there), model.law)
         if bad >= 0:
             raise looks.impossible(bad)
         return state

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import prange
 
-from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel
+from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel, reordered
 from evermap.existence.lifetimes import SHIFT
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
@@ -124,23 +124,13 @@ def _integrated(age: Any, later: Any, s: Any, law: Any) -> Any:
     return max(levels + (law.hazard_hz[s, j] * later - law.hazard_hz[s, i] * age), 0.0)
 
 
-@inlined
+@reordered
 def _sum(values: Any, s: Any, n: Any) -> Any:
-    """Sum of the first `n` of row `s`: eight sums side by side, which a compiler may not make of one."""
-    a = b = c = d = e = f = g = h = 0.0
-    whole = n & ~7
-    for j in range(0, whole, 8):
-        a += values[s, j]
-        b += values[s, j + 1]
-        c += values[s, j + 2]
-        d += values[s, j + 3]
-        e += values[s, j + 4]
-        f += values[s, j + 5]
-        g += values[s, j + 6]
-        h += values[s, j + 7]
-    for j in range(whole, n):
-        a += values[s, j]
-    return ((a + b) + (c + d)) + ((e + f) + (g + h))
+    """Sum of the first `n` of row `s`, in any order, so that vectors add them."""
+    total = 0.0
+    for j in range(n):
+        total += values[s, j]
+    return total
 
 
 @inlined

@@ -266,23 +266,16 @@ class LivingMap(Shown):
 
             p_here = predicted(self, LivingConfig(), at)
         cliques, row = np.unique(self.sites.clique_id, return_inverse=True)
-        total = np.bincount(row, p_here, minlength=len(cliques))
-        mine = np.minimum(np.searchsorted(cliques, self.members.clique_id), max(len(cliques) - 1, 0))
-        found = cliques[mine] == self.members.clique_id if len(cliques) else np.zeros(len(self.members), np.bool_)
-        return np.where(found, total[mine] if len(total) else 0.0, 0.0)
+        total = np.append(np.bincount(row, p_here, minlength=len(cliques)), 0.0)  # row -1 is the last
+        return np.asarray(total[_rows_among(cliques, self.members.clique_id)], dtype=np.float64)
 
     def site_of(self) -> IntArray:
         """Return (L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
         order = np.lexsort((self.sites.p_here, self.sites.clique_id))
         clique = self.sites.clique_id[order]
-        last = np.flatnonzero(np.append(clique[1:] != clique[:-1], True)) if len(clique) else np.zeros(0, np.int64)
-        best = order[last]  # one a clique, by clique
-        at = np.searchsorted(clique[last], self.members.clique_id)
-        ok = at < len(last)
-        ok[ok] = clique[last][at[ok]] == self.members.clique_id[ok]
-        site = np.full(len(self.members), UNKNOWN, dtype=np.int64)
-        site[ok] = self.sites.site_id[best[at[ok]]]
-        return site
+        last = np.flatnonzero(np.diff(clique, append=-1) != 0)  # one a clique, by clique
+        site = np.append(self.sites.site_id[order[last]], UNKNOWN)
+        return np.asarray(site[_rows_among(clique[last], self.members.clique_id)])
 
     def told_site(self) -> IntArray:
         """Return (L,) `site_id` at which each landmark's clique is said to stand: where its stay goes on; `UNKNOWN`
@@ -294,11 +287,9 @@ class LivingMap(Shown):
         known = np.isin(self.members.clique_id, self.stays.clique_id)
         goes_on = np.flatnonzero(self.stays.gone_s == np.inf)
         order = goes_on[np.argsort(self.stays.clique_id[goes_on], kind="stable")]
-        clique = self.stays.clique_id[order]
-        at = np.minimum(np.searchsorted(clique, self.members.clique_id), max(len(order) - 1, 0))
-        stands = clique[at] == self.members.clique_id if len(order) else np.zeros(len(site), dtype=np.bool_)
-        told = self.stays.site_id[order][at] if len(order) else site
-        return np.asarray(np.where(stands, told, np.where(known, UNKNOWN, site)))
+        at = _rows_among(self.stays.clique_id[order], self.members.clique_id)
+        told = np.append(self.stays.site_id[order], UNKNOWN)[at]
+        return np.asarray(np.where(at >= 0, told, np.where(known, UNKNOWN, site)))
 
     def place_row(self, landmark_id: IntArray, site_id: IntArray) -> IntArray:
         """Return (K,) rows of `places` for pairs of landmark and site, -1 where there is none."""
@@ -403,6 +394,12 @@ class LivingMap(Shown):
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
             covariance_m2=self.covariance_m2[np.ix_(corner, corner)],
         )
+
+
+def _rows_among(ids: IntArray, asked: IntArray) -> IntArray:
+    """(N,) first row of each id among sorted ones, -1 where it is missing."""
+    row = np.searchsorted(ids, asked)
+    return np.where(np.append(ids, -1)[row] == asked, row, -1)
 
 
 def clique_rows(sites: Sites) -> tuple[IntArray, IntArray]:

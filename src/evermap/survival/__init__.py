@@ -7,8 +7,7 @@ from evermap.survival.hazards import (
     CallableHazard,
     PeriodicHazard,
     PiecewiseConstantHazard,
-    gone_by_day,
-    gone_overnight,
+    gone_daily,
 )
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import StepLifetime, never_leaves
@@ -28,8 +27,7 @@ __all__ = [
     "StepLifetime",
     "Uniform",
     "Weibull",
-    "gone_by_day",
-    "gone_overnight",
+    "gone_daily",
     "never_leaves",
     "parse_prior",
 ]

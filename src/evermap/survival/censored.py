@@ -25,7 +25,6 @@ instants are unknown, and are a little too narrow.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -158,24 +157,6 @@ def lifetimes_of_sightings(
     left, right = last[rows] - arrival, gone[rows] - arrival
     weight = _weights(left, right, instants, given)
     return CensoredLifetimes.of(left, right, first[rows] + least_stay_s - arrival, weight), rows
-
-
-def settled_samples(
-    estimate: Callable[[CensoredLifetimes], LifetimePrior],
-    samples_given: Callable[[LifetimePrior | None], CensoredLifetimes],
-    rounds: int = 4,
-) -> CensoredLifetimes:
-    """Iterate samples and estimate until the weights agree with the lifetimes estimated from them.
-
-    Args:
-        estimate: lifetimes from samples; a rough one is enough, since it only weights the instants of arrival.
-        samples_given: samples with weights by an estimate, or None: `lifetimes_of_sightings` for some stays.
-        rounds: number of iterations.
-    """
-    samples = samples_given(None)
-    for _ in range(rounds):
-        samples = samples_given(estimate(samples))
-    return samples
 
 
 def log_sighting(prior: LifetimePrior, left: FloatArray, right: FloatArray) -> FloatArray:

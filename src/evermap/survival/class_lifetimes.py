@@ -199,24 +199,14 @@ def absence_log_likelihood(
         back_s: (K,) next sighting; inf if there was none.
     """
     share = 1.0 / (1.0 + np.exp(-LOGIT_RETURN))
-    first, last, back = (_away(ages) for ages in _ages(there_s, first_s, last_s, back_s))  # (K, 2, M)
+    begin_s = there_s[:, None] + _INSTANTS * (first_s - there_s)[:, None]
+    first, last, back = (  # (K, 2, M) probabilities that one that returns is still away
+        np.exp(-(stamp_s[:, None] - begin_s)[..., None] * np.exp(-LOG_MEAN)) for stamp_s in (first_s, last_s, back_s)
+    )
     ended = np.isfinite(back_s)
     seen = last[..., None] * share + (1.0 - share)
     seen[ended] = np.maximum(last[ended] - back[ended], _LEAST)[..., None] * share
     return np.asarray(np.log(seen.mean(axis=1)) - np.log((first[..., None] * share + (1.0 - share)).mean(axis=1)))
-
-
-def _away(ages: FloatArray) -> FloatArray:
-    """Return the probability (K, 2, M) that a landmark that returns is still away."""
-    return np.asarray(np.exp(-ages[..., None] * np.exp(-LOG_MEAN)))
-
-
-def _ages(
-    before: FloatArray, first: FloatArray, last: FloatArray, after: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return ages (K, 2) at the three later stamps, for two instants of beginning."""
-    begin = before[:, None] + _INSTANTS * (first - before)[:, None]
-    return first[:, None] - begin, last[:, None] - begin, after[:, None] - begin
 
 
 def _posterior(log_likelihood: FloatArray, log_second: FloatArray, said: FloatArray | float) -> FloatArray:

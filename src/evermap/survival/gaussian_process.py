@@ -127,7 +127,7 @@ class GpHazard(Shown):
             raise DataError("is needed" if name in wanted else "was not learned from", field=name)
         group = 0
         if row.class_id is not None:
-            group = _group(row.class_id, self.class_ids)[0]
+            group = group_of(row.class_id, self.class_ids)[0]
         columns = np.zeros((len(self.edges_s), len(self.posterior.mean)))
         start, levels = 0, iter(self._smooth)
         for term in self._terms:
@@ -155,7 +155,7 @@ def gp_fit(data: CensoredLifetimes, covariates: Covariates | None = None) -> GpH
     class_ids = np.zeros(0, dtype=np.int64) if known.class_id is None else np.unique(known.class_id)
     group = np.zeros(len(data.left_s), dtype=np.int64)
     if known.class_id is not None:
-        group = _group(known.class_id, class_ids)
+        group = group_of(known.class_id, class_ids)
     named = curve_terms(edges_s, max(len(class_ids), 1))
     smooth = tuple(_smooth_terms(known))
     for one in smooth:
@@ -285,7 +285,8 @@ def _kernel(a: FloatArray, b: FloatArray, length: float) -> FloatArray:
     return np.asarray(np.exp(-0.5 * distance / length**2))
 
 
-def _group(class_id: IntArray, class_ids: IntArray) -> IntArray:
+def group_of(class_id: IntArray, class_ids: IntArray) -> IntArray:
+    """Return the rows (N,) of classes among those that were learned from; raise a DataError for any other."""
     rows = np.searchsorted(class_ids, class_id)
     wrong = (rows == len(class_ids)) | (class_ids[np.minimum(rows, len(class_ids) - 1)] != class_id)
     if wrong.any():

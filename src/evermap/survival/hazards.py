@@ -43,12 +43,7 @@ class PiecewiseConstantHazard(Lifetime):
     rates: tuple[float, ...]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "edges_s", tuple(float(e) for e in self.edges_s))
-        object.__setattr__(self, "rates", tuple(float(r) for r in self.rates))
-        check_edges(self.edges_s)
-        if len(self.rates) != len(self.edges_s):
-            raise ConfigError(f"{len(self.edges_s)} edges need as many rates, not {len(self.rates)}", field="rates")
-        check_rates(self.rates)
+        _check_steps(self)
 
     @property
     def p_never_leaves(self) -> float:
@@ -89,15 +84,10 @@ class PeriodicHazard(Lifetime):
     start_s: float = 0.0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "edges_s", tuple(float(e) for e in self.edges_s))
-        object.__setattr__(self, "rates", tuple(float(r) for r in self.rates))
+        _check_steps(self)
         check_positive(self.period_s, "period_s")
-        check_edges(self.edges_s)
         if self.edges_s[-1] >= self.period_s:
             raise ConfigError(f"edges must lie below the period, not at {self.edges_s[-1]!r}", field="edges_s")
-        if len(self.rates) != len(self.edges_s):
-            raise ConfigError(f"{len(self.edges_s)} edges need as many rates, not {len(self.rates)}", field="rates")
-        check_rates(self.rates)
         if not 0.0 <= self.start_s < self.period_s:
             raise ConfigError(f"must lie in [0, {self.period_s!r}), not {self.start_s!r}", field="start_s")
 
@@ -140,6 +130,16 @@ class PeriodicHazard(Lifetime):
         edges, rates = self._pattern()
         stretch = np.searchsorted(edges, np.fmod(t, self.period_s), side="right") - 1
         return np.asarray(np.log(rates[np.minimum(stretch, len(rates) - 1)]))
+
+
+def _check_steps(prior: PiecewiseConstantHazard | PeriodicHazard) -> None:
+    """Make edges and rates tuples of numbers; raise a ConfigError if they do not fit."""
+    for name in ("edges_s", "rates"):
+        object.__setattr__(prior, name, tuple(float(value) for value in getattr(prior, name)))
+    check_edges(prior.edges_s)
+    if len(prior.rates) != len(prior.edges_s):
+        raise ConfigError(f"{len(prior.edges_s)} edges need as many rates, not {len(prior.rates)}", field="rates")
+    check_rates(prior.rates)
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,36 +280,25 @@ class CallableHazard(Lifetime):
         return np.asarray(np.log(np.where(t < self.horizon_s, inside, self._rate_after)))
 
 
-def gone_overnight(
-    probability: float, *, first_seen_hour: float, night_hours: tuple[float, float] = (20.0, 6.0)
-) -> PeriodicHazard:
-    """Return the hazard of things that are safe by day and gone with `probability` after each night, as parked cars.
+def gone_daily(probability: float, *, first_seen_hour: float, hours: tuple[float, float]) -> PeriodicHazard:
+    """Return the hazard of things that leave within some hours of the day only, as parked cars do by night.
 
     Args:
-        probability: of leaving during one whole night, above 0 and below 1.
+        probability: of leaving in these hours of one day, above 0 and below 1.
         first_seen_hour: local time of day at t = 0, in hours, in [0, 24).
-        night_hours: begin and end of the night in hours of local time, in [0, 24); it may pass midnight.
+        hours: begin and end in hours of local time, in [0, 24), of the hours; they may pass midnight.
+
+    Raises:
+        ConfigError: numbers out of range, or hours that begin when they end.
     """
-    return _daily(probability, first_seen_hour, night_hours, "night_hours")
-
-
-def gone_by_day(
-    probability: float, *, first_seen_hour: float, day_hours: tuple[float, float] = (8.0, 18.0)
-) -> PeriodicHazard:
-    """Return the hazard of things that are safe at night and gone with `probability` after each day (an office)."""
-    return _daily(probability, first_seen_hour, day_hours, "day_hours")
-
-
-def _daily(probability: float, first_seen_hour: float, hours: tuple[float, float], name: str) -> PeriodicHazard:
-    """Return the hazard of a daily stretch of hours, constant within, that ends stays with `probability`."""
     if not 0.0 < probability < 1.0:
         raise ConfigError(f"must lie above 0 and below 1, not {probability!r}", field="probability")
     begin, end = hours
-    for hour, argument in ((begin, name), (end, name), (first_seen_hour, "first_seen_hour")):
+    for hour, argument in ((begin, "hours"), (end, "hours"), (first_seen_hour, "first_seen_hour")):
         if not 0.0 <= hour < 24.0:
             raise ConfigError(f"an hour of the day must lie in [0, 24), not {hour!r}", field=argument)
     if begin == end:
-        raise ConfigError(f"begin and end must differ, not both {begin!r}", field=name)
+        raise ConfigError(f"begin and end must differ, not both {begin!r}", field="hours")
     length_s = ((end - begin) % 24.0) * _HOUR_S
     rate = -math.log1p(-probability) / length_s
     # The period starts with the stretch, so that midnight is no special case.

@@ -20,7 +20,7 @@ from evermap.errors import DataError
 from evermap.show import Shown
 from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
-from evermap.survival.gaussian_process import curve_terms, weibull_baseline
+from evermap.survival.gaussian_process import curve_terms, group_of, weibull_baseline
 from evermap.survival.hazard_regression import (
     Exposures,
     HazardDraws,
@@ -71,12 +71,7 @@ class PooledHazard(Shown):
         Raises:
             DataError: a class without samples, or an invalid place.
         """
-        found = np.flatnonzero(self.class_ids == class_id)
-        if not found.size:
-            raise DataError(
-                f"class {class_id} was never seen", field="class_id", hint=", ".join(map(str, self.class_ids))
-            )
-        group = int(found[0])
+        group = int(group_of(np.array([class_id]), self.class_ids)[0])
         x, y = chunks_of(np.asarray(place_m)[None, :], self.size_m)[0].tolist()
         columns = np.zeros((len(self.edges_s), len(self.posterior.mean)))
         columns[:, : self._curves.shape[2]] = self._curves[group]

@@ -17,7 +17,7 @@ from evermap.survival.base import LifetimePrior
 from evermap.survival.durations import parse_duration_s, parse_hour, parse_number, parse_positive, parse_rate_hz
 from evermap.survival.families import Exponential, Gamma, LogNormal, Uniform, Weibull
 from evermap.survival.general_purpose import GeneralPurpose
-from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_by_day, gone_overnight
+from evermap.survival.hazards import PeriodicHazard, PiecewiseConstantHazard, gone_daily
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import StepLifetime, never_leaves
 
@@ -174,12 +174,8 @@ def _unknown(values: Values) -> GeneralPurpose:
     return GeneralPurpose.from_mean_stays(shortest_s, longest_s)
 
 
-def _daily(make: Callable[..., PeriodicHazard], hours: str) -> Callable[[Values], PeriodicHazard]:
-    def build(values: Values) -> PeriodicHazard:
-        stretch = {f"{hours}_hours": values[hours]} if hours in values else {}
-        return make(values["p"], first_seen_hour=values["seen"], **stretch)
-
-    return build
+def _daily(key: str, usual: tuple[float, float]) -> Callable[[Values], PeriodicHazard]:
+    return lambda v: gone_daily(v["p"], first_seen_hour=v["seen"], hours=v.get(key, usual))
 
 
 FORMS: Mapping[str, Form] = {
@@ -230,14 +226,14 @@ FORMS: Mapping[str, Form] = {
     "gone-overnight": Form(
         "gone-overnight:p=0.3,seen=10:00,night=20:00..6:00",
         "a night takes 30 %, a day nothing; first seen at 10:00",
-        _daily(gone_overnight, "night"),
+        _daily("night", (20.0, 6.0)),
         needed={"p": parse_number, "seen": parse_hour},
         optional={"night": _between(parse_hour)},
     ),
     "gone-by-day": Form(
         "gone-by-day:p=0.3,seen=10:00,day=8:00..18:00",
         "a day takes 30 %, a night nothing",
-        _daily(gone_by_day, "day"),
+        _daily("day", (8.0, 18.0)),
         needed={"p": parse_number, "seen": parse_hour},
         optional={"day": _between(parse_hour)},
     ),

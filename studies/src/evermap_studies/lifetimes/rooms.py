@@ -16,11 +16,11 @@ import numpy as np
 from evermap.errors import InputError, NumericalError
 from evermap.io.columns import read_columns
 from evermap.survival import LifetimePrior
-from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.nonparametric import KaplanMeier, Npmle, kaplan_meier, npmle
 from evermap.types import BoolArray, FloatArray
 from evermap.valid import STAMP_S
-from evermap_studies.lifetimes.truth import Value
+from evermap_studies.lifetimes.truth import Value, settled_samples
 from evermap_studies.presence.tasks import HOME
 
 EVERY = (2, 5, 15)

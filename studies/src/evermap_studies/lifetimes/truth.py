@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import NumericalError
 from evermap.survival import LifetimePrior
-from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings, settled_samples
+from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.gaussian_process import gp_fit
 from evermap.survival.nonparametric import kaplan_meier
 from evermap.survival.parametric_fit import fit, fit_best, fit_sightings
@@ -31,6 +31,24 @@ INSTANTS = 3
 Value = dict[str, Any]
 Curve = tuple[FloatArray, FloatArray, FloatArray]
 """Estimated `P(T > t)` at some times, and the two bounds of its 95 % band."""
+
+
+def settled_samples(
+    estimate: Callable[[CensoredLifetimes], LifetimePrior],
+    samples_given: Callable[[LifetimePrior | None], CensoredLifetimes],
+    rounds: int = 4,
+) -> CensoredLifetimes:
+    """Iterate samples and estimate until the weights agree with the lifetimes estimated from them.
+
+    Args:
+        estimate: lifetimes from samples; a rough one is enough, since it only weights the instants of arrival.
+        samples_given: samples with weights by an estimate, or None: `lifetimes_of_sightings` for some stays.
+        rounds: number of iterations.
+    """
+    samples = samples_given(None)
+    for _ in range(rounds):
+        samples = samples_given(estimate(samples))
+    return samples
 
 
 @dataclass(frozen=True, slots=True)
