@@ -234,10 +234,10 @@ def test_progress_is_told_to_the_end() -> None:
 
 def test_what_cannot_be_learned_from_is_refused() -> None:
     one_look_each = Looks.from_rows([0, 1], [1.0, 2.0], [1, 0], 0.1, 0.1)
-    with pytest.raises(DataError, match="no feature was looked at twice"):
+    with pytest.raises(DataError, match="no feature has looks at two instants"):
         learn(one_look_each)
     at_one_time = Looks.from_rows([0, 0], [1.0, 1.0], [1, 0], 0.1, 0.1)
-    with pytest.raises(DataError, match="no feature was looked at twice"):
+    with pytest.raises(DataError, match="no feature has looks at two instants"):
         learn(at_one_time)
     looks = Looks.from_rows([0, 0], [1.0, 2.0], [1, 0], 0.1, 0.1)
     with pytest.raises(ConfigError, match=r"families.*unknown family 'cauchy'.*exponential"):

@@ -71,10 +71,7 @@ class Limits(NamedTuple):
         Raises:
             DataError: no feature has looks at two instants.
         """
-        gaps = looks.gaps_s
-        if not gaps.size:
-            raise DataError("no feature has looks at two instants: nothing can be learned about its habits")
-        gap, span = float(np.median(gaps)), float(np.ptp(looks.stamp_s))
+        gap, span = looks.median_gap_s(), float(np.ptp(looks.stamp_s))
         return cls(FASTEST / gap, 0.5 * float(np.sqrt(gap * span)))
 
 

@@ -104,7 +104,7 @@ class Data(Shown):
         pieces = [lattice(one, step) for one in map(looks.of, range(looks.n_features)) if len(one.stamp_s)]
         pieces = [piece for piece in pieces if len(piece.stamp_s) > 1]
         if not pieces:
-            raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
+            raise DataError("no feature has looks at two instants", hint="there is nothing to learn from")
         last = max(float(piece.stamp_s[-1]) for piece in pieces)
         weights = tuple(2.0 ** (-(last - piece.stamp_s[1:]) / half_life_s) for piece in pieces)
         span = max(float(np.ptp(piece.stamp_s)) for piece in pieces)
@@ -311,10 +311,7 @@ def learn(
         DataError: no feature with two looks at different times.
     """
     allowed = _allowed(families, rhythm=rhythm)
-    gaps = looks.gaps_s
-    if not gaps.size:
-        raise DataError("no feature was looked at twice", hint="there is nothing to learn from")
-    step = step_s or float(np.median(gaps))
+    step = step_s or looks.median_gap_s()
     data = Data.of(looks, step, half_life_s, rhythm=False)
     tell = progress or (lambda _: None)
 

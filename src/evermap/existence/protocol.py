@@ -198,11 +198,16 @@ class Looks(Shown):
         """(M,) feature of every look."""
         return feature_of(self.first)
 
-    @property
-    def gaps_s(self) -> FloatArray:
-        """Times above 0 between successive looks at a feature."""
+    def median_gap_s(self) -> float:
+        """Return the median time above 0 between successive looks at a feature.
+
+        Raises:
+            DataError: no feature has looks at two instants.
+        """
         gaps = np.diff(self.stamp_s)[np.diff(self.feature) == 0]
-        return np.asarray(gaps[gaps > 0.0])
+        if not (gaps > 0.0).any():
+            raise DataError("no feature has looks at two instants", hint="there is nothing to learn from")
+        return float(np.median(gaps[gaps > 0.0]))
 
     def of(self, feature: int) -> Looks:
         """Return the looks at one feature alone."""
