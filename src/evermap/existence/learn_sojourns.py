@@ -175,6 +175,11 @@ class Ascent(Shown):
         events = sum(counts.n_events for counts in self.expected.counts)
         return self.expected.log_evidence - 0.5 * self.freedom * float(np.log(max(events, 2.0)))
 
+    @property
+    def candidate(self) -> Candidate:
+        """The same in numbers."""
+        return Candidate(self.name, self.expected.log_evidence, self.freedom, self.score)
+
 
 def climb(data: Data, model: RunLength, families: Sequence[str], rounds: int) -> Ascent:
     """Iterate expectation and maximisation until the evidence settles; families are chosen in the first
@@ -332,8 +337,7 @@ def learn(
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
     candidates: dict[str, Candidate] = {}
     for ascent in ranked:  # the best of each kind
-        numbers = ascent.expected.log_evidence, ascent.freedom, ascent.score
-        candidates.setdefault(ascent.name, Candidate(ascent.name, *numbers))
+        candidates.setdefault(ascent.name, ascent.candidate)
     return LearnedSojourns(
         ranked[0].model,
         ranked[0].expected.log_evidence,
