@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import gc
 import hashlib
 import os
 import pickle
@@ -25,6 +26,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 UNREADABLE = (AttributeError, ImportError, EOFError, pickle.UnpicklingError)
 """Raised by an index of kept code that names types which this evermap does not have any more, or that was cut off."""
+
+OBJECTS_BEFORE_COLLECTION = 100_000
+"""While a kernel is compiled, garbage is looked for after so many new objects."""
 
 
 def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]:
@@ -71,18 +75,23 @@ def _whole(compile_for: Callable[..., Any], effort: int) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def _optimising(effort: int) -> Iterator[None]:
-    """Numba knows one level for all functions: it is ours while this thread, alone, compiles."""
+    """Numba knows one level for all functions: it is ours while this thread, alone, compiles.
+
+    It makes millions of objects that are all needed to the end: looking for garbage among them is a tenth of the time.
+    """
     from numba import config
     from numba.core.compiler_lock import global_compiler_lock
 
     settings: Any = config
     with global_compiler_lock:
-        before = settings.OPT
+        before, collecting = settings.OPT, gc.get_threshold()
         try:
             settings.OPT = type(before)(min(effort, _asked()))
+            gc.set_threshold(max(collecting[0], OBJECTS_BEFORE_COLLECTION) if collecting[0] else 0, *collecting[1:])
             yield
         finally:
             settings.OPT = before
+            gc.set_threshold(*collecting)
 
 
 @functools.cache
