@@ -205,6 +205,7 @@ def by_gtsam(drive: Drive, start: str) -> dict[str, Any]:
         "marginals_s": found.marginals.wall_s,
         "wall_s": found.solve.wall_s + found.marginals.wall_s,
         "cpu_s": found.solve.cpu_s + found.marginals.cpu_s,
+        "marginals_cpu_s": found.marginals.cpu_s,
         "iterations": found.n_iterations,
         "objective": plain.objective(drive.factors, found.estimate),
         **_accuracy(drive.factors.landmark_id, found.estimate.landmark, drive.recording),

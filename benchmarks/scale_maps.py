@@ -45,6 +45,8 @@ LOCALISE_S = 120.0
 START_FRAMES = 20
 """Frames in which the start pose is found, and that no step is counted in."""
 SIGMA_MAP_M = 0.03
+CORRELATED_M = 30.0
+"""Distance over which errors of places are correlated, half of their variance; sessions leave no two independent."""
 MAP_POSE = np.array([30.0, -20.0, 0.7])
 """Of the warehouse in the map's frame: where the robot starts is nowhere near the origin."""
 SEEN_S = 3_600.0
@@ -60,7 +62,7 @@ COMPLETE_AFTER = 10
 def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
     """Return a map of the warehouse as sessions would have left it, without lines of sight.
 
-    The places are `SIGMA_MAP_M` off, independently; the covariance says so.
+    The places are `SIGMA_MAP_M` off; the covariance is full, as that of a map that grew by sessions.
     """
     landmark = warehouse_landmarks(config, seed=seed)
     rng, count = np.random.default_rng([seed, 2]), len(landmark)
@@ -75,10 +77,17 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
         sites=Sites(name, name, np.full(count, 0.99), np.full(count, 0.99), first, seen),
         places=Places(name, name, position, np.full(count, 50), np.zeros(count, np.int64)),
         stays=Stays(name, name, no_class, position, -never, first, seen, never, np.zeros(count)),
-        covariance_m2=SIGMA_MAP_M**2 * np.eye(2 * count),
+        covariance_m2=_covariance(position),
         n_cliques_ever=count,
         n_sites_ever=count,
     )
+
+
+def _covariance(position_m: FloatArray) -> FloatArray:
+    """(2 P, 2 P) of places with errors that are partly shared by those around."""
+    apart = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
+    shared = 0.5 * np.exp(-apart / CORRELATED_M) + 0.5 * np.eye(len(position_m))
+    return np.asarray(np.kron(SIGMA_MAP_M**2 * shared, np.eye(2)))
 
 
 def dense_gb(n_places: int) -> float:

@@ -22,6 +22,8 @@ CONTENDERS = {
 }
 """Columns of a row, as tables and figures call them."""
 UNKNOWN = "–"
+DENSE = Path(__file__).resolve().parent / "scale_dense.json"
+"""What sessions cost with an estimator that was dense in the landmarks, to compare with."""
 FRAMES = {"median_ms": "median", "p99_ms": "99 % below", "longest_ms": "longest"}
 
 
@@ -114,7 +116,7 @@ def _claim(name: str, limit: float, value: float | str, unit: str = "") -> list[
     most = f"≤ {limit:,g} {unit}".strip()
     if isinstance(value, str):
         return [name, most, value, "**no**"]
-    return [name, most, f"{value:,.3g} {unit}".strip(), "yes" if value <= limit else "**no**"]
+    return [name, most, f"{_number(value)} {unit}".strip(), "yes" if value <= limit else "**no**"]
 
 
 def _ratio(row: dict[str, Any]) -> float:
@@ -148,9 +150,9 @@ def figure(shown: dict[str, Any], before: dict[str, Any] | None = None) -> Figur
         "evermap": "evermap: poses, map, calibration, noise",
         "lm": "gtsam LM: poses, map",
         "isam2": "gtsam iSAM2: poses, map",
-        "before": "evermap before, dense",
+        "before": "evermap, dense, of 2026-11-22",
     }
-    drawn = Figure(figsize=(8.4, 4.2), layout="constrained")
+    drawn = Figure(figsize=(8.4, 4.4), layout="constrained")
     times, peaks = drawn.subplots(1, 2)
     for name, key, rows in series:
         timed = [row for row in rows if key in row]
@@ -165,11 +167,12 @@ def figure(shown: dict[str, Any], before: dict[str, Any] | None = None) -> Figur
     return drawn
 
 
-def write(shown: dict[str, Any], folder: Path, before: dict[str, Any] | None = None) -> None:
+def write(shown: dict[str, Any], folder: Path) -> None:
     """Write `table.md`, `cost.png` and `scale.json` into a folder, from which `docs/gen/results.py` takes them."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "table.md").write_text(as_markdown(shown) + "\n", encoding="utf-8")
     (folder / "scale.json").write_text(json.dumps(shown, indent=2) + "\n", encoding="utf-8")
+    before = json.loads(DENSE.read_text(encoding="utf-8"))
     figure(shown, before).savefig(folder / "cost.png", dpi=150)
 
 
@@ -216,6 +219,11 @@ def _as_log_log(axes: Axes, what: str) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+def _number(value: float) -> str:
+    """Three digits, and thousands without an exponent."""
+    return f"{value:,.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
+
+
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, left: int = 0) -> str:
     """A Markdown table, its first `left` columns aligned to the left."""
     lines = [head, ["---" if k < left else "---:" for k in range(len(head))], *rows]
@@ -239,7 +247,7 @@ def _sessions(rows: Sequence[dict[str, Any]]) -> str:
 def _seconds(row: dict[str, Any], key: str) -> str:
     if key not in row:
         return UNKNOWN
-    return f"{row[key]['cpu_s']:.3g}{' (another optimum)' if is_stuck(row, key) else ''}"
+    return f"{_number(row[key]['cpu_s'])}{' (another optimum)' if is_stuck(row, key) else ''}"
 
 
 def _objectives(rows: Sequence[dict[str, Any]]) -> str:
@@ -270,8 +278,9 @@ def _streams(rows: Sequence[dict[str, Any]]) -> str:
         cells = [f"{row['landmarks']:,}", f"{row['sightings'] / row['poses']:.1f}"]
         for key in ("evermap", "isam2"):
             found = row.get(key, {})
-            cells += [f"{found[name]:.3g}" if name in found else UNKNOWN for name in FRAMES]
-        table.append(cells)
+            cells += [_number(found[name]) if name in found else UNKNOWN for name in FRAMES]
+        if set(cells[2:]) != {UNKNOWN}:
+            table.append(cells)
     return _table(head, table)
 
 
@@ -281,7 +290,7 @@ def _dlr(row: dict[str, Any]) -> str:
     cells = [f"{row[name]:,}" for name in ("landmarks", "poses", "sightings")]
     cells += [_seconds(row, key) for key in ("evermap", "plain", "lm_odometry")]
     above = row["plain"]["objective"] / row["best"] - 1.0
-    return _table(head, [[*cells, f"{row['evermap']['longest_ms']:.3g}", f"{above:.1e}"]])
+    return _table(head, [[*cells, _number(row["evermap"]["longest_ms"]), f"{above:.1e}"]])
 
 
 _MAP_TABLES = {
@@ -316,14 +325,14 @@ def _maps(shown: dict[str, Any]) -> list[str]:
         rows = []
         for row in shown[key]:
             found = [f"not run: {row['not_run']}", *[""] * (len(columns) - 1)] if "not_run" in row else None
-            cells = found or [f"{row[name]:.3g}" for name in columns.values()]
+            cells = found or [_number(row[name]) for name in columns.values()]
             rows.append([f"{row['places']:,} places", *cells])
         tables.append(_table([title, *columns], rows, left=1))
     done = shown["building"]
     if "not_run" not in done:
         count = done["compared"]
         rows = [
-            [label, f"{done['first'][name]:.3g}", f"{done['last'][name]:.3g}", f"{done['ratio'][name]:.2f}"]
+            [label, _number(done["first"][name]), _number(done["last"][name]), f"{done['ratio'][name]:.2f}"]
             for name, label in _BUILDING.items()
         ]
         head = [f"{done['sessions']:,} sessions of a building", f"first {count}", f"last {count}", "ratio"]

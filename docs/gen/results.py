@@ -30,6 +30,7 @@ STUDIES = (
     "tracking",
     "persistence-speed",
     "soak",
+    "scale",
 )
 PROVENANCE = re.compile(r"Computed by `(?P<command>[^`]+)`\. Tables of commit `(?P<commit>\w+)`, (?P<date>[\d-]+)")
 HEAD = """# Results

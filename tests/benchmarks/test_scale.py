@@ -119,7 +119,7 @@ def test_tables_and_the_figure_show_every_size(
     tables = [block.splitlines() for block in text.split("\n\n")]
     assert all(len({line.count("|") for line in lines}) == 1 for lines in tables)
     assert any(line.startswith("| a map's file grows") and "**no**" in line for line in tables[0])
-    report.write(shown, tmp_path, before=shown)
+    report.write(shown, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"table.md", "cost.png", "scale.json"}
     times = report.figure(shown).axes[0]
     drawn = {line.get_label(): line.get_xydata() for line in times.lines}
