@@ -81,13 +81,13 @@ def _claims_of_maps(shown: dict[str, Any]) -> list[list[str]]:
     over = f"{into[-1]['places']:,} over {into[0]['places']:,} places"
     return [
         _claim(f"time of a session of 200 landmarks brought into a map, {over}", 1.2, _grows(into, "cpu_s")),
-        _claim(f"its memory, {over}", 1.2, _grows(into, "grown_mb")),
+        _claim(f"memory of such a session, {over}", 1.2, _grows(into, "grown_mb")),
         _claim("a map's file grows in a session of 200 landmarks by", 1.0, _worst(into, "file_grown_mb"), "MB"),
         _claim("localisation: start from an unknown pose", 0.5, _worst(localised, "start_s"), "s"),
         _claim("localisation: 99 % of steps below", 3.0, _worst(localised, "p99_ms"), "ms"),
         _claim(f"localisation: median step, {over}", 1.3, _grows(localised, "median_ms")),
         _claim(f"opening a map of {opened[-1]['places']:,} places", 0.3, _worst(opened, "load_s"), "s"),
-        _claim("its memory", 300.0, _worst(opened, "grown_mb"), "MB"),
+        _claim("memory of opening it", 300.0, _worst(opened, "grown_mb"), "MB"),
         *(
             _claim(f"sessions of a building, the last over the first: {label}", 1.2, shown["building"]["ratio"][name])
             for name, label in _BUILDING.items()
@@ -148,7 +148,7 @@ def figure(shown: dict[str, Any], before: dict[str, Any] | None = None) -> Figur
     ]
     labels = {
         "evermap": "evermap: poses, map, calibration, noise",
-        "lm": "gtsam LM: poses, map",
+        "lm": "gtsam LM: poses, map, marginals",
         "isam2": "gtsam iSAM2: poses, map",
         "before": "evermap, dense, of 2026-11-22",
     }

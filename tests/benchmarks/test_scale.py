@@ -63,7 +63,7 @@ def test_exponents_are_over_what_grows(scale: ModuleType) -> None:
 
 def test_both_sides_solve_the_same_problem(row: dict[str, Any]) -> None:
     """evermap's objective is as good as that of the peer's optimum, and each is no worse than the others' start."""
-    assert row["plain"]["objective"] <= row["best"] * (1.0 + 1e-4)
+    assert row["plain"]["objective"] <= row["best"] * (1.0 + 1e-5)
     assert row["lm"]["objective"] == pytest.approx(row["best"], rel=1e-4)
     assert row["lm_odometry"]["objective"] == pytest.approx(row["best"], rel=1e-4)
     assert row["isam2"]["objective"] >= row["best"] * (1.0 - 1e-6)

@@ -125,15 +125,51 @@ def test_a_warehouse_without_size_is_an_error(field: str) -> None:
         replace(SMALL, **{field: 0})
 
 
-def test_the_objective_is_what_gtsam_computes(recording: Recording, factors: Factors) -> None:
-    graph = plain_gtsam.graph_of(factors)
+@pytest.mark.parametrize("logarithm", [True, False])
+def test_the_objective_is_what_gtsam_computes(recording: Recording, factors: Factors, logarithm: bool) -> None:
+    graph = plain_gtsam.graph_of(factors, logarithm=logarithm)
     for estimate in (
         truth_of(factors, recording),
         near_start(factors, recording, 0.2),
         dead_reckoned_start(factors),
     ):
         theirs = graph.error(plain_gtsam.values_of(estimate))
-        assert objective(factors, estimate) == pytest.approx(theirs, rel=1e-9)
+        assert objective(factors, estimate, logarithm=logarithm) == pytest.approx(theirs, rel=1e-9)
+
+
+def test_coordinates_as_residuals_have_the_derivatives_that_they_should(factors: Factors) -> None:
+    """Against differences, at poses that fit odometry badly."""
+    one = replace(
+        factors,
+        stamp_s=factors.stamp_s[:2],
+        pose_row=factors.pose_row[:0],
+        landmark_row=factors.landmark_row[:0],
+        reading=factors.reading[:0],
+        sigma=factors.sigma[:0],
+    )
+    factor = plain_gtsam.graph_of(one, logarithm=False).at(1)
+    poses = [gtsam.Pose2(1.0, 2.0, 0.3), gtsam.Pose2(1.5, 1.7, 0.9)]
+
+    def residual(*moved: np.ndarray) -> np.ndarray:
+        values = gtsam.Values()
+        for key, pose, step in zip(factor.keys(), poses, moved, strict=True):
+            values.insert(key, pose.compose(gtsam.Pose2.Expmap(step)))
+        return np.asarray(factor.unwhitenedError(values))
+
+    values = gtsam.Values()
+    for key, pose in zip(factor.keys(), poses, strict=True):
+        values.insert(key, pose)
+    linear = factor.linearize(values)
+    whiten = np.linalg.inv(np.linalg.cholesky(factors.covariance[0]))
+    still, step = np.zeros(3), 1e-6
+    for which in (0, 1):
+        expected = np.empty((3, 3))
+        for k, axis in enumerate(step * np.eye(3)):
+            ahead, back = ([axis * sign if which == n else still for n in (0, 1)] for sign in (1.0, -1.0))
+            expected[:, k] = (residual(*ahead) - residual(*back)) / (2.0 * step)
+        found = linear.getA()[:, 3 * which : 3 * which + 3]
+        # whitened by any square root of the information
+        np.testing.assert_allclose(found.T @ found, (whiten @ expected).T @ (whiten @ expected), rtol=1e-5, atol=1e-1)
 
 
 def test_integrated_odometry_is_what_gtsam_composes(recording: Recording, factors: Factors) -> None:

@@ -127,14 +127,19 @@ def integrated(recording: Recording, stamp_s: FloatArray, sigma: FloatArray) -> 
     return increment, covariance
 
 
-def objective(factors: Factors, estimate: PlainEstimate) -> float:
+def objective(factors: Factors, estimate: PlainEstimate, *, logarithm: bool = True) -> float:
     """Return half the sum of squared normalised residuals, the first pose's at the origin included.
 
-    Residuals of motions are logarithms on SE(2), as in gtsam.
+    Args:
+        factors: the measurements.
+        estimate: where they are compared.
+        logarithm: residuals of motions are their logarithms on SE(2), as in gtsam's factors; else (x, y, theta), as in
+            evermap. Where odometry is rough the two have optima that differ.
     """
     pose = estimate.pose
     held = se2.log(pose[0]) / FIRST_POSE_SIGMA
-    off = se2.log(se2.between(factors.increment, se2.between(pose[:-1], pose[1:])))
+    off = se2.between(factors.increment, se2.between(pose[:-1], pose[1:]))
+    off = se2.log(off) if logarithm else off
     moved = np.einsum("ni,nij,nj->", off, np.linalg.inv(factors.covariance), off)
     seen = predicted_readings(pose[factors.pose_row], estimate.landmark[factors.landmark_row])
     miss = factors.reading - seen

@@ -52,12 +52,17 @@ class Stream:
     step_s: FloatArray
 
 
-def graph_of(factors: Factors) -> Any:
-    """Return the `gtsam.NonlinearFactorGraph` of all factors; poses are x0, x1 ..., landmarks l0, l1 ..."""
-    graph = gtsam.NonlinearFactorGraph()
+def graph_of(factors: Factors, *, logarithm: bool = True) -> Any:
+    """Return the `gtsam.NonlinearFactorGraph` of all factors; poses are x0, x1 ..., landmarks l0, l1 ...
+
+    Args:
+        factors: the measurements.
+        logarithm: of the residuals of motions, see `factors.objective`; without it these factors are in Python, slow.
+    """
+    graph, odometry = gtsam.NonlinearFactorGraph(), _odometry if logarithm else _odometry_by_coordinates
     graph.add(_first_pose())
     for row in range(1, len(factors.stamp_s)):
-        graph.add(_odometry(factors, row))
+        graph.add(odometry(factors, row))
     noises = _Noises(factors.sigma)
     for m in range(len(factors.pose_row)):
         graph.add(_detection(factors, m, noises))
@@ -75,7 +80,12 @@ def values_of(estimate: PlainEstimate) -> Any:
 
 
 def levenberg_marquardt(
-    factors: Factors, start: PlainEstimate, *, tolerance: float = 1e-5, marginals: bool = True
+    factors: Factors,
+    start: PlainEstimate,
+    *,
+    tolerance: float = 1e-5,
+    marginals: bool = True,
+    logarithm: bool = True,
 ) -> Batch:
     """Return the optimum from `start`, with the marginals of all landmarks.
 
@@ -84,9 +94,10 @@ def levenberg_marquardt(
         start: where to begin.
         tolerance: relative and absolute decrease of the error at which it stops (gtsam's default).
         marginals: whether they are wanted.
+        logarithm: see `graph_of`.
     """
     at = [_now()]
-    graph, values = graph_of(factors), values_of(start)
+    graph, values = graph_of(factors, logarithm=logarithm), values_of(start)
     at.append(_now())
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(tolerance)
@@ -169,6 +180,27 @@ def _odometry(factors: Factors, row: int) -> Any:
     """The factor between pose `row` and the one before."""
     noise = gtsam.noiseModel.Gaussian.Covariance(factors.covariance[row - 1])
     return gtsam.BetweenFactorPose2(_POSE + row - 1, _POSE + row, gtsam.Pose2(*factors.increment[row - 1]), noise)
+
+
+def _odometry_by_coordinates(factors: Factors, row: int) -> Any:
+    """The same with the residual (x, y, theta) of the motion left over."""
+    noise = gtsam.noiseModel.Gaussian.Covariance(factors.covariance[row - 1])
+    increment = gtsam.Pose2(*factors.increment[row - 1])
+    back = increment.rotation().matrix().T
+
+    def error(this: Any, values: Any, jacobians: Any) -> FloatArray:
+        before, after = (values.atPose2(key) for key in this.keys())  # noqa: SIM118
+        between = before.between(after)
+        left = increment.between(between)
+        if jacobians is not None:
+            first, second = -np.eye(3), np.eye(3)
+            first[:2, :2] = -back
+            first[:2, 2] = back @ [between.y(), -between.x()]
+            second[:2, :2] = left.rotation().matrix()
+            jacobians[0], jacobians[1] = first, second
+        return np.array([left.x(), left.y(), left.theta()])
+
+    return gtsam.CustomFactor(noise, [_POSE + row - 1, _POSE + row], error)
 
 
 def _detection(factors: Factors, m: int, noises: _Noises) -> Any:
