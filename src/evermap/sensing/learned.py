@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,8 @@ if TYPE_CHECKING:
 
 FACES = 6
 """Directions that a landmark's own detectability is learned for: the faces of a cube around it."""
+SUMS = ("range_hits", "range_expected", "facing_hits", "facing_expected", "false_hits", "false_looks")
+"""What the profile sums up, in the order of the kernels."""
 SURELY_THERE = 0.99
 SURELY_GONE = 0.001
 """Beliefs at which what pends of a clique is taken for what it is."""
@@ -247,30 +249,15 @@ def confirm(model: LearnedDetection, seen: CliqueLook, probability: FloatArray) 
     there = in_view & (belief > SURELY_THERE) & (seen.p_occluded < MOSTLY_FREE)
     gone = in_view & (belief < SURELY_GONE)
     profile = model.profile
-    sums = np.concatenate(
-        [
-            profile.range_hits,
-            profile.range_expected,
-            profile.facing_hits,
-            profile.facing_expected,
-            [profile.false_hits, profile.false_looks, 0.0, 0.0],
-        ]
-    )
+    before = {name: np.atleast_1d(getattr(profile, name)) for name in SUMS}
+    sums = np.concatenate([*before.values(), np.zeros(2)])
     pending, log_chain, log_weight = model.pending.copy(), model.log_chain.copy(), profile.log_weight.copy()
     kernels.collect(there, gone, pending, log_chain, sums, log_weight)
-    range_hits, range_expected, facing_hits, facing_expected, rest = np.split(
-        sums, np.cumsum([RANGE_BINS, RANGE_BINS, FACING_BINS, FACING_BINS])
-    )
-    learned = replace(
-        profile,
-        range_hits=range_hits,
-        range_expected=range_expected,
-        facing_hits=facing_hits,
-        facing_expected=facing_expected,
-        false_hits=float(rest[0]),
-        false_looks=float(rest[1]),
-        log_weight=log_weight - log_weight.max(),
-    )
+    parts = np.split(sums[:-2], np.cumsum([len(part) for part in before.values()])[:-1])
+    after: dict[str, Any] = {
+        name: part if len(part) > 1 else float(part[0]) for name, part in zip(SUMS, parts, strict=True)
+    }
+    learned = replace(profile, **after, log_weight=log_weight - log_weight.max())
     return replace(model, profile=learned, pending=pending, log_chain=log_chain)
 
 
