@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gzip
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -163,3 +165,26 @@ def test_what_is_written_reads_back_the_same(tmp_path: Path) -> None:
         assert [found[k] for k in who] == [names[k].strip() for k in index]
     assert csv_bytes({"v": np.zeros(0)}) == b"v\n"
     assert csv_bytes({"v": np.array([1.0, np.nan]), "who": named(["a"], np.array([0, 0]))}) == b"v,who\n1,a\n,a\n"
+
+
+def test_tables_are_written_and_read_without_pandas(tmp_path: Path) -> None:
+    """What pyarrow converts by itself imports pandas, which takes 0.4 s."""
+    code = f"""
+import sys
+import numpy as np
+from evermap.io.columns import csv_bytes, named, read_columns
+from evermap.io.table import parquet_bytes
+from evermap.valid import Quantity
+
+numbers = np.array([1.5, np.nan, 3.0])
+path = {str(tmp_path)!r} + "/table"
+open(path + ".csv", "wb").write(csv_bytes({{"x": numbers, "name": named(["a", "b, c"], np.array([1, 0, 1]))}}))
+open(path + ".parquet", "wb").write(parquet_bytes({{"x": numbers, "name": ["b, c", "", "a"]}}))
+for ending, names in ((".csv", ["a", "b, c"]), (".parquet", ["a", "b, c"])):
+    table = read_columns(path + ending, [])
+    np.testing.assert_array_equal(table.numbers(Quantity("x", optional=True)), numbers)
+    assert table.labels("name")[0] == names
+print("pandas" in sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.io.table import Table, dates_as_text, parse_csv, read_parquet
+from evermap.io.table import Table, arrow_cells, dates_as_text, numbers_of, parse_csv, read_parquet
 from evermap.io.text import quote, reason
-from evermap.types import UNKNOWN, Clock, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
 from evermap.valid import Quantity
 
 _FLAGS = {"1": 1.0, "0": 0.0, "true": 1.0, "false": 0.0, "1.0": 1.0, "0.0": 0.0, "": np.nan, "nan": np.nan}
@@ -63,11 +63,12 @@ class Columns:
         cells = self.cells[quantity.name]
         if _is_text(cells.type):
             text = pc.utf8_trim_whitespace(cells)
-            blank = pc.equal(text, "")
+            length, given = numbers_of(pc.binary_length(text), np.int32)
+            blank = given & (length == 0)
             try:
-                if not quantity.optional and pc.any(blank).as_py():
+                if not quantity.optional and blank.any():
                     raise pa.ArrowInvalid("an empty cell")
-                values = _as_float(pc.if_else(blank, pa.scalar(None, text.type), text))
+                values = _as_float(_without(text, given & ~blank))
             except pa.ArrowInvalid:
                 return self._table({quantity.name: cells.to_pylist()}).numbers(quantity)
         else:
@@ -126,7 +127,7 @@ class Columns:
             if wrong.size:
                 problem = f"{values[wrong[0]]:g} is no name"
                 raise self.error(problem, row=int(wrong[0]), field=name, hint="text or whole numbers")
-            cells = pa.array(values, from_pandas=True).cast(pa.int64())
+            cells = arrow_cells(values, ~np.isnan(values)).cast(pa.int64())
         elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
             raise self.error(f"holds {cells.type}, not names", row=None, field=name, hint="text or whole numbers")
         row_name, names = _coded(pc.utf8_trim_whitespace(cells.cast(pa.string())))
@@ -172,9 +173,7 @@ def read_columns(path: str | Path, warnings: list[str]) -> Columns:
 
 def named(names: Sequence[str], index: IntArray) -> Any:
     """Return a column of names for `csv_bytes`: which of `names` each row has."""
-    import pyarrow as pa
-
-    return pa.array(list(names), type=pa.string()).take(pa.array(index))
+    return arrow_cells(list(names)).take(arrow_cells(index))
 
 
 def csv_bytes(columns: Mapping[str, Any]) -> bytes:
@@ -187,7 +186,7 @@ def csv_bytes(columns: Mapping[str, Any]) -> bytes:
     import pyarrow.compute as pc
     from pyarrow import csv
 
-    arrays = {name: pa.array(cells, from_pandas=True) for name, cells in columns.items()}
+    arrays = {name: _cells(column) for name, column in columns.items()}
     marks = any(
         _is_text(cells.type) and pc.any(pc.match_substring_regex(cells, r'[",\r\n#]|^\s|\s$')).as_py()
         for cells in arrays.values()
@@ -198,6 +197,21 @@ def csv_bytes(columns: Mapping[str, Any]) -> bytes:
     if len(next(iter(arrays.values()))):
         csv.write_csv(pa.table(arrays), sink, options)
     return bytes(sink.getvalue())
+
+
+def _cells(column: Any) -> Any:
+    """A column for a CSV file, nan as null."""
+    if not isinstance(column, np.ndarray):
+        return column
+    return arrow_cells(column, ~np.isnan(column) if column.dtype.kind == "f" else None)
+
+
+def _without(text: Any, known: BoolArray) -> Any:
+    """An array of text with null for what is not known."""
+    import pyarrow as pa
+
+    valid = np.packbits(np.concatenate([np.zeros(text.offset, dtype=np.bool_), known]), bitorder="little")
+    return pa.Array.from_buffers(text.type, len(text), [pa.py_buffer(valid), *text.buffers()[1:]], offset=text.offset)
 
 
 def _content(path: Path) -> bytes:
@@ -245,10 +259,8 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
 
 
 def _careful_csv(data: bytes, path: Path, warnings: list[str]) -> Columns:
-    import pyarrow as pa
-
     table = parse_csv(data, path, warnings)
-    cells = {name: pa.array(list(column), type=pa.string()) for name, column in table.columns.items()}
+    cells = {name: arrow_cells(list(column)) for name, column in table.columns.items()}
     return Columns(path, cells, table.line, table.header_line)
 
 
@@ -274,14 +286,15 @@ def _as_float(cells: Any) -> FloatArray:
 
     if pa.types.is_boolean(cells.type):
         cells = cells.cast(pa.int8())
-    return np.array(cells.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), dtype=np.float64)
+    values, known = numbers_of(cells.cast(pa.float64(), safe=False), np.float64)
+    return np.where(known, values, np.nan)
 
 
 def _coded(words: Any) -> tuple[IntArray, list[str]]:
     """Which of its different values each cell has, -1 where it is missing, and these values."""
     coded = words.dictionary_encode()
-    codes = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
-    return codes, coded.dictionary.to_pylist()
+    codes, known = numbers_of(coded.indices, np.int32)
+    return np.where(known, codes, -1).astype(np.int64), coded.dictionary.to_pylist()
 
 
 def _natural(names: list[str]) -> Any:
