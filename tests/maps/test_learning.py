@@ -11,7 +11,7 @@ from scipy import stats as law
 from simulated_stays import TrueStay, as_seen, histories, two_looks_a_day
 
 from evermap.config import LifetimeConfig
-from evermap.maps.learning import class_survival, learned_lives
+from evermap.maps.learning import ClassLives
 from evermap.maps.lives import Lives
 from evermap.maps.living import Stays
 from evermap.survival.general_purpose import GeneralPurpose
@@ -34,13 +34,13 @@ def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float)
     covered = []
     for seed in SEEDS:
         stays = seen_in_four_weeks(seed, warmup_days)
-        lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+        lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
         for kind, item in enumerate(DEFAULT_CLASSES):
             if item.stay is None:
                 continue
             truth = law.gamma(item.stay.shape, scale=item.stay.mean_days / item.stay.shape)
             ages_days = truth.ppf([0.1, 0.3, 0.5, 0.7, 0.9])
-            _, lower, upper = class_survival(stays, lives, kind, ages_days * DAY_S)
+            _, lower, upper = ClassLives.of(stays, lives).band(kind, ages_days * DAY_S)
             survival = truth.sf(ages_days)
             covered.append((lower <= survival) & (survival <= upper))
     assert np.mean(covered) >= 0.9
@@ -49,7 +49,7 @@ def test_bands_cover_the_lifetimes_of_the_simulated_building(warmup_days: float)
 
 def test_a_class_that_never_leaves_is_believed_to_stay() -> None:
     stays = seen_in_four_weeks(0)
-    life = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).of(0, np.zeros(2))
+    life = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives.of(0, np.zeros(2))
     assert life.n_stays == DEFAULT_CLASSES[0].count
     assert life.n_ended == 0
     assert np.exp(life.stay.log_conditional_survival(28 * DAY_S, 29 * DAY_S)) > 0.99
@@ -66,7 +66,7 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
         ObjectClass("is-taken", count=25, stay=Duration(2.0), p_vanish=1.0, p_return=0.0),
     )  # fmt: skip
     stays = as_seen(histories(classes, END_S, np.random.default_rng(1), 0.0), LOOKS_S)
-    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
     swing, comes_back, wanders, is_taken = (lives.of(kind, np.zeros(2)) for kind in range(4))
     assert swing.p_hop > 0.9
     assert swing.p_known > 0.9
@@ -80,7 +80,7 @@ def test_returns_hops_and_known_sites_are_learned() -> None:
 
 
 def test_without_stays_nothing_is_believed_but_looks_are_counted() -> None:
-    lives = learned_lives(Stays.empty(), Lives(), 100.0)
+    lives = ClassLives.of(Stays.empty(), Lives(), 100.0).lives
     assert len(lives.life) == 0
     assert lives.looks_s.tolist() == [100.0]
 
@@ -89,19 +89,19 @@ def test_a_new_class_gets_what_the_others_have_in_common() -> None:
     """Of everything that leaves within days, the next thing does so, too; with less certainty than its fellows."""
     classes = tuple(ObjectClass(f"kind-{n}", count=12, stay=Duration(2.0), p_vanish=0.0) for n in range(6))
     stays = as_seen(histories(classes, END_S, np.random.default_rng(3), 0.0), LOOKS_S)
-    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
     unknown = lives.of(17, np.zeros(2)).stay
     assert unknown is lives.of(UNKNOWN, np.zeros(2)).stay
     assert 0.5 * DAY_S < unknown.quantile(0.5) < 4.0 * DAY_S
-    _, lower, upper = class_survival(stays, lives, 17, [2.0 * DAY_S])
-    _, lower_known, upper_known = class_survival(stays, lives, 3, [2.0 * DAY_S])
+    _, lower, upper = ClassLives.of(stays, lives).band(17, [2.0 * DAY_S])
+    _, lower_known, upper_known = ClassLives.of(stays, lives).band(3, [2.0 * DAY_S])
     assert upper - lower > 2.0 * (upper_known - lower_known)
 
 
 def test_order_of_stays_does_not_matter() -> None:
     stays = seen_in_four_weeks(2)
     shuffled = stays[np.random.default_rng(0).permutation(len(stays))]
-    one, other = (learned_lives(s, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]) for s in (stays, shuffled))
+    one, other = (ClassLives.of(s, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives for s in (stays, shuffled))
     np.testing.assert_allclose([life.p_hop for life in one.life], [life.p_hop for life in other.life], rtol=1e-12)
     for a, b in zip(one.life, other.life, strict=True):
         np.testing.assert_allclose(a.stay.log_survival(DAY_S), b.stay.log_survival(DAY_S), rtol=1e-6)
@@ -116,7 +116,7 @@ def test_forecasts_of_the_next_session_beat_the_general_purpose_prior_and_are_ca
         for until in range(20, len(LOOKS_S) - 1, 4):
             stays = as_seen(true, LOOKS_S[:until])
             now_s, next_s = LOOKS_S[until - 1], LOOKS_S[until]
-            lives = learned_lives(stays, Lives(looks_s=LOOKS_S[: until - 1]), now_s)
+            lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[: until - 1]), now_s).lives
             there = {(stay.thing, stay.site) for stay in true if stay.start_s <= next_s < stay.end_s}
             for row in np.flatnonzero(np.isinf(stays.gone_s)):
                 age_s = now_s - stays.first_s[row]
@@ -146,7 +146,7 @@ def test_places_differ_only_where_they_do() -> None:
     corner = np.array([[5.0, 5.0], [25.0, 5.0]])
     by_place = np.repeat(corner, 15, axis=0)
     stays = as_seen([TrueStay(s.thing, 0, s.site, s.start_s, s.end_s) for s in true], LOOKS_S, by_place)
-    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
     here, there, elsewhere = (lives.of(0, np.array(place)).stay for place in (*corner, (95.0, 5.0)))
     next_day = [float(np.exp(life.log_conditional_survival(DAY_S, 2.0 * DAY_S))) for life in (here, elsewhere, there)]
     truth = np.exp([-1.0 / 6.0, -1.0])
@@ -157,7 +157,7 @@ def test_places_differ_only_where_they_do() -> None:
     # the same things, placed by lot: chunks are what their class is
     by_lot = corner[rng.integers(0, 2, 30)]
     alike = as_seen(histories((slow, slow), END_S, rng, 0.0), LOOKS_S, by_lot)
-    lives = learned_lives(replace(alike, class_id=0 * alike.class_id), Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    lives = ClassLives.of(replace(alike, class_id=0 * alike.class_id), Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
     medians = [float(lives.of(0, place).stay.quantile(0.5)) for place in (*corner, np.array([95.0, 5.0]))]
     assert max(medians) / min(medians) < 1.25
 
@@ -168,9 +168,9 @@ def test_learning_does_not_depend_on_how_long_ago_a_class_was_first_seen() -> No
     looks_s = two_looks_a_day(180)
     stays = as_seen(histories(classes, 180 * DAY_S, np.random.default_rng(6), 0.0), looks_s)
     assert len(stays) > 1.5 * LifetimeConfig().newest
-    lives = learned_lives(stays, Lives(looks_s=looks_s[:-1]), looks_s[-1])
+    lives = ClassLives.of(stays, Lives(looks_s=looks_s[:-1]), looks_s[-1]).lives
     assert lives.of(0, np.zeros(2)).n_stays == LifetimeConfig().newest
-    mean, lower, upper = class_survival(stays, lives, 0, [2.0 * DAY_S])
+    mean, lower, upper = ClassLives.of(stays, lives).band(0, [2.0 * DAY_S])
     assert lower < np.exp(-1.0) < upper
     assert upper - lower < 0.15
     assert np.exp(lives.of(0, np.zeros(2)).stay.log_survival(2.0 * DAY_S)) == pytest.approx(mean[0], rel=1e-2)
@@ -187,7 +187,7 @@ def with_doubts(stays: Stays, kind: int, n: int, p_gone: float) -> Stays:
 
 def survival(stays: Stays, kind: int) -> np.ndarray:
     """Of a class, after a day, a week and a month."""
-    lives = learned_lives(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1])
+    lives = ClassLives.of(stays, Lives(looks_s=LOOKS_S[:-1]), LOOKS_S[-1]).lives
     return np.exp(lives.of(kind, np.array([500.0, 500.0])).stay.log_survival(np.array([1.0, 7.0, 28.0]) * DAY_S))
 
 

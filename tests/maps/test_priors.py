@@ -18,7 +18,7 @@ from evermap.errors import ConfigError, InputError
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.models import NamedModels, lifetimes_of, save_models
 from evermap.existence.run_length import RunLength
-from evermap.maps.learning import absence_said, learned_lives, lifetimes_by_class, stay_said, with_priors
+from evermap.maps.learning import ClassLives, absence_said, lifetimes_by_class, stay_said, with_priors
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store.content import Chunk, pack, unpack
@@ -85,13 +85,13 @@ def test_one_stay_that_goes_on_hardly_moves_a_prior_and_hundreds_do(prior) -> No
     ages_s = prior.quantile(np.array([0.2, 0.5, 0.8]))
     living = with_priors(LivingMap(), told(cart=prior), ["cart"], worth=50)
     lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
-    one = learned_lives(stays_of(0, [0.01], gone=False), lives, 100.0 * DAY_S).of(0)
+    one = ClassLives.of(stays_of(0, [0.01], gone=False), lives, 100.0 * DAY_S).lives.of(0)
     np.testing.assert_allclose(np.exp(one.stay.log_survival(ages_s)), [0.8, 0.5, 0.2], atol=0.07)
     assert (one.n_stays, one.n_ended) == (1, 0)
     days = stats.weibull_min.ppf((np.arange(250) + 0.5) / 250, 2.0, scale=20.0)
-    many = learned_lives(stays_of(0, days.tolist()), lives, 100.0 * DAY_S + 60.0).of(0)
-    without = learned_lives(stays_of(0, days.tolist()), replace(lives, prior=(), prior_class_id=np.zeros(0, np.int64)),
-                            100.0 * DAY_S + 60.0).of(0)  # fmt: skip
+    many = ClassLives.of(stays_of(0, days.tolist()), lives, 100.0 * DAY_S + 60.0).lives.of(0)
+    untold = replace(lives, prior=(), prior_class_id=np.zeros(0, np.int64))
+    without = ClassLives.of(stays_of(0, days.tolist()), untold, 100.0 * DAY_S + 60.0).lives.of(0)
     at_s = 20.0 * DAY_S
     far = abs(np.exp(prior.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
     near = abs(np.exp(many.stay.log_survival(at_s)) - np.exp(without.stay.log_survival(at_s)))
@@ -104,7 +104,7 @@ def test_more_worth_holds_a_prior_longer() -> None:
     for worth in (2, 20, 200):
         living = with_priors(LivingMap(), told(cart=WEIBULL), ["cart"], worth)
         lives = replace(living.lives, looks_s=np.arange(1, 100) * DAY_S)
-        stay = learned_lives(stays_of(0, days), lives, 100.0 * DAY_S + 60.0).of(0).stay
+        stay = ClassLives.of(stays_of(0, days), lives, 100.0 * DAY_S + 60.0).lives.of(0).stay
         survival.append(float(np.exp(stay.log_survival(6.0 * DAY_S))))
     assert survival[0] > survival[1] > survival[2] > float(np.exp(WEIBULL.log_survival(6.0 * DAY_S)))
 

@@ -170,18 +170,6 @@ def _newest(kind: IntArray, first_s: FloatArray, most: int) -> BoolArray:
     return newest
 
 
-def learned_lives(stays: Stays, before: Lives, now_s: float, settings: LifetimeConfig = USUAL) -> Lives:
-    """Learn lifetimes by class and place from all stays of a map until now.
-
-    Args:
-        stays: of all cliques, also those that go on.
-        before: what was learned after the session before; its chunks, looks and priors are kept.
-        now_s: end of the session.
-        settings: what is learned from, and how firmly.
-    """
-    return ClassLives.of(stays, before, now_s, settings).lives
-
-
 @dataclass(frozen=True, slots=True)
 class ClassLives:
     """What the stays of a map say of the lifetimes of its classes; the last row of all is of a class never seen.
@@ -198,11 +186,11 @@ class ClassLives:
 
     @classmethod
     def of(cls, stays: Stays, before: Lives, now_s: float | None = None, settings: LifetimeConfig = USUAL) -> Self:
-        """Learn from all stays of a map; see `learned_lives`.
+        """Learn lifetimes by class and place from all stays of a map until now.
 
         Args:
-            stays: of all cliques.
-            before: what was learned before, whose looks are told of.
+            stays: of all cliques, also those that go on; the classes learn from each other.
+            before: what was learned after the session before; its chunks, looks and priors are kept.
             now_s: end of the newest session; None where `before` tells of it, too.
             settings: what is learned from, and how firmly.
         """
@@ -248,21 +236,6 @@ class ClassLives:
             mine = class_id == kind
             upper[mine] = self.band(int(kind), age_s[mine], confidence)[2]
         return upper
-
-
-def class_survival(
-    stays: Stays, lives: Lives, class_id: int, ages_s: ArrayLike, confidence: float = 0.95
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return what the stays of a map say about one class, as `ClassLives.band` does.
-
-    Args:
-        stays: of all cliques; the classes learn from each other.
-        lives: learned from them.
-        class_id: of the class; any that was never seen for a new one.
-        ages_s: (N,) in seconds.
-        confidence: probability that the truth lies between the bounds, at each age by itself.
-    """
-    return ClassLives.of(stays, lives).band(class_id, ages_s, confidence)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evermap.maps.learning import class_survival
+from evermap.maps.learning import ClassLives
 from evermap.survival import Gamma
 from evermap.types import FloatArray
 from evermap_studies.demo.study import Study
@@ -58,11 +58,11 @@ def _learned(study: Study, row: int, kind: ObjectClass, longest_days: float) -> 
     living, truth = study.living, true_life(kind, study.scenario.change_rate)
     span = longest_days if truth is None else min(longest_days, 3.0 * truth.mean() / DAY_S)
     age_days = np.linspace(0.0, span, 61)
-    mean, low, high = class_survival(living.stays, living.lives, row, age_days * DAY_S, CONFIDENCE)
+    mean, low, high = ClassLives.of(living.stays, living.lives).band(row, age_days * DAY_S, CONFIDENCE)
     covers: tuple[bool, ...] = ()
     if truth is not None:
         at_s = truth.quantile([1.0 - share for share in QUARTILES])
-        _, below, above = class_survival(living.stays, living.lives, row, at_s, CONFIDENCE)
+        _, below, above = ClassLives.of(living.stays, living.lives).band(row, at_s, CONFIDENCE)
         covers = tuple((below[k] <= share <= above[k]).item() for k, share in enumerate(QUARTILES))
     mine = living.stays.class_id == row
     return LearnedLife(
