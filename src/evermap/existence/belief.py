@@ -18,7 +18,7 @@ from evermap.show import Shown
 from evermap.types import FloatArray, IntArray
 
 
-class Beliefs(Shown, ABC):
+class BeliefTable(Shown, ABC):
     """Presence of N features, one row each, and the time of each row's last look."""
 
     __slots__ = ()
@@ -76,7 +76,7 @@ class Beliefs(Shown, ABC):
         return index, [checks.as_rows(column, len(index), field) for field, column in columns.items()]
 
 
-class RecurrentBeliefs(Beliefs):
+class RecurrentBeliefTable(BeliefTable):
     """Presence of N features that leave and return."""
 
     __slots__ = ()

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from evermap.existence import protocol as checks
-from evermap.existence.belief import RecurrentBeliefs
+from evermap.existence.belief import RecurrentBeliefTable
 from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants, Looks
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S, bin_of_week
@@ -19,7 +19,7 @@ from evermap.types import BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class PhaseBelief(RecurrentBeliefs):
+class PhaseBelief(RecurrentBeliefTable):
     """Presence of N features, one row each.
 
     Attributes:

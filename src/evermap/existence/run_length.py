@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.errors import ConfigError, NumericalError
 from evermap.existence import protocol as checks
-from evermap.existence.belief import RecurrentBeliefs
+from evermap.existence.belief import RecurrentBeliefTable
 from evermap.existence.lifetimes import HazardTable, Lifetimes, bins_of, edges, proportional, tabulate
 from evermap.existence.protocol import Instants, Looks, Track, impossible
 from evermap.existence.rhythm import BIN_S, BINS, Rhythm
@@ -206,7 +206,7 @@ def _equilibrium(table: HazardTable, n: int) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class RunLengthBelief(RecurrentBeliefs):
+class RunLengthBelief(RecurrentBeliefTable):
     """Beliefs about N features, one row each; state `s` is 0 absent, 1 present.
 
     Attributes:

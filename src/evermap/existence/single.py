@@ -17,14 +17,14 @@ import numpy as np
 
 from evermap.errors import ConfigError, NumericalError
 from evermap.existence import protocol as checks
-from evermap.existence.belief import Beliefs
+from evermap.existence.belief import BeliefTable
 from evermap.existence.lifetimes import log_death_odds
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
-class Belief(Beliefs):
+class Belief(BeliefTable):
     """Persistence of `N` features, one row each.
 
     Attributes:

@@ -132,7 +132,7 @@ class CliqueRows(NamedTuple):
     pending: FloatArray
 
 
-class Detections(NamedTuple):
+class FrameSeen(NamedTuple):
     """What a frame saw.
 
     Attributes:
@@ -196,7 +196,7 @@ def p_detect(frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, out: FloatA
 
 @kernel
 def look(
-    frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, cliques: CliqueRows, seen_now: Detections, out: LookRows
+    frame: SensorFrame, law: SensorLaw, rows: LandmarkRows, cliques: CliqueRows, seen_now: FrameSeen, out: LookRows
 ) -> None:
     """Fill `out`, and update what changes of `rows` and `cliques` in place."""
     range_rate, facing_rate, p_false, come_hz, go_hz, log_weight = law

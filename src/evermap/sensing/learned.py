@@ -214,7 +214,7 @@ def look(
         _law(model.profile),
         kernels.LandmarkRows(model.landmark_m, model.outward, after.hits, after.expected),
         kernels.CliqueRows(model.first, after.occluded, after.log_chain, after.pending),
-        kernels.Detections(hit, chosen, np.nan_to_num(stamp_s - model.stamp_s)),
+        kernels.FrameSeen(hit, chosen, np.nan_to_num(stamp_s - model.stamp_s)),
         kernels.LookRows(seen.log_there, seen.log_gone, seen.p_occluded, seen.expected),
     )
     in_view = seen.expected > 0
