@@ -70,8 +70,9 @@ class DensePosterior:
         problem, prior = self.problem, self.problem.prior
         out = [((estimate.states - prior.mean) / prior.sigma)[self.free]]
         # the joint prior of the known landmarks by way of the covariance of all; a singular value of zero is no prior
-        mapped = np.flatnonzero(problem.landmark_information.any(axis=0))
-        covariance = np.linalg.inv(problem.landmark_information[np.ix_(mapped, mapped)])
+        information = problem.landmark_information.toarray()
+        mapped = np.flatnonzero(information.any(axis=0))
+        covariance = np.linalg.inv(information[np.ix_(mapped, mapped)])
         seen = np.isin(mapped // 2, self.known)
         information = np.linalg.inv(covariance[np.ix_(seen, seen)])
         moved = (estimate.landmark - problem.landmark_mean).ravel()[mapped[seen]]

@@ -9,9 +9,9 @@ import pytest
 from problems import QUIET, World, default_prior, integrated, make_world, slow_increment
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.problem import Estimate
+from evermap.slam.smoother import Smoother
 
 # where a closing error of centimetres and hundredths of a radian is as linear as the bridge takes it to be
 CALM = replace(QUIET, detection=0.2 * QUIET.detection, odometry=0.2 * QUIET.odometry)

@@ -9,8 +9,8 @@ import pytest
 from problems import default_prior, make_world
 
 from evermap.errors import ConfigError
-from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import FORWARD, NAMES, SLOPE, SPECS, CalibrationPrior
+from evermap.slam.smoother import Smoother
 
 
 def test_default_prior_is_the_table():

@@ -13,11 +13,11 @@ from problems import default_prior, slow_detection
 from recordings import building, first_seconds
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
-from evermap.slam.border import BorderFilter
 from evermap.slam.intake import prepare
+from evermap.slam.local_filter import LocalFilter
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.slam.solver import Motion, compare
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import Recording
@@ -42,7 +42,7 @@ def graph_of(problem: Problem, noise: Noise, *, heavy: bool) -> gtsam.NonlinearF
     held = gtsam.noiseModel.Isotropic.Precision(3, problem.start_information)
     graph.add(gtsam.PriorFactorPose2(pose_key(0), gtsam.Pose2(*problem.start_pose), held))
     for j in range(len(problem.landmark_mean)):
-        information = problem.landmark_information[2 * j : 2 * j + 2, 2 * j : 2 * j + 2]
+        information = problem.landmark_information[2 * j : 2 * j + 2, 2 * j : 2 * j + 2].toarray()
         if information.any():
             noise_model = gtsam.noiseModel.Gaussian.Information(information)
             graph.add(gtsam.PriorFactorPoint2(landmark_key(j), problem.landmark_mean[j], noise_model))
@@ -188,7 +188,7 @@ def test_streaming_ends_near_the_batch_optimum(run):
 SOLVERS = {
     "gtsam, all poses": partial(IncrementalSmoother, kept=1000),
     "gtsam, last poses": partial(IncrementalSmoother, kept=10),
-    "arrow": BorderFilter,
+    "arrow": LocalFilter,
 }
 
 

@@ -10,9 +10,9 @@ import pytest
 from dense import DensePosterior
 from problems import QUIET, World, default_prior, integrated, make_world
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.noise import START, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Noise
+from evermap.slam.smoother import Smoother
 
 # sensors that look backwards have a range law that jumps there; not what is tested here
 PRIOR = default_prior(range_skew_per_rad=0.0)

@@ -12,14 +12,14 @@ from problems import QUIET, World, make_world
 from test_smoother import elsewhere, tied
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
-from evermap.slam.border import BorderFilter
+from evermap.slam.local_filter import LocalFilter
 from evermap.slam.problem import Estimate
+from evermap.slam.smoother import Smoother
 from evermap.slam.solver import IncrementalSolver, Motion
 from evermap.slam.streaming import sighted_at
 from evermap_studies.peers.isam import IncrementalSmoother
 
-SOLVERS: dict[str, Callable[..., IncrementalSolver]] = {"arrow": BorderFilter, "gtsam": IncrementalSmoother}
+SOLVERS: dict[str, Callable[..., IncrementalSolver]] = {"arrow": LocalFilter, "gtsam": IncrementalSmoother}
 
 
 @pytest.fixture(params=SOLVERS)
@@ -122,7 +122,7 @@ def test_detections_may_be_given_to_a_new_place_between_two_steps(solver_of):
     last = (problem.pose_row == n - 1) & (problem.landmark_row == 0)
     assert last.sum() == 1
     joint = np.zeros((2 * count + 2, 2 * count + 2))
-    joint[:-2, :-2] = problem.landmark_information
+    joint[:-2, :-2] = problem.landmark_information.toarray()
     solver.problem = replace(
         problem,
         landmark_row=np.where(last, count, problem.landmark_row),

@@ -172,7 +172,8 @@ class LivingMap(Shown):
         stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
         session_start_s: begin of the newest session; one that begins earlier is late.
         members, sites, places, stays: see there.
-        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known.
+        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known; or
+            (P, 2, 2), while the places are independent.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
         lives: how long things of a class stay, stay away, and where they turn up again.
@@ -352,7 +353,9 @@ class LivingMap(Shown):
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(2)
         arm = self.places.position_m[row] - middle
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
-        return np.asarray(self.covariance_m2[corner[:, :, None], corner[:, None, :]] + size)
+        own = self.covariance_m2
+        own = own[row] if own.ndim == 3 else own[corner[:, :, None], corner[:, None, :]]
+        return np.asarray(own + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
         """Return every place as a record of its own, in the order of `places`: what a robot may meet.

@@ -26,8 +26,8 @@ BEARING_MARGIN_RAD = 0.05
 """Softness of the field of view's edge, where pose and map errors decide."""
 WORTH_A_LOOK = 0.3
 """Share of the sensor's detection probability from which on a landmark counts as looked at."""
-AT_ONCE = 2_000_000
-"""Pairs of poses and landmarks that are held in memory at a time."""
+AT_ONCE = 64
+"""Consecutive poses that are compared with the landmarks near any of them."""
 
 
 class DetectionModel(Protocol):
@@ -96,15 +96,26 @@ def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tup
         position_m: (L, 2) landmarks in the same frame, taken to be there.
         seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
     """
-    field, step = NominalField(sensor), max(1, AT_ONCE // max(len(position_m), 1))
+    field = NominalField(sensor)
+    eye = se2.compose(pose, np.asarray(sensor.mount_robot_sensor))[:, :2]
+    reach = sensor.range_max_m + 3.0 * RANGE_MARGIN_M
+    by_pose = np.argsort(seen[0], kind="stable")
+    first_seen = np.searchsorted(seen[0][by_pose], np.arange(0, len(pose) + AT_ONCE, AT_ONCE))
     parts = []
-    for start in range(0, max(len(pose), 1), step):
-        p = field.p_detect(pose[start : start + step], position_m)
-        mine = (seen[0] >= start) & (seen[0] < start + len(p))
+    for k, start in enumerate(range(0, max(len(pose), 1), AT_ONCE)):
+        some = pose[start : start + AT_ONCE]
+        mine = by_pose[first_seen[k] : first_seen[k + 1]]
+        # consecutive poses are near each other: what none of them reaches is not worth a look of any
+        low = eye[start : start + AT_ONCE].min(axis=0, initial=np.inf) - reach
+        high = eye[start : start + AT_ONCE].max(axis=0, initial=-np.inf) + reach
+        near = ((position_m >= low) & (position_m <= high)).all(axis=1)
+        near[seen[1][mine]] = True
+        rows = np.flatnonzero(near)
+        p = field.p_detect(some, position_m[rows])
         hit = np.zeros(p.shape, dtype=np.bool_)
-        hit[seen[0][mine] - start, seen[1][mine]] = True
-        row, landmark = np.nonzero(field.worth_a_look(p) | hit)
-        parts.append((row + start, landmark, p[row, landmark], hit[row, landmark]))
+        hit[seen[0][mine] - start, np.searchsorted(rows, seen[1][mine])] = True
+        row, column = np.nonzero(field.worth_a_look(p) | hit)
+        parts.append((row + start, rows[column], p[row, column], hit[row, column]))
     return LooksAt(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

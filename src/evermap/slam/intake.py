@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import sparse
 
 from evermap.config import SlamConfig
 from evermap.errors import DataError
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.noise import start_noise
-from evermap.slam.problem import Drive, Noise, Problem, independent
+from evermap.slam.problem import Drive, Noise, Problem
 from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
 
@@ -48,9 +49,8 @@ class Prepared:
         """Return the prior map as the joint search compares with it: landmark by landmark, with covariances."""
         if self.prior_map is None:
             return None
-        given, rows = self.prior_map.given, np.arange(len(self.landmark_id))
-        blocks = self.prior_map.information.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
-        covariance = np.linalg.inv(np.where(given[:, None, None], blocks, np.eye(2)))
+        given = self.prior_map.given
+        covariance = np.linalg.inv(np.where(given[:, None, None], self.prior_map.information, np.eye(2)))
         return GivenMap(self.prior_map.mean, covariance, given)
 
 
@@ -96,7 +96,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
         start_pose=np.zeros(3),
         start_information=FIRST_POSE_INFORMATION,
         landmark_mean=np.zeros((len(landmark_id), 2)),
-        landmark_information=np.zeros((2 * len(landmark_id), 2 * len(landmark_id))),
+        landmark_information=sparse.csr_array((2 * len(landmark_id), 2 * len(landmark_id))),
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
@@ -127,4 +127,4 @@ def _in_rows(prior_map: Landmarks, landmark_id: IntArray) -> PriorMap | None:
             given[k] = True
             mean[k] = prior_map.position_m[row]
             information[k] = np.linalg.inv(prior_map.covariance_m2[row] + 1e-6 * np.eye(2))
-    return PriorMap(mean, independent(information), given)
+    return PriorMap(mean, information, given)

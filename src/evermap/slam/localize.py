@@ -15,10 +15,10 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
-from evermap.slam.border import drive_on
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.kernels import AT_PLACES
 from evermap.slam.known_places import LEAST_BELIEF, KnownPlaces, LocalTrack, Neighbourhood, Placed
+from evermap.slam.local_filter import drive_on
 from evermap.slam.problem import Drive, Noise
 from evermap.slam.schmidt import choose_places, update_considering
 from evermap.slam.solver import Motion

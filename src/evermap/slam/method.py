@@ -85,6 +85,11 @@ class Method(Protocol):
         """
         return problem, estimate
 
+    def revises(self, problem: Problem) -> bool:
+        """Return whether `revise` may change this problem before the end; else it is solved beside the stream."""
+        del problem
+        return True
+
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Return the best explanation of everything so far.
 
@@ -108,6 +113,11 @@ class Static(Method):
         """Return the place of each detection's landmark."""
         del row, compare
         return problem.landmark_row[detections]
+
+    def revises(self, problem: Problem) -> bool:
+        """Return False."""
+        del problem
+        return False
 
     def revise(self, problem: Problem, estimate: Estimate, noise: Noise, *, heavy: bool, final: bool) -> Explanation:
         """Return the problem as it is."""

@@ -12,17 +12,14 @@ Thompson 1971; the multiplicative form keeps variances positive). Truth is never
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from evermap.config import NoiseConfig
-from evermap.slam.kernels import (
-    detection_residual,
-    kernel,
-    sandwich,
-)
+from evermap.slam.kernels import kernel, multiply
+from evermap.slam.linearise import detection_residuals, root_of
 from evermap.slam.preintegration import Intervals, linearise_interval
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.types import FloatArray
@@ -83,32 +80,17 @@ def refine_noise(
         start: levels that `start.pseudo_count` imaginary residuals vouch for.
     """
     free, pseudo = problem.prior.free, start.pseudo_count
-    squares, counts = _detection_sums(
-        estimate.pose,
-        estimate.landmark,
-        estimate.states,
-        problem.pose_row,
-        problem.landmark_row,
-        problem.reading,
-        noise.of_detections(problem.sigma_given),
-        np.isfinite(problem.sigma_given),
-        problem.mount,
-        free,
-        weights,
-        marginals.pose,
-        marginals.pose_shared,
-        marginals.shared,
-    )
+    residual = detection_residuals(problem, estimate)
+    learned = np.where(np.isfinite(problem.sigma_given), 0.0, weights[:, None])
+    left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
+    squares, counts = (learned * residual**2).sum(axis=0), (learned * np.maximum(left, 0.0)).sum(axis=0)
     detection = np.sqrt((squares + pseudo * start.detection**2) / (counts + pseudo))
     pulls, chances, fisher = _odometry_sums(
         estimate.pose,
         problem.drive.between(problem.stamp_s, estimate.states),
         noise.odometry**2,
         free,
-        marginals.pose,
-        marginals.consecutive,
-        marginals.pose_shared,
-        marginals.shared,
+        marginals.explained_odometry,
     )
     # tr(W P_k) is a count only after multiplying by the variance
     count = np.maximum(noise.odometry**2 * chances, 0.0)
@@ -121,6 +103,38 @@ def refine_noise(
     )
 
 
+class Extrapolation:
+    """Noise levels ahead of a sequence of `refine_noise` steps: Anderson's mixing (1965) of their logarithms.
+
+    Kinds of noise that act on the same residuals take dozens of steps to be told apart, each a few per cent in the same
+    direction. The steps so far tell where that leads.
+    """
+
+    def __init__(self) -> None:
+        self._levels: list[FloatArray] = []
+        self._steps: list[FloatArray] = []
+
+    def ahead(self, before: Noise, after: Noise) -> Noise:
+        """Return levels to go on from, given those before and after a step."""
+        level = np.log(np.concatenate([before.detection, before.odometry]))
+        step = np.log(np.concatenate([after.detection, after.odometry])) - level
+        self._levels, self._steps = [*self._levels, level][-MIXED:], [*self._steps, step][-MIXED:]
+        if len(self._steps) > 1:
+            by_level, by_step = np.diff(self._levels, axis=0).T, np.diff(self._steps, axis=0).T
+            share = np.linalg.lstsq(by_step, step, rcond=LEAST_MIXED)[0]
+            step = np.clip(step - (by_level + by_step) @ share, -LARGEST_STEP, LARGEST_STEP)
+        mixed = np.exp(level + step)
+        return replace(after, detection=mixed[:2], odometry=mixed[2:])
+
+
+MIXED = 5
+"""Steps that are extrapolated from."""
+LEAST_MIXED = 1e-2
+"""Relative size of differences between steps that are not rounding, or the values that settle beside them."""
+LARGEST_STEP = 0.5
+"""Of the logarithm of a level."""
+
+
 def _inflation(fisher: FloatArray) -> FloatArray:
     """Factor by which each variance is known less well because others act on the same residuals (>= 1)."""
     scale = np.sqrt(np.maximum(np.diag(fisher), 1e-300))
@@ -130,101 +144,34 @@ def _inflation(fisher: FloatArray) -> FloatArray:
 
 
 @kernel
-def joint_covariance(
-    pose: int, place: int, cov_pose: FloatArray, cov_cross: FloatArray, cov_shared: FloatArray, out: FloatArray
-) -> None:
-    """Compute the covariance (10, 10) of one pose, one place and the five sensor states, from `Marginals`."""
-    at_states = len(cov_shared) - 9
-    out[:3, :3] = cov_pose[pose]
-    for a in range(7):
-        row = 2 * place + a if a < 2 else at_states + a - 2
-        for b in range(3):
-            out[3 + a, b] = out[b, 3 + a] = cov_cross[pose, b, row]
-        for b in range(7):
-            out[3 + a, 3 + b] = cov_shared[row, 2 * place + b if b < 2 else at_states + b - 2]
-
-
-@kernel
-def _detection_sums(
-    pose: FloatArray,
-    landmark: FloatArray,
-    states: FloatArray,
-    pose_row: Any,
-    landmark_row: Any,
-    reading: FloatArray,
-    sigma: FloatArray,
-    given: Any,
-    mount: FloatArray,
-    free: Any,
-    weights: FloatArray,
-    cov_pose: FloatArray,
-    cov_cross: FloatArray,
-    cov_shared: FloatArray,
-) -> tuple[FloatArray, FloatArray]:
-    """Weighted squares of residuals and their effective number, range and bearing apart."""
-    squares, counts = np.zeros(2), np.zeros(2)
-    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    j = np.zeros((2, 10))
-    cov, part, explained = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2))
-    for m in range(len(pose_row)):
-        i = pose_row[m]
-        detection_residual(
-            pose[i], landmark[landmark_row[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc
-        )
-        for k in range(5):
-            if not free[k]:
-                jc[:, k] = 0.0
-        j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
-        joint_covariance(i, landmark_row[m], cov_pose, cov_cross, cov_shared, cov)
-        sandwich(j, cov, part, explained)
-        w = weights[m]
-        for k in range(2):
-            if not given[m, k]:
-                squares[k] += w * e[k] * e[k]
-                counts[k] += w * max(1.0 - w * explained[k, k] / sigma[m, k] ** 2, 0.0)
-    return squares, counts
-
-
-@kernel
 def _odometry_sums(
     pose: FloatArray,
     driven: Intervals,
     variance: FloatArray,
     free: Any,
-    cov_pose: FloatArray,
-    cov_next: FloatArray,
-    cov_cross: FloatArray,
-    cov_shared: FloatArray,
+    explained: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Of every kind of odometry noise, with `L = W - W V W`: sums of `e' W P_k W e` and of `tr(L P_k)`.
 
     And the Fisher information of the variances, `sum tr(P_k L P_l L) / 2`.
     """
     kinds = len(variance)
-    shared = len(cov_shared)
     pulls, chances, fisher = np.zeros(kinds), np.zeros(kinds), np.zeros((kinds, kinds))
     weighted = np.zeros((kinds, 3, 3))
-    information, left = np.zeros((3, 3)), np.zeros((3, 3))
+    information, root, left = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    part, kept = np.zeros((3, 3)), np.zeros((3, 3))
     e, pull, j = np.zeros(3), np.zeros(3), np.zeros((3, 10))
-    cov, part, explained = np.zeros((10, 10)), np.zeros((3, 10)), np.zeros((3, 3))
-    cov[6:, 6:] = cov_shared[shared - 4 :, shared - 4 :]
     for i in range(len(pose) - 1):
         noise = driven.noise[i]
         linearise_interval(driven, i, pose, variance, free, e, j, information)
+        root_of(information, root)
         for a in range(3):
-            for b in range(3):
-                cov[a, b], cov[3 + a, 3 + b] = cov_pose[i, a, b], cov_pose[i + 1, a, b]
-                cov[a, 3 + b] = cov[3 + b, a] = cov_next[i, a, b]
-            for b in range(4):
-                cov[a, 6 + b] = cov[6 + b, a] = cov_cross[i, a, shared - 4 + b]
-                cov[3 + a, 6 + b] = cov[6 + b, 3 + a] = cov_cross[i + 1, a, shared - 4 + b]
             pull[a] = information[a, 0] * e[0] + information[a, 1] * e[1] + information[a, 2] * e[2]
-        sandwich(j, cov, part, explained)
-        # W - W V W: what the residual still is allowed to be
-        sandwich(information, explained, part, left)
-        for a in range(3):
             for b in range(3):
-                left[a, b] = information[a, b] - left[a, b]
+                kept[a, b] = (1.0 if a == b else 0.0) - explained[i, a, b]
+        # W - W V W = R' (1 - A S A') R with W = R' R: what the residual still is allowed to be
+        multiply(kept, root, part)
+        multiply(root.T, part, left)
         for k in range(kinds):
             for a in range(3):
                 for b in range(3):

@@ -20,7 +20,11 @@ from evermap.slam.kernels import (
     odometry_residual,
     residual_by_states,
 )
+from evermap.slam.sparse.system import Slices
 from evermap.types import FloatArray
+
+A_SLICE = 500
+"""Intervals that are integrated in about a millisecond."""
 
 
 class Intervals(NamedTuple):
@@ -49,8 +53,8 @@ class Preintegration:
 
     def between(
         self, stamp_s: FloatArray, states: FloatArray, odometry: tuple[FloatArray, FloatArray, FloatArray]
-    ) -> Intervals:
-        """Return the intervals between consecutive poses.
+    ) -> Slices[Intervals]:
+        """Return the intervals between consecutive poses, in slices.
 
         Args:
             stamp_s: (N,) instants of the poses.
@@ -63,19 +67,27 @@ class Preintegration:
             if np.array_equal(self._stamp_s[first : first + len(stamp_s)], stamp_s):
                 rows = slice(first, first + len(stamp_s) - 1)
                 return Intervals(*(part[rows] for part in kept))
-        self._stamp_s, self._motion_states = stamp_s.copy(), states[5:].copy()
-        self._intervals = Intervals(*_integrate(stamp_s, *odometry, states))
-        return self._intervals
+        n = len(stamp_s) - 1
+        room = Intervals(np.empty((n, 3)), np.empty((n, 3, 4)), np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3)))
+        for first in range(0, n, A_SLICE):
+            _integrate(stamp_s, *odometry, states, room, first, min(first + A_SLICE, n))
+            yield min(A_SLICE, n - first) / A_SLICE
+        self._stamp_s, self._motion_states, self._intervals = stamp_s.copy(), states[5:].copy(), room
+        return room
 
 
 @kernel
 def _integrate(
-    stamp: FloatArray, odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    n = len(stamp) - 1
-    increment, by_states = np.empty((n, 3)), np.empty((n, 3, 4))
-    noise, floor = np.empty((n, N_NOISE, 3, 3)), np.empty((n, 3, 3))
-    for i in range(n):
+    stamp: FloatArray,
+    odometry_stamp: FloatArray,
+    velocity: FloatArray,
+    unknown: FloatArray,
+    states: FloatArray,
+    out: Intervals,
+    first: int,
+    last: int,
+) -> None:
+    for i in range(first, last):
         integrate_odometry(
             odometry_stamp,
             velocity,
@@ -83,12 +95,11 @@ def _integrate(
             stamp[i],
             stamp[i + 1],
             states,
-            increment[i],
-            by_states[i],
-            noise[i],
-            floor[i],
+            out.increment[i],
+            out.by_states[i],
+            out.noise[i],
+            out.floor[i],
         )
-    return increment, by_states, noise, floor
 
 
 @kernel

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.preintegration import Intervals, Preintegration
+from evermap.slam.sparse.elimination import Spread
+from evermap.slam.sparse.system import Factorised, Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SILENCE_S = 1.0
@@ -35,6 +40,10 @@ class Drive:
 
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
         """Return motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""
+        return exhausted(self.in_slices(stamp_s, states))
+
+    def in_slices(self, stamp_s: FloatArray, states: FloatArray) -> Slices[Intervals]:
+        """Return what `between` does, in slices."""
         return self._preintegration.between(stamp_s, states, (self.stamp_s, self.velocity, self.unknown))
 
     @classmethod
@@ -94,8 +103,9 @@ class Problem:
         start_pose: (3,) where the first pose is held.
         start_information: how firmly, [1/m^2] and [1/rad^2].
         landmark_mean: (L, 2) prior positions, zeros where there is none.
-        landmark_information: (2 L, 2 L) inverse of their joint prior covariance, zeros where there is none. Blocks off
-            the diagonal tie landmarks to each other, for example those that may have moved together.
+        landmark_information: (2 L, 2 L) sparse inverse of their joint prior covariance, empty where there is none.
+            Blocks off the diagonal tie landmarks to each other, for example those that may have moved together. A dense
+            array is taken, too.
     """
 
     stamp_s: FloatArray
@@ -109,12 +119,15 @@ class Problem:
     start_pose: FloatArray
     start_information: float
     landmark_mean: FloatArray
-    landmark_information: FloatArray
+    landmark_information: sparse.csr_array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
 
     @property
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""
-        held: BoolArray = np.diag(self.landmark_information)[::2] > 0.0
+        held: BoolArray = self.landmark_information.diagonal()[::2] > 0.0
         return held
 
     def with_places(self, count: int) -> Problem:
@@ -123,34 +136,40 @@ class Problem:
         return replace(
             self,
             landmark_mean=np.pad(self.landmark_mean, ((0, new), (0, 0))),
-            landmark_information=np.pad(self.landmark_information, (0, 2 * new)),
+            landmark_information=padded(self.landmark_information, new),
         )
 
-    def prior_information(self, known: BoolArray) -> FloatArray:
+    def prior_information(self, known: BoolArray) -> sparse.csr_array:
         """Return (2 K, 2 K) what the prior says about the K `known` landmarks alone, the others marginalised out.
 
         Leaving rows out of an information matrix would hold the others at their means; out of a covariance it is exact,
         which in terms of information is the Schur complement.
         """
-        rows = np.repeat(known, 2)
-        kept = self.landmark_information[np.ix_(rows, rows)]
-        ties = self.landmark_information[np.ix_(rows, ~rows)]
-        if not ties.any():
+        rows = np.flatnonzero(np.repeat(known, 2))
+        kept = between_rows(self.landmark_information, rows)
+        others = np.flatnonzero(np.repeat(~known, 2))
+        ties = self.landmark_information[others][:, rows]
+        others = others[np.diff(ties.indptr) > 0]
+        if not len(others):
             return kept
+        # all that is tied to what is tied, else it would be held at its mean
+        _, group = connected_components(self.landmark_information, directed=False)
+        others = np.flatnonzero(np.isin(group, group[others]) & ~np.repeat(known, 2))
+        ties = self.landmark_information[others][:, rows]
         # pseudo-inverse: landmarks may be tied to each other but to no place
-        rest = np.linalg.pinv(self.landmark_information[np.ix_(~rows, ~rows)], hermitian=True)
-        marginal: FloatArray = kept - ties @ rest @ ties.T
-        return marginal
+        rest = np.linalg.pinv(between_rows(self.landmark_information, others).toarray(), hermitian=True)
+        return sparse.csr_array(kept - ties.T @ sparse.csr_array(rest) @ ties)
 
     def conditional_prior(self, row: int, known: BoolArray) -> ConditionalPrior:
         """Return what the prior says about landmark `row`, given the `known` ones (of which it is none)."""
         column = slice(2 * row, 2 * row + 2)
-        own = self.landmark_information[column, column]
-        if np.count_nonzero(self.landmark_information[column]) == np.count_nonzero(own):
+        mine = self.landmark_information[column]
+        own = mine[:, column].toarray()
+        if np.count_nonzero(mine.data) == np.count_nonzero(own):
             return ConditionalPrior(self.landmark_mean[row], own, np.zeros(0, dtype=np.int64), np.zeros((2, 0)))
         among = known.copy()
         among[row] = True
-        information = self.prior_information(among)
+        information = self.prior_information(among).toarray()
         at = 2 * int(known[:row].sum())
         own = information[at : at + 2, at : at + 2]
         gain = -np.linalg.pinv(own, hermitian=True) @ np.delete(information[at : at + 2], [at, at + 1], axis=1)
@@ -174,13 +193,31 @@ class Problem:
         )
 
 
-def independent(blocks: FloatArray) -> FloatArray:
+def independent(blocks: FloatArray) -> sparse.csr_array:
     """Return the joint information (2 L, 2 L) of independent landmarks with blocks (L, 2, 2)."""
-    count = len(blocks)
-    joint = np.zeros((count, 2, count, 2))
-    rows = np.arange(count)
-    joint[rows, :, rows, :] = blocks
-    return joint.reshape(2 * count, 2 * count)
+    given = np.flatnonzero(blocks.any(axis=(1, 2)))
+    row = (2 * given[:, None, None] + np.array([[0, 0], [1, 1]])).ravel()
+    column = (2 * given[:, None, None] + np.array([[0, 1], [0, 1]])).ravel()
+    return sparse.csr_array((blocks[given].ravel(), (row, column)), shape=(2 * len(blocks), 2 * len(blocks)))
+
+
+def padded(information: sparse.csr_array, new: int) -> sparse.csr_array:
+    """Return the joint information with room for new landmarks behind the others, of which nothing is known."""
+    size = information.shape[0] + 2 * new
+    first = np.append(information.indptr, np.full(2 * new, information.indptr[-1]))
+    return sparse.csr_array((information.data, information.indices, first), shape=(size, size))
+
+
+def embedded(matrix: FloatArray, rows: IntArray, size: int) -> sparse.csr_array:
+    """Return a matrix (k, k) as rows and columns `rows` of one that is zero elsewhere."""
+    at, to = np.repeat(rows, len(rows)), np.tile(rows, len(rows))
+    return sparse.csr_array((matrix.ravel(), (at, to)), shape=(size, size))
+
+
+def between_rows(information: sparse.csr_array, rows: IntArray) -> sparse.csr_array:
+    """Return some rows and the same columns of a joint information."""
+    picked: sparse.csr_array = information[rows][:, rows]
+    return picked
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,30 +263,96 @@ class Noise:
         return np.where(np.isfinite(sigma_given), sigma_given, self.detection)
 
 
-@dataclass(frozen=True, slots=True)
 class Marginals:
-    """Covariances at an optimum. `G = 2 L + 9`: all landmarks, then the calibration states.
+    """Covariances at an optimum, worked out when they are asked for.
 
-    Attributes:
-        pose: (N, 3, 3).
-        consecutive: (N, 3, 3) of pose i with pose i + 1; the last is zero.
-        pose_shared: (N, 3, G) of poses with landmarks and states.
-        shared: (G, G).
+    Args:
+        solved: the factorised normal equations of poses, known landmarks, sensor and motion states; their factors begin
+            with odometry and detections.
+        n_poses: N of them.
+        n_detections: M.
+        known: (L,) landmarks that have a position; what is asked of others is zero.
     """
 
-    pose: FloatArray
-    consecutive: FloatArray
-    pose_shared: FloatArray
-    shared: FloatArray
+    def __init__(self, solved: Factorised, n_poses: int, n_detections: int, known: BoolArray) -> None:
+        self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
+
+    def in_slices(self) -> Slices[None]:
+        """Work out all that the factorised equations hold, in slices."""
+        self._held = yield from self._solved.spread(self._n - 1)
+
+    def step(self) -> FloatArray:
+        """Return the Gauss-Newton step (numbers,) from where the equations were linearised."""
+        return exhausted(self._solved.solution())
+
+    @cached_property
+    def _held(self) -> Spread:
+        return exhausted(self._solved.spread(self._n - 1))
 
     @property
+    def pose(self) -> FloatArray:
+        """(N, 3, 3) covariance of every pose, in its own frame."""
+        return self._held.own[: self._held.own_first[self._n]].reshape(self._n, 3, 3)
+
+    @cached_property
+    def consecutive(self) -> FloatArray:
+        """(N, 3, 3) of pose i with pose i + 1; the last is zero."""
+        pairs = self._held.pairs if self._n > 1 else np.zeros((0, 3, 3))
+        return np.concatenate([pairs, np.zeros((1, 3, 3))])
+
+    @cached_property
     def landmark(self) -> FloatArray:
         """(L, 2, 2) covariance of every landmark."""
-        count = (len(self.shared) - 9) // 2
-        rows = np.arange(count)
-        return self.shared[: 2 * count, : 2 * count].reshape(count, 2, count, 2)[rows, :, rows, :]
+        first, last = self._held.own_first[[self._n, self._n + int(self.known.sum())]]
+        landmark = np.zeros((len(self.known), 2, 2))
+        landmark[self.known] = self._held.own[first:last].reshape(-1, 2, 2)
+        return landmark
 
-    @property
+    @cached_property
     def states(self) -> FloatArray:
         """(9, 9) covariance of the calibration states."""
-        return self.shared[-9:, -9:]
+        return self._solved.border_covariance()
+
+    @property
+    def explained_odometry(self) -> FloatArray:
+        """(N - 1, 3, 3) `A S A'`: part of whitened odometry residuals that the estimate's own uncertainty explains."""
+        return self._held.of_factors[: self._held.of_factors_first[self._n - 1]].reshape(-1, 3, 3)
+
+    @property
+    def explained_detections(self) -> FloatArray:
+        """(M, 2, 2) the same of the detections, weighted as inliers."""
+        first, last = self._held.of_factors_first[[self._n - 1, self._n - 1 + self._m]]
+        return self._held.of_factors[first:last].reshape(-1, 2, 2)
+
+    def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
+        """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""
+        n = self._n
+        rank = np.cumsum(self.known) - 1
+        rows = np.asarray(landmarks, dtype=np.int64)
+        known = self.known[rows]
+        every = [np.zeros(0, dtype=np.int64) if poses is None else poses, n + rank[rows[known]]]
+        if states:
+            every.append(n + int(self.known.sum()) + np.arange(2))
+        found = self._solved.joint(np.concatenate(every))
+        if known.all():
+            return found
+        n_poses = 3 * len(every[0])
+        kept = np.concatenate([np.ones(n_poses, bool), np.repeat(known, 2), np.ones(9 if states else 0, bool)])
+        joint = np.zeros((len(kept), len(kept)))
+        joint[np.ix_(kept, kept)] = found
+        return joint
+
+    @cached_property
+    def shared(self) -> FloatArray:
+        """(G, G) of all landmarks and the states: dense, for few landmarks."""
+        return self.joint(np.arange(len(self.known)), states=True)
+
+    @cached_property
+    def pose_shared(self) -> FloatArray:
+        """(N, 3, G) of all poses with all landmarks and the states: dense, for few landmarks."""
+        n = self._n
+        kept = np.append(np.repeat(self.known, 2), np.ones(9, dtype=bool))
+        cross = np.zeros((n, 3, len(kept)))
+        found = self._solved.columns(np.arange(n, len(self._solved.system.tree.dim)))
+        cross[:, :, kept] = found[: 3 * n].reshape(n, 3, -1)
+        return cross

@@ -20,7 +20,7 @@ from evermap.slam.kernels import (
     odometry_covariance,
     sandwich,
 )
-from evermap.slam.problem import Drive, Estimate, Noise, Problem
+from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -79,8 +79,15 @@ class IncrementalSolver(Protocol):
 
     problem: Problem
 
-    def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
-        """Restart at `estimate`, an optimum of the first poses, with other noise, other places or other priors."""
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
+        """Restart at `estimate`, an optimum of the first poses, with other noise, other places or other priors.
+
+        Args:
+            estimate: values of the first poses, and of all places that they saw.
+            noise: standard deviations from here on.
+            problem: the measurements.
+            marginals: covariances at `estimate`, where they are known already.
+        """
         ...
 
     def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:

@@ -16,13 +16,14 @@ import numpy as np
 from evermap import plugins
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.arrow import Smoother
-from evermap.slam.border import BorderFilter
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.local_filter import LocalFilter
 from evermap.slam.method import Explanation, Method, Static
-from evermap.slam.noise import NoiseFit, refine_noise
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
+from evermap.slam.smoother import Smoother
 from evermap.slam.solver import IncrementalSolver, Motion, compare
+from evermap.slam.sparse.system import Slices
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_RELINEARISATION = 40
@@ -30,6 +31,8 @@ FIRST_RELINEARISATION = 40
 SHORTEST_SPELL = 5
 LONGEST_SPELL = 1 / 8
 """Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
+SETTLED_AT, SETTLED_SPELL = 4000, 1 / 2
+"""Poses from which most of what is new lies where nothing was before, and the share from then on."""
 SURPRISING_NIS = 50.0
 DISPUTED_AT = (2, 4, 8, 16)
 """Comparisons of a landmark after which it is asked whether most of them were surprising."""
@@ -39,10 +42,16 @@ MIN_ALIGN_SPREAD_M = 1.0
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
 FINAL_ROUNDS = 12
+SLICES_A_FRAME = 3.0
+"""Work on a relinearisation in every frame, in milliseconds of a usual core."""
+CAUGHT_UP_MS = 0.15
+"""What a frame takes that is processed again."""
+STEPS_BETWEEN = 2
+"""Gauss-Newton steps where the noise is not learned."""
 STEPS_A_ROUND = 3
 """Gauss-Newton steps between two estimates of the noise."""
-FINAL_TOLERANCE = 1e-5
-"""Step (m, rad or 1) at which the final optimum is reached."""
+FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-3
+"""Step (m, rad or 1), or what it gains (nats), at which the final optimum is reached."""
 NOISE_CONVERGED = 0.01
 """Relative change of every noise level below which the final rounds stop."""
 FINAL_REVISIONS = 3
@@ -51,7 +60,7 @@ FINAL_REVISIONS = 3
 
 @dataclass(frozen=True, slots=True)
 class PriorMap:
-    """A map to localise in, in rows of the problem's landmarks: mean (L, 2), information (2 L, 2 L), given (L,)."""
+    """A map to localise in, by rows of the problem: mean (L, 2), information (L, 2, 2), given (L,)."""
 
     mean: FloatArray
     information: FloatArray
@@ -120,7 +129,9 @@ class StreamingSlam:
         self._robust = robust
         self._estimate_noise = estimate_noise
         self._method = Static(len(problem.landmark_mean)) if method is None else method
+        self._solver_name: Literal["arrow", "gtsam"] = solver
         self._solver = _solver(solver, self._problem, noise, robust=robust)
+        self._job: Slices[None] | None = None
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
@@ -142,63 +153,88 @@ class StreamingSlam:
         """Process the next pose: predict, compare, add, and relinearise when it is time."""
         row = self._n_poses
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-        states = self._solver.states()
-        motion = Motion.between(self._problem, self._noise, row, states) if row > 0 else None
+        motion = self._motion(self._solver, row)
         self._assign(row, motion, detections)
         if motion is not None:
             self._compare(motion, detections)
-        self._meet_new_landmarks(motion, states, detections)
+        self._meet_new_landmarks(self._solver, self._landmark, motion, detections)
         self._solver.add(row, motion, self._landmark)
         self._n_poses += 1
-        if self._n_poses == self._next_relinearisation:
-            self._relinearise_all()
-            self._next_relinearisation *= 2
-        elif self._robust and self._is_disputed(detections):
-            self._relinearise_all()
-        elif self._n_poses - self._relinearised_at >= max(SHORTEST_SPELL, int(LONGEST_SPELL * self._n_poses)):
-            self._relinearise()
+        self._plan(detections)
+        self._work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
         stretch = np.array([self._scale, self._scale, 1.0])
         self.online_pose[row] = self._solver.last_pose() * stretch
         self.online_covariance[row] = self._solver.last_covariance() * np.outer(stretch, stretch)
 
+    def _motion(self, solver: IncrementalSolver, row: int) -> Motion | None:
+        return Motion.between(self._problem, self._noise, row, solver.states()) if row > 0 else None
+
+    def _plan(self, detections: IntArray) -> None:
+        """Begin to relinearise if it is time."""
+        since = self._n_poses - self._relinearised_at
+        share = LONGEST_SPELL if self._n_poses < SETTLED_AT else SETTLED_SPELL
+        if self._n_poses == self._next_relinearisation:
+            self._job = self._relinearised(learn=True)
+            self._next_relinearisation *= 2
+        elif self._robust and self._is_disputed(detections):
+            self._job = self._relinearised(learn=True)
+        elif self._job is None and since >= max(SHORTEST_SPELL, int(share * self._relinearised_at)):
+            self._job = self._relinearised(learn=False)
+
+    def _work(self) -> None:
+        """Go on with a relinearisation: a few slices a frame, or all of it where it may change what detections are
+        of.
+        """
+        left_ms = np.inf if self._job is not None and self._method.revises(self._problem) else SLICES_A_FRAME
+        while self._job is not None and left_ms > 0.0:
+            try:
+                left_ms -= next(self._job)
+            except StopIteration:
+                self._job = None
+
     def finish(self) -> Outcome:
         """Smooth everything processed so far, with noise levels iterated to convergence, and divide the scale."""
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
+        self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._solver.estimate())
-        estimate, fit = self._converged(problem, estimate, self._noise)
+        smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
             if revision.problem is problem:
                 break
             problem = revision.problem
-            estimate, fit = self._converged(problem, revision.estimate, fit.noise)
-        smoother = Smoother(problem, fit.noise, robust=self._robust)
-        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE)
+            smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
+        smoother = smoother.under(fit.noise, heavy=False)
+        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
         return self._divided(revision, estimate, smoother.marginals(estimate), fit, smoother)
 
-    def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Estimate, NoiseFit]:
+    def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Smoother, Estimate, NoiseFit]:
         """The optimum and its noise levels, in turns until neither changes."""
-        fit = None
+        fit, ahead = None, Extrapolation()
+        smoother = Smoother(problem, noise, robust=self._robust)
         for round_ in range(FINAL_ROUNDS):
             heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
-            smoother = Smoother(problem, noise, heavy=heavy, robust=self._robust)
+            smoother = smoother.under(noise, heavy=heavy)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
-            estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
+            if round_ in (0, 2):
+                estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
             marginals = smoother.marginals(estimate)
+            estimate = smoother.stepped(estimate, marginals)
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
             if not self._estimate_noise:
                 if not heavy:
                     break
                 continue
-            before, noise = noise, fit.noise
-            if not heavy and _settled(before, noise):
+            if not heavy and _settled(noise, fit.noise):
+                noise = fit.noise
                 break
+            noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
         assert fit is not None
-        return estimate, replace(fit, noise=noise)
+        return smoother, estimate, replace(fit, noise=noise)
 
     def _assign(self, row: int, motion: Motion | None, detections: IntArray) -> None:
         """Ask the method for the places of the coming pose's detections."""
@@ -249,62 +285,80 @@ class StreamingSlam:
         mapped = self._problem.mapped  # the map is believed: no vote moves its landmarks
         return any(not mapped[j] and self._n_compared[j] in DISPUTED_AT for j in doubted)
 
-    def _meet_new_landmarks(self, motion: Motion | None, states: FloatArray, detections: IntArray) -> None:
+    def _meet_new_landmarks(
+        self, solver: IncrementalSolver, landmark: FloatArray, motion: Motion | None, detections: IntArray
+    ) -> None:
         """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
         for m in detections:
             j = self._problem.landmark_row[m]
-            if np.isfinite(self._landmark[j, 0]):
+            if np.isfinite(landmark[j, 0]):
                 continue
             if self._problem.mapped[j]:
-                prior = self._problem.conditional_prior(j, np.isfinite(self._landmark[:, 0]))
-                self._landmark[j] = prior.place(self._landmark, self._problem.landmark_mean)
+                prior = self._problem.conditional_prior(j, np.isfinite(landmark[:, 0]))
+                landmark[j] = prior.place(landmark, self._problem.landmark_mean)
             else:
-                pose = self._solver.last_pose()
+                pose = solver.last_pose()
                 if motion is not None:
                     pose = se2.compose(pose, motion.increment)
-                self._landmark[j] = sighted_at(pose, self._problem.reading[m], states, self._problem.mount)
+                landmark[j] = sighted_at(pose, self._problem.reading[m], solver.states(), self._problem.mount)
 
-    def _relinearise_all(self) -> None:
-        """Optimum and noise levels of everything so far, from where the solver goes on."""
-        problem = self._problem.until(self._n_poses)
+    def _relinearised(self, *, learn: bool) -> Slices[None]:
+        """Relinearise all poses so far beside the stream, catch up with it, and take over.
+
+        With `learn`, also vote on places, ask the method, and learn the noise.
+        """
+        self._relinearised_at = n = self._n_poses
+        problem, estimate = self._problem.until(n), self._solver.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        estimate = self._solver.estimate()
-        if self._robust:
+        if learn and self._robust:
             voted = outvoted(problem, estimate, smoother.inlier_probability(estimate))
             # what was compared with a place that was never the landmark's own says nothing about consistency
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
             estimate = voted
-        estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
-        revision = self._method.revise(problem, estimate, self._noise, heavy=True, final=False)
-        if revision.problem is not problem:
-            problem, estimate = revision.problem, revision.estimate
-            smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-            coming = self._problem.landmark_row[len(problem.landmark_row) :]
-            whole = replace(
-                self._problem,
-                landmark_row=np.append(problem.landmark_row, coming),
-                landmark_mean=problem.landmark_mean,
-                landmark_information=problem.landmark_information,
-            )
-            self._adopt(whole, estimate.landmark)
-        if self._estimate_noise:
-            marginals = smoother.marginals(estimate)
+        steps, tolerance = (STEPS_A_ROUND, 1e-4) if learn else (STEPS_BETWEEN, 1e-6)
+        estimate = yield from smoother.optimum_in_slices(estimate, iterations=steps, tolerance=tolerance)
+        if learn and self._method.revises(problem):
+            revision = self._method.revise(problem, estimate, self._noise, heavy=True, final=False)
+            if revision.problem is not problem:
+                problem, estimate = revision.problem, revision.estimate
+                smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
+                coming = self._problem.landmark_row[len(problem.landmark_row) :]
+                whole = replace(
+                    self._problem,
+                    landmark_row=np.append(problem.landmark_row, coming),
+                    landmark_mean=problem.landmark_mean,
+                    landmark_information=problem.landmark_information,
+                )
+                self._adopt(whole, estimate.landmark)
+        marginals = yield from smoother.marginals_in_slices(estimate)
+        if learn and self._estimate_noise:
+            yield from marginals.in_slices()
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, self._noise, self._start_noise)
             self._noise = fit.noise
-        self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
-        self._restart(estimate)
-
-    def _relinearise(self) -> None:
-        """Relinearise everything, the solver's steps from here on included."""
-        problem = self._problem.until(self._n_poses)
-        smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
-        self._restart(smoother.optimum(self._solver.estimate(), iterations=2))
+            marginals = yield from smoother.under(self._noise, heavy=True).marginals_in_slices(estimate)
+        if learn:
+            self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
+        solver = _solver(self._solver_name, self._problem, self._noise, robust=self._robust)
+        solver.restart(estimate, self._noise, self._problem, marginals)
+        landmark = estimate.landmark.copy()
+        for row in range(n, len(self.online_pose)):
+            if row == self._n_poses:
+                break
+            solver.problem = self._problem
+            landmark = np.pad(
+                landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
+            )
+            motion = self._motion(solver, row)
+            detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+            self._meet_new_landmarks(solver, landmark, motion, detections)
+            solver.add(row, motion, landmark)
+            yield CAUGHT_UP_MS
+        self._solver, self._landmark = solver, landmark
 
     def _restart(self, estimate: Estimate) -> None:
-        self._landmark = estimate.landmark
-        self._relinearised_at = self._n_poses
+        self._landmark = estimate.landmark.copy()
         self._solver.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
@@ -345,13 +399,13 @@ class StreamingSlam:
             start_pose=moved.pose[0],
             start_information=ALIGNED_INFORMATION,
             landmark_mean=np.where(given[:, None], mean, 0.0),
-            landmark_information=np.pad(prior_map.information, (0, 2 * new)),
+            landmark_information=independent(np.pad(prior_map.information, ((0, new), (0, 0), (0, 0)))),
         )
         done = self._n_poses
         self.online_pose[:done] = se2.compose(pose_map_world, self.online_pose[:done])
-        self._landmark = moved.landmark
         self._restart(moved)
-        self._relinearise_all()
+        self._job = self._relinearised(learn=True)
+        self._work()
 
     def _divided(
         self, revision: Explanation, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
@@ -382,7 +436,7 @@ class StreamingSlam:
 
 def _solver(name: Literal["arrow", "gtsam"], problem: Problem, noise: Noise, *, robust: bool) -> IncrementalSolver:
     if name == "arrow":
-        return BorderFilter(problem, noise, robust=robust)
+        return LocalFilter(problem, noise, robust=robust)
     solver: IncrementalSolver = plugins.load("evermap.solvers", name)(problem, noise, robust=robust)
     return solver
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy import sparse
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.bridge import bridged, dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import WindowEvidence, compare
@@ -14,6 +14,7 @@ from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem
+from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
 
 
@@ -49,7 +50,7 @@ def _drive() -> None:
         start_pose=np.zeros(3),
         start_information=1e8,
         landmark_mean=np.zeros((1, 2)),
-        landmark_information=np.zeros((2, 2)),
+        landmark_information=sparse.csr_array((2, 2)),
     )
     slam = StreamingSlam(problem, START, prior)
     for _ in range(count):

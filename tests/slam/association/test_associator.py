@@ -10,7 +10,6 @@ from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise
 from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
@@ -18,6 +17,7 @@ from evermap.slam.association.identify import identified
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
+from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
 
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})

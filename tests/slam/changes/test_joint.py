@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from worlds import Move, Session, landmark_rmse, make_session, pose_rmse
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.method import Explanation
+from evermap.slam.smoother import Smoother
 from evermap.types import ChangeKind, MapChange
 
 BEFORE = Move((1, 2, 5), (0.3, -0.2))

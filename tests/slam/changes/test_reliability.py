@@ -9,11 +9,11 @@ import pytest
 from references import static_evidence
 from worlds import Move, make_session
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.changes.evidence import compare, landmark_evidence
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.weigh import MAP_FACTOR_SPREAD, MAP_FACTORS, Verdict, weigh
+from evermap.slam.smoother import Smoother
 
 PRIOR = ChangePrior(p_moved=0.3, move_sigma_m=0.08)
 """A third of the worlds changes, half of them by less than what shows, so that probabilities spread."""
@@ -131,7 +131,7 @@ def test_misfit_of_a_static_world_is_a_chi_square(n_windows: int) -> None:
         free = replace(
             session.problem,
             prior=world.problem.prior.without_scale(),
-            landmark_information=np.zeros_like(session.problem.landmark_information),
+            landmark_information=np.zeros(session.problem.landmark_information.shape),
         )
         estimate = Smoother(free, world.noise).optimum(world.truth)
         bounds = np.linspace(0, 200, n_windows + 1).astype(int)

@@ -8,12 +8,12 @@ import numpy as np
 from problems import World, default_prior, make_world, slow_detection
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
 from evermap.slam.changes.explain import GivenMap
 from evermap.slam.changes.gain import ChangePrior
 from evermap.slam.changes.joint import Joint
 from evermap.slam.method import Explanation
 from evermap.slam.problem import Estimate, Problem, independent
+from evermap.slam.smoother import Smoother
 
 ALIGNED_INFORMATION = 1e-2
 """The start is not known once a session is in a map."""

@@ -46,6 +46,8 @@ def with_session(
         (P + N, 2) and (2 (P + N), 2 (P + N)).
     """
     count, new = len(position_m), len(session_m) - len(seen)
+    if count == 0:  # a map begins
+        return session_m, session_covariance_m2
     s = se2.xy_rows(seen)
     k = len(s)
     u = np.setdiff1d(np.arange(2 * count), s)
@@ -106,7 +108,9 @@ def blocks(covariance_m2: FloatArray) -> FloatArray:
 
 
 def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
-    """Return (2 K, 2 K) joint covariance of some places, in their order."""
+    """Return (2 K, 2 K) joint covariance of some places, in their order; of independent ones (P, 2, 2), (K, 2, 2)."""
+    if covariance_m2.ndim == 3:
+        return np.asarray(covariance_m2[rows])
     at = se2.xy_rows(rows)
     return np.asarray(covariance_m2[np.ix_(at, at)])
 
@@ -143,9 +147,8 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
     least = np.full(len(estimate.known), settings.sightings)
     least[[] if in_place is None else in_place] = settings.sightings_in_place
     row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
-    at = se2.xy_rows(row)
     position = estimate.landmark[row] * outcome.scale
-    return OwnLandmarks(row, position, outcome.graph_marginals.shared[np.ix_(at, at)] * outcome.scale**2)
+    return OwnLandmarks(row, position, outcome.graph_marginals.joint(row) * outcome.scale**2)
 
 
 def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:

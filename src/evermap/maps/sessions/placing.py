@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from evermap.config import FitConfig, LivingConfig
 from evermap.geometry import se2
@@ -13,9 +14,9 @@ from evermap.geometry.rigid import consensus, rigid
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import of_places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
-from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
@@ -298,7 +299,7 @@ def _in_map(
         start_pose=start.pose[0],
         start_information=ALIGNED_INFORMATION,
         landmark_mean=mean,
-        landmark_information=information,
+        landmark_information=sparse.csr_array(information),
     )
     return problem, start
 

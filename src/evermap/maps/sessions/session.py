@@ -421,8 +421,6 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
     """
     mapped = slam.landmarks
     count = len(mapped)
-    covariance = np.zeros((count, 2, count, 2))
-    covariance[np.arange(count), :, np.arange(count), :] = mapped.covariance_m2
     nowhere = np.full(count, UNKNOWN, dtype=np.int64)
     found = Found(
         landmark_id=mapped.landmark_id,
@@ -430,7 +428,7 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
         place=nowhere,
         probability=np.ones(count),
         position_m=mapped.position_m,
-        covariance_m2=covariance.reshape(2 * count, 2 * count),
+        covariance_m2=mapped.covariance_m2,  # beliefs look at each by itself
         object_id=nowhere,
         first_s=mapped.first_seen_s,
         last_s=mapped.last_seen_s,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 
 from evermap.slam.problem import Estimate, Problem
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -84,7 +85,7 @@ class Assignment:
             reading=self.measured.reading[used],
             sigma_given=self.measured.sigma_given[used],
             landmark_mean=np.zeros((count, 2)),
-            landmark_information=np.zeros((2 * count, 2 * count)),
+            landmark_information=sparse.csr_array((2 * count, 2 * count)),
         )
 
     def without(self, landmarks: BoolArray) -> Assignment:

@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.constellation import RISE_NATS, propose_constellation, propose_merges
 from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.jcbb import Pairings, pairing_probability
-from evermap.slam.kernels import detection_residual
+from evermap.slam.linearise import detection_residuals
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
 CAUTION = 2.0
@@ -189,7 +189,7 @@ class Associator:
         assignment, marginals = self._solved(assignment)
         refused: set[tuple[int, int]] = set()
         for _ in range(MERGE_ROUNDS):
-            honest = replace(marginals, shared=assignment.with_shared_errors(marginals.shared))
+            honest = assignment.with_shared_errors(marginals.shared)
             pairs = propose_merges(assignment, honest, density=self._density, probability=P_MERGE)
             pairs = [pair for pair in pairs if pair not in refused]
             if not pairs:
@@ -298,7 +298,7 @@ def fit_sighting_noise(problem: Problem, estimate: Estimate, start: FloatArray) 
         start: (2,) standard deviations that `PSEUDO_SIGHTINGS` imaginary sightings vouch for.
     """
     free = ~np.isfinite(problem.sigma_given)
-    squared = residuals(problem, estimate) ** 2
+    squared = detection_residuals(problem, estimate) ** 2
     fourth = problem.reading[free[:, 0], 0] ** 4
     middle = float(np.median(fourth)) if len(fourth) else 1.0
     in_range, in_bearing = squared[free[:, 0], 0], squared[free[:, 1], 1]
@@ -314,19 +314,6 @@ def fit_sighting_noise(problem: Problem, estimate: Estimate, start: FloatArray) 
         total = np.minimum(in_bearing, CLIPPED_AT * bearing).sum() + PSEUDO_SIGHTINGS * start[1] ** 2
         bearing = total / (len(in_bearing) + PSEUDO_SIGHTINGS)
     return SightingNoise(variance, growth, float(bearing))
-
-
-def residuals(problem: Problem, estimate: Estimate) -> FloatArray:
-    """Return (M, 2) measured minus predicted range [m] and bearing [rad]."""
-    out = np.empty((len(problem.pose_row), 2))
-    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    for m, (i, j) in enumerate(zip(problem.pose_row, problem.landmark_row, strict=True)):
-        range_m, bearing_rad = problem.reading[m]
-        detection_residual(
-            estimate.pose[i], estimate.landmark[j], estimate.states, problem.mount, range_m, bearing_rad,
-            out[m], jx, jl, jc,
-        )  # fmt: skip
-    return out
 
 
 def _line_not_negative(x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, float]:

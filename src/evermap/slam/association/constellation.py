@@ -17,7 +17,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment
 from evermap.slam.association.jcbb import Pairings, gates, most_pairings, pairing_probability
-from evermap.slam.problem import Estimate, Marginals
+from evermap.slam.problem import Estimate
 from evermap.types import BoolArray, FloatArray, IntArray
 
 CONFIDENCE = 0.999
@@ -221,17 +221,17 @@ cost does not know: it rises by some tens for one landmark, by hundreds for two.
 
 
 def propose_merges(
-    assignment: Assignment, marginals: Marginals, *, density: float, probability: float
+    assignment: Assignment, joint: FloatArray, *, density: float, probability: float
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
 
     Args:
         assignment: at its optimum.
-        marginals: covariances at it.
+        joint: (2 L + 9, 2 L + 9) covariance of landmarks and states at it.
         density: landmarks a square metre that one expects.
         probability: least posterior probability.
     """
-    candidates = pairs_in_reach(assignment, marginals)
+    candidates = pairs_in_reach(assignment, joint)
     sightings = assignment.sightings
     merges: list[tuple[int, int]] = []
     # the landmarks with most sightings are the best placed
@@ -239,7 +239,7 @@ def propose_merges(
     for begin in range(0, len(sources), MAX_SOURCES):
         some = sorted(sources[begin : begin + MAX_SOURCES])
         pairs = [(u, o) for u, o in candidates if u in some]
-        pairings = differences(assignment.estimate, marginals, pairs, density)
+        pairings = differences(assignment.estimate, joint, pairs, density)
         weights, complete = pairing_probability(pairings, confidence=CONFIDENCE)
         if complete:
             merges += [pairs[k] for k in np.flatnonzero(weights >= probability)]
@@ -248,16 +248,16 @@ def propose_merges(
 
 def propose_constellation(
     assignment: Assignment,
-    marginals: Marginals,
+    joint: FloatArray,
     *,
     density: float,
     probability: float,
     refused: set[tuple[int, int]],
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) by which a part of the map that is loose lies on the rest in one way only."""
-    joint, place = marginals.shared, assignment.estimate.landmark
+    place = assignment.estimate.landmark
     apart, sightings = assignment.apart, assignment.sightings
-    root, loose = stiff_and_loose(assignment, marginals)
+    root, loose = stiff_and_loose(assignment, joint)
     if len(loose) < 2:
         return []
     loose = loose[np.argsort(-sightings[loose], kind="stable")]
@@ -272,9 +272,8 @@ def propose_constellation(
     return [_ordered(loose[k], root[m]) for k, m in pairs]
 
 
-def stiff_and_loose(assignment: Assignment, marginals: Marginals) -> tuple[IntArray, IntArray]:
+def stiff_and_loose(assignment: Assignment, joint: FloatArray) -> tuple[IntArray, IntArray]:
     """Return landmarks that hang together with the oldest, each well known against the next; and all others."""
-    joint = marginals.shared
     seen = np.flatnonzero(assignment.sightings >= MIN_SIGHTINGS)
     within = np.array(
         [[np.linalg.norm(_spread(joint, u, o), 2) < STIFF_M**2 for o in seen.tolist()] for u in seen.tolist()]
@@ -307,9 +306,9 @@ def _spread(joint: FloatArray, u: int, o: int) -> FloatArray:
     return spread
 
 
-def pairs_in_reach(assignment: Assignment, marginals: Marginals) -> list[tuple[int, int]]:
+def pairs_in_reach(assignment: Assignment, joint: FloatArray) -> list[tuple[int, int]]:
     """Return pairs (younger, older) whose difference is insignificant by itself, sorted."""
-    joint, gate = marginals.shared, gates(1, CONFIDENCE)[1]
+    gate = gates(1, CONFIDENCE)[1]
     estimate, sightings, apart = assignment.estimate, assignment.sightings, assignment.apart
     found = []
     for u in range(len(sightings)):
@@ -323,10 +322,10 @@ def pairs_in_reach(assignment: Assignment, marginals: Marginals) -> list[tuple[i
     return found
 
 
-def differences(estimate: Estimate, marginals: Marginals, pairs: list[tuple[int, int]], density: float) -> Pairings:
+def differences(estimate: Estimate, joint: FloatArray, pairs: list[tuple[int, int]], density: float) -> Pairings:
     """Return pairs (younger, older), sorted, as pairings whose innovation is their difference."""
     n = len(pairs)
-    select = np.zeros((2 * n, len(marginals.shared)))
+    select = np.zeros((2 * n, len(joint)))
     for k, (u, o) in enumerate(pairs):
         select[2 * k : 2 * k + 2, 2 * u : 2 * u + 2] = np.eye(2)
         select[2 * k : 2 * k + 2, 2 * o : 2 * o + 2] = -np.eye(2)
@@ -337,7 +336,7 @@ def differences(estimate: Estimate, marginals: Marginals, pairs: list[tuple[int,
         source.astype(np.int64),
         older,
         estimate.landmark[younger] - estimate.landmark[older],
-        select @ marginals.shared @ select.T,
+        select @ joint @ select.T,
         np.full(n, np.log(density)),
         len(sources),
     )

@@ -13,8 +13,8 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.association.jcbb import Pairings, gates
-from evermap.slam.border import drive_on
 from evermap.slam.kernels import AT_PLACES, detection_residual, kernel
+from evermap.slam.local_filter import drive_on
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.solver import Motion
 from evermap.slam.streaming import sighted_at

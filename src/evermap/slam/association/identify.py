@@ -9,13 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from evermap.slam.arrow import Smoother
 from evermap.slam.association.assignment import Assignment
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Noise
+from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
 
 MAP_FLOOR_M = 1e-3

@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 from scipy.linalg import cho_factor, cho_solve
 
-from evermap.slam.arrow import Normal, Smoother, eliminate_chain
 from evermap.slam.calibration import FORWARD, N_STATES, SKEW, SLIP, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -258,12 +259,14 @@ def _piece(
         prior=CalibrationPrior(prior.mean, np.full(N_STATES, np.inf), prior.free),
         start_information=0.0,
         landmark_mean=np.zeros((count, 2)),
-        landmark_information=np.zeros((2 * count, 2 * count)),
+        landmark_information=sparse.csr_array((2 * count, 2 * count)),
     )
     position = _copies(part, estimate, pose_row, landmark)
     local = Estimate(estimate.pose[start:last], position, estimate.states)
-    normal = Smoother(part, noise).normal(local)
-    information, right = _without_inner_poses(normal)
+    ends = np.unique([0, last - start - 1])
+    information, right = Smoother(part, noise).information(local, ends[::-1])
+    if len(ends) == 1:  # a window of one pose: it is the first and there is no other
+        information, right = np.pad(information, ((3, 0), (3, 0))), np.pad(right, (3, 0))
     return _Piece(landmark, position, information, right)
 
 
@@ -275,39 +278,6 @@ def _copies(part: Problem, estimate: Estimate, pose_row: IntArray, landmark: Int
     order = np.argsort(part.landmark_row, kind="stable")
     groups = np.split(points[order], np.cumsum(np.bincount(part.landmark_row, minlength=len(landmark)))[:-1])
     return np.array([np.median(group, axis=0) for group in groups]).reshape(-1, 2)
-
-
-def _without_inner_poses(normal: Normal) -> tuple[FloatArray, FloatArray]:
-    """Information and right side of the last pose, the first pose, the landmarks and the states."""
-    if len(normal.diagonal) == 1:  # a window of one pose: it is the first and there is no other
-        size = len(normal.corner)
-        information = np.zeros((6 + size, 6 + size))
-        information[3:6, 3:6] = normal.diagonal[0]
-        information[3:6, 6:] = normal.border[0]
-        information[6:, 3:6] = normal.border[0].T
-        information[6:, 6:] = normal.corner
-        return information, np.concatenate([np.zeros(3), normal.right_pose[0], normal.right_shared])
-    size = len(normal.corner)
-    border = np.zeros((len(normal.border) - 1, 3, 3 + size))
-    border[:, :, 3:] = normal.border[1:]
-    border[0, :, :3] = normal.off[0]
-    corner = np.zeros((3 + size, 3 + size))
-    corner[:3, :3] = normal.diagonal[0]
-    corner[:3, 3:] = normal.border[0]
-    corner[3:, :3] = normal.border[0].T
-    corner[3:, 3:] = normal.corner
-    kept = Normal(
-        diagonal=np.ascontiguousarray(normal.diagonal[1:]),
-        off=np.ascontiguousarray(normal.off[1:]),
-        border=border,
-        corner=corner,
-        right_pose=np.ascontiguousarray(normal.right_pose[1:]),
-        right_shared=np.concatenate([normal.right_pose[0], normal.right_shared]),
-        cost=normal.cost,
-        weights=normal.weights,
-    )
-    information, right = eliminate_chain(kept)
-    return information, right
 
 
 def in_sensor_metres(estimate: Estimate, prior: CalibrationPrior) -> Estimate:

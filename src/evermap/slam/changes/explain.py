@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import sparse
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
 from evermap.slam.kernels import detection_residual, kernel, outlier_loss
-from evermap.slam.problem import Estimate, Noise, Problem, independent
+from evermap.slam.problem import Estimate, Noise, Problem, between_rows, embedded, independent, padded
+from evermap.slam.smoother import Smoother
 from evermap.types import BoolArray, FloatArray, IntArray
 
 SLACK_M = 0.005
@@ -120,20 +121,21 @@ def explained(
         members = group.members
         if group.since_s is None:
             rows = se2.xy_rows(members)
-            own = independent(covariance[members])
+            own = independent(covariance[members]).toarray()
             landmark[members] = group.moved(mean)
             mean[members] += offset
-            information[np.ix_(rows, rows)] = np.linalg.inv(own + motion_covariance)
+            tied = np.linalg.inv(own + motion_covariance) - between_rows(information, rows).toarray()
+            information = sparse.csr_array(information + embedded(tied, rows, 2 * len(places)))
             continue
         new = len(places) + np.arange(len(members))
         places.extend(int(j) for j in members)
         old_rows = se2.xy_rows(members)
         new_rows = se2.xy_rows(new)
         tie = np.linalg.inv(motion_covariance + SLACK_M**2 * np.eye(len(old_rows)))
-        information = np.pad(information, (0, len(new_rows)))
-        for first, second, sign in ((old_rows, old_rows, 1), (new_rows, new_rows, 1), (old_rows, new_rows, -1)):
-            information[np.ix_(first, second)] += sign * tie
-        information[np.ix_(new_rows, old_rows)] -= tie
+        both = np.concatenate([old_rows, new_rows])
+        information = padded(information, len(new))
+        parted = embedded(np.kron([[1.0, -1.0], [-1.0, 1.0]], tie), both, 2 * len(places))
+        information = sparse.csr_array(information + parted)
         mean = np.vstack([mean, mean[members] + offset])
         landmark = np.vstack([landmark, group.moved(landmark[:count])])
         for k, j in enumerate(members):
@@ -165,7 +167,7 @@ def unswayed(problem: Problem, estimate: Estimate, noise: Noise, members: IntArr
         sigma_given=problem.sigma_given[others],
         # the other landmarks stay where they are, or the whole might turn away from the members' places
         landmark_mean=np.nan_to_num(estimate.landmark[: len(problem.landmark_mean)]),
-        landmark_information=np.eye(problem.landmark_mean.size) / HELD_M**2,
+        landmark_information=independent(np.tile(np.eye(2) / HELD_M**2, (len(problem.landmark_mean), 1, 1))),
     )
     start = Estimate(estimate.pose, estimate.landmark[: len(problem.landmark_mean)], estimate.states)
     free = Smoother(rest, noise, heavy=True).optimum(start, iterations=5, tolerance=1e-4)

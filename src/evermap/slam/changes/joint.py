@@ -12,10 +12,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.arrow import Smoother
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare, in_sensor_metres, landmark_evidence
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained, parting_time, unswayed
@@ -25,6 +25,7 @@ from evermap.slam.changes.weigh import Verdict, weigh
 from evermap.slam.method import Compare, Explanation, Method, Rival
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate, Noise, Problem, independent
+from evermap.slam.smoother import Smoother
 from evermap.slam.streaming import outvoted
 from evermap.types import ChangeKind, FloatArray, IntArray, MapChange
 
@@ -93,6 +94,10 @@ class Joint(Method):
         current: IntArray = self._current()[problem.landmark_row[detections]]
         return current
 
+    def revises(self, problem: Problem) -> bool:
+        """Return False where there is neither a map nor, for so many landmarks, more than one window."""
+        return self._in_map(problem) or self._count <= MOST_ITEMS // 2
+
     def unprejudiced(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """Return the problem with the map believed to 1 m: a wrong one bends the solution or looks noisy."""
         if self._given is None or not self._in_map(problem):
@@ -106,7 +111,7 @@ class Joint(Method):
         start = in_sensor_metres(self._where_most_agree(self._first_places(estimate)), self._calibration)
         # what the map puts in the wrong place is where most of its sightings say, whatever the map
         weights = Smoother(free, START, heavy=True, robust=self._robust).inlier_probability(start)
-        unmapped = replace(free, landmark_information=np.zeros_like(free.landmark_information))
+        unmapped = replace(free, landmark_information=sparse.csr_array(free.landmark_information.shape))
         self._loosened = _Loosened(problem, free, outvoted(unmapped, start, weights))
         return free, self._loosened.start
 

@@ -14,9 +14,9 @@ import gtsam
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
 from evermap.slam.frame_factor import whitened_detections, whitened_odometry
-from evermap.slam.problem import ConditionalPrior, Estimate, Noise, Problem
+from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
 
@@ -60,8 +60,9 @@ class IncrementalSmoother:
         self._older = np.zeros((0, 3))
         self._last_pose = problem.start_pose
 
-    def restart(self, estimate: Estimate, noise: Noise, problem: Problem) -> None:
+    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
         """Throw the tree away and build it anew at `estimate`."""
+        del marginals
         self.problem, self._noise = problem, noise
         self._isam = gtsam.ISAM2(_parameters())
         self._older = estimate.pose

@@ -9,8 +9,8 @@ from problems import World, make_world, slow_detection
 
 from evermap.config import ModesConfig
 from evermap.geometry import se2
-from evermap.slam.arrow import Smoother
-from evermap.slam.problem import Estimate, Problem
+from evermap.slam.problem import Estimate, Problem, padded
+from evermap.slam.smoother import Smoother
 from evermap.types import Sensor
 from evermap_studies.nielsen2024.modes.alternation import ModeModel
 
@@ -63,7 +63,7 @@ def make_moving_world(
         problem,
         landmark_row=np.where(late, count, problem.landmark_row),
         landmark_mean=np.vstack([problem.landmark_mean, np.zeros(2)]),
-        landmark_information=np.pad(problem.landmark_information, (0, 2)),
+        landmark_information=padded(problem.landmark_information, 1),
     )
     return MovingWorld(world, moved, since, at, problem, told)
 

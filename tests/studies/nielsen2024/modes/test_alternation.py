@@ -9,8 +9,8 @@ import pytest
 from moving import FAR, MovingWorld, make_moving_world, model_of
 from problems import make_world
 
-from evermap.slam.arrow import Smoother
-from evermap.slam.problem import Estimate
+from evermap.slam.problem import Estimate, padded
+from evermap.slam.smoother import Smoother
 from evermap_studies.nielsen2024.modes.alternation import Explanation, explain_with_modes
 from evermap_studies.nielsen2024.modes.changes import switches
 from evermap_studies.nielsen2024.modes.places import FREE, Modes
@@ -131,7 +131,7 @@ def test_a_false_birth_is_undone_by_merging():
         problem,
         landmark_row=np.where(half, 5, problem.landmark_row),
         landmark_mean=np.vstack([problem.landmark_mean, np.zeros(2)]),
-        landmark_information=np.pad(problem.landmark_information, (0, 2)),
+        landmark_information=padded(problem.landmark_information, 1),
     )
     start = replace(optimum, landmark=np.vstack([optimum.landmark, optimum.landmark[1]]))
     start = Smoother(torn, world.noise).optimum(start)

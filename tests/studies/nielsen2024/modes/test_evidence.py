@@ -9,7 +9,7 @@ import pytest
 from moving import MovingWorld, make_moving_world, model_of
 from scipy import stats
 
-from evermap.slam.arrow import Smoother
+from evermap.slam.smoother import Smoother
 from evermap_studies.nielsen2024.modes import evidence
 from evermap_studies.nielsen2024.modes.alternation import Explanation, explain_with_modes
 from evermap_studies.nielsen2024.modes.evidence import (

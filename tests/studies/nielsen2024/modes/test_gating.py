@@ -9,7 +9,7 @@ from moving import make_moving_world
 from problems import make_world
 from scipy import stats
 
-from evermap.slam.arrow import Smoother
+from evermap.slam.smoother import Smoother
 from evermap_studies.nielsen2024.modes.gating import distances, distances_to_modes, gate_threshold, with_births
 from evermap_studies.nielsen2024.modes.places import FREE, Modes
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import ModesConfig
-from evermap.slam.arrow import Smoother
 from evermap.slam.problem import Estimate, Noise, Problem
+from evermap.slam.smoother import Smoother
 from evermap.survival.text import parse_prior
 from evermap.types import IntArray, Sensor
 from evermap_studies.nielsen2024.modes.evidence import united

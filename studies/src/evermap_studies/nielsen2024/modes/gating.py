@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from evermap.slam.kernels import detection_residual, kernel
-from evermap.slam.noise import joint_covariance
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
+from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 from evermap_studies.nielsen2024.modes.places import FREE, Modes, at_places, grown, moved_to
@@ -91,8 +90,8 @@ def with_map_restored(
     dragged = []
     seen = np.bincount(problem.landmark_row, minlength=len(problem.landmark_mean)) > 0
     for row in np.flatnonzero(problem.mapped & estimate.known & seen):
-        block = slice(2 * row, 2 * row + 2)
-        scatter = np.linalg.inv(problem.landmark_information[block, block]) - marginals.shared[block, block]
+        own = between_rows(problem.landmark_information, np.arange(2 * row, 2 * row + 2)).toarray()
+        scatter = np.linalg.inv(own) - marginals.landmark[row]
         away = estimate.landmark[row] - problem.landmark_mean[row]
         if away @ np.linalg.solve(scatter, away) > 2.0 * switch_cost:
             dragged.append(row)
@@ -249,8 +248,23 @@ def _distances(
             if not free[k]:
                 jc[:, k] = 0.0
         j[:, :3], j[:, 3:5], j[:, 5:] = jx, jl, jc
-        joint_covariance(i, place[m], cov_pose, cov_cross, cov_shared, cov)
+        _joint_covariance(i, place[m], cov_pose, cov_cross, cov_shared, cov)
         s = j @ cov @ j.T
         s00, s01, s11 = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
         out[m] = (s11 * e[0] ** 2 - 2.0 * s01 * e[0] * e[1] + s00 * e[1] ** 2) / (s00 * s11 - s01 * s01)
     return out
+
+
+@kernel
+def _joint_covariance(
+    pose: int, place: int, cov_pose: FloatArray, cov_cross: FloatArray, cov_shared: FloatArray, out: FloatArray
+) -> None:
+    """Compute the covariance (10, 10) of one pose, one place and the five sensor states, from `Marginals`."""
+    at_states = len(cov_shared) - 9
+    out[:3, :3] = cov_pose[pose]
+    for a in range(7):
+        row = 2 * place + a if a < 2 else at_states + a - 2
+        for b in range(3):
+            out[3 + a, b] = out[b, 3 + a] = cov_cross[pose, b, row]
+        for b in range(7):
+            out[3 + a, 3 + b] = cov_shared[row, 2 * place + b if b < 2 else at_states + b - 2]

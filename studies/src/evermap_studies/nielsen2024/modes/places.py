@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.slam.problem import Estimate, Problem
+from evermap.slam.problem import Estimate, Problem, between_rows
 from evermap.types import FloatArray, IntArray
 
 FREE = -1
@@ -84,12 +84,12 @@ def compacted(problem: Problem, estimate: Estimate, modes: Modes) -> tuple[Probl
     rows = np.append(np.arange(modes.n_landmarks), extra[np.argsort(when[extra], kind="stable")])
     to = np.full(len(modes.landmark), FREE)
     to[rows] = np.arange(len(rows))
-    axes = (2 * rows[:, None] + [0, 1]).ravel()
+    axes = np.asarray((2 * rows[:, None] + [0, 1]).ravel(), dtype=np.int64)
     problem = replace(
         problem,
         landmark_row=to[problem.landmark_row],
         landmark_mean=problem.landmark_mean[rows],
-        landmark_information=problem.landmark_information[np.ix_(axes, axes)],
+        landmark_information=between_rows(problem.landmark_information, axes),
     )
     estimate = replace(estimate, landmark=estimate.landmark[rows])
     return problem, estimate, replace(modes, landmark=modes.landmark[rows]), to

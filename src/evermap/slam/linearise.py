@@ -1,0 +1,156 @@
+"""A problem as whitened linear factors: Jacobians and right sides, in the layout of `sparse`."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.slam.kernels import detection_residual, inlier_weight, kernel, outlier_loss
+from evermap.slam.preintegration import Intervals, linearise_interval
+from evermap.slam.problem import Estimate, Problem
+from evermap.types import BoolArray, FloatArray, IntArray
+
+ODOMETRY, DETECTION = 33, 22
+"""Numbers of one factor: three rows by two poses and four states, two rows by pose, place and five states; and the
+right side."""
+
+
+class Sightings(NamedTuple):
+    """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas; (3,) mount.
+
+    `free` (9,) are the calibration states that are estimated; `log_odds` and `heavy` as for `kernels.inlier_weight`.
+    """
+
+    pose_row: IntArray
+    place: IntArray
+    reading: FloatArray
+    sigma: FloatArray
+    mount: FloatArray
+    free: BoolArray
+    log_odds: float
+    heavy: bool
+
+
+@kernel
+def root_of(information: FloatArray, root: FloatArray) -> None:
+    """Compute the upper triangular root of `information = root' root`, (3, 3); what is below stays as it is."""
+    for a in range(3):
+        for b in range(a, 3):
+            total = information[a, b]
+            for k in range(a):
+                total -= root[k, a] * root[k, b]
+            root[a, b] = math.sqrt(total) if a == b else total / root[a, a]
+
+
+@kernel
+def linearise(
+    pose: FloatArray,
+    place: FloatArray,
+    states: FloatArray,
+    driven: Intervals,
+    variance: FloatArray,
+    seen: Sightings,
+    values: FloatArray,
+    weight: FloatArray,
+    begin: int,
+    end: int,
+    first: int,
+    last: int,
+) -> float:
+    """Linearise the odometry from poses `begin` to `end - 1`, and the detections from `first` to `last - 1`.
+
+    Args:
+        pose: (N, 3) values of poses.
+        place: (P, 2) of places.
+        states: (9,) of the calibration.
+        driven: odometry between the poses.
+        variance: (5,) of its kinds of noise.
+        seen: all detections.
+        values: factors of odometry, then those of detections; filled in.
+        weight: (M,) inlier weights; filled in.
+        begin: first pose whose odometry to the next one is done.
+        end: pose after the last of these.
+        first: first detection.
+        last: detection after the last.
+
+    Returns:
+        Negative log likelihood, up to a constant.
+    """
+    cost, at = 0.0, ODOMETRY * begin
+    information, e, root = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
+    j = np.zeros((3, 10))
+    for i in range(begin, end):
+        linearise_interval(driven, i, pose, variance, seen.free, e, j, information)
+        root_of(information, root)
+        for a in range(3):
+            for b in range(10):
+                total = 0.0
+                for k in range(a, 3):
+                    total += root[a, k] * j[k, b]
+                values[at + b] = total
+            total = 0.0
+            for k in range(a, 3):
+                total += root[a, k] * e[k]
+            values[at + 10] = -total
+            cost += 0.5 * total * total
+            at += 11
+    at = ODOMETRY * (len(pose) - 1) + DETECTION * first
+    z, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    for m in range(first, last):
+        detection_residual(
+            pose[seen.pose_row[m]], place[seen.place[m]], states, seen.mount, seen.reading[m, 0], seen.reading[m, 1],
+            z, jx, jl, jc,
+        )  # fmt: skip
+        squared = (z[0] / seen.sigma[m, 0]) ** 2 + (z[1] / seen.sigma[m, 1]) ** 2
+        weight[m] = inlier_weight(squared, seen.log_odds, seen.heavy)
+        cost += outlier_loss(squared, seen.log_odds, seen.heavy)
+        for row in range(2):
+            scale = math.sqrt(weight[m]) / seen.sigma[m, row]
+            for a in range(3):
+                values[at + a] = scale * jx[row, a]
+            for a in range(2):
+                values[at + 3 + a] = scale * jl[row, a]
+            for a in range(5):
+                values[at + 5 + a] = scale * jc[row, a] if seen.free[a] else 0.0
+            values[at + 10] = -scale * z[row]
+            at += 11
+    return cost
+
+
+def detection_residuals(problem: Problem, estimate: Estimate) -> FloatArray:
+    """Return (M, 2) measured minus predicted range [m] and bearing [rad]."""
+    out = np.empty((len(problem.pose_row), 2))
+    _detection_residuals(
+        estimate.pose, estimate.landmark, estimate.states, problem.pose_row, problem.landmark_row, problem.reading,
+        problem.mount, out,
+    )  # fmt: skip
+    return out
+
+
+@kernel
+def _detection_residuals(
+    pose: FloatArray,
+    landmark: FloatArray,
+    states: FloatArray,
+    pose_row: Any,
+    landmark_row: Any,
+    reading: FloatArray,
+    mount: FloatArray,
+    out: FloatArray,
+) -> None:
+    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    for m in range(len(pose_row)):
+        detection_residual(
+            pose[pose_row[m]],
+            landmark[landmark_row[m]],
+            states,
+            mount,
+            reading[m, 0],
+            reading[m, 1],
+            out[m],
+            jx,
+            jl,
+            jc,
+        )

@@ -1,0 +1,1 @@
+"""One sparse least-squares solver, of any variables: elimination tree, factorisation, selected inverse."""

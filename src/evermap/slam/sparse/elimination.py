@@ -1,0 +1,497 @@
+"""Numbers along the elimination tree: Cholesky factor, solution, and the covariances that fronts hold.
+
+Every front is a small dense matrix (multifrontal method, Duff and Reid 1983; Liu 1992), so the loops are over rows in
+memory. Covariances of everything that a factor ties are found on the way back, without an inverse of the whole
+(Erisman and Tinney 1975); those of other pairs from the rows of `L^-1` along their ways to the root.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.compiled import kept
+from evermap.slam.sparse.tree import Factors, Tree
+from evermap.types import FloatArray, IntArray
+
+TINY = 1e-12
+"""Share of its own information below which a pivot is rounding."""
+BLOCK = 4
+"""Rows that are eliminated at once: as many as fit into registers beside what they change."""
+
+kernel = kept(effort=3, error_model="numpy")
+
+
+class Spread(NamedTuple):
+    """Covariances at the optimum.
+
+    Attributes:
+        own: covariance of each variable by itself, one after the other, in rows.
+        own_first: (V + 1,) where they begin.
+        with_border: (numbers, B) covariance of every number with those of the border.
+        of_factors: `A S A'` of each factor with Jacobian A, (rows, rows) each, one after the other.
+        of_factors_first: (F + 1,) where they begin.
+        pairs: (P, a, b) covariances of the first two variables of each of the first P factors.
+        held: room for the covariances of the fronts from the root to one of them.
+    """
+
+    own: FloatArray
+    own_first: IntArray
+    with_border: FloatArray
+    of_factors: FloatArray
+    of_factors_first: IntArray
+    pairs: FloatArray
+    held: FloatArray
+
+
+class Elimination(NamedTuple):
+    """Numbers of an elimination that may be under way.
+
+    Attributes:
+        stored: rows (own, size) of the Cholesky factor `L'`, front after front.
+        right: (numbers,) right side, `L^-1 b`.
+        waiting: updates of fronts whose parents come later.
+        where, whose: where each of these begins, and the front that it is of.
+        n_waiting: (1,) how many.
+        front: room for the largest front and its right side.
+    """
+
+    stored: FloatArray
+    right: FloatArray
+    waiting: FloatArray
+    where: IntArray
+    whose: IntArray
+    n_waiting: IntArray
+    front: FloatArray
+
+    @classmethod
+    def of(cls, tree: Tree) -> Elimination:
+        """Return room for the numbers of a tree, before the first front."""
+        largest, count = int(tree.size.max()), len(tree.parent)
+        return cls(
+            np.empty(tree.stored[-1]),
+            np.zeros(tree.begin[-1]),
+            np.empty(tree.most_waiting),
+            np.zeros(count + 1, dtype=np.int64),
+            np.empty(count, dtype=np.int64),
+            np.zeros(1, dtype=np.int64),
+            np.zeros((largest, largest + 1)),
+        )
+
+    def border(self, tree: Tree) -> FloatArray:
+        """Return (B, B + 1) information of the border and its right side, upper triangle, when all is done."""
+        left = int(tree.size[0] - tree.own[0])
+        return self.waiting[: left * (left + 1)].reshape(left, left + 1)
+
+
+@kernel
+def eliminate(
+    tree: Tree, factors: Factors, values: FloatArray, extra: FloatArray, state: Elimination, high: int, low: int
+) -> None:
+    """Eliminate the fronts from `high - 1` down to `low`.
+
+    Args:
+        tree: the elimination tree.
+        factors: what ties the variables.
+        values: Jacobian and right side of each factor, whitened: the cost is `|A x - b|^2 / 2`.
+        extra: information that is added on the diagonal.
+        state: with all later fronts eliminated; filled in.
+        high: front after the first.
+        low: the last front.
+    """
+    stored, right, waiting, where, whose = state.stored, state.right, state.waiting, state.where, state.whose
+    front, n_waiting = state.front, state.n_waiting[0]
+    diagonal, index = np.zeros(len(front)), np.empty(len(front) + 1, np.int64)
+    position = np.empty(len(front) + 1, np.int64)
+    for node in range(high - 1, low - 1, -1):
+        size, own = tree.size[node], tree.own[node]
+        for i in range(size):
+            for j in range(i, size):
+                front[i, j] = 0.0
+            front[i, size] = 0.0
+        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+            v = tree.variable[k]
+            for a in range(tree.dim[v]):
+                front[tree.at[k] + a, tree.at[k] + a] = extra[tree.begin[v] + a]
+        for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
+            f = tree.factor[j]
+            width = 0
+            for k in range(factors.first[f], factors.first[f + 1]):
+                for a in range(tree.dim[factors.variable[k]]):
+                    index[width] = tree.factor_at[k] + a
+                    width += 1
+            begin = tree.value_first[f]
+            for _ in range(factors.rows[f]):
+                b = values[begin + width]
+                for a in range(width):
+                    value, i = values[begin + a], index[a]
+                    if value == 0.0:
+                        continue
+                    front[i, size] += value * b
+                    for c in range(a, width):
+                        j2 = index[c]
+                        if i <= j2:
+                            front[i, j2] += value * values[begin + c]
+                        else:
+                            front[j2, i] += value * values[begin + c]
+                begin += width + 1
+        while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
+            n_waiting -= 1
+            child = whose[n_waiting]
+            left = 0
+            for k in range(tree.first[child] + tree.n_own[child], tree.first[child + 1]):
+                for a in range(tree.dim[tree.variable[k]]):
+                    position[left] = tree.up[k] + a
+                    left += 1
+            at = where[n_waiting]
+            for i in range(left):
+                for j in range(i, left):
+                    front[position[i], position[j]] += waiting[at + j]
+                front[position[i], size] += waiting[at + left]
+                at += left + 1
+        for i in range(own):
+            diagonal[i] = front[i, i]
+        _eliminate_rows(front, diagonal, own, size)
+        at = tree.stored[node]
+        for i in range(own):
+            for j in range(i, size):
+                stored[at + j] = front[i, j]
+            at += size
+        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+            v = tree.variable[k]
+            for a in range(tree.dim[v]):
+                right[tree.begin[v] + a] = front[tree.at[k] + a, size]
+        left, at = size - own, where[n_waiting]
+        for i in range(left):
+            for j in range(i, left + 1):
+                waiting[at + j] = front[own + i, own + j]
+            at += left + 1
+        whose[n_waiting] = node
+        n_waiting += 1
+        where[n_waiting] = at
+    state.n_waiting[0] = n_waiting
+
+
+@kernel
+def _eliminate_rows(front: FloatArray, diagonal: FloatArray, own: int, size: int) -> None:
+    """Make the first `own` rows of the upper triangle those of a Cholesky factor, and the rest its complement."""
+    for first in range(0, own, BLOCK):
+        last = min(first + BLOCK, own)
+        for k in range(first, last):
+            for p in range(first, k):
+                m = front[p, k]
+                if m != 0.0:
+                    for j in range(k, size + 1):
+                        front[k, j] -= m * front[p, j]
+            scale = 1.0 / math.sqrt(max(front[k, k], TINY * diagonal[k] + 1e-300))
+            for j in range(k, size + 1):
+                front[k, j] *= scale
+            front[k, k] = 1.0 / scale
+        if last - first == BLOCK:
+            for i in range(last, size):
+                m0, m1, m2, m3 = front[first, i], front[first + 1, i], front[first + 2, i], front[first + 3, i]
+                if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
+                    for j in range(i, size + 1):
+                        front[i, j] -= (
+                            m0 * front[first, j]
+                            + m1 * front[first + 1, j]
+                            + m2 * front[first + 2, j]
+                            + m3 * front[first + 3, j]
+                        )
+        else:
+            for k in range(first, last):
+                for i in range(last, size):
+                    m = front[k, i]
+                    if m != 0.0:
+                        for j in range(i, size + 1):
+                            front[i, j] -= m * front[k, j]
+
+
+@kernel
+def back_substitute(
+    tree: Tree, stored: FloatArray, right: FloatArray, border: FloatArray, x: FloatArray, low: int, high: int
+) -> None:
+    """Solve `L' x = right` for the variables of the fronts from `low` to `high - 1`, those before being done.
+
+    Args:
+        tree: the elimination tree.
+        stored: rows of the Cholesky factor, `L'`.
+        right: (numbers,) its right side.
+        border: (B,) solution of the border.
+        x: (numbers,) filled in.
+        low: the first front.
+        high: front after the last.
+    """
+    position, largest = 0, 0
+    for v in tree.border:
+        for a in range(tree.dim[v]):
+            x[tree.begin[v] + a] = border[position]
+            position += 1
+    for node in range(low, high):
+        largest = max(largest, tree.size[node])
+    mine = np.empty(largest)
+    for node in range(low, high):
+        size, own = tree.size[node], tree.own[node]
+        for k in range(tree.first[node], tree.first[node + 1]):
+            v = tree.variable[k]
+            for a in range(tree.dim[v]):
+                at = tree.begin[v] + a
+                mine[tree.at[k] + a] = right[at] if tree.at[k] < own else x[at]
+        for i in range(own - 1, -1, -1):
+            at = tree.stored[node] + i * size
+            total = mine[i]
+            for j in range(i + 1, size):
+                total -= stored[at + j] * mine[j]
+            mine[i] = total / stored[at + i]
+        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+            v = tree.variable[k]
+            for a in range(tree.dim[v]):
+                x[tree.begin[v] + a] = mine[tree.at[k] + a]
+
+
+def spread_room(tree: Tree, factors: Factors, border: FloatArray, n_pairs: int) -> Spread:
+    """Return room for covariances, with those of the border in it.
+
+    Args:
+        tree: the elimination tree.
+        factors: what ties the variables.
+        border: (B, B) covariance of the border.
+        n_pairs: factors, from the first, whose first two variables' covariance is wanted; all of the same two sizes.
+    """
+    own_first = np.append(0, np.cumsum(tree.dim**2))
+    of_first = np.append(0, np.cumsum(factors.rows**2))
+    shape = tree.dim[factors.variable[factors.first[0] : factors.first[0] + 2]] if n_pairs else np.zeros(2, np.int64)
+    room = Spread(
+        np.zeros(own_first[-1]),
+        own_first,
+        np.zeros((tree.begin[-1], len(border))),
+        np.zeros(of_first[-1]),
+        of_first,
+        np.zeros((n_pairs, int(shape[0]), int(shape[1]))),
+        np.empty(tree.most_held),
+    )
+    for v in tree.border:
+        at = tree.in_border[v] + np.arange(tree.dim[v])
+        room.with_border[tree.begin[v] : tree.begin[v + 1]] = border[at]
+        room.own[own_first[v] : own_first[v + 1]] = border[np.ix_(at, at)].ravel()
+    return room
+
+
+@kernel
+def spread(
+    tree: Tree,
+    factors: Factors,
+    values: FloatArray,
+    stored: FloatArray,
+    border: FloatArray,
+    out: Spread,
+    low: int,
+    high: int,
+) -> None:
+    """Find the covariances that the fronts from `low` to `high - 1` hold, those before being done.
+
+    Args:
+        tree: the elimination tree.
+        factors: what ties the variables.
+        values: as for `eliminate`.
+        stored: rows of the Cholesky factor, `L'`.
+        border: (B, B) covariance of the border.
+        out: filled in, see `spread_room`.
+        low: the first front.
+        high: front after the last.
+    """
+    own_first, of_first, way, held = out.own_first, out.of_factors_first, tree.way, out.held
+    n_pairs, a_dim, b_dim = out.pairs.shape
+    largest = 0
+    for node in range(low, high):
+        largest = max(largest, tree.size[node])
+    index = np.empty(largest + 1, np.int64)
+    part = np.empty(largest)
+    for node in range(low, high):
+        size, own = tree.size[node], tree.own[node]
+        left = size - own
+        cov = held[way[node] : way[node] + size * size].reshape(size, size)
+        for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
+            for a in range(tree.dim[tree.variable[k]]):
+                index[tree.at[k] - own + a] = tree.up[k] + a
+        if node > 0:
+            up = tree.parent[node]
+            above = held[way[up] : way[up] + tree.size[up] ** 2].reshape(tree.size[up], tree.size[up])
+            for i in range(left):
+                for j in range(left):
+                    cov[own + i, own + j] = above[index[i], index[j]]
+        else:
+            for i in range(left):
+                for j in range(left):
+                    cov[own + i, own + j] = border[index[i], index[j]]
+        _spread_rows(cov, part, stored[tree.stored[node] : tree.stored[node + 1]].reshape(own, size), own, size)
+        for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+            v, at = tree.variable[k], tree.at[k]
+            dim = tree.dim[v]
+            for a in range(dim):
+                for b in range(dim):
+                    out.own[own_first[v] + a * dim + b] = cov[at + a, at + b]
+            for j in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
+                # the border stands last in every front, in its own order
+                if tree.in_border[tree.variable[j]] >= 0:
+                    to = tree.in_border[tree.variable[j]]
+                    for a in range(dim):
+                        for b in range(tree.dim[tree.variable[j]]):
+                            out.with_border[tree.begin[v] + a, to + b] = cov[at + a, tree.at[j] + b]
+        for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
+            f = tree.factor[j]
+            width = 0
+            for k in range(factors.first[f], factors.first[f + 1]):
+                for a in range(tree.dim[factors.variable[k]]):
+                    index[width] = tree.factor_at[k] + a
+                    width += 1
+            for r in range(factors.rows[f]):
+                begin = tree.value_first[f] + r * (width + 1)
+                for c in range(width):
+                    part[c] = 0.0
+                for a in range(width):
+                    value = values[begin + a]
+                    if value != 0.0:
+                        for c in range(width):
+                            part[c] += value * cov[index[a], index[c]]
+                for other in range(r + 1):
+                    begin = tree.value_first[f] + other * (width + 1)
+                    total = 0.0
+                    for c in range(width):
+                        total += part[c] * values[begin + c]
+                    out.of_factors[of_first[f] + r * factors.rows[f] + other] = total
+                    out.of_factors[of_first[f] + other * factors.rows[f] + r] = total
+            if f < n_pairs:
+                for a in range(a_dim):
+                    for b in range(b_dim):
+                        out.pairs[f, a, b] = cov[index[a], index[a_dim + b]]
+
+
+@kernel
+def _spread_rows(cov: FloatArray, row: FloatArray, rows: FloatArray, own: int, size: int) -> None:
+    """Fill in the covariance of a front's own numbers, from the last to the first, beside that of those passed on."""
+    for i in range(own - 1, -1, -1):
+        for j in range(i + 1, size):
+            row[j] = 0.0
+        p = i + 1
+        while p + BLOCK <= size:
+            m0, m1, m2, m3 = rows[i, p], rows[i, p + 1], rows[i, p + 2], rows[i, p + 3]
+            if m0 != 0.0 or m1 != 0.0 or m2 != 0.0 or m3 != 0.0:
+                for j in range(i + 1, size):
+                    row[j] -= m0 * cov[p, j] + m1 * cov[p + 1, j] + m2 * cov[p + 2, j] + m3 * cov[p + 3, j]
+            p += BLOCK
+        for q in range(p, size):
+            for j in range(i + 1, size):
+                row[j] -= rows[i, q] * cov[q, j]
+        scale = 1.0 / rows[i, i]
+        total = scale
+        for j in range(i + 1, size):
+            value = row[j] * scale
+            cov[i, j] = value
+            cov[j, i] = value
+            total -= rows[i, j] * value
+        cov[i, i] = total * scale
+
+
+@kernel
+def ways_to_border(
+    tree: Tree, stored: FloatArray, node_of: Any, wanted: Any
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return columns of `L^-1` for the numbers of some variables, only the rows that any of them reaches.
+
+    Args:
+        tree: the elimination tree.
+        stored: rows of the Cholesky factor, `L'`.
+        node_of: (V,) front that eliminates each variable, -1 of the border.
+        wanted: (K,) variables.
+
+    Returns:
+        (rows, columns) of the eliminated numbers, (B, columns) of the border before it is factorised itself, and
+        (T,) the first row of each front, -1 where no variable's way passes.
+    """
+    reached = np.full(len(tree.parent), -1)
+    columns = 0
+    for v in wanted:
+        columns += tree.dim[v]
+        node = node_of[v]
+        while node >= 0 and reached[node] < 0:
+            reached[node] = 0
+            node = tree.parent[node]
+    total, largest = 0, 1
+    for node in range(len(tree.parent)):
+        largest = max(largest, tree.size[node])
+        if reached[node] == 0:
+            reached[node] = total
+            total += tree.own[node]
+    n_border = 0
+    for v in tree.border:
+        n_border += tree.dim[v]
+    out, rest = np.zeros((total, columns)), np.zeros((n_border, columns))
+    column = 0
+    mine, above = np.zeros(max(largest, n_border)), np.zeros(max(largest, n_border))
+    for v in wanted:
+        for a in range(tree.dim[v]):
+            node = node_of[v]
+            if node < 0:
+                rest[tree.in_border[v] + a, column] = 1.0
+            else:
+                mine[: tree.size[node]] = 0.0
+                for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+                    if tree.variable[k] == v:
+                        mine[tree.at[k] + a] = 1.0
+            while node >= 0:
+                size, own = tree.size[node], tree.own[node]
+                for i in range(own):
+                    at = tree.stored[node] + i * size
+                    value = mine[i] / stored[at + i]
+                    out[reached[node] + i, column] = value
+                    if value != 0.0:
+                        for j in range(i + 1, size):
+                            mine[j] -= value * stored[at + j]
+                up = tree.parent[node]
+                above[: tree.size[up] if up >= 0 else n_border] = 0.0
+                for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
+                    for b in range(tree.dim[tree.variable[k]]):
+                        above[tree.up[k] + b] = mine[tree.at[k] + b]
+                mine, above = above, mine
+                node = up
+                if node < 0:
+                    for j in range(n_border):
+                        rest[j, column] = mine[j]
+            column += 1
+    return out, rest, reached
+
+
+@kernel
+def columns_of_inverse(
+    tree: Tree, stored: FloatArray, ways: FloatArray, reached: Any, border: FloatArray
+) -> FloatArray:
+    """Return columns (numbers, columns) of the inverse, from those of `L^-1` and the (B, columns) of the border."""
+    out = np.empty((tree.begin[-1], ways.shape[1]))
+    right, x = np.zeros(tree.begin[-1]), np.zeros(tree.begin[-1])
+    for column in range(ways.shape[1]):
+        for node in range(len(tree.parent)):
+            for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
+                v = tree.variable[k]
+                for a in range(tree.dim[v]):
+                    row = reached[node] + tree.at[k] + a
+                    right[tree.begin[v] + a] = ways[row, column] if reached[node] >= 0 else 0.0
+        back_substitute(tree, stored, right, border[:, column].copy(), x, 0, len(tree.parent))
+        out[:, column] = x
+    return out
+
+
+@kernel
+def curvature(tree: Tree, factors: Factors, values: FloatArray) -> FloatArray:
+    """Return the diagonal of `A' A`, for damping."""
+    out, at = np.zeros(tree.begin[-1]), 0
+    for f in range(len(factors.rows)):
+        for _ in range(factors.rows[f]):
+            for k in range(factors.first[f], factors.first[f + 1]):
+                for a in range(tree.dim[factors.variable[k]]):
+                    out[tree.begin[factors.variable[k]] + a] += values[at] ** 2
+                    at += 1
+            at += 1
+    return out

@@ -1,0 +1,200 @@
+"""Sparse linear least squares: the structure once, then numbers as often as they change."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+
+from evermap.errors import DataError, NumericalError
+from evermap.slam.sparse.elimination import (
+    Elimination,
+    Spread,
+    back_substitute,
+    columns_of_inverse,
+    eliminate,
+    spread,
+    spread_room,
+    ways_to_border,
+)
+from evermap.slam.sparse.tree import Factors, Tree, tree_of
+from evermap.types import FloatArray, IntArray
+
+_Result = TypeVar("_Result")
+Slices: TypeAlias = Generator[float, None, _Result]
+"""Work that may be left after every slice of at most about a millisecond: parts of a millisecond, then its result."""
+
+SLICE = 1e6
+"""Multiplications of a slice."""
+
+
+def exhausted(slices: Slices[_Result]) -> _Result:
+    """Return the result of work that is done at once."""
+    while True:
+        try:
+            next(slices)
+        except StopIteration as done:
+            result: _Result = done.value
+            return result
+
+
+@dataclass(frozen=True, slots=True)
+class Factorised:
+    """A least-squares problem with all but its border eliminated.
+
+    Attributes:
+        system: its structure.
+        values: Jacobians and right sides.
+        rows: rows of the Cholesky factor `L'`, front after front.
+        own_right: (numbers,) its right side, `L^-1 b`.
+        information: (B, B) of the border, all else marginalised.
+        right: (B,) its right side.
+    """
+
+    system: System
+    values: FloatArray
+    rows: FloatArray
+    own_right: FloatArray
+    information: FloatArray
+    right: FloatArray
+
+    def solution(self) -> Slices[FloatArray]:
+        """Return (numbers,) the optimum of all variables, in slices.
+
+        Raises:
+            NumericalError: the border is not determined.
+        """
+        tree = self.system.tree
+        border = cho_solve(self._border(), self.right) if len(self.right) else self.right
+        x = np.zeros(tree.begin[-1])
+        for low, high, share in self.system.cuts(10.0 * tree.own * tree.size):
+            back_substitute(tree, self.rows, self.own_right, border, x, low, high)
+            yield share
+        return x
+
+    def border_covariance(self) -> FloatArray:
+        """Return (B, B) covariance of the border.
+
+        Raises:
+            NumericalError: the border is not determined.
+        """
+        if not len(self.right):
+            return self.information
+        root = solve_triangular(self._border()[0], np.eye(len(self.right)), trans="T")
+        return np.asarray(root.T @ root)
+
+    def spread(self, n_pairs: int = 0) -> Slices[Spread]:
+        """Return covariances of all variables, with the border, and of what each factor ties, in slices; see `Spread`.
+
+        Raises:
+            NumericalError: the border is not determined.
+        """
+        tree, factors, border = self.system.tree, self.system.factors, self.border_covariance()
+        room = spread_room(tree, factors, border, n_pairs)
+        for low, high, share in self.system.cuts(tree.own * tree.size**2 + tree.size**2):
+            spread(tree, factors, self.values, self.rows, border, room, low, high)
+            yield share
+        return room
+
+    def joint(self, variables: IntArray) -> FloatArray:
+        """Return the joint covariance of different variables, in their order; the cost is that of their ways up."""
+        wanted = np.ascontiguousarray(variables, dtype=np.int64)
+        ways, rest, _ = ways_to_border(self.system.tree, self.rows, self.system.node_of, wanted)
+        joint = ways.T @ ways
+        if len(rest):
+            rest = solve_triangular(self._border()[0], rest, trans="T")
+            joint += rest.T @ rest
+        return np.asarray(joint)
+
+    def columns(self, variables: IntArray) -> FloatArray:
+        """Return (numbers, n) covariance of everything with some variables; the cost is that of n solutions."""
+        tree = self.system.tree
+        wanted = np.ascontiguousarray(variables, dtype=np.int64)
+        ways, rest, reached = ways_to_border(tree, self.rows, self.system.node_of, wanted)
+        border = cho_solve(self._border(), rest) if len(rest) else rest
+        return columns_of_inverse(tree, self.rows, ways, reached, border)
+
+    def _border(self) -> tuple[FloatArray, bool]:
+        try:
+            root, lower = cho_factor(self.information)
+        except (LinAlgError, ValueError):
+            raise NumericalError(
+                "the measurements do not determine a solution", hint="check units and stamps"
+            ) from None
+        return root, bool(lower)
+
+
+MEMORY_LIMIT_GB = 8.0
+
+
+class System:
+    """Structure of a least-squares problem: what is eliminated where.
+
+    Args:
+        dim: (V,) numbers of each variable.
+        factors: what ties them.
+        coordinate: (leaves, axes), see `tree_of`.
+        border: (B,) variables that are kept to the last, for example what all factors share.
+
+    Raises:
+        DataError: a factor that does not fit into memory.
+    """
+
+    def __init__(self, dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray) -> None:
+        self.factors = factors
+        self.tree: Tree = tree_of(dim, factors, coordinate, border)
+        size_gb = 8e-9 * (self.tree.stored[-1] + self.tree.most_waiting)
+        if size_gb > MEMORY_LIMIT_GB:
+            problem = f"{len(dim)} poses and landmarks tied by {len(factors.rows)} measurements need {size_gb:.0f} GB"
+            raise DataError(problem, hint="split the recording into sessions")
+        node = np.repeat(np.arange(len(self.tree.parent)), self.tree.n_own)
+        self.node_of = np.full(len(dim), -1)
+        own = self.tree.up < 0
+        self.node_of[self.tree.variable[own]] = node
+
+    def cuts(self, work: ArrayLike) -> list[tuple[int, int, float]]:
+        """Return ranges of fronts with about a slice of work (T,) each, and the share of a slice that each takes."""
+        total = np.append(0.0, np.cumsum(np.asarray(work, dtype=np.float64))) / SLICE
+        _, first = np.unique(np.floor(total[:-1]), return_index=True)
+        bounds = [*first.tolist(), len(total) - 1]
+        return [(low, high, float(total[high] - total[low])) for low, high in pairwise(bounds)]
+
+    def factorised(
+        self,
+        values: FloatArray,
+        *,
+        extra: FloatArray | None = None,
+        border_information: FloatArray | None = None,
+        border_right: FloatArray | None = None,
+    ) -> Slices[Factorised]:
+        """Eliminate everything but the border, in slices.
+
+        Args:
+            values: Jacobian and right side of each factor, whitened, in rows: the cost is `|A x - b|^2 / 2`.
+            extra: (numbers,) information that is added on the diagonal.
+            border_information: (B, B) information on the border from elsewhere.
+            border_right: (B,) its right side.
+        """
+        tree = self.tree
+        extra = np.zeros(tree.begin[-1]) if extra is None else extra
+        state = Elimination.of(tree)
+        for low, high, share in reversed(self.cuts(tree.own * tree.size**2 + 2 * tree.size**2)):
+            eliminate(tree, self.factors, values, extra, state, high, low)
+            yield share
+        border = state.border(tree)
+        information = np.triu(border[:, :-1])
+        information += np.triu(information, 1).T
+        right = border[:, -1].copy()
+        first, dim = tree.begin[tree.border], tree.dim[tree.border]
+        at = np.repeat(first - tree.in_border[tree.border], dim) + np.arange(len(right))
+        information[np.diag_indices(len(right))] += extra[at]
+        if border_information is not None:
+            information = information + border_information
+        if border_right is not None:
+            right = right + border_right
+        return Factorised(self, values, state.stored, state.right, information, right)
