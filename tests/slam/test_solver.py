@@ -12,6 +12,7 @@ from problems import QUIET, World, make_world
 from test_smoother import elsewhere, tied
 
 from evermap.geometry import se2
+from evermap.slam import local_filter
 from evermap.slam.local_filter import LocalFilter
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
@@ -158,3 +159,36 @@ def test_a_wrong_identity_moves_next_to_nothing(solver_of):
         moved[robust] = np.linalg.norm(se2.between(*ends))
     assert moved[True] < 0.05
     assert moved[False] > 5 * moved[True]
+
+
+def test_far_places_wait_and_come_back_where_their_neighbours_are(monkeypatch):
+    """With room for few places the filter says nearly what it says with room for all."""
+    world = make_world(9, noise=PRECISE, n_poses=120, n_landmarks=14, p_seen=0.15)
+    problem, n = world.problem, len(world.problem.stamp_s) - 1  # the last frame sees all
+    first = 60
+    before = optimum_of(world, first)
+    found = {}
+    for room in (96, 6):
+        monkeypatch.setattr(local_filter, "MOST_ACTIVE", room)
+        monkeypatch.setattr(local_filter, "LEAVING", 2)
+        solver = LocalFilter(problem, world.noise, robust=False)
+        solver.restart(before, world.noise, problem)
+        landmark = before.landmark.copy()
+        most = 0
+        for row in range(first, n):
+            motion = Motion.between(problem, world.noise, row, solver.states())
+            predicted = se2.compose(solver.last_pose(), motion.increment)
+            for m in np.flatnonzero(problem.pose_row == row):
+                j = problem.landmark_row[m]
+                if np.isnan(landmark[j, 0]):
+                    landmark[j] = sighted_at(predicted, problem.reading[m], solver.states(), problem.mount)
+            solver.add(row, motion, landmark)
+            most = max(most, (len(solver._covariance) - 12) // 2)
+        found[room] = solver, most
+    all_, few = found[96][0], found[6][0]
+    assert found[6][1] <= 6
+    assert found[96][1] > 10
+    sigma = np.sqrt(np.diag(all_.last_covariance()))
+    assert np.abs(se2.log(se2.between(all_.last_pose(), few.last_pose())) / sigma).max() < 1.0
+    assert np.sqrt(np.diag(few.last_covariance())) / sigma == pytest.approx(1.0, abs=0.3)
+    assert np.abs(all_.estimate().landmark - few.estimate().landmark).max() < 0.02

@@ -17,7 +17,7 @@ ODOMETRY, DETECTION = 33, 22
 right side."""
 
 
-class Sightings(NamedTuple):
+class Readings(NamedTuple):
     """Detections as the kernel reads them: (M,) rows of pose and place, (M, 2) readings and sigmas; (3,) mount.
 
     `free` (9,) are the calibration states that are estimated; `log_odds` and `heavy` as for `kernels.inlier_weight`.
@@ -51,7 +51,7 @@ def linearise(
     states: FloatArray,
     driven: Intervals,
     variance: FloatArray,
-    seen: Sightings,
+    seen: Readings,
     values: FloatArray,
     weight: FloatArray,
     begin: int,

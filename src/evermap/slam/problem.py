@@ -278,7 +278,7 @@ class Marginals:
         self._solved, self._n, self._m, self.known = solved, n_poses, n_detections, known
 
     def in_slices(self) -> Slices[None]:
-        """Work out all that the factorised equations hold, in slices."""
+        """Compute all that the factorised equations hold, in slices."""
         self._held = yield from self._solved.spread(self._n - 1)
 
     def step(self) -> FloatArray:

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.errors import NumericalError
 from evermap.geometry import se2
-from evermap.slam.linearise import DETECTION, ODOMETRY, Sightings, linearise
+from evermap.slam.linearise import DETECTION, ODOMETRY, Readings, linearise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.sparse.elimination import curvature
 from evermap.slam.sparse.system import Factorised, Slices, System, exhausted
@@ -203,7 +203,7 @@ class Smoother:
         values, weights = np.zeros(structure.system.tree.value_first[-1]), np.zeros(len(problem.pose_row))
         driven = yield from problem.drive.in_slices(problem.stamp_s, estimate.states)
         place, variance, cost = estimate.landmark[structure.known], noise.odometry**2, 0.0
-        seen = Sightings(
+        seen = Readings(
             problem.pose_row,
             structure.rank[problem.landmark_row],
             problem.reading,
