@@ -160,13 +160,10 @@ class LocalFilter:
         landmark[: len(self._position)] = self._position
         return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self._states.copy())
 
-    def joint_covariance(self, places: IntArray) -> FloatArray:
-        """Return (12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
+    def around(self, places: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the covariance with these places in it, all its places, and which of them these are."""
         self._activate(places, self._position)
-        columns = AT_PLACES + (2 * self._slot[places][:, None] + [0, 1]).ravel()
-        rows = np.concatenate([np.arange(AT_PLACES), columns])
-        joint: FloatArray = self._covariance[np.ix_(rows, rows)]
-        return joint
+        return self._covariance, self._position[self._active], self._slot[places]
 
     def _activate(self, rows: IntArray, landmark: FloatArray) -> None:
         """Have places in the covariance; those without a position yet are at their prior, or where `landmark` says."""

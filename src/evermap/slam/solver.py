@@ -120,8 +120,13 @@ class IncrementalSolver(Protocol):
         """Return values of everything so far; old poses may be from when they were added."""
         ...
 
-    def joint_covariance(self, places: IntArray) -> FloatArray:
-        """Return (12 + 2 k, 12 + 2 k) of the newest pose, the calibration states, and k known places, in order."""
+    def around(self, places: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return a covariance in which known places (k,) stand, their positions, and where.
+
+        Returns:
+            (12 + 2 P, 12 + 2 P) of the newest pose, the calibration states, and P places, not to be changed; (P, 2)
+            these places; (k,) which of them each is.
+        """
         ...
 
 
@@ -142,14 +147,14 @@ def compare(
         `log |S|`.
     """
     problem = solver.problem
-    different, column = np.unique(places, return_inverse=True)
     nis, log_det = np.empty(len(detections)), np.empty(len(detections))
+    joint, place, column = solver.around(places)
     _innovations(
-        solver.joint_covariance(different),
+        joint,
         solver.last_pose(),
         motion.increment,
         solver.states(),
-        np.array([solver.landmark(int(place)) for place in different]).reshape(-1, 2),
+        place,
         column,
         motion.by_states,
         motion.covariance,

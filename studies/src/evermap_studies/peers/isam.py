@@ -131,11 +131,13 @@ class IncrementalSmoother:
             landmark[j] = values.atPoint2(_landmark_key(j))
         return Estimate(pose, landmark, np.asarray(values.atVector(STATES_KEY)))
 
-    def joint_covariance(self, places: IntArray) -> FloatArray:
-        """(12 + 2 k, 12 + 2 k) of the newest pose, the calibration states and k known places."""
-        keys = [_pose_key(self._n_poses - 1), STATES_KEY, *(_landmark_key(int(j)) for j in places)]
+    def around(self, places: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Return the joint covariance of newest pose, calibration states and places; these places; where each is."""
+        different, column = np.unique(places, return_inverse=True)
+        keys = [_pose_key(self._n_poses - 1), STATES_KEY, *(_landmark_key(int(j)) for j in different)]
         joint = self._isam.jointMarginalCovariance(gtsam.KeyVector(keys))
-        return np.block([[joint.at(a, b) for b in keys] for a in keys])
+        place = np.array([self.landmark(int(j)) for j in different]).reshape(-1, 2)
+        return np.block([[joint.at(a, b) for b in keys] for a in keys]), place, column
 
     def _insert_priors(self, graph: Any) -> None:
         problem = self.problem
