@@ -37,9 +37,9 @@ UNKNOWN_VARIANCE = 1e4
 ITERATIONS = 10
 SMALL_STEP = 1e-4
 """Iterations of an update at most, and the step (m, rad or 1) that ends them."""
-MOST_ACTIVE = 96
+MOST_ACTIVE = 64
 """Places in the covariance: those of several views around the robot."""
-LEAVING = 24
+LEAVING = 16
 """Places that leave at once when there are more."""
 NEIGHBOURS = 8
 """Places, the nearest, to which a place is tied while it is not in the covariance."""

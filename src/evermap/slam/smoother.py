@@ -115,13 +115,13 @@ class Smoother:
     ) -> Slices[Estimate]:
         """Return what `optimum` does, in slices."""
         estimate = start
-        now = yield from self._linearised(estimate)
+        now = yield from self.linearised_in_slices(estimate)
         damping = 0.0
         for _ in range(iterations):
             solved = yield from self._eliminated(estimate, now, damping)
             step = yield from solved.solution()
             trial = self._moved(estimate, step)
-            following = yield from self._linearised(trial)
+            following = yield from self.linearised_in_slices(trial)
             if np.isfinite(following.cost) and following.cost <= now.cost + COST_SLACK:
                 gain = now.cost - following.cost
                 estimate, now = trial, following
@@ -155,7 +155,7 @@ class Smoother:
 
     def marginals_in_slices(self, estimate: Estimate) -> Slices[Marginals]:
         """Return what `marginals` does, in slices."""
-        now = yield from self._linearised(estimate)
+        now = yield from self.linearised_in_slices(estimate)
         solved = yield from self._eliminated(estimate, now, 0.0)
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
 
@@ -194,9 +194,10 @@ class Smoother:
 
     def linearised(self, estimate: Estimate) -> Linearised:
         """Return the problem linearised at `estimate`; landmarks without position are left out."""
-        return exhausted(self._linearised(estimate))
+        return exhausted(self.linearised_in_slices(estimate))
 
-    def _linearised(self, estimate: Estimate) -> Slices[Linearised]:
+    def linearised_in_slices(self, estimate: Estimate) -> Slices[Linearised]:
+        """Return what `linearised` does, in slices."""
         if self._last is not None and self._last[0] is estimate:
             return self._last[1]
         problem, noise, structure = self.problem, self.noise, self._structure_of(estimate)

@@ -311,7 +311,8 @@ class StreamingSlam:
         problem, estimate = self._problem.until(n), self._solver.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
-            voted = outvoted(problem, estimate, smoother.inlier_probability(estimate))
+            now = yield from smoother.linearised_in_slices(estimate)
+            voted = outvoted(problem, estimate, now.weights)
             # what was compared with a place that was never the landmark's own says nothing about consistency
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan

@@ -97,7 +97,7 @@ def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: Int
     """
     dim = np.ascontiguousarray(dim, dtype=np.int64)
     border = np.ascontiguousarray(border, dtype=np.int64)
-    leaf_first, leaf_variable = _leaves(factors, len(coordinate), len(dim))
+    leaf_first, leaf_variable = _leaves(factors.first, factors.variable, factors.leaf, len(coordinate), len(dim))
     owner = np.full(len(dim), FREE)
     owner[border] = ABOVE
     parent, node_of_leaf, leaf_of_node = _dissected(
@@ -141,12 +141,31 @@ FREE, ABOVE = -2, -1
 """Owners of variables that no front eliminates yet, or none ever will."""
 
 
-def _leaves(factors: Factors, n_leaves: int, n_variables: int) -> tuple[IntArray, IntArray]:
+@kernel
+def _leaves(
+    variable_first: Any, variable: Any, leaf: Any, n_leaves: int, n_variables: int
+) -> tuple[IntArray, IntArray]:
     """The different variables of each leaf: where they begin (leaves + 1,), and which."""
-    leaf = np.repeat(factors.leaf, np.diff(factors.first))
-    both = np.unique(leaf * n_variables + factors.variable)
-    first = np.searchsorted(both, np.arange(n_leaves + 1) * n_variables)
-    return first.astype(np.int64), both % n_variables
+    begin = np.zeros(n_leaves + 1, np.int64)
+    for f in range(len(leaf)):
+        begin[leaf[f] + 1] += 1
+    for k in range(n_leaves):
+        begin[k + 1] += begin[k]
+    factor, filled = np.empty(len(leaf), np.int64), begin[:-1].copy()
+    for f in range(len(leaf)):
+        factor[filled[leaf[f]]] = f
+        filled[leaf[f]] += 1
+    first, out, count = np.zeros(n_leaves + 1, np.int64), np.empty(len(variable), np.int64), 0
+    stamp = np.full(n_variables, -1)
+    for k in range(n_leaves):
+        for j in range(begin[k], begin[k + 1]):
+            for i in range(variable_first[factor[j]], variable_first[factor[j] + 1]):
+                if stamp[variable[i]] != k:
+                    stamp[variable[i]] = k
+                    out[count] = variable[i]
+                    count += 1
+        first[k + 1] = count
+    return first, out[:count].copy()
 
 
 @kernel
