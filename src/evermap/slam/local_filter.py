@@ -171,10 +171,14 @@ class LocalFilter:
         if new > 0:
             self._position = np.pad(self._position, ((0, new), (0, 0)), constant_values=np.nan)
             self._slot = np.pad(self._slot, (0, new), constant_values=-1)
-        now = len(self._old_pose) + len(self._new_pose)
-        waiting = [j for j in dict.fromkeys(rows.tolist()) if self._slot[j] < 0]
-        self._used_at[self._slot[rows[self._slot[rows] >= 0]]] = now
-        if waiting and len(self._active) + len(waiting) > MOST_ACTIVE:
+        now, slots = len(self._old_pose) + len(self._new_pose), self._slot[rows]
+        here = slots >= 0
+        if here.all():
+            self._used_at[slots] = now
+            return
+        self._used_at[slots[here]] = now
+        waiting = list(dict.fromkeys(rows[~here].tolist()))
+        if len(self._active) + len(waiting) > MOST_ACTIVE:
             self._leave(len(self._active) + len(waiting) - MOST_ACTIVE + LEAVING, now)
         for j in waiting:
             self._enter(j, landmark, now)

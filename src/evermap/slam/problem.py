@@ -162,6 +162,9 @@ class Problem:
 
     def conditional_prior(self, row: int, known: BoolArray) -> ConditionalPrior:
         """Return what the prior says about landmark `row`, given the `known` ones (of which it is none)."""
+        first = self.landmark_information.indptr
+        if first[2 * row] == first[2 * row + 2]:
+            return ConditionalPrior(self.landmark_mean[row], np.zeros((2, 2)), np.zeros(0, np.int64), np.zeros((2, 0)))
         column = slice(2 * row, 2 * row + 2)
         mine = self.landmark_information[column]
         own = mine[:, column].toarray()

@@ -246,8 +246,9 @@ class StreamingSlam:
                 squared[known], log_volume[known] = compare(self._solver, self._noise, motion, of[known], places[known])
             return squared, log_volume
 
+        before = self._problem.landmark_row[detections]
         places = self._method.assign(self._problem, row, detections, distances)
-        if np.array_equal(places, self._problem.landmark_row[detections]):
+        if (places == before).all():
             return
         landmark_row = self._problem.landmark_row.copy()
         landmark_row[detections] = places

@@ -77,9 +77,10 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     """
     if len(position_m) == 0:  # all that was seen was taken for mistakes
         return covariance_m2
-    motion = se2.rigid_directions(position_m - position_m.mean(axis=0))
-    onto = np.eye(len(motion)) - motion @ np.linalg.pinv(motion)
-    return np.asarray(onto @ covariance_m2 @ onto.T)
+    motion, _ = np.linalg.qr(se2.rigid_directions(position_m - position_m.mean(axis=0)))
+    along = covariance_m2 @ motion
+    taken = along @ motion.T
+    return np.asarray(covariance_m2 - taken - taken.T + motion @ (motion.T @ along) @ motion.T)
 
 
 def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
