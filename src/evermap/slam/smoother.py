@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
-from scipy.linalg import cholesky, solve_triangular
 from scipy.sparse.csgraph import connected_components
 
 from evermap.errors import NumericalError
@@ -180,17 +179,6 @@ class Smoother:
         information[-9:, -9:] += np.diag(1.0 / self.problem.prior.sigma**2)
         right[-9:] += now.states_right
         return information, right
-
-    def summary(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
-        """Return information on the last pose, the known landmarks and the states, linearised at `estimate`.
-
-        Returns:
-            `R` upper triangular (n, n) and `d` (n,), n = 3 + 2 known landmarks + 9: the cost of a step `x` is
-            `|R x - d|^2 / 2` up to a constant.
-        """
-        information, right = self.information(estimate, np.array([len(estimate.pose) - 1]))
-        root: FloatArray = cholesky(information, lower=False)
-        return root, solve_triangular(root, right, trans="T")
 
     def linearised(self, estimate: Estimate) -> Linearised:
         """Return the problem linearised at `estimate`; landmarks without position are left out."""

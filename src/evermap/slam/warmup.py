@@ -56,7 +56,7 @@ def _drive() -> None:
     for _ in range(count):
         slam.step()
     outcome = slam.finish()
-    Smoother(problem, START).summary(outcome.graph_estimate)
+    Smoother(problem, START).information(outcome.graph_estimate, np.array([0, count - 1]))
     marginals = outcome.graph_marginals
     bridged(
         stamps[:2],

@@ -12,13 +12,14 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
-from evermap.slam.frame_factor import whitened_detections, whitened_odometry
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
 from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
+from evermap_studies.peers.whitened import whitened_detections, whitened_odometry
 
 STATES_KEY = gtsam.symbol("c", 0)
 KEPT = 100
@@ -160,7 +161,10 @@ class IncrementalSmoother:
         for j in landmarks:
             values.insert(_landmark_key(int(j)), estimate.landmark[j])
             self._known.add(int(j))
-        graph.add(_summary_factor(row, landmarks, linearised, *smoother.summary(linearised)))
+        information, right = smoother.information(linearised, np.array([row]))
+        root = cholesky(information, lower=False)
+        summary = root, solve_triangular(root, right, trans="T")
+        graph.add(_summary_factor(row, landmarks, linearised, *summary))
 
     def _insert_frame(self, graph: Any, values: Any, row: int, pose: FloatArray, landmark: FloatArray) -> None:
         problem = self.problem
