@@ -333,3 +333,58 @@ def collect(
             learned[last - 4] += pending[c, last - 2]
             learned[last - 3] += pending[c, last - 1]
             pending[c, :] = 0.0
+
+
+@kernel
+def witnessed(
+    order: Any,
+    frame: Any,
+    clique: Any,
+    hit: Any,
+    place: FloatArray,
+    range_m: FloatArray,
+    bearing: FloatArray,
+    limits: tuple[float, float, float],
+    beside: Any,
+    along: Any,
+) -> None:
+    """Find looks in whose frame another clique was seen beside or behind the place, or along the very line.
+
+    Args:
+        order: (N,) looks by frame.
+        frame: (N,) of each.
+        clique: (N,) that is looked at.
+        hit: (N,) whether it was detected.
+        place: (N, 2) where it is looked for [m].
+        range_m: (N,) how far that is from the sensor.
+        bearing: (N,) in which direction, in the map's frame.
+        limits: distance [m] and angle [rad] that are beside, and distance [m] from the line that is along it.
+        beside: (N,) out.
+        along: (N,) out, behind the place and close to the line.
+    """
+    beside_m, beside_rad, along_m = limits
+    begin, hits = 0, np.empty(len(order), np.int64)
+    while begin < len(order):
+        end, n_hits = begin, 0
+        while end < len(order) and frame[order[end]] == frame[order[begin]]:
+            if hit[order[end]]:
+                hits[n_hits] = order[end]
+                n_hits += 1
+            end += 1
+        for k in range(begin, end):
+            one = order[k]
+            for h in range(n_hits):
+                other = hits[h]
+                if clique[one] == clique[other]:
+                    continue
+                dx, dy = place[one, 0] - place[other, 0], place[one, 1] - place[other, 1]
+                angle = abs(bearing[one] - bearing[other])
+                angle = min(angle, 2.0 * math.pi - angle)
+                beyond = range_m[other]
+                if dx * dx + dy * dy < beside_m * beside_m or (
+                    angle < beside_rad and beyond > range_m[one] - 0.5 * beside_m
+                ):
+                    beside[one] = True
+                if angle * range_m[one] < along_m and angle < 0.25 * math.pi and beyond > range_m[one] + along_m:
+                    along[one] = True
+        begin = end

@@ -94,8 +94,10 @@ def looked_at(
     clique = clique_rows(living.sites)[1][site]
     eye = sensor_poses(sighting, sensor)
     cell = living.sightlines.cells(eye[frame, :2], places.position_m[place])
-    line, key = np.unique(np.column_stack([place, cell]), axis=0, return_inverse=True)
-    key = key.ravel().astype(np.int64)
+    lowest = int(cell.min(initial=0))
+    span = int(cell.max(initial=0)) - lowest + 1
+    both, key = np.unique(place * span + (cell - lowest), return_inverse=True)
+    line = np.column_stack([both // span, both % span + lowest])
     p_nominal = np.bincount(key, np.maximum(nominal, 1e-3), minlength=len(line)) / np.maximum(
         np.bincount(key, minlength=len(line)), 1
     )
@@ -132,22 +134,14 @@ def _beside(
     rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray, settings: LooksConfig
 ) -> tuple[BoolArray, BoolArray]:
     """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
+    from evermap.sensing.kernels import witnessed
+
     beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
-    hit = np.flatnonzero(rows.hit)
-    order = hit[np.argsort(frame[hit], kind="stable")]
-    mine = np.arange(len(rows))
-    low, high = (np.searchsorted(frame[order], frame[mine], side=side) for side in ("left", "right"))
-    one = np.repeat(mine, high - low)
-    other = order[np.repeat(low - np.append(0, np.cumsum(high - low)[:-1]), high - low) + np.arange(len(one))]
-    away, there = place_m[one] - eye[one, :2], place_m[other] - eye[other, :2]
-    range_m, beyond_m = np.hypot(*away.T), np.hypot(*there.T)
-    angle = np.abs(se2.wrap(np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(there[:, 1], there[:, 0])))
-    near = np.hypot(*(place_m[one] - place_m[other]).T) < settings.beside_m
-    behind = (angle < settings.beside_rad) & (beyond_m > range_m - 0.5 * settings.beside_m)
-    others = rows.clique[one] != rows.clique[other]
-    beside[one[(near | behind) & others]] = True
-    close = (angle * range_m < settings.along_m) & (angle < np.pi / 4.0) & (beyond_m > range_m + settings.along_m)
-    along[one[close & others]] = True
+    away = place_m - eye[:, :2]
+    witnessed(
+        np.argsort(frame, kind="stable"), frame, rows.clique, rows.hit, place_m, np.hypot(*away.T),
+        np.arctan2(away[:, 1], away[:, 0]), (settings.beside_m, settings.beside_rad, settings.along_m), beside, along,
+    )  # fmt: skip
     return beside, along
 
 
