@@ -100,7 +100,7 @@ def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tup
     eye = se2.compose(pose, np.asarray(sensor.mount_robot_sensor))[:, :2]
     reach = sensor.range_max_m + 3.0 * RANGE_MARGIN_M
     by_pose = np.argsort(seen[0], kind="stable")
-    first_seen = np.searchsorted(seen[0][by_pose], np.arange(0, len(pose) + AT_ONCE, AT_ONCE))
+    first_seen = np.searchsorted(seen[0][by_pose], np.arange(0, max(len(pose), 1) + AT_ONCE, AT_ONCE))
     parts = []
     for k, start in enumerate(range(0, max(len(pose), 1), AT_ONCE)):
         some = pose[start : start + AT_ONCE]
