@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 CONTENDERS = {
     "evermap": "evermap",
+    "mapped": "evermap, into a new map",
     "plain": "evermap, plain",
     "lm": "gtsam LM, from 0.5 m off",
     "lm_odometry": "gtsam LM, from odometry",
