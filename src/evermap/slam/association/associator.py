@@ -243,6 +243,7 @@ class Associator:
         problem = assignment.measured
         sigma = problem.sigma_given
         row = np.full_like(assignment.landmark_row, NOBODY)
+        marginals.pose_shared  # noqa: B018 (of all poses at once)
         for i in range(self._done):
             detections = np.arange(self._first[i], self._first[i + 1])
             belief = PoseBelief.at(assignment.estimate, marginals, i)

@@ -50,7 +50,7 @@ class PoseBelief:
         order = np.append(n + np.arange(9), np.arange(n))
         covariance = np.zeros((12 + n, 12 + n))
         covariance[:3, :3] = marginals.pose[row]
-        covariance[:3, 3:] = marginals.pose_shared[row][:, order]
+        covariance[:3, 3:] = marginals.of_pose(row)[:, order]
         covariance[3:, :3] = covariance[:3, 3:].T
         covariance[3:, 3:] = marginals.shared[np.ix_(order, order)]
         return cls(estimate.pose[row], estimate.states, estimate.landmark, covariance)
