@@ -34,6 +34,8 @@ from evermap.types import FloatArray, IntArray
 
 UNKNOWN_VARIANCE = 1e4
 """Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
+LEAST_VARIANCE = 1e-12
+"""Of neighbours, m^2: two that are known exactly, or as one, say no more than one of them."""
 ITERATIONS = 10
 SMALL_STEP = 1e-4
 """Iterations of an update at most, and the step (m, rad or 1) that ends them."""
@@ -212,13 +214,14 @@ class LocalFilter:
             there = np.flatnonzero(self._slot[ties.rows] >= 0)
             at = 2 + (2 * there[:, None] + [0, 1]).ravel()
             given = ties.rows[there]
-            gain = np.asarray(np.linalg.solve(ties.joint[np.ix_(at, at)], ties.joint[at, :2]).T, dtype=np.float64)
+            known = ties.joint[np.ix_(at, at)] + LEAST_VARIANCE * np.eye(len(at))
+            gain = np.asarray(np.linalg.solve(known, ties.joint[at, :2]).T, dtype=np.float64)
             spread: FloatArray = ties.joint[:2, :2] - gain @ ties.joint[at, :2]
             place: FloatArray = ties.place + gain @ (self._position[given] - ties.neighbours[there]).ravel()
         else:
-            known = np.zeros(len(problem.landmark_mean), dtype=bool)
-            known[self._active] = True
-            prior = problem.conditional_prior(row, known)
+            active = np.zeros(len(problem.landmark_mean), dtype=bool)
+            active[self._active] = True
+            prior = problem.conditional_prior(row, active)
             given, gain = prior.given, prior.gain
             if prior.information.any():
                 spread = np.asarray(np.linalg.inv(prior.information))
