@@ -77,7 +77,8 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     """
     if len(position_m) == 0:  # all that was seen was taken for mistakes
         return covariance_m2
-    motion, _ = np.linalg.qr(se2.rigid_directions(position_m - position_m.mean(axis=0)))
+    direction, size, _ = np.linalg.svd(se2.rigid_directions(position_m - position_m.mean(axis=0)), full_matrices=False)
+    motion = direction[:, size > 1e-12 * size[0]]  # places that are one have no heading
     along = covariance_m2 @ motion
     taken = along @ motion.T
     return np.asarray(covariance_m2 - taken - taken.T + motion @ (motion.T @ along) @ motion.T)
