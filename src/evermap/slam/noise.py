@@ -106,7 +106,7 @@ def refine_noise(
 class Extrapolation:
     """Noise levels ahead of a sequence of `refine_noise` steps: Anderson's mixing (1965) of their logarithms.
 
-    Kinds of noise that act on the same residuals take dozens of steps to be told apart, each a few per cent in the same
+    Kinds of noise that act on the same residuals take dozens of steps to separate, each a few per cent in the same
     direction. The steps so far tell where that leads.
     """
 
