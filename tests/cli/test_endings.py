@@ -14,7 +14,7 @@ from evermap.errors import InputError
 
 VERBS = ["demo", "simulate", "check", "slam", "persist", "track", "convert", "bench"]
 GROUPS = {
-    "map": ["log", "show", "diff", "export", "why", "verify", "revert", "pin", "unpin", "delete", "undelete"],
+    "map": ["log", "show", "diff", "export", "why", "verify", "gc", "revert", "pin", "unpin", "delete", "undelete"],
     "survival": ["plot", "fit", "learn"],
 }
 

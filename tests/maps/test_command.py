@@ -229,6 +229,49 @@ def test_why_with_figure_and_json(site: Path, tmp_path: Path) -> None:
     assert content["looks"]["stamp_s"][-len(seen) :] == seen.stamp_s.tolist()
 
 
+def test_gc_prunes_old_revisions(site: Path, tmp_path: Path) -> None:
+    landmark = int(MAPS[2].members.landmark_id[0])
+    assert run("pin", site, landmark, "--note", "surveyed").exit_code == 0
+    assert run("unpin", site, landmark).exit_code == 0
+    asked = [("log", site), ("why", site, landmark), ("show", site), ("diff", site, 4, 5)]
+    before, size, data = [run(*one).stdout for one in asked], site.stat().st_size, site.read_bytes()
+    assert "an operator pinned it in revision 4" in before[1]
+
+    plan = run("gc", site, "--keep", 2, "--dry-run")
+    assert plan.exit_code == 0
+    assert plan.stderr.startswith("evermap: would be pruned: the content of 1 to 3 (")
+    assert site.read_bytes() == data
+    planned, done = said("gc", site, "--keep", 2, "--dry-run"), said("gc", site, "--keep", 2)
+    assert planned == {**done, "dry_run": True}
+    assert (done["pruned"], done["kept"]) == ([1, 2, 3], [4, 5])
+    assert site.stat().st_size <= size - done["bytes"]
+    assert run("gc", site).stderr == "evermap: nothing to prune: 2 revisions have content\n"
+
+    assert [run(*one).stdout for one in asked] == before
+    checked = run("verify", site)
+    assert checked.exit_code == 0
+    assert "all 5 revisions are intact" in checked.stderr
+    assert "; the content of 1 to 3 is pruned" in checked.stderr
+    assert said("verify", site)["pruned"] == [1, 2, 3]
+    out = tmp_path / "map.csv"
+    for use in (
+        ("show", site, "--revision", 2),
+        ("diff", site, 2),
+        ("diff", site, 5, 2),
+        ("export", site, "--out", out, "--revision", 2),
+        ("why", site, landmark, "--revision", 2),
+        ("revert", site, 2),
+    ):
+        result = run(*use)
+        assert result.exit_code == 2
+        assert result.stdout == ""
+        (line,) = result.stderr.splitlines()
+        assert "the content of revision 2 is pruned since 20" in line
+        assert " UTC; kept: 4, 5 (try: " in line
+    assert not out.exists()
+    assert run("gc", site, "--keep", 0).exit_code == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

@@ -153,14 +153,14 @@ def test_what_stands_and_was_not_known_is_grown_unless_told_of() -> None:
 def test_a_map_differs_by_nothing_from_itself(seed: int) -> None:
     living = random_map(seed)
     assert net([], living, living) == ()
-    assert edits(living, living) == ()
+    assert edits(living.members, living.members) == ()
     assert not len(grown(living.members.landmark_id, living, ()))
 
 
 def test_edits_are_what_operators_said() -> None:
     living = a_map({5: HERE})
-    assert edits(living, living.edited(5, pinned=True, deleted=True)) == ((5, "deleted"), (5, "pinned"))
-    assert edits(living.edited(5, deleted=True), living) == ((5, "undeleted"),)
+    assert edits(living.members, living.edited(5, pinned=True, deleted=True).members) == ((5, "deleted"), (5, "pinned"))
+    assert edits(living.edited(5, deleted=True).members, living.members) == ((5, "undeleted"),)
 
 
 # --- sessions of a building, of which each sees a part ---

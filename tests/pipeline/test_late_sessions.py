@@ -138,6 +138,43 @@ def test_a_revision_without_its_recording_is_named(tmp_path: Path) -> None:
             em.enter_session(store, SESSIONS[0])
 
 
+def test_a_pruned_map_goes_on_as_if_it_were_whole(tmp_path: Path, in_order: LivingMap) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        for k in (0, 1, 2):
+            fed(store, SESSIONS[k])
+        assert store.prune(1).revisions == (1, 2)
+        with pytest.raises(InputError, match="is in the map already, as revision 1"):
+            em.enter_session(store, SESSIONS[0])
+        fed(store, SESSIONS[3])
+        living = store.load()
+    assert repr(living) == repr(in_order)
+    assert_same(living, in_order)
+
+
+def test_a_late_session_starts_from_a_revision_that_is_kept(tmp_path: Path, in_order: LivingMap) -> None:
+    path = tmp_path / "site.evermap"
+    built(path, (0, 1, 3))
+    with open_store(path) as store:
+        assert store.prune(2).kept == (2, 3)
+        fed(store, SESSIONS[2])
+        assert_same(store.load(), in_order)
+
+
+def test_a_late_session_before_what_is_kept_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "site.evermap"
+    built(path, (0, 1, 3))
+    with open_store(path) as store:
+        store.prune(1)
+        line = (
+            f"site.evermap: {SESSIONS[2].name}: begins before the session of revision 3, but the content of revision 2 "
+            "is pruned since "
+        )
+        with pytest.raises(InputError, match=r"kept: 3 \(try: an older copy of the file") as caught:
+            em.enter_session(store, SESSIONS[2])
+        assert line in caught.value.one_line()
+        assert store.head() == 3
+
+
 def test_the_map_as_it_was(tmp_path: Path) -> None:
     with open_store(tmp_path / "site.evermap", create=True) as store:
         for k in (0, 1, 2):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evermap.cli.map_edits import AsJson, MapFile, delete, pin, revert, undelete, unpin, verify
+from evermap.cli.map_edits import AsJson, MapFile, delete, gc, pin, revert, undelete, unpin, verify
 from evermap.cli.terminal import check_picture, echo, print_json, print_table, say, write_picture
 from evermap.errors import ConfigError
 
@@ -268,5 +268,5 @@ def _writer(out: Path) -> Any:
     )
 
 
-for command in (verify, revert, pin, unpin, delete, undelete):
+for command in (verify, gc, revert, pin, unpin, delete, undelete):
     app.command()(command)

@@ -1,4 +1,7 @@
-"""`evermap map revert | pin | unpin | delete | undelete`: an operator's word, as revisions that can be reverted."""
+"""`evermap map revert | pin | unpin | delete | undelete`: an operator's word, as revisions that can be reverted.
+
+`verify` and `gc` look after the file.
+"""
 
 from __future__ import annotations
 
@@ -56,6 +59,7 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
     from pathlib import Path
 
     from evermap.maps.store import verify_store
+    from evermap.maps.store.history import ranges
 
     found = verify_store(file)
     if as_json:
@@ -67,6 +71,7 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
                 "intact": list(found.intact),
                 "damaged": {str(number): reason for number, reason in found.damaged.items()},
                 "lost": list(found.lost),
+                "pruned": list(found.pruned),
                 "problems": list(found.problems),
                 "chunks": found.n_chunks,
                 "bytes": found.n_bytes,
@@ -76,7 +81,40 @@ def verify(file: MapFile, as_json: AsJson = False) -> None:
         raise found.error(Path(file))
     if not as_json:
         earlier = f"; lost to earlier damage: {', '.join(map(str, found.lost))}" if found.lost else ""
-        say(f"{file}: all {len(found.intact)} revisions are intact ({found.n_chunks} parts were checked){earlier}")
+        pruned = f"; the content of {ranges(found.pruned)} is pruned" if found.pruned else ""
+        count = len(found.intact) + len(found.pruned)
+        say(f"{file}: all {count} revisions are intact ({found.n_chunks} parts were checked){earlier}{pruned}")
+
+
+def gc(
+    file: MapFile,
+    keep: Annotated[int, typer.Option(min=1, metavar="N", help="Newest revisions that stay whole.")] = 10,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be deleted.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Prune old revisions: delete their content, and shrink the file.
+
+    The log, the evidence, the recordings and what operators said stay; but a pruned revision cannot be shown, compared,
+    exported or reverted to, and no session can be entered before it any more.
+
+    \b
+    Example:
+      evermap map gc site.evermap --keep 20
+    """
+    from evermap.maps.store import open_store
+    from evermap.maps.store.history import ranges
+
+    with open_store(file) as store:
+        found = store.prune(keep, dry_run=dry_run)
+    if as_json:
+        told = {"pruned": list(found.revisions), "kept": list(found.kept), "dry_run": dry_run}
+        print_json({"map": file, **told, "parts": found.n_chunks, "bytes": found.n_bytes})
+    elif found.revisions:
+        done = "would be pruned" if dry_run else "pruned"
+        what = f"{found.n_chunks} parts, {found.n_bytes / 1e3:,.0f} kB"
+        say(f"{done}: the content of {ranges(found.revisions)} ({what}); {ranges(found.kept)} kept")
+    else:
+        say(f"nothing to prune: {len(found.kept)} revisions have content")
 
 
 def pin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
@@ -144,7 +182,7 @@ def _edit(
             except KeyError:
                 problem = f"no landmark {name} in revision {parent}"
                 raise InputError(problem, path=file, hint=f"evermap map show {file} --all") from None
-        changed = [name for name, _ in edits(before, after)]
+        changed = [name for name, _ in edits(before.members, after.members)]
         number = parent
         if changed:
             listed = ", ".join(map(after.label, changed))

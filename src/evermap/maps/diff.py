@@ -19,7 +19,7 @@ import numpy as np
 
 from evermap.config import DecisionConfig
 from evermap.geometry.rigid import rigid
-from evermap.maps.living import LivingMap
+from evermap.maps.living import LivingMap, Members
 from evermap.maps.store.protocol import MapStore
 from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
@@ -101,7 +101,8 @@ def diff(store: MapStore, a: int, b: int | None = None) -> Difference:
     before, after = store.load(a), store.load(b)
     names = after.landmark_names | before.landmark_names
     changes = tuple(change.named(names) for change in net(told_between(store, a, b), before, after))
-    return Difference(a, b, changes, grown(before.members.landmark_id, after, changes), edits(before, after))
+    new = grown(before.members.landmark_id, after, changes)
+    return Difference(a, b, changes, new, edits(before.members, after.members))
 
 
 def told_between(store: MapStore, a: int, b: int) -> list[ToldBySession]:
@@ -163,12 +164,12 @@ def grown(known: IntArray, b: LivingMap, changes: Iterable[MapChange]) -> IntArr
     return np.setdiff1d(stands, np.concatenate([known, np.array(told, dtype=np.int64)]))
 
 
-def edits(a: LivingMap, b: LivingMap) -> tuple[tuple[int, str], ...]:
+def edits(a: Members, b: Members) -> tuple[tuple[int, str], ...]:
     """Return what operators said between two maps: landmark and 'pinned', 'unpinned', 'deleted' or 'undeleted'."""
-    ids, row_a, row_b = np.intersect1d(a.members.landmark_id, b.members.landmark_id, return_indices=True)
+    ids, row_a, row_b = np.intersect1d(a.landmark_id, b.landmark_id, return_indices=True)
     words = []
     for name, yes, no in (("pinned", "pinned", "unpinned"), ("deleted", "deleted", "undeleted")):
-        before, after = getattr(a.members, name)[row_a], getattr(b.members, name)[row_b]
+        before, after = getattr(a, name)[row_a], getattr(b, name)[row_b]
         words += [(int(ids[k]), yes if after[k] else no) for k in np.flatnonzero(before != after)]
     return tuple(sorted(words))
 

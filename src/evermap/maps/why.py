@@ -159,7 +159,7 @@ def _edits(store: MapStore, line: list[Revision], landmark_id: int) -> tuple[tup
         (item.number, item.created_at, word)
         for item in line
         if item.provenance.kind is RevisionKind.EDIT
-        for name, word in edits(store.load(item.parent), store.load(item.number))
+        for name, word in edits(store.members(item.parent), store.members(item.number))
         if name == landmark_id
     )
 

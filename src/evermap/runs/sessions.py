@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.errors import ConfigError, DataError, InputError, suggestion
-from evermap.maps.store import Attachment, MapStore, Provenance, Revision, RevisionKind
+from evermap.maps.store import Attachment, MapStore, Provenance, PrunedRevisionError, Revision, RevisionKind
 from evermap.types import Progress
 
 if TYPE_CHECKING:
@@ -121,7 +121,8 @@ def enter_session(
         progress: told after every frame of this session.
 
     Raises:
-        InputError: it is in the map already, or it is late and a later session kept no recording.
+        InputError: it is in the map already, or it is late and a later session kept no recording, or the revision
+            before that is pruned.
         ConfigError: a prior of a class that neither the map nor the recording has.
         DataError, NumericalError: as `pipeline.run_session`.
     """
@@ -164,7 +165,13 @@ def _enter_late(
 
     head, start_s = store.head(), float(recording.frames.stamp_s[0])
     first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
-    base = store.load(steps[first].revision.parent)
+    parent = steps[first].revision.parent
+    try:
+        base = store.load(parent)
+    except PrunedRevisionError as error:
+        problem = f"{recording.name}: begins before the session of revision {parent + 1}, but {error.problem}"
+        hint = "an older copy of the file; this map can only be continued without that session"
+        raise InputError(problem, path=store.where, hint=hint) from None
     later = sorted(steps[first:], key=lambda step: step.start_s)
     # ids that were given since are not given again
     living = replace(base, n_cliques_ever=newest.n_cliques_ever, n_sites_ever=newest.n_sites_ever)
@@ -281,7 +288,7 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
             "pinned": {"pinned": True}, "unpinned": {"pinned": False},
             "deleted": {"deleted": True}, "undeleted": {"deleted": False},
         }  # fmt: skip
-        for landmark, word in edits(store.load(step.revision.parent), store.load(number)):
+        for landmark, word in edits(store.members(step.revision.parent), store.members(number)):
             if landmark in living.members.landmark_id:
                 living = living.edited(landmark, **words[word])
         return living, ()

@@ -36,6 +36,8 @@ _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
 NAME_BYTES = 32
+MEMBERS = "members."
+"""The table that stays of a pruned revision: whose evidence it has, and what operators said."""
 _LIFE = ("lives.life", "lives.prior")
 _PRIOR = ("lives.prior_class_id", "lives.prior")
 """Not written where there is none, so that an older evermap reads the map."""
@@ -191,10 +193,13 @@ def unpack_columns(name: bytes, columns: Iterable[str], fetch: Fetch) -> dict[st
     return _arrays(wanted, fetch)
 
 
-def names_in(name: bytes, fetch: Fetch) -> set[bytes]:
-    """Return the names of all chunks of a map, its manifest's among them. Errors as `unpack`."""
-    columns = _manifest(name, fetch)["columns"].values()
-    return {name, *(name_of(part) for _, _, _, names in columns for part in names)}
+def names_in(name: bytes, fetch: Fetch, table: str = "") -> set[bytes]:
+    """Return the names of all chunks of a map, or of one of its tables, its manifest's among them. Errors as
+    `unpack`.
+    """
+    columns = _manifest(name, fetch)["columns"].items()
+    listed = (names for column, (_, _, _, names) in columns if column.startswith(table))
+    return {name, *(name_of(part) for names in listed for part in names)}
 
 
 _EQUALLY_LONG = {

@@ -45,6 +45,7 @@ _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "lost": dict,
 }
 """Values of a record, and their types in JSON; null for nan."""
+_SHOWN = 5
 _MAY_BE_NAN = ("stamp_from_s", "stamp_to_s", "wall_s")
 
 
@@ -175,6 +176,37 @@ def lineage(origin: Mapping[int, int], number: int) -> tuple[int, ...]:
             line.append(number)
         number = origin.get(number, number - 1)
     return tuple(reversed(line))
+
+
+def pruned_to_text(pruned: Mapping[int, str]) -> str | None:
+    """Return which revisions are pruned, since when, as the row of `store` has it; None for none."""
+    numbers: dict[str, list[int]] = {}
+    for number, since in sorted(pruned.items()):
+        numbers.setdefault(since, []).append(number)
+    return json.dumps(numbers) if numbers else None
+
+
+def read_pruned(text: str | None) -> dict[int, str]:
+    """Read what `pruned_to_text` wrote; `DamagedError` if it is anything else."""
+    try:
+        numbers = {} if text is None else json_object(text)
+        return {int(number): since for since, listed in numbers.items() for number in listed}
+    except (ValueError, TypeError) as error:
+        raise DamagedError(f"the list of pruned revisions is not valid: {error}") from None
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Return '1 to 4, 6 and 9 to 12'; the middle of many is left out."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    words = [str(a) if a == b else f"{a} to {b}" if b > a + 1 else f"{a}, {b}" for a, b in runs]
+    if len(words) > _SHOWN:
+        words = [*words[:2], "...", *words[-2:]]
+    return ", ".join(words[:-1]) + (" and " if len(words) > 1 else "") + "".join(words[-1:])
 
 
 def about(provenance: Provenance, **counts: Any) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.maps.living import Evidence, LivingMap
+from evermap.maps.living import Evidence, LivingMap, Members
 from evermap.types import ChangeKind, MapChange
 
 
@@ -37,6 +37,10 @@ class DamagedMapError(InputError):
     """
 
     intact: tuple[int, ...] = ()
+
+
+class PrunedRevisionError(InputError):
+    """The content of a revision was deleted by `MapStore.prune`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +115,25 @@ class Revision:
     n_grown: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Pruning:
+    """What `MapStore.prune` deleted, or would delete.
+
+    Attributes:
+        revisions: whose content that was.
+        kept: revisions that still have theirs.
+        n_chunks, n_bytes: pieces that only `revisions` held, and their size in the store.
+    """
+
+    revisions: tuple[int, ...]
+    kept: tuple[int, ...]
+    n_chunks: int
+    n_bytes: int
+
+
 class MapStore(Protocol):
-    """Revisions of one living map. A revision is written whole or not at all, and never changed afterwards.
+    """Revisions of one living map. A revision is written whole or not at all, and never changed afterwards; the
+    content of old ones goes by `prune` only.
 
     History is a line: a commit names the revision that it was made from, and fails if that is not the newest any more.
     Methods raise `InputError` where the store cannot be read or written, is damaged, or has no such revision. Where
@@ -139,7 +160,15 @@ class MapStore(Protocol):
         ...
 
     def load(self, revision: int | None = None) -> LivingMap:
-        """Return the map as it was committed, bit by bit; revision 0 is the empty map."""
+        """Return the map as it was committed, bit by bit; revision 0 is the empty map.
+
+        Raises:
+            PrunedRevisionError: its content was pruned.
+        """
+        ...
+
+    def members(self, revision: int | None = None) -> Members:
+        """Return the landmarks of a revision and what operators said of them, also of a pruned one."""
         ...
 
     def commit(
@@ -173,6 +202,21 @@ class MapStore(Protocol):
         """Return a new revision with the content of an older one; reverting to the one before takes it back.
 
         Ids that were given since are not given again.
+        """
+        ...
+
+    def prune(self, keep: int = 10, *, dry_run: bool = False) -> Pruning:
+        """Delete the content that only old revisions hold; all or nothing of it, and nothing from a damaged map.
+
+        Their lines in the log, changes, evidence, attachments, landmarks' ids and operators' words stay, as do all
+        checksums. They cannot be loaded or reverted to any more.
+
+        Args:
+            keep: newest revisions that stay whole, and as many of `lineage()`, which late sessions start from.
+            dry_run: return what would be deleted, and delete nothing.
+
+        Raises:
+            ConfigError: `keep` is less than 1.
         """
         ...
 

@@ -15,7 +15,7 @@ from sqlalchemy import Column, Connection, Integer, LargeBinary, MetaData, Table
 
 from evermap.maps.store.content import DamagedError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 
 metadata = MetaData()
 
@@ -28,6 +28,7 @@ store = Table(
     Column("head", Integer, nullable=False),
     Column("record", LargeBinary),
     Column("checksum", LargeBinary, nullable=False),
+    Column("pruned", Text),
 )
 
 revision = Table(
@@ -45,9 +46,10 @@ chunk = Table(
 )
 
 
-def checksum(schema_version: int, created_at: str, evermap_version: str, head: int, record: bytes | None) -> bytes:
+def checksum(version: int, created_at: str, writer: str, head: int, record: bytes | None, *pruned: str | None) -> bytes:
     """Return the checksum of the row of `store`: it names the newest revision and anchors all checksums."""
-    values = [schema_version, created_at, evermap_version, head, None if record is None else record.hex()]
+    values = [version, created_at, writer, head, None if record is None else record.hex()]
+    values += [text for text in pruned if text is not None]  # without pruned revisions as schema 3 had it
     return hashlib.sha256(json.dumps(values).encode()).digest()
 
 
@@ -136,6 +138,15 @@ def _records(connection: Connection) -> None:
         connection.execute(text(f"DROP TABLE {table}"))
 
 
+def _pruned(connection: Connection) -> None:
+    """3 to 4: which revisions are pruned; the row of `store` is sealed anew, so it must be what was written."""
+    columns = "schema_version, created_at, evermap_version, head, record, checksum"
+    for *values, sealed in connection.execute(text(f"SELECT {columns} FROM store")).all():
+        if values[0] == 3 and sealed != checksum(*values):
+            raise DamagedError("a checksum does not match: of the row that names the newest revision")
+    connection.execute(text("ALTER TABLE store ADD COLUMN pruned TEXT"))
+
+
 def _changes(connection: Connection, number: int) -> list[Any]:
     """Of a revision of schema 2, as lists."""
     named: dict[int, list[int]] = {}
@@ -188,5 +199,5 @@ def _put(connection: Connection, raw: bytes) -> bytes:
     return name
 
 
-MIGRATIONS: tuple[Migration, ...] = (_landmarks_of_changes, _records)
+MIGRATIONS: tuple[Migration, ...] = (_landmarks_of_changes, _records, _pruned)
 """Number k leads from schema k + 1 to k + 2. Never changed once released: they speak SQL, not the tables of today."""

@@ -6,24 +6,27 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from sqlalchemy import Connection, Engine, bindparam, func, insert, inspect, select, update
+from sqlalchemy import Connection, Engine, bindparam, delete, func, insert, inspect, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
 
 from evermap import __version__
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.maps.diff import grown
-from evermap.maps.living import Evidence, LivingMap
+from evermap.maps.living import Evidence, LivingMap, Members
 from evermap.maps.store import content, schema
 from evermap.maps.store.content import Chunk, DamagedError
-from evermap.maps.store.history import Record, about, lineage
+from evermap.maps.store.history import Record, about, lineage, pruned_to_text, ranges, read_pruned
 from evermap.maps.store.measured import evidence_to_chunks, looks_of, read_index
 from evermap.maps.store.protocol import (
     Attachment,
     DamagedMapError,
     Provenance,
+    PrunedRevisionError,
+    Pruning,
     Revision,
     RevisionKind,
     StaleRevisionError,
@@ -45,11 +48,16 @@ class SqlStore(Shown):
     """`MapStore` over an engine of SQLAlchemy, see there. Made by `opened`."""
 
     def __init__(
-        self, engine: Engine, where: str, explain: Callable[[str], InputError | None] = lambda _: None
+        self,
+        engine: Engine,
+        where: str,
+        explain: Callable[[str], InputError | None] = lambda _: None,
+        tidy: Callable[[], None] = lambda: None,
     ) -> None:
         self._engine = engine
         self._where = where
         self._explain = explain
+        self._tidy = tidy
         self._records: dict[bytes, Record] = {}  # they never change, and their names are their checksums
         self._history: tuple[Any, int, dict[int, Record], dict[int, bytes | None]] | None = None  # of `_chain`
         self._checked: set[bytes] = set()  # chunks that this object has read, and found to be what was written
@@ -70,10 +78,10 @@ class SqlStore(Shown):
             engine: of the database.
             where: path or address, for messages.
             create: make the tables where there are none.
-            tidy: called once old tables have been replaced.
+            tidy: called once old tables have been replaced, or content deleted.
             explain: makes the error of a problem with the bytes, saying what is whole; None where there is no map.
         """
-        store = cls(engine, where, explain)
+        store = cls(engine, where, explain, tidy)
         with store._reading() as connection:
             version = store._schema_version(connection)
         if version == 0 and not create:
@@ -155,7 +163,24 @@ class SqlStore(Shown):
         """Return the map as it was committed."""
         with self._reading() as connection:
             number = self._known(connection, revision)
-            return LivingMap() if number == 0 else self._unpacked(connection, self._record(connection, number))
+            if number == 0:
+                return LivingMap()
+            record = self._record(connection, number)
+            pruned = self._pruned(connection)
+            if number in pruned:
+                raise self._gone(number, pruned[number], self._chain(connection)[0].keys() - pruned.keys())
+            return self._unpacked(connection, record)
+
+    def members(self, revision: int | None = None) -> Members:
+        """Return the landmarks of a revision."""
+        with self._reading() as connection:
+            number = self._known(connection, revision)
+            if number == 0:
+                return LivingMap().members
+            name, columns = self._record(connection, number).content, [item.name for item in fields(Members)]
+            listed = [content.MEMBERS + column for column in columns]
+            found = content.unpack_columns(name, listed, lambda keys: self._fetched(connection, keys))
+            return Members(**{column: found[content.MEMBERS + column] for column in columns})
 
     def commit(
         self,
@@ -256,6 +281,30 @@ class SqlStore(Shown):
         origin = replace(origin, kind=RevisionKind.REVERT, note=origin.note or f"back to revision {revision}")
         return self.commit(restored, origin, parent=head, restores=revision, lost=lost)
 
+    def prune(self, keep: int = 10, *, dry_run: bool = False) -> Pruning:
+        """Delete the content that only old revisions hold."""
+        if keep < 1:
+            raise ConfigError(f"{keep} is less than 1", field="keep", hint="1 keeps the newest revision only")
+        with self._reading() if dry_run else self._writing() as connection:
+            records, pruned = self._chain(connection)[0], self._pruned(connection)
+            kept = {*sorted(records)[-keep:], *self._lineage(connection, None)[-keep:]} - pruned.keys()
+            old = records.keys() - pruned.keys() - kept
+            for number in kept:  # as long as one of them is damaged, an old one may be needed
+                self._unpacked(connection, records[number])
+            doomed = self._only_of(connection, records, old, kept)
+            n_bytes, size = 0, select(func.sum(func.length(schema.chunk.c.data)))
+            for some in _batches(doomed):
+                mine = schema.chunk.c.name.in_(some)
+                n_bytes += connection.execute(size.where(mine)).scalar() or 0
+                if not dry_run:
+                    connection.execute(delete(schema.chunk).where(mine))
+            if old and not dry_run:
+                self._move_anchor(connection, *self._anchor(connection), {**pruned, **dict.fromkeys(old, now_utc())})
+        if not dry_run:
+            self._checked -= doomed
+            self._tidy()  # also what an earlier call was killed before
+        return Pruning(tuple(sorted(old)), tuple(sorted(kept)), len(doomed), n_bytes)
+
     def changes(self, revision: int | None = None) -> tuple[MapChange, ...]:
         """Return changes of one revision."""
         with self._reading() as connection:
@@ -309,13 +358,16 @@ class SqlStore(Shown):
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
 
-    def fill(self, chunks: Mapping[bytes, bytes], records: Mapping[int, bytes], head: int) -> None:
+    def fill(
+        self, chunks: Mapping[bytes, bytes], records: Mapping[int, bytes], head: int, pruned: Mapping[int, str]
+    ) -> None:
         """Put revisions from elsewhere into an empty store.
 
         Args:
             chunks: stored bytes by name.
             records: names of the records by number; what is missing up to `head` is lost.
             head: number of the newest.
+            pruned: revisions without content, and since when.
         """
         with self._writing() as connection:
             rows = [{"name": name, "data": data} for name, data in chunks.items()]
@@ -324,7 +376,7 @@ class SqlStore(Shown):
             numbers = [{"number": number, "record": records.get(number)} for number in range(1, head + 1)]
             if numbers:
                 connection.execute(insert(schema.revision), numbers)
-            self._move_anchor(connection, head, records.get(head))
+            self._move_anchor(connection, head, records.get(head), pruned)
 
     def _with_evidence(self, evidence: Evidence | None, chunks: dict[bytes, Chunk]) -> bytes | None:
         """The name of the index of what a session saw, None for nothing; its chunks are added to `chunks`."""
@@ -384,6 +436,30 @@ class SqlStore(Shown):
         if rows:
             connection.execute(insert(schema.chunk), rows)
 
+    def _only_of(
+        self, connection: Connection, records: Mapping[int, Record], old: Collection[int], kept: Collection[int]
+    ) -> set[bytes]:
+        """Names of the chunks that are content of old revisions and nothing else."""
+        fetch = partial(self._fetched, connection)
+        found = {name for number in old for name in content.names_in(records[number].content, fetch)}
+        for number, record in records.items():
+            found -= content.names_in(record.content, fetch, "" if number in kept else content.MEMBERS)
+            found -= record.parts()
+            if record.evidence is not None:
+                index = content.read_text(record.evidence, fetch([record.evidence])[record.evidence])
+                found -= {row.name for row in read_index(index)}
+        return found
+
+    def _pruned(self, connection: Connection) -> dict[int, str]:
+        """Revisions without content, and since when."""
+        return read_pruned(connection.execute(select(schema.store.c.pruned)).scalar())
+
+    def _gone(self, number: int, since: str, kept: Collection[int]) -> PrunedRevisionError:
+        utc = since.replace("T", " ").replace("+00:00", " UTC")
+        gone = f"is pruned since {utc}" if since else "was pruned or lost to damage"
+        problem = f"the content of revision {number} {gone}; kept: {ranges(kept)}"
+        return PrunedRevisionError(problem, path=self._where, hint="one of these, or an older copy of the file")
+
     def _anchor(self, connection: Connection) -> tuple[int, bytes | None]:
         """The newest revision, and the name of its record: of these all others are checked."""
         rows = connection.execute(select(schema.store)).all()
@@ -397,10 +473,14 @@ class SqlStore(Shown):
             raise DamagedError(f"the newest revision is {values[3]}, but the last one listed is {newest}")
         return values[3], values[4]
 
-    def _move_anchor(self, connection: Connection, head: int, record: bytes | None) -> None:
+    def _move_anchor(
+        self, connection: Connection, head: int, record: bytes | None, pruned: Mapping[int, str] | None = None
+    ) -> None:
+        """Seal the row of `store` with other values; `pruned` is None to leave those as they are."""
         row = connection.execute(select(schema.store)).one()
-        values = (row.schema_version, row.created_at, row.evermap_version, head, record)
-        connection.execute(update(schema.store).values(head=head, record=record, checksum=schema.checksum(*values)))
+        listed = row.pruned if pruned is None else pruned_to_text(pruned)
+        sealed = schema.checksum(row.schema_version, row.created_at, row.evermap_version, head, record, listed)
+        connection.execute(update(schema.store).values(head=head, record=record, pruned=listed, checksum=sealed))
 
     def _chain(self, connection: Connection, since: int = 1) -> tuple[dict[int, Record], dict[int, bytes | None]]:
         """Records from a revision to the newest, each checked against the one after it; and which are lost."""
@@ -503,13 +583,15 @@ class SqlStore(Shown):
         version = connection.execute(select(schema.store.c.schema_version)).scalar()
         if not isinstance(version, int) or version < 1:
             raise DamagedError(f"its schema version is {version!r}")
-        if (version < schema.SCHEMA_VERSION) == (set(tables) == schema.metadata.tables.keys()):
-            raise DamagedError(f"its schema version is {version}, but its tables are of another")
         if version > schema.SCHEMA_VERSION:
             problem = (
                 f"a map of schema version {version}; this evermap, {__version__}, knows up to {schema.SCHEMA_VERSION}"
             )
             raise InputError(problem, path=self._where, hint="open it with a newer evermap")
+        columns = {column["name"] for column in inspect(connection).get_columns("store")}
+        today = set(tables) == schema.metadata.tables.keys() and columns == set(schema.store.columns.keys())
+        if (version < schema.SCHEMA_VERSION) == today:
+            raise DamagedError(f"its schema version is {version}, but its tables are of another")
         return version
 
     def _known(self, connection: Connection, revision: int | None) -> int:
@@ -576,16 +658,17 @@ _FAILURES = (
 
 def is_anchor(values: Sequence[Any]) -> bool:
     """Return whether these are the values of the row of `store`, as it was written."""
-    if len(values) != 6:
+    if len(values) not in (6, 7):  # six before schema 4
         return False
-    version, created_at, writer, head, record, checksum = values
+    version, created_at, writer, head, record, checksum, pruned = (*values, None)[:7]
     return (
         type(version) is int
         and type(head) is int
         and isinstance(created_at, str)
         and isinstance(writer, str)
         and (record is None or isinstance(record, bytes))
-        and checksum == schema.checksum(version, created_at, writer, head, record)
+        and (pruned is None or isinstance(pruned, str))
+        and checksum == schema.checksum(version, created_at, writer, head, record, pruned)
     )
 
 

@@ -12,7 +12,7 @@ import sqlite3
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -23,7 +23,7 @@ from evermap.errors import InputError
 from evermap.maps.living import LivingMap
 from evermap.maps.store import content
 from evermap.maps.store.content import DTYPES, NAME_BYTES, Chunk, DamagedError
-from evermap.maps.store.history import Record
+from evermap.maps.store.history import Record, ranges, read_pruned
 from evermap.maps.store.measured import looks_of, read_index
 from evermap.maps.store.protocol import DamagedMapError, Provenance
 from evermap.maps.store.sql import SqlStore
@@ -50,7 +50,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
 
 
 def _compact(engine: Engine) -> None:
-    """Give back the pages that a migration has left; without room to do that they stay."""
+    """Give back the pages that a migration or pruning has left; without room to do that they stay."""
     connection = engine.raw_connection()
     with suppress(sqlite3.DatabaseError):
         connection.cursor().execute("VACUUM")
@@ -90,7 +90,6 @@ _PAGE = 4096
 """Bytes of a page where the header does not say."""
 _TABLE_LEAF = 0x0D
 _INTEGER_BYTES = (0, 1, 2, 3, 4, 6, 8)
-_SHOWN = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +103,7 @@ class Verification:
         lost: revisions that earlier damage has destroyed, as the map says itself.
         problems: of the file as a whole: its pages, its lists.
         n_chunks, n_bytes: pieces that were checked, and the size of the file.
+        pruned: revisions of which only the history is there, and whole.
     """
 
     head: int
@@ -113,6 +113,7 @@ class Verification:
     problems: tuple[str, ...]
     n_chunks: int
     n_bytes: int
+    pruned: tuple[int, ...] = ()
 
     @property
     def sound(self) -> bool:
@@ -145,11 +146,9 @@ def verify(path: Path) -> Verification:
         InputError: the file cannot be read.
     """
     found = _Found.of_file(path)
-    intact, damaged = found.verdicts(deep=True)
-    problems = list(_problems(path))
-    return Verification(
-        found.head, intact, damaged, tuple(sorted(found.lost)), tuple(problems), len(found.chunks), path.stat().st_size
-    )
+    intact, pruned, damaged = found.verdicts(deep=True)
+    lost, problems = tuple(sorted(found.lost)), tuple(_problems(path))
+    return Verification(found.head, intact, damaged, lost, problems, len(found.chunks), path.stat().st_size, pruned)
 
 
 def survey(path: Path) -> Verification | None:
@@ -160,8 +159,8 @@ def survey(path: Path) -> Verification | None:
         return None
     if not found.records and found.anchor is None:
         return None
-    intact, damaged = found.verdicts(deep=False)
-    return Verification(found.head, intact, damaged, tuple(sorted(found.lost)), (), len(found.chunks), 0)
+    intact, pruned, damaged = found.verdicts(deep=False)
+    return Verification(found.head, intact, damaged, tuple(sorted(found.lost)), (), len(found.chunks), 0, pruned)
 
 
 def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path]:
@@ -180,15 +179,15 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
     """
     _finish_transactions(path)
     found = _Found.of_file(path)
-    intact, damaged = found.verdicts(deep=True)
+    intact, pruned, damaged = found.verdicts(deep=True)
     if revision != 0 and revision not in intact:
-        why = damaged.get(revision, "there is no such revision")
+        why = "its content is pruned" if revision in pruned else damaged.get(revision, "there is no such revision")
         checked = Verification(found.head, intact, damaged, (), (), 0, 0)
         raise checked.error(path, f"revision {revision}: {why}")
-    records = {number: found.records[number] for number in intact}
+    records = {number: found.records[number] for number in (*intact, *pruned)}
     kept: set[bytes] = set()
-    for number in intact:
-        kept |= {found.names[number], *found.closure(records[number])}
+    for number, record in records.items():
+        kept |= {found.names[number], *found.closure(record)}
     next_ids = [max((record.next_ids[k] for record in found.records.values()), default=0) for k in (0, 1)]
     before = {number: found.names.get(number - 1) if number - 1 in records else None for number in damaged}
     lost = {**{number: name if number - 1 in records else None for number, name in found.lost.items()}, **before}
@@ -196,8 +195,9 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
     fresh.unlink(missing_ok=True)
     try:
         with open_sqlite(fresh, create=True) as store:
-            names = {number: found.names[number] for number in intact}
-            store.fill({name: found.chunks[name] for name in kept}, names, found.head)
+            names = {number: found.names[number] for number in records}
+            since = {number: found.pruned[number] for number in pruned}
+            store.fill({name: found.chunks[name] for name in kept}, names, found.head, since)
             old = content.unpack(records[revision].content, found.fetch) if revision else LivingMap()
             number = store.restore(old, revision, found.head, (next_ids[0], next_ids[1]), provenance, lost)
         aside = _set_aside(path)
@@ -205,20 +205,6 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
     finally:
         fresh.unlink(missing_ok=True)
     return number, aside
-
-
-def ranges(numbers: Iterable[int]) -> str:
-    """Return '1 to 4, 6 and 9 to 12'; the middle of many is left out."""
-    runs: list[list[int]] = []
-    for number in sorted(numbers):
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    words = [str(a) if a == b else f"{a} to {b}" if b > a + 1 else f"{a}, {b}" for a, b in runs]
-    if len(words) > _SHOWN:
-        words = [*words[:2], "...", *words[-2:]]
-    return ", ".join(words[:-1]) + (" and " if len(words) > 1 else "") + "".join(words[-1:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,6 +216,7 @@ class _Found:
         anchor: number and record of the newest revision; None where the row that names them is damaged.
         records, names: of revisions whose record is whole, and the names of the records.
         lost: as `Record.lost`, of all records.
+        pruned: revisions without content, and since when; '' where that is not known.
     """
 
     chunks: Mapping[bytes, bytes]
@@ -237,6 +224,7 @@ class _Found:
     records: Mapping[int, Record]
     names: Mapping[int, bytes]
     lost: Mapping[int, bytes | None]
+    pruned: Mapping[int, str]
 
     @property
     def head(self) -> int:
@@ -268,10 +256,11 @@ class _Found:
         chunks: dict[bytes, bytes] = {}
         listed: set[bytes] = set()
         anchor: tuple[int, bytes | None] | None = None
+        pruned: dict[int, str] = {}
         candidates: dict[int, dict[bytes, Record]] = {}
         for row in rows:
-            if len(row) == 6 and is_anchor(row) and (anchor is None or row[3] > anchor[0]):
-                anchor = row[3], row[4]
+            if is_anchor(row) and (anchor is None or row[3] > anchor[0]):
+                anchor, pruned = (row[3], row[4]), read_pruned((*row, None)[6])
             if len(row) != 2 or not isinstance(row[1], bytes):
                 continue
             name, data = row
@@ -301,11 +290,17 @@ class _Found:
             records[number], names[number] = these[name], name
             lost |= records[number].lost
             expected = records[number].parent
-        return cls(chunks, anchor, records, names, lost)
+        found = cls(chunks, anchor, records, names, lost, pruned)
+        if anchor is None and records:  # the list is lost: what has its history only may have been pruned
+            guess = replace(found, pruned=dict.fromkeys(found.verdicts(deep=False)[2], ""))
+            found = replace(found, pruned=dict.fromkeys(guess.verdicts(deep=False)[1], ""))
+        return found
 
-    def verdicts(self, *, deep: bool) -> tuple[tuple[int, ...], dict[int, str]]:
-        """Return the revisions that are whole, and what is wrong with the others; `deep` builds their maps, too."""
-        intact, damaged = [], {}
+    def verdicts(self, *, deep: bool) -> tuple[tuple[int, ...], tuple[int, ...], dict[int, str]]:
+        """Return the revisions that are whole, those that are pruned and otherwise whole, and what is wrong with the
+        others; `deep` builds their maps, too.
+        """
+        whole, damaged = [], {}
         for number in range(1, self.head + 1):
             if number in self.lost:
                 continue
@@ -314,18 +309,20 @@ class _Found:
                 continue
             try:
                 self.closure(self.records[number])
-                if deep:
+                if deep and number not in self.pruned:
                     content.unpack(self.records[number].content, self.fetch)
             except DamagedError as error:
                 damaged[number] = str(error)
             else:
-                intact.append(number)
-        return tuple(intact), damaged
+                whole.append(number)
+        pruned = tuple(number for number in whole if number in self.pruned)
+        return tuple(number for number in whole if number not in self.pruned), pruned, damaged
 
     def closure(self, record: Record) -> set[bytes]:
         """Return names of all chunks of a revision but its record; `DamagedError` if one is not there."""
         content.read_text(record.config, self.fetch([record.config])[record.config])
-        names = content.names_in(record.content, self.fetch) | record.parts()
+        table = content.MEMBERS if record.number in self.pruned else ""
+        names = content.names_in(record.content, self.fetch, table) | record.parts()
         if record.evidence is not None:
             index = read_index(content.read_text(record.evidence, self.fetch([record.evidence])[record.evidence]))
             names |= {row.name for row in index}
