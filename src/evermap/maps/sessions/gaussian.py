@@ -79,9 +79,11 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
         return covariance_m2
     direction, size, _ = np.linalg.svd(se2.rigid_directions(position_m - position_m.mean(axis=0)), full_matrices=False)
     motion = direction[:, size > 1e-12 * size[0]]  # places that are one have no heading
-    along = covariance_m2 @ motion
-    taken = along @ motion.T
-    return np.asarray(covariance_m2 - taken - taken.T + motion @ (motion.T @ along) @ motion.T)
+    onto = covariance_m2
+    for _ in range(2):  # the second time takes what rounding has left
+        onto = onto - motion @ (motion.T @ onto)
+        onto = onto - (onto @ motion) @ motion.T
+    return np.asarray(0.5 * (onto + onto.T))
 
 
 def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
