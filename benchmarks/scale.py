@@ -377,13 +377,14 @@ def ratios(shown: dict[str, Any]) -> dict[str, float]:
     """Return the metrics of the default sizes."""
     last, stream = shown["sessions"][-1], shown["stream"]
     grown = last["memory"]
-    return {
+    found = {
         "scale_time_ratio": last["evermap"]["cpu_s"] / last["lm"]["cpu_s"],
         "scale_exponent": shown["exponents"]["evermap"]["landmarks"],
         "scale_memory_ratio": grown["evermap"]["grown_mb"] / grown["gtsam"]["grown_mb"],
         "scale_objective_ratio": max(row["plain"]["objective"] / row["best"] for row in shown["sessions"]),
         "scale_frame_ratio": stream["isam2"]["median_ms"] / stream["evermap"]["median_ms"],
     }
+    return {name: float(value) for name, value in found.items()}
 
 
 def _objective(drive: Drive, estimate: PlainEstimate) -> float:

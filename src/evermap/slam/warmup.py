@@ -15,6 +15,9 @@ from evermap.slam.changes.search import find_changes
 from evermap.slam.noise import START
 from evermap.slam.problem import Drive, Problem
 from evermap.slam.smoother import Smoother
+from evermap.slam.sparse.elimination import curvature
+from evermap.slam.sparse.system import System
+from evermap.slam.sparse.tree import Factors
 from evermap.slam.streaming import FIRST_RELINEARISATION, StreamingSlam
 
 
@@ -57,6 +60,9 @@ def _drive() -> None:
         slam.step()
     outcome = slam.finish()
     Smoother(problem, START).information(outcome.graph_estimate, np.array([0, count - 1]))
+    one = np.ones(1, dtype=np.int64)
+    alone = System(one, Factors(np.arange(2), 0 * one, one, 0 * one), np.zeros((1, 3)), np.zeros(0, dtype=np.int64))
+    curvature(alone.tree, alone.factors, np.zeros(2))  # only steps that are damped ask for it
     marginals = outcome.graph_marginals
     bridged(
         stamps[:2],
