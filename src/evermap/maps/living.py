@@ -172,8 +172,8 @@ class LivingMap(Shown):
         stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
         session_start_s: begin of the newest session; one that begins earlier is late.
         members, sites, places, stays: see there.
-        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y by turns, as if the map's size were known; or
-            (P, 2, 2), while the places are independent.
+        covariance_m2: (2 P, 2 P) joint covariance of all places, x and y interleaved, as if the map's size were known;
+            or (P, 2, 2) blocks, while the places are independent.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
         lives: how long things of a class stay, stay away, and where they turn up again.

@@ -38,13 +38,6 @@ kernel = kept(effort=1, error_model="numpy")
 
 
 @kernel
-def inverse_of(matrix: FloatArray) -> FloatArray:
-    """Return the inverse of a small matrix, row after row in memory as all others."""
-    inverted: Any = np.linalg.inv(matrix)
-    return np.ascontiguousarray(inverted)
-
-
-@kernel
 def multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Multiply a (r, 3) with a (3, n) matrix, without a temporary."""
     for i in range(a.shape[0]):

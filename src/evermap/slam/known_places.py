@@ -26,7 +26,7 @@ class KnownPlaces:
         position_m: (P, 2) in the map's frame.
         covariance_m2: (P, 2, 2) of each by itself.
         p_here: probability that the landmark stands there now; of one landmark they sum to 1 at most.
-        joint_m2: (2 P, 2 P) covariance of all together, x and y by turns; None where the places are independent. A map
+        joint_m2: (2 P, 2 P) covariance of all together, x and y interleaved; None where they are independent. A map
             that is bent as a whole is better than each of its places alone.
     """
 

@@ -52,7 +52,7 @@ def localize(
             with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
         noise: standard deviations; they are not estimated.
-        joint_m2: (2 L, 2 L) covariance of all rows together, x and y by turns; None takes `covariance_m2`, and the rows
+        joint_m2: (2 L, 2 L) covariance of all rows, x and y interleaved; None takes `covariance_m2`, and the rows
             to be independent.
         realtime: process at the recording's pace.
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.

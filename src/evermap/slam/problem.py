@@ -350,13 +350,6 @@ class Marginals:
         """(G, G) of all landmarks and the states: dense, for few landmarks."""
         return self.joint(np.arange(len(self.known)), states=True)
 
-    def of_pose(self, row: int) -> FloatArray:
-        """Return (3, G) covariance of one pose with all landmarks and the states."""
-        if "pose_shared" in self.__dict__:
-            cross: FloatArray = self.pose_shared[row]
-            return cross
-        return self.joint(np.arange(len(self.known)), poses=np.array([row]), states=True)[:3, 3:]
-
     @cached_property
     def pose_shared(self) -> FloatArray:
         """(N, 3, G) of all poses with all landmarks and the states: dense, for few landmarks."""

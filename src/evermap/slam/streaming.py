@@ -184,9 +184,7 @@ class StreamingSlam:
             self._job = self._relinearised(learn=False)
 
     def _work(self) -> None:
-        """Go on with a relinearisation: a few slices a frame, or all of it where it may change what detections are
-        of.
-        """
+        """Go on with a relinearisation: a few slices a frame, or all of it where it may change places."""
         left_ms = np.inf if self._job is not None and self._method.revises(self._problem) else SLICES_A_FRAME
         while self._job is not None and left_ms > 0.0:
             try:

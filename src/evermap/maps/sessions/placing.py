@@ -307,8 +307,9 @@ def _in_map(
 def _solved(problem: Problem, noise: Noise, start: Estimate, *, robust: bool) -> tuple[Smoother, Estimate]:
     """The optimum near `start`."""
     # first with the kernel that never lets go: what was near the session's own map need not be near this one
-    start = Smoother(problem, noise, heavy=True, robust=robust).optimum(start, iterations=HEAVY_STEPS, tolerance=1e-3)
-    smoother = Smoother(problem, noise, robust=robust)
+    near = Smoother(problem, noise, heavy=True, robust=robust)
+    start = near.optimum(start, iterations=HEAVY_STEPS, tolerance=1e-3)
+    smoother = near.under(noise, heavy=False)
     return smoother, smoother.optimum(start, tolerance=FINAL_TOLERANCE)
 
 

@@ -233,8 +233,9 @@ class Associator:
     def _cost(self, assignment: Assignment) -> tuple[float, Estimate]:
         """Cost at the optimum, outliers decided."""
         problem = assignment.problem()
-        estimate = Smoother(problem, self.noise, heavy=True).optimum(assignment.estimate, iterations=10, tolerance=1e-3)
-        smoother = Smoother(problem, self.noise)
+        near = Smoother(problem, self.noise, heavy=True)
+        estimate = near.optimum(assignment.estimate, iterations=10, tolerance=1e-3)
+        smoother = near.under(self.noise, heavy=False)
         estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-3)
         return smoother.cost(estimate), estimate
 
@@ -242,11 +243,10 @@ class Associator:
         """Every detection compared with the whole map once more, and given to whom it most probably belongs."""
         problem = assignment.measured
         sigma = problem.sigma_given
-        row = np.full_like(assignment.landmark_row, NOBODY)
-        marginals.pose_shared  # noqa: B018 (of all poses at once)
+        row, across = np.full_like(assignment.landmark_row, NOBODY), marginals.pose_shared
         for i in range(self._done):
             detections = np.arange(self._first[i], self._first[i + 1])
-            belief = PoseBelief.at(assignment.estimate, marginals, i)
+            belief = PoseBelief.at(assignment.estimate, marginals, i, across[i])
             pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=self._density)
             probability, _ = pairing_probability(pairings, confidence=GATE)
             taken = np.flatnonzero(probability > 0.5)

@@ -44,13 +44,22 @@ class PoseBelief:
         return cls(problem.start_pose.copy(), problem.prior.mean.copy(), np.zeros((0, 2)), np.diag(spread))
 
     @classmethod
-    def at(cls, estimate: Estimate, marginals: Marginals, row: int) -> PoseBelief:
-        """Return the smoothed belief about pose `row`; every landmark has to be known."""
+    def at(cls, estimate: Estimate, marginals: Marginals, row: int, across: FloatArray | None = None) -> PoseBelief:
+        """Return the smoothed belief about pose `row`; every landmark has to be known.
+
+        Args:
+            estimate: the optimum.
+            marginals: its covariances.
+            row: of the pose.
+            across: (3, G) covariance of the pose with landmarks and states, where it is known already.
+        """
         n = 2 * len(estimate.landmark)
         order = np.append(n + np.arange(9), np.arange(n))
         covariance = np.zeros((12 + n, 12 + n))
         covariance[:3, :3] = marginals.pose[row]
-        covariance[:3, 3:] = marginals.of_pose(row)[:, order]
+        if across is None:
+            across = marginals.joint(np.arange(len(estimate.landmark)), poses=np.array([row]), states=True)[:3, 3:]
+        covariance[:3, 3:] = across[:, order]
         covariance[3:, :3] = covariance[:3, 3:].T
         covariance[3:, 3:] = marginals.shared[np.ix_(order, order)]
         return cls(estimate.pose[row], estimate.states, estimate.landmark, covariance)

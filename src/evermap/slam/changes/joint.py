@@ -165,7 +165,7 @@ class Joint(Method):
         if in_map:
             self._given = given
         if not heavy:
-            estimate = Smoother(problem, noise, robust=self._robust).optimum(estimate, iterations=5, tolerance=1e-4)
+            estimate = smoother.under(noise, heavy=False).optimum(estimate, iterations=5, tolerance=1e-4)
         revision = Explanation(
             problem, estimate, self._current(), self._changes(self._groups, verdict.probability, base)
         )

@@ -87,6 +87,28 @@ class Elimination(NamedTuple):
 
 
 @kernel
+def _of_factor(tree: Tree, factors: Factors, f: int, index: Any) -> int:
+    """Write where the numbers of a factor stand in its front; return how many they are."""
+    width = 0
+    for k in range(factors.first[f], factors.first[f + 1]):
+        for a in range(tree.dim[factors.variable[k]]):
+            index[width] = tree.factor_at[k] + a
+            width += 1
+    return width
+
+
+@kernel
+def _passed_on(tree: Tree, node: int, index: Any) -> int:
+    """Write where the numbers that a front passes on stand in its parent's; return how many they are."""
+    left = 0
+    for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
+        for a in range(tree.dim[tree.variable[k]]):
+            index[left] = tree.up[k] + a
+            left += 1
+    return left
+
+
+@kernel
 def eliminate(
     tree: Tree, factors: Factors, values: FloatArray, extra: FloatArray, state: Elimination, high: int, low: int
 ) -> None:
@@ -117,11 +139,7 @@ def eliminate(
                 front[tree.at[k] + a, tree.at[k] + a] = extra[tree.begin[v] + a]
         for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
             f = tree.factor[j]
-            width = 0
-            for k in range(factors.first[f], factors.first[f + 1]):
-                for a in range(tree.dim[factors.variable[k]]):
-                    index[width] = tree.factor_at[k] + a
-                    width += 1
+            width = _of_factor(tree, factors, f, index)
             begin = tree.value_first[f]
             for _ in range(factors.rows[f]):
                 b = values[begin + width]
@@ -140,11 +158,7 @@ def eliminate(
         while n_waiting > 0 and tree.parent[whose[n_waiting - 1]] == node:
             n_waiting -= 1
             child = whose[n_waiting]
-            left = 0
-            for k in range(tree.first[child] + tree.n_own[child], tree.first[child + 1]):
-                for a in range(tree.dim[tree.variable[k]]):
-                    position[left] = tree.up[k] + a
-                    left += 1
+            left = _passed_on(tree, child, position)
             at = where[n_waiting]
             for i in range(left):
                 for j in range(i, left):
@@ -311,11 +325,8 @@ def spread(
     part = np.empty(largest)
     for node in range(low, high):
         size, own = tree.size[node], tree.own[node]
-        left = size - own
         cov = held[way[node] : way[node] + size * size].reshape(size, size)
-        for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
-            for a in range(tree.dim[tree.variable[k]]):
-                index[tree.at[k] - own + a] = tree.up[k] + a
+        left = _passed_on(tree, node, index)
         if node > 0:
             up = tree.parent[node]
             above = held[way[up] : way[up] + tree.size[up] ** 2].reshape(tree.size[up], tree.size[up])
@@ -342,11 +353,7 @@ def spread(
                             out.with_border[tree.begin[v] + a, to + b] = cov[at + a, tree.at[j] + b]
         for j in range(tree.factor_first[node], tree.factor_first[node + 1]):
             f = tree.factor[j]
-            width = 0
-            for k in range(factors.first[f], factors.first[f + 1]):
-                for a in range(tree.dim[factors.variable[k]]):
-                    index[width] = tree.factor_at[k] + a
-                    width += 1
+            width = _of_factor(tree, factors, f, index)
             for r in range(factors.rows[f]):
                 begin = tree.value_first[f] + r * (width + 1)
                 for c in range(width):

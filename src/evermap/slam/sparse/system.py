@@ -103,8 +103,7 @@ class Factorised:
 
     def joint(self, variables: IntArray) -> FloatArray:
         """Return the joint covariance of different variables, in their order; the cost is that of their ways up."""
-        wanted = np.ascontiguousarray(variables, dtype=np.int64)
-        ways, rest, _ = ways_to_border(self.system.tree, self.rows, self.system.node_of, wanted)
+        ways, rest, _ = self._ways(variables)
         joint = ways.T @ ways
         if len(rest):
             rest = solve_triangular(self._border()[0], rest, trans="T")
@@ -113,11 +112,13 @@ class Factorised:
 
     def columns(self, variables: IntArray) -> FloatArray:
         """Return (numbers, n) covariance of everything with some variables; the cost is that of n solutions."""
-        tree = self.system.tree
-        wanted = np.ascontiguousarray(variables, dtype=np.int64)
-        ways, rest, reached = ways_to_border(tree, self.rows, self.system.node_of, wanted)
+        ways, rest, reached = self._ways(variables)
         border = cho_solve(self._border(), rest) if len(rest) else rest
-        return columns_of_inverse(tree, self.rows, ways, reached, border)
+        return columns_of_inverse(self.system.tree, self.rows, ways, reached, border)
+
+    def _ways(self, variables: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        wanted = np.ascontiguousarray(variables, dtype=np.int64)
+        return ways_to_border(self.system.tree, self.rows, self.system.node_of, wanted)
 
     def _border(self) -> tuple[FloatArray, bool]:
         try:
