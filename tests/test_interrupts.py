@@ -123,10 +123,12 @@ def test_other_threads_and_ignored_signals_are_left_alone() -> None:
 
 
 def test_an_estimate_can_be_interrupted_from_python_at_any_instant() -> None:
-    """Whatever the interrupt hits, the frame it hits is finished, and what was done so far is a result."""
+    """Whatever the interrupt hits, the frame it hits is finished, and what was done so far is a result: also where
+    that frame is the last.
+    """
     recording = simulate_building(BuildingConfig(days=1, patrol_s=30.0), seed=1).sessions[0]
     whole = run_slam(recording)
-    for after in (5, 40):
+    for after in (5, 40, len(whole.step_s)):
         count = []
 
         def stop(done_s: float, all_s: float, after: int = after, count: list[float] = count) -> None:

@@ -122,6 +122,7 @@ def fed(
     step_s = np.zeros(len(stamp_s))
     began = time.perf_counter()
     done = 0
+    interrupted = False
     try:
         with watched() as watch:  # Ctrl-C waits for the end of a frame: the estimator is whole then
             for row, stamp in enumerate(stamp_s):
@@ -137,7 +138,8 @@ def fed(
     except KeyboardInterrupt:
         if done < least:
             raise
-    return step_s[:done], done < len(stamp_s)
+        interrupted = True  # also in the last frame: whoever asked a command to end wants it to end
+    return step_s[:done], interrupted
 
 
 def _method(prepared: Prepared, prior: CalibrationPrior, sensor: Sensor, settings: SlamConfig) -> Method:
