@@ -1,4 +1,4 @@
-"""Learned survival functions, samples and maps of chunks, read back from the drawn artists."""
+"""Learned survival functions, read back from the drawn artists."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.text import Text
 
 from evermap.errors import ConfigError
 from evermap.survival import Exponential, Weibull, never_leaves
@@ -14,7 +13,7 @@ from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.nonparametric import kaplan_meier, npmle
 from evermap.survival.parametric_fit import fit
-from evermap.viz.lifetime_figures import plot_chunks, plot_samples, plot_survival
+from evermap.viz.lifetime_figures import plot_survival
 
 DAY_S = 86400.0
 INF = float("inf")
@@ -29,10 +28,6 @@ def band_at(collection: Any, x: float) -> tuple[float, float]:
     corners = np.concatenate([path.vertices for path in collection.get_paths()])
     near = corners[np.abs(corners[:, 0] - x) == np.abs(corners[:, 0] - x).min()]
     return float(near[:, 1].min()), float(near[:, 1].max())
-
-
-def texts(figure: Any) -> list[str]:
-    return [text.get_text() for text in figure.findobj(Text) if text.get_text()]
 
 
 STAYS = Weibull(3 * DAY_S, 1.5).sample(0, 80)
@@ -85,33 +80,3 @@ def test_survival_refuses_nothing_and_no_time() -> None:
     with pytest.raises(ConfigError, match="until_s"):
         plot_survival({"a": Exponential(1.0)}, until_s=0.0)
     assert plot_survival({"wall": never_leaves()}).axes[0].lines[0].get_ydata().min() == 1.0  # type: ignore[union-attr]
-
-
-def test_maps_show_medians_and_their_doubt_where_the_chunks_are() -> None:
-    rng = np.random.default_rng(2)
-    rates = [np.exp(rng.normal(np.log(rate), sigma, (400, 1))) for rate, sigma in ((1e-4, 0.1), (1e-6, 0.5))]
-    hazards = [HazardDraws(np.zeros(1), rate) for rate in rates]
-    figure: Any = plot_chunks([(0, 0), (-2, 3)], 5.0, hazards, title="cars")
-    medians, doubts = (axes.collections[0] for axes in figure.axes[:2])
-    np.testing.assert_allclose(medians.get_array(), [np.median(np.log(2.0) / rate) for rate in rates])
-    factors = [np.quantile(1 / rate, 0.975) / np.quantile(1 / rate, 0.025) for rate in rates]
-    np.testing.assert_allclose(doubts.get_array(), factors)
-    corners = [path.get_extents().p0.tolist() for path in medians.get_paths()]
-    assert corners == [[0.0, 0.0], [-10.0, 15.0]]
-    assert {"cars", "half have gone after", "6 h", "1 day", "1 week"} <= set(texts(figure))
-    with pytest.raises(ConfigError, match="hazards"):
-        plot_chunks([(0, 0)], 5.0, [])
-
-
-def test_samples_have_a_row_each() -> None:
-    data = CensoredLifetimes.of([60.0, 60.0, 60.0, 0.0], [60.0, 120.0, INF, 90.0], [0.0, 0.0, 30.0, 0.0])
-    figure: Any = plot_samples(data, ["exact", "interval", "late", "left"])
-    axes: Any = figure.axes[0]
-    seen, maybe = axes.containers
-    np.testing.assert_allclose([bar.get_x() for bar in seen], [0.0, 0.0, 30.0, 0.0])
-    np.testing.assert_allclose([bar.get_width() for bar in seen], [60.0, 60.0, 30.0, 0.0])
-    np.testing.assert_allclose([bar.get_width() for bar in maybe][:2], [0.0, 60.0])
-    assert line(axes, "the end was watched").get_xdata().tolist() == [60.0]
-    assert line(axes, "never seen gone").get_ydata().tolist() == [1]
-    with pytest.raises(ConfigError, match="names"):
-        plot_samples(data, ["a"])

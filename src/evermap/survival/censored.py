@@ -16,11 +16,8 @@ and the likelihood of a stay is
 
     sum_b [ S(last - b) - S(gone - b) ]  /  sum_b S(first - b)
 
-which `parametric_fit.fit_sightings` maximises. Estimators that take plain samples get several rows for each stay, one
-an instant, whose bounds and entries are exact, and which share its weight in proportion to `S(last - b) - S(gone - b)`.
-As long as lifetimes are not known the shares are equal; with an estimate the samples can be made again, and the
-estimate with them. At the fixed point the score of the likelihood has mean 0 at the truth, but bands ignore that the
-instants are unknown, and are a little too narrow.
+Estimators that take plain samples get several rows for each stay, one an instant, whose bounds and entries are exact,
+and which share its weight. Bands ignore that the instants are unknown, and are a little too narrow.
 """
 
 from __future__ import annotations
@@ -33,7 +30,6 @@ from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError
 from evermap.show import ShownTable
-from evermap.survival.base import LifetimePrior
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -112,7 +108,6 @@ def lifetimes_of_sightings(
     last_s: ArrayLike,
     gone_s: ArrayLike,
     *,
-    given: LifetimePrior | None = None,
     instants: int = 5,
     least_stay_s: float = 0.0,
 ) -> tuple[CensoredLifetimes, IntArray]:
@@ -125,7 +120,6 @@ def lifetimes_of_sightings(
         first_s: (K,) first sighting.
         last_s: (K,) last sighting.
         gone_s: (K,) first look after the last sighting, at which it was not there; inf if there was none.
-        given: an estimate of lifetimes, by which instants of arrival are weighted; None for equal weights.
         instants: number of instants of arrival for each stay.
         least_stay_s: a stay is counted only if it is seen to last this long.
 
@@ -155,25 +149,4 @@ def lifetimes_of_sightings(
     share = np.tile((np.arange(instants) + 0.5) / instants, stay.size)
     arrival = elsewhere[rows] + share * (first[rows] - elsewhere[rows])
     left, right = last[rows] - arrival, gone[rows] - arrival
-    weight = _weights(left, right, instants, given)
-    return CensoredLifetimes.of(left, right, first[rows] + least_stay_s - arrival, weight), rows
-
-
-def log_sighting(prior: LifetimePrior, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return `log(S(left) - S(right))` (N,)."""
-    ended = np.isfinite(right)
-    value = np.asarray(prior.log_survival(left)).copy()
-    value[ended] += prior.log_conditional_death(left[ended], right[ended])
-    return value
-
-
-def _weights(left: FloatArray, right: FloatArray, instants: int, given: LifetimePrior | None) -> FloatArray:
-    """Return the shares (N,) of the instants of every stay: `S(left) - S(right)`, of sum 1 for each."""
-    if given is None:
-        return np.full(left.size, 1.0 / instants)
-    log_share = log_sighting(given, left, right)
-    table = log_share.reshape(-1, instants)
-    most = table.max(axis=1, keepdims=True)
-    share = np.exp(table - np.where(np.isfinite(most), most, 0.0))
-    total = share.sum(axis=1, keepdims=True)
-    return np.asarray(np.where(total > 0.0, share / np.where(total > 0.0, total, 1.0), 1.0 / instants)).ravel()
+    return CensoredLifetimes.of(left, right, first[rows] + least_stay_s - arrival, 1.0 / instants), rows

@@ -22,12 +22,12 @@ from numpy.typing import ArrayLike
 
 from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.survival.base import LifetimePrior, SurvivalEstimate, check_open_share
-from evermap.survival.censored import CensoredLifetimes, log_sighting
+from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.families import Exponential, Gamma, LogNormal, Weibull
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.survival.mixture import Mixture
 from evermap.survival.step import never_leaves
-from evermap.types import FloatArray, IntArray
+from evermap.types import FloatArray
 
 _IMPOSSIBLE = 1e10
 """Replaces an infinite mean of minus the log likelihood, from which the search could not step back."""
@@ -245,35 +245,6 @@ def fit_likelihood(
     return ParametricFit(name, family, family.build(found), found, covariance, -least * n_samples, n_samples)
 
 
-def fit_sightings(kind: str | Kind, samples: CensoredLifetimes, stay: IntArray) -> ParametricFit:
-    """Fit one family to stays of unknown arrival; its bands account for that.
-
-    Args:
-        kind: as of `parametric_fit.fit`.
-        samples: of `lifetimes_of_sightings`; their weights are ignored.
-        stay: (N,) stay of each sample, as it returns them.
-
-    Raises:
-        ConfigError: an unknown family.
-        DataError: no stay has an end.
-        NumericalError: the likelihood has no clear maximum in this family.
-    """
-    ended = np.isfinite(samples.right_s)
-    if not ended.any():
-        raise DataError("no stay has an end", field="gone_s", hint="look again later, or state a prior")
-    instants = int(np.argmax(np.append(stay, -1) != stay[0]))
-    n_stays = stay.size // instants
-
-    def of_stays(prior: LifetimePrior) -> float:
-        seen = log_sighting(prior, samples.left_s, samples.right_s)
-        known = np.asarray(prior.log_survival(samples.entry_s))
-        return float(_log_sums(seen, instants).sum() - _log_sums(known, instants).sum())
-
-    watched_s = float((samples.left_s - samples.entry_s).sum() / instants)
-    n_ended = float(ended.sum() / instants)
-    return fit_likelihood(kind, of_stays, max(watched_s / n_ended, float(np.median(samples.left_s))), float(n_stays))
-
-
 def fit_best(data: CensoredLifetimes, kinds: Sequence[str | Kind] = tuple(KINDS)) -> ParametricFit:
     """Fit several families, and return that of least AIC among those whose likelihood has a maximum.
 
@@ -347,8 +318,3 @@ def _hessian(cost: Callable[[FloatArray], float], at: FloatArray) -> FloatArray:
     steps = _HESSIAN_STEP * np.eye(len(at))
     rows = [[cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b) for b in steps] for a in steps]
     return np.array(rows) / (4.0 * _HESSIAN_STEP**2)
-
-
-def _log_sums(log_values: FloatArray, instants: int) -> FloatArray:
-    """Return the logarithms (K,) of sums over the instants of each stay."""
-    return np.asarray(np.logaddexp.reduce(log_values.reshape(-1, instants), axis=1))

@@ -182,8 +182,6 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[L
     """
     if not (np.isfinite(chunk_m) and chunk_m > 0.0):
         raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="chunk_m", hint="10")
-    from evermap.survival.pooling import chunks_of
-
     keys = np.zeros((len(table), 3), dtype=np.int64)  # class, chunk's column and row
     if BY_CLASS in by:
         if not table.has_classes:
@@ -196,7 +194,7 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[L
         if nowhere.size:
             line = int(table.line[nowhere[0]])
             raise InputError("is empty", path=table.source, line=line, field="x_m", hint="a place in every row")
-        keys[:, 1:] = chunks_of(table.position_m, chunk_m)
+        keys[:, 1:] = np.floor(table.position_m / chunk_m)
     different, group = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(group.ravel(), kind="stable")
     parts = np.split(order, np.cumsum(np.bincount(group.ravel()))[:-1])

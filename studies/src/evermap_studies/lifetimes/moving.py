@@ -10,12 +10,13 @@ import numpy as np
 
 from evermap.config import TrackerConfig
 from evermap.survival.censored import lifetimes_of_sightings
-from evermap.survival.parametric_fit import ParametricFit, fit_sightings
+from evermap.survival.parametric_fit import ParametricFit
 from evermap.tracking.record import Followed, StaticSpells
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
 from evermap.types import FloatArray
+from evermap_studies.lifetimes.sightings import fit_sightings
 from evermap_studies.lifetimes.tracking_scores import TrackingScores, score_tracks
 from evermap_studies.lifetimes.truth import Value
 from evermap_studies.worlds.moving import MovingRun, MovingWorld, simulate_moving

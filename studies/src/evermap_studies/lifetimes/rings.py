@@ -2,7 +2,7 @@
 
 The thesis leaves the estimator open. Greenwood's variance needs ends that were watched, and the nonparametric estimate
 of intervals has none in closed form; a parametric model has one for every kind of censoring, so that is used here. Its
-variance is taken at its median, where a share is least certain. `evermap.survival.pooling` is compared with it.
+variance is taken at its median, where a share is least certain. `pooling` is compared with it.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from evermap.errors import DataError, NumericalError
 from evermap.survival.base import check_positive
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.parametric_fit import ParametricFit, fit
-from evermap.survival.pooling import Chunk, chunks_of
 from evermap.types import IntArray
+from evermap_studies.lifetimes.pooling import Chunk, chunks_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,11 +16,12 @@ import numpy as np
 from evermap.errors import InputError, NumericalError
 from evermap.io.columns import read_columns
 from evermap.survival import LifetimePrior
-from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
+from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.nonparametric import KaplanMeier, Npmle, kaplan_meier, npmle
 from evermap.types import BoolArray, FloatArray
 from evermap.valid import STAMP_S
-from evermap_studies.lifetimes.truth import Value, settled_samples
+from evermap_studies.lifetimes.sightings import settled_samples, weighted_sightings
+from evermap_studies.lifetimes.truth import Value
 from evermap_studies.presence.tasks import HOME
 
 EVERY = (2, 5, 15)
@@ -138,7 +139,7 @@ def _allowing_for_the_unseen(stays: FloatArray) -> Npmle | None:
     """Turnbull's estimate of samples that know when each stay was first seen."""
 
     def samples(given: LifetimePrior | None) -> CensoredLifetimes:
-        return lifetimes_of_sightings(*stays, given=given)[0]
+        return weighted_sightings(stays, given)
 
     try:
         return npmle(settled_samples(lambda known: npmle(known).prior(), samples, rounds=3))

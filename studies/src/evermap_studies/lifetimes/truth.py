@@ -17,8 +17,9 @@ from evermap.survival import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.gaussian_process import gp_fit
 from evermap.survival.nonparametric import kaplan_meier
-from evermap.survival.parametric_fit import fit, fit_best, fit_sightings
+from evermap.survival.parametric_fit import fit, fit_best
 from evermap.types import FloatArray
+from evermap_studies.lifetimes.sightings import fit_sightings, settled_samples, weighted_sightings
 from evermap_studies.worlds.patrol_lifetimes import PatrolRun, PatrolWorld, simulate_patrols
 
 SHARES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95)
@@ -31,24 +32,6 @@ INSTANTS = 3
 Value = dict[str, Any]
 Curve = tuple[FloatArray, FloatArray, FloatArray]
 """Estimated `P(T > t)` at some times, and the two bounds of its 95 % band."""
-
-
-def settled_samples(
-    estimate: Callable[[CensoredLifetimes], LifetimePrior],
-    samples_given: Callable[[LifetimePrior | None], CensoredLifetimes],
-    rounds: int = 4,
-) -> CensoredLifetimes:
-    """Iterate samples and estimate until the weights agree with the lifetimes estimated from them.
-
-    Args:
-        estimate: lifetimes from samples; a rough one is enough, since it only weights the instants of arrival.
-        samples_given: samples with weights by an estimate, or None: `lifetimes_of_sightings` for some stays.
-        rounds: number of iterations.
-    """
-    samples = samples_given(None)
-    for _ in range(rounds):
-        samples = samples_given(estimate(samples))
-    return samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +51,7 @@ class Stays:
 
     def samples(self, given: LifetimePrior | None = None, instants: int = INSTANTS) -> CensoredLifetimes:
         """Censored samples that know of the unseen ones."""
-        return lifetimes_of_sightings(*self.columns, given=given, instants=instants)[0]
+        return weighted_sightings(self.columns, given, instants)
 
     @property
     def columns(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

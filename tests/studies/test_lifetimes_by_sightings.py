@@ -11,8 +11,8 @@ from scipy.stats import chi2
 from evermap.errors import ConfigError, DataError
 from evermap.survival import Exponential, LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
-from evermap.survival.parametric_fit import fit, fit_sightings
-from evermap_studies.lifetimes.truth import settled_samples
+from evermap.survival.parametric_fit import fit
+from evermap_studies.lifetimes.sightings import fit_sightings, settled_samples, weighted_sightings
 
 
 def test_bounds_by_hand() -> None:
@@ -61,7 +61,7 @@ def weibull(samples: CensoredLifetimes) -> LifetimePrior:
 def test_true_lifetimes_come_out_though_many_are_never_seen(scale_s: float, shape: float) -> None:
     """Of those that stay for one gap between looks half are not; forgetting them makes lifetimes far too long."""
     stays = patrols(0, scale_s, shape)
-    samples = settled_samples(weibull, lambda given: lifetimes_of_sightings(*stays, given=given)[0], rounds=8)
+    samples = settled_samples(weibull, lambda given: weighted_sightings(stays, given), rounds=8)
     found = fit("weibull", samples)
     off = (found.parameters - np.log([scale_s, shape])) / found.standard_errors
     assert (np.abs(off) < 3.0).all()
@@ -98,9 +98,8 @@ def test_without_memory_it_makes_no_difference_when_it_came() -> None:
 
 def test_weights_are_the_probabilities_of_the_sighting() -> None:
     """Of what left between 60 and 90 s after it came rather than between 50 and 80 s, for an exponential of 100 s."""
-    samples, _ = lifetimes_of_sightings(
-        [90.0], [110.0], [155.0], [185.0], given=Exponential.from_mean(100.0), instants=2
-    )
+    stays = [90.0], [110.0], [155.0], [185.0]
+    samples = weighted_sightings(stays, Exponential.from_mean(100.0), instants=2)
     assert samples.left_s.tolist() == [60.0, 50.0]
     chance = np.exp([-0.6, -0.5]) - np.exp([-0.9, -0.8])
     np.testing.assert_allclose(samples.weight, chance / chance.sum(), rtol=1e-12)

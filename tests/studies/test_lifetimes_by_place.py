@@ -1,4 +1,4 @@
-"""Chunks against brute force, rings by their bound, pooling against the truth and against rings."""
+"""Chunks against brute force, rings by their bound, pooling against the truth and rings, figures read back."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.text import Text
 
 from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.existence import single
 from evermap.survival import Weibull
 from evermap.survival.censored import CensoredLifetimes
+from evermap.survival.hazard_regression import HazardDraws
 from evermap.survival.parametric_fit import fit, log_likelihood
-from evermap.survival.pooling import chunks_of, pooled_fit
 from evermap.types import FloatArray, IntArray
+from evermap_studies.lifetimes.pooling import chunks_of, pooled_fit
 from evermap_studies.lifetimes.rings import ChunkIndex, ring_query
+from evermap_studies.lifetimes.sample_figures import plot_chunks, plot_samples
 
 INF = float("inf")
 SIDE_M = 10.0
@@ -139,7 +142,7 @@ def town() -> Town:
 
 
 @pytest.mark.slow
-def test_pooling_foretells_better_than_rings_and_than_classes_alone(town: Town) -> None:
+def test_pooling_predicts_better_than_rings_and_than_classes_alone(town: Town) -> None:
     """Mean log likelihood of 30 % held out: the truth -2.142, pooled -2.174, rings at best -2.216, classes -2.282."""
     known = ~town.held_out
     data, place, classes = town.data[known], town.place_m[known], town.class_id[known]
@@ -219,3 +222,41 @@ def test_pooling_refuses_what_does_not_fit() -> None:
         pooled_fit(CensoredLifetimes.of(np.ones(400), np.full(400, 2.0)), np.arange(800.0).reshape(-1, 2), 0.1)
     with pytest.raises(DataError, match=r"class 7 was never seen"):
         pooled_fit(data, np.zeros((2, 2)), 1.0).at([0.0, 0.0], 7)
+
+
+def line(axes: Any, label: str) -> Any:
+    return next(item for item in axes.lines if item.get_label() == label)
+
+
+def texts(figure: Any) -> list[str]:
+    return [text.get_text() for text in figure.findobj(Text) if text.get_text()]
+
+
+def test_maps_show_medians_and_their_doubt_where_the_chunks_are() -> None:
+    rng = np.random.default_rng(2)
+    rates = [np.exp(rng.normal(np.log(rate), sigma, (400, 1))) for rate, sigma in ((1e-4, 0.1), (1e-6, 0.5))]
+    hazards = [HazardDraws(np.zeros(1), rate) for rate in rates]
+    figure: Any = plot_chunks([(0, 0), (-2, 3)], 5.0, hazards, title="cars")
+    medians, doubts = (axes.collections[0] for axes in figure.axes[:2])
+    np.testing.assert_allclose(medians.get_array(), [np.median(np.log(2.0) / rate) for rate in rates])
+    factors = [np.quantile(1 / rate, 0.975) / np.quantile(1 / rate, 0.025) for rate in rates]
+    np.testing.assert_allclose(doubts.get_array(), factors)
+    corners = [path.get_extents().p0.tolist() for path in medians.get_paths()]
+    assert corners == [[0.0, 0.0], [-10.0, 15.0]]
+    assert {"cars", "half have gone after", "6 h", "1 day", "1 week"} <= set(texts(figure))
+    with pytest.raises(ConfigError, match="hazards"):
+        plot_chunks([(0, 0)], 5.0, [])
+
+
+def test_samples_have_a_row_each() -> None:
+    data = CensoredLifetimes.of([60.0, 60.0, 60.0, 0.0], [60.0, 120.0, INF, 90.0], [0.0, 0.0, 30.0, 0.0])
+    figure: Any = plot_samples(data, ["exact", "interval", "late", "left"])
+    axes: Any = figure.axes[0]
+    seen, maybe = axes.containers
+    np.testing.assert_allclose([bar.get_x() for bar in seen], [0.0, 0.0, 30.0, 0.0])
+    np.testing.assert_allclose([bar.get_width() for bar in seen], [60.0, 60.0, 30.0, 0.0])
+    np.testing.assert_allclose([bar.get_width() for bar in maybe][:2], [0.0, 60.0])
+    assert line(axes, "the end was watched").get_xdata().tolist() == [60.0]
+    assert line(axes, "never seen gone").get_ydata().tolist() == [1]
+    with pytest.raises(ConfigError, match="names"):
+        plot_samples(data, ["a"])
