@@ -105,7 +105,7 @@ def _asked() -> int:
 
 @functools.cache
 def _keeper() -> Callable[[Any], Any]:
-    """Numba's keeper of machine code, for several processes, and for an installation that nobody may write to.
+    """Numba's keeper of machine code, for several processes, and for an installation that is read-only.
 
     Its own reads the index of what is kept, chooses a file and writes both, without a lock. Of processes that compile
     a function for different arguments at the same moment, one could be given the machine code of the other's. And it
@@ -167,7 +167,7 @@ def temporary_folder() -> str:
     """Return where machine code goes if it can go nowhere else, said once by a warning.
 
     The next process of the same user finds it again. Code is loaded from there, so it is a folder that belongs to this
-    user and that nobody else may write to, or else a new one of this process.
+    user and that no other user may write to, or else a new one of this process.
     """
     name = f"evermap-kernels-{os.getuid()}" if hasattr(os, "getuid") else "evermap-kernels"
     folder = Path(tempfile.gettempdir()) / name
@@ -203,7 +203,7 @@ def _locked(folder: Path) -> Iterator[None]:
 def _stamp_of(dispatcher: Any) -> str:
     """A digest of everything of ours that the machine code of a kernel depends on, and of nothing else.
 
-    Line numbers, comments and the plain Python around it are no part of it.
+    Line numbers, comments and the plain Python around it are not part of it.
     """
     import numpy as np
 

@@ -184,7 +184,7 @@ def _end_process() -> None:
         for stream in (sys.stdout, sys.stderr):
             try:  # noqa: SIM105 (contextlib would be loaded first)
                 stream.flush()
-            except (OSError, ValueError):  # nobody reads it any more
+            except (OSError, ValueError):  # the reader is gone
                 pass
         os._exit(_exit_code[0])
 

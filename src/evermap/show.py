@@ -57,7 +57,7 @@ class ShownTable(Shown):
     __slots__ = ()
     __dataclass_fields__: ClassVar[dict[str, Any]]
     _besides: ClassVar[frozenset[str]] = frozenset()
-    """Arrays that are no columns."""
+    """Arrays that are not columns."""
 
     def to_pandas(self) -> Any:
         """Return a data frame with a row an item; positions, poses and covariances become several columns.

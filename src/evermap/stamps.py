@@ -27,7 +27,7 @@ def stamp_text(stamp_s: float, clock: Clock) -> str:
 
 
 def between_text(from_s: float, to_s: float, clock: Clock) -> str:
-    """Return 'between A and B'; 'before B' where nobody had looked before."""
+    """Return 'between A and B'; 'before B' without an earlier look."""
     late = stamp_text(to_s, clock)
     early = stamp_text(from_s, clock)
     if early == "-":

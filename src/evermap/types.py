@@ -80,7 +80,7 @@ def _numbers(given: Any, owner: str, name: str) -> Any:
     try:
         return np.asarray(given) if len(given) else np.zeros(0)
     except (TypeError, ValueError):
-        raise InputError(f"{owner}: {type(given).__name__} is no array of numbers", field=name) from None
+        raise InputError(f"{owner}: {type(given).__name__} is not an array of numbers", field=name) from None
 
 
 def _as_kind(array: Any, owner: str, name: str, *, whole: bool) -> Any:
@@ -448,7 +448,7 @@ class Innovations(_Columns):
         detection: (K,) row of `Recording.detections`.
         landmark_id: (K,) landmark it was compared with.
         nis: (K,) squared Mahalanobis distance of the innovation, chi-square with 2 degrees of freedom if consistent.
-        p_inlier: (K,) final probability that it is no outlier, after smoothing.
+        p_inlier: (K,) final probability that it is not an outlier, after smoothing.
     """
 
     stamp_s: FloatArray
@@ -590,7 +590,7 @@ _Table = TypeVar("_Table", bound="DataclassInstance")
 
 
 def rows_of(table: _Table, rows: IntArray | BoolArray) -> _Table:
-    """Return some rows of a table of columns, by number, in that order, or by a mask; what is no column stays."""
+    """Return some rows of a table of columns, by number, in that order, or by a mask; what is not a column stays."""
     columns = {item.name: getattr(table, item.name) for item in fields(table)}
     some: dict[str, Any] = {name: column[rows] for name, column in columns.items() if isinstance(column, np.ndarray)}
     return replace(table, **some)

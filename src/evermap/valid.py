@@ -112,12 +112,12 @@ def validate(recording: Any) -> None:
     for quantity in (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD):
         quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
     _require((detections.frame >= 0) & (detections.frame < len(frames)), detections.frame, "detections.frame",
-             f"is no row of {len(frames)} frames", "the row of frames in which it was made")  # fmt: skip
+             f"is not a row of {len(frames)} frames", "the row of frames in which it was made")  # fmt: skip
     _require(np.diff(detections.frame, prepend=0) >= 0, detections.frame, "detections.frame",
              "comes after a later frame", "sort the detections by frame")  # fmt: skip
     for name in ("landmark_id", "class_id"):
         ids = getattr(detections, name)
-        _require(ids >= UNKNOWN, ids, f"detections.{name}", "is no identity", "whole numbers from 0; -1 for unknown")
+        _require(ids >= UNKNOWN, ids, f"detections.{name}", "is not an identity", "whole numbers from 0; -1: unknown")
     _check_sensor(recording.sensor)
     if recording.truth is not None:
         _check_trajectory(recording.truth, "truth")
@@ -149,7 +149,7 @@ def check_landmarks(landmarks: Any, field: str) -> None:
     with np.errstate(invalid="ignore"):
         fine = np.isfinite(covariance).all(axis=(1, 2)) & (variance >= 0.0).all(axis=1)
         fine &= size >= -1e-6 * variance.prod(axis=1) - 1e-30
-    _require(fine, ids, f"{field}.covariance_m2", "has no covariance: not positive semidefinite", "square metres")
+    _require(fine, ids, f"{field}.covariance_m2", "is not a covariance: not positive semidefinite", "square metres")
 
 
 def _check_trajectory(trajectory: Trajectory, field: str) -> None:
@@ -165,15 +165,15 @@ def _check_sensor(sensor: Sensor) -> None:
             raise InputError(problem, field=f"sensor.{low}", hint="metres, and radians counter-clockwise")
     for name in ("p_detect", "p_false"):
         if not 0.0 <= getattr(sensor, name) <= 1.0:
-            raise InputError(f"{getattr(sensor, name)} is no probability", field=f"sensor.{name}", hint="0 to 1")
+            raise InputError(f"{getattr(sensor, name)} is not a probability", field=f"sensor.{name}", hint="0 to 1")
     for name in ("sigma_range_m", "sigma_bearing_rad"):
         sigma = getattr(sensor, name)
         if sigma is not None and not 0.0 < sigma < inf:
-            raise InputError(f"{sigma} is no standard deviation", field=f"sensor.{name}", hint="None where unknown")
+            raise InputError(f"{sigma} is not a standard deviation", field=f"sensor.{name}", hint="None where unknown")
     mount = np.asarray(sensor.mount_robot_sensor, dtype=np.float64)
     if mount.shape != (3,) or not np.isfinite(mount).all():
         raise InputError(
-            f"{sensor.mount_robot_sensor} is no pose", field="sensor.mount_robot_sensor", hint="x, y, theta"
+            f"{sensor.mount_robot_sensor} is not a pose", field="sensor.mount_robot_sensor", hint="x, y, theta"
         )
 
 

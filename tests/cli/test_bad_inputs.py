@@ -307,7 +307,7 @@ def of_looks() -> Iterator[Case]:
         yield Case(
             "persist", f"detected {cell}", column(file, "detected", lambda _, c=cell: c, row=1), 2, "neither 1 nor 0"
         )
-    yield Case("persist", "nobody looked", column(file, "detected", lambda _: ""), 2, "nobody looked")
+    yield Case("persist", "nobody looked", column(file, "detected", lambda _: ""), 2, "no row is a look")
     yield Case(
         "persist",
         "no name",

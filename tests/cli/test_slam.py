@@ -194,7 +194,7 @@ def test_shortcuts_are_settings() -> None:
     ("options", "problem"),
     [
         (["--shift", "1:1.0"], "there is no map to shift"),
-        (["--prior-map", "truth", "--shift", "one:1.0"], "'one' is no landmark id"),
+        (["--prior-map", "truth", "--shift", "one:1.0"], "'one' is not a landmark id"),
         (["--prior-map", "truth", "--shift", "987654:1.0"], "no landmark 987654 in the prior map"),
         (["--method", "guess"], "field '--method': input should be 'nohyp'"),
     ],

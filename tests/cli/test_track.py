@@ -177,14 +177,14 @@ FEW = "stamp_s,x_m,y_m,z_m,class_id\n" + "".join(f"{0.1 * k:.1f},1,2,3,car\n" fo
 @pytest.mark.parametrize(
     ("content", "options", "named"),
     [
-        (FEW, ("--range-m", "5"), "field '--range-m': nobody knows where the sensor was"),
+        (FEW, ("--range-m", "5"), "field '--range-m': the position of the sensor is unknown"),
         (FEW, ("--range-m", "-5"), "field '--range-m': input should be greater than 0"),
         (FEW, ("--gap-s", "0"), "field '--gap-s': input should be greater than 0"),
         (FEW, ("--min-score", "2"), "field '--min-score': input should be less than or equal to 1"),
         (FEW, ("--prior", "bus=never-leaves"), "no detection is of class 'bus' (try: one of car)"),
         (FEW, ("--prior", "exponentail:mean=1h"), "try: exponential"),
         (FEW, ("--speed", "bus=0.2"), "no detection is of class 'bus'"),
-        (FEW, ("--speed", "fast"), "'fast' is no CLASS=SPEED"),
+        (FEW, ("--speed", "fast"), "'fast' is not CLASS=SPEED"),
         (FEW, ("--set", "warmup=2"), "field 'track.warmup': unknown key (try: track.warm_up)"),
         (FEW, ("--set", "warm_up=two"), "field 'track.warm_up': input should be a valid integer"),
         (FEW, ("--set", "p_detect=1.5"), "field 'track.p_detect': input should be less than 1, not 1.5"),

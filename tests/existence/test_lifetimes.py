@@ -16,7 +16,6 @@ from evermap.existence.phase_type import PhaseType
 from evermap.existence.rhythm import BINS, Rhythm
 from evermap.existence.run_length import RunLength
 from evermap.survival import (
-    CallableHazard,
     Exponential,
     Gamma,
     LogNormal,
@@ -25,6 +24,7 @@ from evermap.survival import (
     Weibull,
     never_leaves,
 )
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 AGES = np.array([0.0, 1.0, 30.0, 400.0, 5000.0])
 MIXED = Mixture.of([Exponential(0.1), Exponential(1e-3)], [0.3, 0.7])

@@ -11,7 +11,6 @@ from evermap.errors import ConfigError, NumericalError
 from evermap.existence.one_stay import OneStay, PersistenceFilter, births
 from evermap.existence.protocol import Instants, Looks
 from evermap.survival import (
-    CallableHazard,
     Exponential,
     GeneralPurpose,
     LifetimePrior,
@@ -20,6 +19,7 @@ from evermap.survival import (
     Weibull,
     never_leaves,
 )
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 PRIORS: dict[str, LifetimePrior] = {
     "exponential": Exponential(0.02),

@@ -152,7 +152,7 @@ def test_the_evidence_is_the_product_of_the_predictions(name: str, seen: Looks) 
     for k in range(len(seen.stamp_s)):
         past = Looks(np.array([0, k]), *(column[:k] for column in columns))
         if k == 0 and name == "one stay":
-            continue  # the detection of the birth is no observation
+            continue  # the detection of the birth is not an observation
         p = model.track(past, Instants.same_for_all(1, seen.stamp_s[k : k + 1])).p_present[0]
         total += np.log(p * there[k] + (1.0 - p) * gone[k])
     assert model.track(seen).log_evidence[0] == pytest.approx(total, rel=1e-8, abs=1e-9)

@@ -141,7 +141,7 @@ def test_bad_flags_names_and_files(tmp_path: Path) -> None:
         read(tmp_path, b"a\n\xff\n")
     pq.write_table(pa.table({"a": [1.5], "s": [[1]]}), tmp_path / "t.parquet")
     table = read_columns(tmp_path / "t.parquet", [])
-    with pytest.raises(InputError, match=r"t\.parquet:1: field 'a': 1\.5 is no name"):
+    with pytest.raises(InputError, match=r"t\.parquet:1: field 'a': 1\.5 is not a name"):
         table.labels("a")
     with pytest.raises(InputError, match=r"field 's': holds list<.*>, not numbers"):
         table.numbers(Quantity("s"))

@@ -152,9 +152,9 @@ def test_dates_with_a_zone_are_unix_and_without_one_the_clocks_on_the_wall(tmp_p
             "odometry.csv",
             "2026-03-01T12:00:05Z",
             "2026-13-01T12:00:05Z",
-            r"odometry.csv:\d+: field 'stamp_s': .*is no date",
+            r"odometry.csv:\d+: field 'stamp_s': .*is not a date",
         ),
-        ("odometry.csv", "2026-03-01T12:00:05Z", "noon", "is no date"),
+        ("odometry.csv", "2026-03-01T12:00:05Z", "noon", "is not a date"),
         ("odometry.csv", "2026-03-01T12:00:05Z", "2026-03-01T11:00:05Z", "time runs backwards"),
         (
             "sensor.toml",

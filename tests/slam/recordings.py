@@ -44,7 +44,7 @@ def with_odometry(recording: Recording, keep: np.ndarray) -> Recording:
 
 
 def some_rows(table: Any, keep: np.ndarray | slice) -> Any:
-    """A dataclass of columns with some of its rows; what is no column stays."""
+    """A dataclass of columns with some of its rows; what is not a column stays."""
     columns = {field.name: getattr(table, field.name) for field in fields(table)}
     return replace(table, **{name: column[keep] for name, column in columns.items() if isinstance(column, np.ndarray)})
 

@@ -192,11 +192,11 @@ VALID = {
     "nan range": (readings(range_m=lambda r: np.full_like(r, np.nan)), "detections.range_m.*row 0: nan"),
     "infinite range": (readings(range_m=lambda r: np.full_like(r, np.inf)), "detections.range_m.*row 0: inf"),
     "degrees": (readings(bearing_rad=lambda b: b + 90), "detections.bearing_rad.*radians, not degrees"),
-    "frames that do not exist": (readings(frame=lambda f: f + 10**6), "detections.frame.*is no row of"),
-    "negative frame": (readings(frame=lambda f: f - 5), "detections.frame.*is no row of"),
+    "frames that do not exist": (readings(frame=lambda f: f + 10**6), "detections.frame.*is not a row of"),
+    "negative frame": (readings(frame=lambda f: f - 5), "detections.frame.*is not a row of"),
     "unsorted detections": (readings(frame=lambda f: f[::-1]), "detections.frame.*comes after a later"),
-    "identity": (readings(landmark_id=lambda i: i - 10**6), "detections.landmark_id.*is no identity"),
-    "class": (readings(class_id=lambda i: i - 10**6), "detections.class_id.*is no identity"),
+    "identity": (readings(landmark_id=lambda i: i - 10**6), "detections.landmark_id.*is not an identity"),
+    "class": (readings(class_id=lambda i: i - 10**6), "detections.class_id.*is not an identity"),
     "sigma": (readings(sigma_range_m=np.zeros_like), "detections.sigma_range_m.*greater than zero"),
     "frames backwards": (
         lambda rec: replace(rec, frames=replace(rec.frames, stamp_s=rec.frames.stamp_s[::-1])),
@@ -207,7 +207,7 @@ VALID = {
     "probability": (lambda rec: replace(rec, sensor=replace(rec.sensor, p_detect=1.5)), "sensor.p_detect"),
     "mount": (
         lambda rec: replace(rec, sensor=replace(rec.sensor, mount_robot_sensor=(0.0, np.nan, 0.0))),
-        "is no pose",
+        "is not a pose",
     ),
     "truth": (
         lambda rec: replace(rec, truth=replace(rec.truth, pose_world_robot=np.nan * rec.truth.pose_world_robot)),
@@ -244,7 +244,7 @@ def test_a_path_is_no_recording(run: Callable[[object], object]) -> None:
         (readings(range_m=lambda r: np.stack([r, r])), "Detections of shape"),
         (readings(landmark_id=lambda i: i + 0.5), "fractions where whole numbers"),
         (readings(range_m=lambda r: np.full(len(r), "far")), "holds no numbers"),
-        (readings(range_m=lambda _: None), "no array of numbers"),
+        (readings(range_m=lambda _: None), "is not an array of numbers"),
     ],
 )
 def test_columns_that_do_not_fit_are_refused_where_they_are_made(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from evermap import survival
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 TOLERANCE = 1e-9
 Reference = Callable[["mp.mpf"], tuple["mp.mpf", "mp.mpf"]]
@@ -146,19 +147,19 @@ CASES: dict[str, tuple[survival.LifetimePrior, Reference]] = {
         mixture([(0.5, point(1.0)), (0.25, stretch(1e-3, 1e4)), (0.25, point(np.inf))]),
     ),
     "callable, infinite at 0": (
-        survival.CallableHazard(lambda t: 1e-3 / np.sqrt(t), horizon_s=2e12),
+        CallableHazard(lambda t: 1e-3 / np.sqrt(t), horizon_s=2e12),
         hazard_of(lambda t: mp.mpf(2e-3) * mp.sqrt(t)),
     ),
     "callable, falling": (
-        survival.CallableHazard(lambda t: 1.0 / (100.0 + t), horizon_s=2e12),
+        CallableHazard(lambda t: 1.0 / (100.0 + t), horizon_s=2e12),
         hazard_of(lambda t: mp.log1p(t / 100)),
     ),
     "callable, growing": (
-        survival.CallableHazard(lambda t: 1e-9 * t**1.5, horizon_s=2e12),
+        CallableHazard(lambda t: 1e-9 * t**1.5, horizon_s=2e12),
         hazard_of(lambda t: mp.mpf(1e-9) * t ** mp.mpf("2.5") / mp.mpf("2.5")),
     ),
     "callable, finite integral": (
-        survival.CallableHazard(lambda t: 1e-2 / (1.0 + 1e-3 * t) ** 2, horizon_s=2e12),
+        CallableHazard(lambda t: 1e-2 / (1.0 + 1e-3 * t) ** 2, horizon_s=2e12),
         hazard_of(lambda t: mp.mpf(1e-2) * t / (1 + mp.mpf(1e-3) * t)),
     ),
     "periodic": (

@@ -11,6 +11,7 @@ from scipy import stats
 from evermap import survival
 from evermap.errors import ConfigError
 from evermap.survival import LifetimePrior
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 CONTINUOUS: dict[str, LifetimePrior] = {
     "exponential": survival.Exponential(2e-3),
@@ -23,12 +24,12 @@ CONTINUOUS: dict[str, LifetimePrior] = {
     "mixture": survival.Mixture((survival.Exponential(0.1), survival.Uniform(800.0)), (0.4, 0.6)),
     "piecewise": survival.PiecewiseConstantHazard((0.0, 10.0, 50.0), (0.05, 0.0, 0.002)),
     "periodic": survival.PeriodicHazard(24.0, (0.0, 8.0, 18.0), (0.0, 0.01, 0.002), start_s=11.0),
-    "callable": survival.CallableHazard(lambda t: 0.01 / (1.0 + t / 50.0) + 1e-3, horizon_s=1e4),
+    "callable": CallableHazard(lambda t: 0.01 / (1.0 + t / 50.0) + 1e-3, horizon_s=1e4),
     "intervals": survival.StepLifetime((0.0, 20.0), (10.0, 400.0), (0.3, 0.7)),
 }
 SOME_STAY: dict[str, LifetimePrior] = {
     "piecewise, some stay": survival.PiecewiseConstantHazard((0.0, 100.0), (0.01, 0.0)),
-    "callable, some stay": survival.CallableHazard(lambda t: np.exp(-t / 100.0) / 100.0, 1e5, rate_after=0.0),
+    "callable, some stay": CallableHazard(lambda t: np.exp(-t / 100.0) / 100.0, 1e5, rate_after=0.0),
     "mixture, some stay": survival.Mixture((survival.never_leaves(), survival.Exponential(0.01)), (0.3, 0.7)),
     "points": survival.StepLifetime.at_points((5.0, 60.0, math.inf), (0.5, 0.3, 0.2)),
     "turnbull": survival.StepLifetime((10.0, 30.0, 100.0), (20.0, 30.0, math.inf), (0.5, 0.25, 0.25)),

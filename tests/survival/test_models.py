@@ -11,6 +11,7 @@ from scipy import stats
 from evermap import survival
 from evermap.errors import ConfigError
 from evermap.survival import LifetimePrior
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 HOUR_S, DAY_S = 3600.0, 86400.0
 
@@ -99,7 +100,7 @@ def test_nobody_outlives_a_limit() -> None:
 
 def test_a_callable_hazard_finds_jumps_and_equals_the_pieces() -> None:
     written = survival.PiecewiseConstantHazard((0.0, 3.0, 500.0), (1.5, 1e-7, 2e-3))
-    computed = survival.CallableHazard(lambda t: np.where(t < 3.0, 1.5, np.where(t < 500.0, 1e-7, 2e-3)), horizon_s=1e4)
+    computed = CallableHazard(lambda t: np.where(t < 3.0, 1.5, np.where(t < 500.0, 1e-7, 2e-3)), horizon_s=1e4)
     a = np.array([0.0, 1.0, 2.999, 3.1, 40.0, 499.0, 2e4])
     b = np.array([1.0, 3.5, 3.001, 3.2, 700.0, 501.0, 3e4])
     for ask in ("log_conditional_survival", "log_conditional_death"):
@@ -108,7 +109,7 @@ def test_a_callable_hazard_finds_jumps_and_equals_the_pieces() -> None:
 
 
 def test_a_hazard_of_finite_integral_says_who_stays() -> None:
-    prior = survival.CallableHazard(lambda t: 2.0 * np.exp(-t), horizon_s=100.0, rate_after=0.0)
+    prior = CallableHazard(lambda t: 2.0 * np.exp(-t), horizon_s=100.0, rate_after=0.0)
     assert prior.p_never_leaves == pytest.approx(math.exp(-2.0), rel=1e-12)
     assert survival.PiecewiseConstantHazard((0.0, 10.0), (0.1, 0.0)).p_never_leaves == pytest.approx(math.exp(-1.0))
     assert survival.PeriodicHazard(1.0, (0.0,), (0.0,)).p_never_leaves == 1.0
@@ -138,10 +139,10 @@ def test_a_hazard_of_finite_integral_says_who_stays() -> None:
         (lambda: survival.PeriodicHazard(24.0, (0.0, 25.0), (0.1, 0.1)), "edges_s"),
         (lambda: survival.PeriodicHazard(24.0, (0.0, 5.0), (0.1, math.nan)), "rates"),
         (lambda: survival.PeriodicHazard(24.0, (0.0,), (0.1,), start_s=24.0), "start_s"),
-        (lambda: survival.CallableHazard(lambda t: 0.1 - t, 10.0), "hazard"),
-        (lambda: survival.CallableHazard(lambda t: 1.0 / t, 10.0), "hazard"),
-        (lambda: survival.CallableHazard(lambda t: np.ones(3), 10.0), "hazard"),
-        (lambda: survival.CallableHazard(lambda t: 0.1, 10.0, rate_after=-1.0), "rate_after"),
+        (lambda: CallableHazard(lambda t: 0.1 - t, 10.0), "hazard"),
+        (lambda: CallableHazard(lambda t: 1.0 / t, 10.0), "hazard"),
+        (lambda: CallableHazard(lambda t: np.ones(3), 10.0), "hazard"),
+        (lambda: CallableHazard(lambda t: 0.1, 10.0, rate_after=-1.0), "rate_after"),
         (lambda: survival.gone_daily(1.0, first_seen_hour=3.0, hours=(20.0, 6.0)), "probability"),
         (lambda: survival.gone_daily(0.5, first_seen_hour=24.0, hours=(20.0, 6.0)), "first_seen_hour"),
     ],

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from evermap.errors import ConfigError
-from evermap.survival import CallableHazard, LifetimePrior, Mixture, StepLifetime, Uniform, never_leaves, parse_prior
+from evermap.survival import LifetimePrior, Mixture, StepLifetime, Uniform, never_leaves, parse_prior
 from evermap.survival.text import CLASSES, FORMS, prior_from_dict, prior_to_dict
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 PRIORS: list[LifetimePrior] = [
     *(parse_prior(form.example) for form in FORMS.values()),

@@ -167,7 +167,7 @@ def test_bad_input_is_told_in_one_line(given: dict[str, object], says: str) -> N
         (
             lambda: Tracker(n_classes=2, confusion=np.array([[0.5, 0.6], [0.0, 1.0]])),
             (
-                "field 'confusion': row 0 is no distribution over detected classes (sum 1.1) "
+                "field 'confusion': row 0 is not a distribution over detected classes (sum 1.1) "
                 "(try: rows are true classes and sum to 1)"
             ),
         ),

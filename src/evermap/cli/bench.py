@@ -64,17 +64,17 @@ def _numbers(text: str) -> tuple[int, ...]:
     """Read '400,1000' as numbers of landmarks."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) >= 2 for part in parts):
-        raise InputError(f"'{text}' is no list of numbers from 2", field="--sizes", hint="--sizes 400,1000,4000")
+        raise InputError(f"'{text}' is not a list of numbers from 2", field="--sizes", hint="--sizes 400,1000,4000")
     return tuple(map(int, parts))
 
 
 def load_benchmarks(root: Path = Path(__file__).resolve().parents[3]) -> ModuleType:
     """Return the module `benchmarks.run` of a source checkout.
 
-    It is no part of the installed package: it compares with libraries that users need not have.
+    It is not part of the installed package: it compares with libraries that users need not have.
 
     Raises:
-        InputError: `root` is no source checkout.
+        InputError: `root` is not a source checkout.
     """
     path = root / "benchmarks" / "run.py"
     if not path.is_file():

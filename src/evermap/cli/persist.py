@@ -97,7 +97,7 @@ HELP = """\
 Tell what is still there, from detections and misses.
 
 \b
-The table has a row a look: stamp_s, feature_id, and detected (1, 0, or empty where nobody looked); it may have
+The table has a row a look: stamp_s, feature_id, and detected (1, 0, or empty where there was no look); it may have
 p_miss, p_false, class_id, and the truth as present. The folder gets beliefs.csv, changes.jsonl, forecasts.csv,
 summary.json, figures and report.html.
 

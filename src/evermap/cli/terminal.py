@@ -113,7 +113,7 @@ def warm_up(compile_kernels: Callable[[], None] | None = None) -> None:
 
 @contextmanager
 def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]:
-    """Yield A progress bar on stderr; None, and silence, where stderr is no terminal.
+    """Yield a progress bar on stderr; None, and silence, where stderr is no terminal.
 
     Args:
         label: in front of the bar.

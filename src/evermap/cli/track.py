@@ -55,7 +55,7 @@ MinScore = Annotated[float | None, typer.Option(help="Leave out detections of a 
 Gap = Annotated[
     float | None,
     typer.Option(
-        help="A longer time between two frames is one at which nobody looked [s].", show_default="ten times the usual"
+        help="A longer time between two frames is one without any look [s].", show_default="ten times the usual"
     ),
 ]
 Scene = Annotated[bool, typer.Option("--scene/--no-scene", help="Write scene.rrd for the rerun viewer.")]
@@ -82,7 +82,7 @@ Most useful with --set:
   max_missed=10           frames without a detection until it is kept in mind, or given up if it moved
   rest_for_s=2            time without motion before an object counts as resting [s]
   place_sigma_m=0.2       how exactly a resting object is found again in its place, beside the noise [m]
-  moved_reach_m=0         how far objects may be moved while nobody looks; wants appearances [m]
+  moved_reach_m=0         how far objects may be moved between looks; wants appearances [m]
 
 \b
 Examples:
@@ -144,7 +144,7 @@ def _speeds(texts: Sequence[str] | None) -> dict[str, float] | None:
         except ValueError:
             speed = -1.0
         if not equals or not 0.0 < speed < float("inf"):
-            raise ConfigError(f"'{text}' is no CLASS=SPEED", field="speed", hint="pallet=0.2")
+            raise ConfigError(f"'{text}' is not CLASS=SPEED", field="speed", hint="pallet=0.2")
         if name in speeds:
             raise ConfigError(f"given twice for class '{name}'", field="speed")
         speeds[name] = speed

@@ -62,7 +62,7 @@ class CheckConfig(Section):
     )
     most_pairs: Count = Field(default=1000, description="pairs of sightings compared for each lag, at most")
     fits: Positive = Field(
-        default=0.03, description="difference between two readings that surprises nobody: share of the range, and rad"
+        default=0.03, description="difference between two readings that is usual: share of the range, and rad"
     )
     apart: Positive = Field(
         default=3.0, description="a pair distinguishes two explanations that differ by so many median residuals"

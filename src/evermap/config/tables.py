@@ -152,7 +152,7 @@ class TrackerConfig(Section):
         for row in range(n_classes):
             if not (np.all(matrix[row] >= 0.0) and abs(sums[row] - 1.0) < 1e-6):
                 raise ConfigError(
-                    f"row {row} is no distribution over detected classes (sum {sums[row]:g})",
+                    f"row {row} is not a distribution over detected classes (sum {sums[row]:g})",
                     field="confusion",
                     hint="rows are true classes and sum to 1",
                 )
@@ -183,7 +183,7 @@ class TrackConfig(TrackerConfig):
     )
     min_score: Probability = Field(default=0.0, description="detections of a lower score are left out")
     gap_s: Positive | None = Field(
-        default=None, description="a longer time between two frames is one at which nobody looked [s]; unset: chosen"
+        default=None, description="a longer time between two frames is one without any look [s]; unset: chosen"
     )
     gap_steps: float = Field(default=10.0, gt=1.0, description="that time in usual steps, where gap_s is unset")
 

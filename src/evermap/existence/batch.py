@@ -115,7 +115,7 @@ def look(
     if not 0.0 <= horizon_s < np.inf:
         raise InputError(f"{horizon_s} s is not a time after the look", field="horizon_s", hint="a finite number >= 0")
     given: Parts = (before, rates, sight)
-    columns, torch = _by_name(given), sys.modules.get("torch")  # who has tensors has loaded it
+    columns, torch = _by_name(given), sys.modules.get("torch")  # tensors exist only where it is loaded
     if torch is not None and isinstance(before.inverse_odds, torch.Tensor):
         if out is not None:
             raise InputError("is for arrays only", field="out", hint="leave it out: torch keeps memory for reuse")
@@ -263,7 +263,7 @@ class _Selections(ast.NodeTransformer):
 @cache
 def _formulas(double: bool) -> dict[str, Any]:
     """The formulas, compiled once for each type of tensors."""
-    torch: Any = sys.modules["torch"]  # who has tensors has loaded it
+    torch: Any = sys.modules["torch"]  # tensors exist only where it is loaded
 
     def where(condition: Any, a: Any, b: Any) -> Any:
         if not isinstance(condition, torch.Tensor):

@@ -19,7 +19,7 @@ from evermap.types import FloatArray, IntArray
 
 
 def _compiled_formulas() -> dict[str, Any]:
-    """The formulas of `recursion`, inlined into the kernels that call them, with exponentials that are no calls."""
+    """The formulas of `recursion`, inlined into the kernels that call them, with exponentials that are not calls."""
     space = dict(vars(recursion))
     for name, formula in vars(recursion).items():
         if isinstance(formula, FunctionType):

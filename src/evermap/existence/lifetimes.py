@@ -30,7 +30,7 @@ DOUBLINGS = 24
 WIDE = 1.01
 """Ratio of highest to lowest rate above which the kernel of the unknown-rate prior keeps ten digits."""
 CERTAIN = 800.0
-"""Integrated hazard that nobody survives: e^-800 is 0."""
+"""Integrated hazard that nothing survives: e^-800 is 0."""
 
 
 class Lifetimes(NamedTuple):

@@ -150,7 +150,7 @@ class OneStay(Shown):
     """A feature is born with its first detection, stays for one lifetime, and never returns (Rosen 2016).
 
     Before its birth nothing is believed. The detection of the birth itself is taken as true, as in Rosen's
-    initial condition; it is no observation and adds nothing to the evidence.
+    initial condition; it is not an observation and adds nothing to the evidence.
 
     Attributes:
         prior: how long such features stay.
@@ -201,7 +201,7 @@ class OneStay(Shown):
         same = np.flatnonzero(feature[1:] == feature[:-1]) + 1
         before_s[same] = age_s[same - 1]
         odds = np.full(len(time), -np.inf)
-        gap = np.flatnonzero(age_s > before_s)  # nobody dies in no time, and some priors take long to say so
+        gap = np.flatnonzero(age_s > before_s)  # nothing leaves in no time, and some priors take long to say so
         odds[gap] = log_death_odds((self.prior,), np.zeros(len(gap), dtype=np.int64), before_s[gap], age_s[gap])
         evidence, belief = np.zeros(looks.n_features), np.empty(len(time))
         bad = int(stream(Stream(feature, odds, there, gone), np.zeros(looks.n_features), evidence, belief))

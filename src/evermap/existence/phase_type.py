@@ -142,7 +142,7 @@ class PhaseType(Shown):
             absence: likewise.
 
         Raises:
-            ConfigError: a prior that is no mixture of exponentials.
+            ConfigError: a prior that is not a mixture of exponentials.
         """
         away, there = exponential_mixture_of(absence), exponential_mixture_of(stay)
         k, m = len(away.weights), len(there.weights)

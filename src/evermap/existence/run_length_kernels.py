@@ -20,7 +20,7 @@ from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
 MOST = 700.0
-"""Integrated hazard that nobody survives."""
+"""Integrated hazard that nothing survives."""
 NO_MERGE = -1
 AS_THEY_ARE = (1.0, 1.0)
 _POSITION = 0xFFFFF

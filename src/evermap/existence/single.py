@@ -32,7 +32,7 @@ class Belief(BeliefTable):
         stamp_s: (N,) time of the last observation, seconds since the feature's birth; 0 before the first.
         priors: the lifetimes in use.
         prior_of_row: (N,) which of `priors` each row has.
-        log_evidence: (N,) `log p(y_1:n)` summed so far, or None where nobody asked for it.
+        log_evidence: (N,) `log p(y_1:n)` summed so far, or None where it was not asked for.
     """
 
     inverse_odds: FloatArray

@@ -200,11 +200,11 @@ def renew(
         seat: (C + 1,) rows of the seats of each clique.
         route: (R, W) where one that leaves a seat goes; what is missing to 1 stays.
         moves: (R,) sum of that.
-        death_old: (R, M) odds of leaving, in each step, of who has been there since before.
-        death_new: (R, M) odds of leaving of who came: in what was left of the step then, and in each one after it.
+        death_old: (R, M) odds of leaving, in each step, of those that have been there since before.
+        death_new: (R, M) odds of leaving of those that came: in the rest of the step then, and in each one after it.
         old: (R,) probabilities, updated in place.
-        new: (R,) filled in: of who came in the meantime.
-        began: (R,) filled in: when that was on average, in steps; the middle of the gap where nobody came.
+        new: (R,) filled in: of those that came in the meantime.
+        began: (R,) filled in: when that was on average, in steps; the middle of the gap where none came.
     """
     steps = death_old.shape[1]
     come = np.zeros((old.size, steps))

@@ -61,7 +61,7 @@ class SiteDynamics(Shown):
         absence: C lifetimes of the time away of each clique.
         away_since_s: (C,) when it went away, if it is away.
         p_hop: (C,) probability that a clique that leaves a site stands at another one at once.
-        return_share: (S,) probability that who turns up does so at this site, at most 1 in sum of a clique; the rest
+        return_share: (S,) probability that what turns up does so at this site, at most 1 in sum of a clique; the rest
             turns up at places that are not known, which is 'away'. One that hops from a site has the shares of the
             others and of unknown places, scaled to sum 1. 0 for a clique that never returns.
     """
@@ -276,7 +276,7 @@ def _said_by(frames: CliqueFrames, looks: SiteLooks, chains: CliqueChains, senso
 STEPS = 32
 """Of a gap between sessions, in each of which a clique leaves or returns at most once."""
 SELDOM = 0.01
-"""A gap in which nobody leaves or returns with more than these odds is one step."""
+"""A gap in which nothing leaves or returns with more than these odds is one step."""
 
 
 def follow_sites(

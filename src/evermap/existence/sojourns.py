@@ -27,7 +27,7 @@ PEAK_SPREAD = 0.05
 """Spread of a peak to begin with. Then each peak's spread is its own and, as one more event, that of all peaks
 together: a peak of one event would have none else."""
 BACKGROUND_SPREAD = 1.0
-"""Spread of the wide component that takes what is no peak, as one event."""
+"""Spread of the wide component that takes what is not a peak, as one event."""
 SHARE_STRENGTH = 0.5
 """Events added to each component, so that none dies out."""
 _MOST_LOG_SHAPE = 6.0

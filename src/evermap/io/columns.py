@@ -125,7 +125,7 @@ class Columns:
             values = self._converted(cells, name)
             wrong = np.flatnonzero(~np.isnan(values) & ~((values == np.floor(values)) & (np.abs(values) < 2.0**63)))
             if wrong.size:
-                problem = f"{values[wrong[0]]:g} is no name"
+                problem = f"{values[wrong[0]]:g} is not a name"
                 raise self.error(problem, row=int(wrong[0]), field=name, hint="text or whole numbers")
             cells = arrow_cells(values, ~np.isnan(values)).cast(pa.int64())
         elif not _is_text(cells.type) and not pa.types.is_integer(cells.type) and not pa.types.is_null(cells.type):
@@ -144,7 +144,7 @@ class Columns:
         return Table(self.path, columns, self.line, self.header_line)
 
     def _converted(self, cells: Any, name: str) -> FloatArray:
-        """Cells that are no text as float64."""
+        """Cells that are not text as float64."""
         import pyarrow as pa
 
         kind = cells.type

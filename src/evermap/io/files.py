@@ -79,7 +79,7 @@ class FileSet:
 def file_sets(path: str | Path) -> list[FileSet]:
     """Return every folder with files in it: of a zip all, of a folder itself and the folders directly below.
 
-    A plain file that is no zip gives an empty list.
+    A plain file that is not a zip gives an empty list.
 
     Raises:
         InputError: nothing is there, or the zip is damaged.

@@ -267,7 +267,7 @@ def _covariance(table: Table, sigma_m: float) -> FloatArray:
         # estimates of well-known landmarks may miss being positive by rounding
         wrong = np.flatnonzero((xx < 0) | (yy < 0) | (xy**2 > xx * yy * (1 + 1e-6) + 1e-30))
         if len(wrong):
-            problem = "is no covariance: not positive semidefinite"
+            problem = "is not a covariance: not positive semidefinite"
             raise table.error(problem, row=int(wrong[0]), field="cov_xx_m2")
         covariance[:, 0, 0], covariance[:, 1, 1] = xx, yy
         covariance[:, 0, 1] = covariance[:, 1, 0] = xy

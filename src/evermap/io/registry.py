@@ -26,7 +26,8 @@ def reader_for(path: str | Path) -> Reader:
         if reader.matches(path):
             return reader
     if path.is_file() and not found:
-        raise InputError("a single file is no recording", path=path, hint=f"its folder {path.parent}, or a zip of it")
+        hint = f"its folder {path.parent}, or a zip of it"
+        raise InputError("a single file is not a recording", path=path, hint=hint)
     names = sorted(name for files in found for name in files.members)
     holds = ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "") if names else "no files"
     wanted = "; ".join(f"{reader.name}: {reader.looks_for}" for reader in READERS)

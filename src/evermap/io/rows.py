@@ -50,7 +50,7 @@ def parse_rows(data: bytes, path: Path, quantities: tuple[Quantity, ...], warnin
     it is left out, and `warnings` gets a remark.
 
     Raises:
-        InputError: a line has the wrong number of columns or something that is no number; a value is not finite or
+        InputError: a line has the wrong number of columns or something that is not a number; a value is not finite or
             out of its limits; the file is not text.
     """
     text = decode_text(data, path)

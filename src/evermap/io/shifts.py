@@ -92,7 +92,7 @@ def _shifted(landmarks: Landmarks, shift: Shift) -> Landmarks:
 
 
 def _words(text: str) -> list[str]:
-    """Words between commas; nothing at all is no word, but an empty place between commas is one."""
+    """Words between commas; nothing at all is not a word, but an empty place between commas is one."""
     return [word.strip() for word in text.split(",")] if text.strip() else []
 
 
@@ -100,14 +100,14 @@ def _whole(word: str, text: str) -> int:
     try:
         return int(word)
     except ValueError:
-        raise _wrong(text, f"'{word}' is no landmark id") from None
+        raise _wrong(text, f"'{word}' is not a landmark id") from None
 
 
 def _finite(word: str, text: str) -> float:
     try:
         number = float(word)
     except ValueError:
-        raise _wrong(text, f"'{word}' is no number") from None
+        raise _wrong(text, f"'{word}' is not a number") from None
     if not math.isfinite(number):
         raise _wrong(text, f"'{word}' is not finite")
     return number

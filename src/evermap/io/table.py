@@ -28,7 +28,7 @@ class Table:
         path: file it came from, for messages.
         columns: name -> cells.
         line: (R,) line numbers in the file; for Parquet the row, for GeoJSON the feature, counted from 1.
-        header_line: where the names of the columns stand, None where that is no line of text.
+        header_line: where the names of the columns stand, None where that is not a line of text.
     """
 
     path: Path
@@ -87,7 +87,7 @@ class Table:
         Args:
             name: of the column.
             optional: whether a cell may be empty.
-            names: takes up the texts of cells that are no numbers, by their id (`landmark_id_of`); None refuses them.
+            names: takes up the texts of cells that are not numbers, by their id (`landmark_id_of`); None refuses them.
 
         Raises:
             InputError: a fraction, a negative number, or nothing where an id is needed; two texts with one id.
@@ -165,7 +165,7 @@ class Table:
                     continue
             except (ValueError, OverflowError):
                 hint = "2026-03-01T12:00:00.5, with or without a zone such as +01:00 or Z; or seconds throughout"
-                raise self.error(f"{quote(cell)} is no date", row=row, field=quantity.name, hint=hint) from None
+                raise self.error(f"{quote(cell)} is not a date", row=row, field=quantity.name, hint=hint) from None
             if other is not clock:
                 problem = f"{quote(cell)} has {'a' if other is Clock.UNIX else 'no'} zone, unlike the dates above"
                 raise self.error(problem, row=row, field=quantity.name, hint="a zone everywhere, or nowhere")
@@ -173,14 +173,14 @@ class Table:
 
 
 def parse_csv(data: bytes, path: Path, warnings: list[str]) -> Table:
-    """Return a CSV table: comma separated, the first line that is no comment names the columns, `#` starts a comment
+    """Return a CSV table: comma separated, the first line that is not a comment names the columns, `#` starts a comment
     line.
 
     A last line with too few cells, or without line end and with an empty or broken last cell, was cut off while it
     was written: it is left out, and `warnings` gets a remark.
 
     Raises:
-        InputError: no header, a repeated column name, a line with the wrong number of cells, bytes that are no text.
+        InputError: no header, a repeated column name, a line with the wrong number of cells, bytes that are not text.
     """
     lines = decode_text(data, path).split("\n")
     content = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"]
@@ -335,7 +335,7 @@ def _split(line: str, path: Path, number: int) -> list[str]:
 
 
 def _broken(cell: str, others: list[list[str]]) -> bool:
-    """Whether a cell is no number in a column that otherwise is one."""
+    """Whether a cell is not a number in a column that otherwise is one."""
     return not _is_number(cell) and bool(others) and all(_is_number(row[-1]) for row in others[-8:])
 
 

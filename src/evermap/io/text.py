@@ -1,4 +1,4 @@
-"""Bytes of a text file to lines, with any line end and with the line number of what is no text."""
+"""Bytes of a text file to lines, with any line end and with the line number of what is not text."""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ class RunFolder:
                 self._replaced.rename(self.out)
             raise
         _remove(self._replaced, ours)
-        for name in _entries(self._replaced):  # what came in the last moment, or belongs to nobody
+        for name in _entries(self._replaced):  # what came in the last moment, or is not listed
             if not os.path.lexists(self.out / name):
                 (self.out / name).parent.mkdir(parents=True, exist_ok=True)
                 (self._replaced / name).rename(self.out / name)

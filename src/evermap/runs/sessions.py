@@ -49,7 +49,7 @@ class Entered:
 
     @property
     def grown(self) -> IntArray:
-        """Landmarks that the map did not know before, and that nobody saw appear."""
+        """Landmarks that the map did not know before, and whose appearance was not seen."""
         from evermap.maps.diff import grown
 
         return grown(self.newest.members.landmark_id, self.living, self.changes)
@@ -66,7 +66,7 @@ class Entered:
             wall_s: what estimating took.
 
         Raises:
-            StaleRevisionError: somebody else committed in between.
+            StaleRevisionError: another commit came in between.
         """
         from evermap.config import Config, to_toml
 

@@ -4,7 +4,6 @@ from evermap.survival.base import LifetimePrior, Seed
 from evermap.survival.families import Exponential, Gamma, LogNormal, Uniform, Weibull
 from evermap.survival.general_purpose import GeneralPurpose
 from evermap.survival.hazards import (
-    CallableHazard,
     PeriodicHazard,
     PiecewiseConstantHazard,
     gone_daily,
@@ -14,7 +13,6 @@ from evermap.survival.step import StepLifetime, never_leaves
 from evermap.survival.text import parse_prior
 
 __all__ = [
-    "CallableHazard",
     "Exponential",
     "Gamma",
     "GeneralPurpose",

@@ -232,7 +232,7 @@ def plot_why(history: LandmarkHistory, *, title: str) -> Figure:
 
 
 def _draw_belief(axes: Axes, axis: TimeAxis, history: LandmarkHistory) -> None:
-    """A line within every session, a thin one between sessions, where nobody looked; log odds as probabilities."""
+    """A line within every session, a thin one between sessions, where there was no look; log odds as probabilities."""
     at, belief = axis.coordinates(history.stamp_s), np.clip(history.p_exists, _P_CLIP, 1.0 - _P_CLIP)
     axes.set_yscale("logit")
     edge = f", cut at {100 * _P_CLIP:g} % and {100 - 100 * _P_CLIP:g} %"

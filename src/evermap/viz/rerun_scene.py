@@ -347,7 +347,7 @@ def log_tracks(
     sensor_m: FloatArray | None = None,
     reach_m: float | None = None,
 ) -> Path:
-    """Write `path` (.rrd): tracklets with their ids, static ones blue and dynamic ones purple, and who rests, smaller.
+    """Write `path` (.rrd): tracklets with their ids, static blue and dynamic purple, and resting objects, smaller.
 
     Args:
         path: of the file.

@@ -76,7 +76,7 @@ def test_parquet_gives_the_same(tmp_path: Path) -> None:
         (f"{HEADER}\n1.7e18,a,1\n", r":2: field 'stamp_s': .* is outside .* not in milli- or nanoseconds"),
         (f"{HEADER}\n1,a,2\n", r":2: field 'detected': '2' is neither 1 nor 0"),
         (f"{HEADER}\n1,a,0.7\n", r":2: field 'detected': '0\.7' is neither 1 nor 0"),
-        (f"{HEADER}\n1,a,\n2,a,nan\n", r"field 'detected': nobody looked"),
+        (f"{HEADER}\n1,a,\n2,a,nan\n", r"field 'detected': no row is a look"),
         (f"{HEADER}\n1,,1\n", r":2: field 'feature_id': is empty"),
         (f"{HEADER},p_miss\n1,a,1,0.1\n1,a,1,1.5\n", r":3: field 'p_miss': 1\.5 is outside \[0, 1\]"),
         (f"{HEADER},p_false\n1,a,1,-0.1\n", r":2: field 'p_false': -0\.1 is outside \[0, 1\]"),
@@ -90,7 +90,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, content: str, message
 
 
 def test_defaults_must_be_probabilities(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"field 'p_miss': 2 is no probability"):
+    with pytest.raises(ConfigError, match=r"field 'p_miss': 2 is not a probability"):
         read(tmp_path, f"{HEADER}\n1,a,1\n", p_miss=2)
 
 

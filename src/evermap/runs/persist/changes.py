@@ -62,7 +62,7 @@ def find_changes(looks: Looks, p_present: FloatArray, confidence: float, tail: f
         confidence: belief in a state from which on it is taken to be so, above 0.5.
         tail: probability that a change lies before the interval given for it, and as much after it.
     """
-    feature = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    feature = looks.feature
     state = np.where(p_present >= confidence, 1, np.where(p_present <= 1.0 - confidence, -1, 0))
     sure = np.flatnonzero(state)
     same = feature[sure[1:]] == feature[sure[:-1]]

@@ -26,7 +26,7 @@ _COMMENT = """\
 Looks of a detector at things that come and go: replace these rows by your own, in any order.
 stamp_s     seconds, of any clock
 feature_id  any name or number
-detected    1: detected, 0: looked at and not detected; empty: nobody looked, but the belief is wanted
+detected    1: detected, 0: looked at and not detected; empty: no look, but the belief is wanted
 optional    p_miss, p_false: of this look, where --p-miss and --p-false do not fit
 optional    class_id: any name, for lifetimes of classes, as in --prior cart=exponential:half-life=1d
 optional    present: the truth, 1 or 0, empty where unknown; it only scores the result"""

@@ -242,7 +242,7 @@ def learn_models(
 
 def _check_span(looks: Looks, kind: str) -> None:
     """Raise DataError for stamps between which there are more steps than can be gone through."""
-    of_look = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    of_look = looks.feature
     pause_s = np.diff(looks.stamp_s)[np.diff(of_look) == 0]
     if not np.any(pause_s > 0.0):
         return

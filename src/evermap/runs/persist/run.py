@@ -150,7 +150,7 @@ def _filter(
         (p_ahead, p_exists), track = ask(models, looks, ahead, (feature, stamp_s))
         p_at_looks = p_exists[order[table.looked[order]]]
     else:
-        at_looks = np.repeat(np.arange(looks.n_features), np.diff(looks.first)), looks.stamp_s
+        at_looks = looks.feature, looks.stamp_s
         (p_ahead, p_exists, p_at_looks), track = ask(models, looks, ahead, (feature, stamp_s), at_looks)
     forecasts = forecasts_of(models, looks, later_s, p_ahead.reshape(looks.n_features, len(later_s)))
     return Beliefs(stamp_s, feature, p_exists), p_at_looks, forecasts, float(track.merged_mass.max())
@@ -229,7 +229,7 @@ def _odd_looks(looks: Looks) -> list[str]:
         )
     elif hits == 0 and count > looks.n_features:
         remarks.append(f"not one of {count:,} looks is a detection: is the column 'detected' inverted?")
-    of_look = np.repeat(np.arange(looks.n_features), np.diff(looks.first))
+    of_look = looks.feature
     again = (np.diff(of_look) == 0) & (np.diff(looks.stamp_s) == 0.0)
     other = again & (np.diff(looks.detected) != 0.0)
     for what, many in (("repeat", again & ~other), ("contradict", other)):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import ConfigError, InputError
-from evermap.existence.protocol import Looks
+from evermap.existence.protocol import Looks, feature_of
 from evermap.io.columns import Columns, read_columns
 from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
@@ -29,7 +29,7 @@ class LookTable:
         names: F feature ids as they were given, in natural order.
         feature: (R,) index of each row's feature.
         stamp_s: (R,) when.
-        detected: (R,) 1 where the detector fired, 0 where it did not, nan where nobody looked.
+        detected: (R,) 1 where the detector fired, 0 where it did not, nan where there was no look.
         p_miss: (R,) `P(no detection | there)`.
         p_false: (R,) `P(detection | not there)`.
         class_names: classes in use.
@@ -78,7 +78,7 @@ class LookTable:
         for name in ("detected", "present"):
             if columns[name] is not None:
                 self._refuse(~(np.isin(columns[name], (0.0, 1.0)) | np.isnan(columns[name])), name,
-                             "is neither 1 nor 0", "1, 0, or nan where nobody looked")  # fmt: skip
+                             "is neither 1 nor 0", "1, 0, or nan where there was no look")  # fmt: skip
         inverted = self.looked & (self.p_miss + self.p_false >= 1.0)
         if inverted.any():
             row = int(np.argmax(inverted))
@@ -149,7 +149,7 @@ class Truth:
 
     def at(self, feature: IntArray, stamp_s: FloatArray) -> FloatArray:
         """Return (N,) truth about features at instants; nan before a feature's first sample and after its last."""
-        of_sample = np.repeat(np.arange(len(self.first) - 1), np.diff(self.first))
+        of_sample = feature_of(self.first)
         n = len(of_sample)
         asked = np.concatenate([np.full(n, -1), np.arange(len(stamp_s))])
         all_features = np.concatenate([of_sample, feature])
@@ -174,11 +174,11 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
 
     Raises:
         InputError: anything wrong in the file, by line and column.
-        ConfigError: a default that is no probability.
+        ConfigError: a default that is not a probability.
     """
     for name, value in (("p_miss", p_miss), ("p_false", p_false)):
         if not 0.0 <= value <= 1.0:
-            raise ConfigError(f"{value} is no probability", field=name, hint="a number between 0 and 1")
+            raise ConfigError(f"{value} is not a probability", field=name, hint="a number between 0 and 1")
     if p_miss + p_false >= 1.0:
         problem = f"{p_miss:g} and `p_false` {p_false:g} make 1 or more: a detection would speak against the feature"
         hint = "both below 0.5; P(detection | there) is 1 - p_miss"
@@ -193,7 +193,7 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
     detected = table.flags("detected", hint=_FLAG_HINT + ", empty where the sensor did not look")
     if np.isnan(detected).all():
         hint = "1 where it was detected, 0 where it was looked at and not detected"
-        raise InputError("nobody looked: the whole column is empty", path=path, field="detected", hint=hint)
+        raise InputError("no row is a look: the whole column is empty", path=path, field="detected", hint=hint)
     class_names, class_of_feature = _classes(table, feature, names)
     present = table.flags("present", hint=_FLAG_HINT + ", empty where unknown") if "present" in table else None
     return LookTable(

@@ -172,7 +172,7 @@ def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
     if wrong.any():
         row = int(rows[np.argmax(wrong)])
         raise table.error(
-            "is no covariance: not positive definite", row=row, field=COVARIANCE[0], hint="or leave it empty"
+            "is not a covariance: not positive definite", row=row, field=COVARIANCE[0], hint="or leave it empty"
         )
     return np.where(whole[:, None, None], matrix, np.nan)
 
@@ -215,7 +215,7 @@ def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:
         (C, C) `P(detected class | true class)`, a row a true class.
 
     Raises:
-        InputError: a class is missing or there twice, or a row is no distribution; by line and column.
+        InputError: a class is missing or there twice, or a row is not a distribution; by line and column.
     """
     table = read_columns(path, [])
     table.expect(("class_id", *class_names))

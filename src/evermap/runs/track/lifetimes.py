@@ -75,8 +75,8 @@ class LifetimeGroup:
 
     Attributes:
         rows: their indices.
-        class_id: the class, '' for rows that name none; None where classes are not told apart.
-        chunk: (column, row) of the square on the ground; None where places are not told apart.
+        class_id: the class, '' for rows that name none; None where classes are not separated.
+        chunk: (column, row) of the square on the ground; None where places are not separated.
     """
 
     rows: IntArray
@@ -85,7 +85,7 @@ class LifetimeGroup:
 
     @property
     def label(self) -> str:
-        """For people: `car in chunk (0, -3)`; 'all' where nothing is told apart."""
+        """For people: `car in chunk (0, -3)`; 'all' where nothing is separated."""
         what = None if self.class_id is None else self.class_id or "of no class"
         where = None if self.chunk is None else f"chunk ({self.chunk[0]}, {self.chunk[1]})"
         return " in ".join(part for part in (what, where) if part) or "all"
@@ -169,7 +169,7 @@ def parse_by(text: str) -> tuple[str, ...]:
 
 
 def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[LifetimeGroup]:
-    """Return the rows told apart by class, by square chunk of the ground, by both or not at all; in natural order.
+    """Return the rows grouped by class, by square chunk of the ground, by both or not at all; in natural order.
 
     Args:
         table: the lifetimes.
@@ -178,7 +178,7 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[L
 
     Raises:
         ConfigError: a column that this needs is not in the table, or `chunk_m` cannot be.
-        InputError: a row without a position where places are told apart.
+        InputError: a row without a position where places are separated.
     """
     if not (np.isfinite(chunk_m) and chunk_m > 0.0):
         raise ConfigError(f"must be positive and finite, not {chunk_m:g}", field="chunk_m", hint="10")

@@ -46,7 +46,7 @@ class TrackResult(Shown):
         lifetimes: samples of how long things stay, several rows a spell (see `survival.censored`); None where the
             beginning of no spell is bounded.
         spell_of_lifetime: (N,) the spell that each row of `lifetimes` belongs to.
-        n_gaps: times at which nobody looked, between two frames.
+        n_gaps: times without any look, between two frames.
         seconds: wall time of the tracker.
         warnings: remarks.
     """
@@ -121,7 +121,7 @@ def run_track(
     config = config or TrackConfig()
     if config.range_m is not None and table.sensor_m is None:
         hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
-        raise ConfigError("nobody knows where the sensor was", field="range_m", hint=hint)
+        raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
     names = table.class_names
     tracker = Tracker(
         config.model_copy(update={"class_speed_mps": _speeds(config, names)}),
@@ -160,7 +160,7 @@ def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePr
     """Return how long objects of every class rest, from texts or files of models.
 
     Raises:
-        ConfigError: text that is no prior, or a class that no detection has.
+        ConfigError: text that is not a prior, or a class that no detection has.
         InputError: a file that cannot be read.
     """
     _check_classes(config.class_priors, class_names, "class_priors")
@@ -198,7 +198,7 @@ def _check_classes(by_class: Mapping[str, object], class_names: Sequence[str], f
 def _follow(
     tracker: Tracker, table: DetectionTable, config: TrackConfig, progress: Callable[[float, float], None] | None
 ) -> tuple[Recorder, IntArray, int]:
-    """Frame after frame; between them, where nobody looked for long, blind ones."""
+    """Frame after frame; between them, where there was no look for long, blind ones."""
     noise = _noise(table, config.sigma_position_m)
     step_s = _usual_step_s(table)
     gap_s = config.gap_s or config.gap_steps * step_s
@@ -284,7 +284,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
         remarks.append("without `range_m`, what should be seen and is not counts for nothing")
     unknown = int((~_bounded(spells)).sum())
     if unknown:
-        what = f"{counted(unknown, 'spell')} with a beginning that nobody can bound"
+        what = f"{counted(unknown, 'spell')} whose beginning has no bound"
         remarks.append(f"{what}, as the place had not been looked at before: in spells.csv, not in lifetimes.csv")
     return remarks
 

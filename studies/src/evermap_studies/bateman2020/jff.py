@@ -79,7 +79,7 @@ def init(
 
     Raises:
         ConfigError: as `single.init`.
-        InputError: a clique that does not exist, or a weight that is no probability.
+        InputError: a clique that does not exist, or a weight that is not a probability.
     """
     member = checks.check_rows(clique, n_cliques, twice=True, field="clique")
     share = checks.as_rows(weight, n_cliques, "weight")

@@ -242,7 +242,7 @@ def _read_looks(folder: Path, name: str) -> dict[str, tuple[Looks, FloatArray, F
     table.expect(("stamp_s", "feature_id", "detected", "present"))
     stamp_s, detected, present = (
         table.numbers(STAMP_S),
-        table.flags("detected", hint=_FLAGS + ", or nothing where nobody looked"),
+        table.flags("detected", hint=_FLAGS + ", or nothing where there was no look"),
         table.flags("present", hint=_FLAGS),
     )
     if np.isnan(present).any():

@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.existence.one_stay import PersistenceFilter
-from evermap.survival import CallableHazard, Exponential, GeneralPurpose, LifetimePrior, PeriodicHazard
+from evermap.survival import Exponential, GeneralPurpose, LifetimePrior, PeriodicHazard
 from evermap.types import BoolArray, FloatArray
 from evermap.viz.lifetime_figures import plot_lifetimes
 from evermap.viz.presence_figures import plot_belief
+from evermap_studies.rosen2016.callable_hazard import CallableHazard
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -34,7 +34,7 @@ class StreamFaults:
         p_late: to arrive late, after newer ones, by up to `late_s`; its stamp is right.
         p_misstamped: to be stamped when it arrives instead of when it was taken, up to `late_s` after it.
         late_s: largest delay.
-        p_stamp_garbled: probability that a stamp is no number, or any number.
+        p_stamp_garbled: probability that a stamp is not a number, or any number.
         outages_per_h: mean number of stretches in an hour without any message.
         outage_s: mean length of one, exponential.
         jumps_per_h: mean number of times in an hour that this sensor's clock is set forward or back.

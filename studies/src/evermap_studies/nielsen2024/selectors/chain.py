@@ -89,7 +89,7 @@ class ModeChain:
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.switch_probability <= 1.0:
-            problem = f"{self.switch_probability} is no probability"
+            problem = f"{self.switch_probability} is not a probability"
             raise ConfigError(problem, field="switch_probability", hint="a number between 0 and 1")
 
     @property

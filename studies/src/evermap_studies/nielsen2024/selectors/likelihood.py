@@ -159,7 +159,7 @@ def miss_weight_from(detected: FloatArray, first: IntArray, p_detect: float) -> 
     """
     _, after_miss = hit_probabilities(detected, first)
     if not 0.0 < p_detect < 1.0:
-        raise InputError(f"{p_detect} is no probability", field="p_detect", hint="between 0 and 1")
+        raise InputError(f"{p_detect} is not a probability", field="p_detect", hint="between 0 and 1")
     return float(min(1.0, np.log1p(-after_miss) / np.log1p(-p_detect)))
 
 
