@@ -13,7 +13,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from evermap.cli.main import app
-from evermap.cli.slam import HowMoved, default_out
+from evermap.cli.options import default_out
+from evermap.cli.slam import HowMoved
 from evermap.config import SlamConfig
 from evermap.io import parse_shift, read_landmarks, read_recording, read_tum, write_native
 
@@ -97,6 +98,7 @@ def test_out_defaults_to_the_name_of_the_recording(
         ("../../etc", "etc"),
         ("Halle 3 / früh", "halle-3-fr-h"),
         ("...", "run"),
+        ("Looks.csv.gz", "looks"),
     ],
 )
 def test_default_out_is_one_plain_folder(name: str, folder: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
-from evermap.existence.models import KINDS, _until, choose
+from evermap.existence.models import KINDS, choose
 from evermap.existence.protocol import Looks
 
 P_ERROR = 0.1
@@ -54,7 +54,7 @@ def test_score_is_the_density_of_the_last_fifth_given_the_rest() -> None:
 
 def test_looks_before_an_instant_keep_their_features() -> None:
     looks = Looks.from_rows([0, 0, 2, 2, 2, 4], [0.0, 9.0, 1.0, 2.0, 8.0, 9.0], 1, 0.1, 0.1, n_features=6)
-    before = _until(looks, 5.0)
+    before = looks.taken(looks.stamp_s < 5.0)
     np.testing.assert_array_equal(np.diff(before.first), [1, 0, 2, 0, 0, 0])
     np.testing.assert_array_equal(before.stamp_s, [0.0, 1.0, 2.0])
 

@@ -16,13 +16,12 @@ from typer.testing import CliRunner
 from evermap.cli.main import app
 from evermap.errors import ConfigError, InputError
 from evermap.existence.lifetimes import Lifetimes
-from evermap.existence.models import NamedModels, lifetimes_of, save_models
+from evermap.existence.models import NamedModels, lifetimes_of, priors_of, save_models
 from evermap.existence.run_length import RunLength
 from evermap.maps.learning import ClassLives, absence_said, lifetimes_by_class, stay_said, with_priors
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Stays
 from evermap.maps.store.content import Chunk, pack, unpack
-from evermap.runs.sessions import priors_of
 from evermap.survival import Exponential, Mixture, Weibull, never_leaves
 from evermap.survival.class_lifetimes import LOG_MEAN, LOG_SHAPE, LOGIT_RETURN, finer
 from evermap.types import UNKNOWN
@@ -135,7 +134,7 @@ def test_texts_and_files_by_class(tmp_path: Path) -> None:
     assert found[""].stay == ENDLESS
     assert priors_of(None, {"wagon": str(file)})["wagon"].stay == ENDLESS
     only = save_models(NamedModels({"cart": RunLength(WEIBULL, ENDLESS, 60.0)}, "class"), tmp_path / "cart.json")
-    with pytest.raises(InputError, match=r"says nothing of class 'crat'.*cart"):
+    with pytest.raises(InputError, match=r"has no lifetime of class 'crat'.*cart"):
         priors_of(None, {"crat": str(only)})
 
 

@@ -103,6 +103,14 @@ def duration_s(text: str | None, field: str) -> float | None:
         raise ConfigError(error.problem, field=field, hint=error.hint) from None
 
 
+def default_out(name: str) -> Path:
+    """Return `evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1', and `evermap-out/looks` for
+    'looks.csv.gz'.
+    """
+    name = re.sub(r"(\.csv|\.gz|\.parquet)+$", "", name.lower())
+    return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name).strip("-.") or "run")
+
+
 class Verb(TyperCommand):
     """A command whose errors and remarks speak of its options where the core speaks of arguments."""
 

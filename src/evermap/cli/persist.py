@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -20,6 +19,7 @@ from evermap.cli.options import (
     ShowConfig,
     TableOut,
     configured,
+    default_out,
     duration_s,
     priors_by_class,
 )
@@ -160,7 +160,7 @@ def persist(
         raise ConfigError("a table is needed", field="input", hint="--init looks.csv writes an example")
     from evermap.types import Clock
 
-    out = out or default_out(input)
+    out = out or default_out(input.name)
     inputs: list[str | Path | None] = [input, chosen.model, truth, config]
     counts = None if clock is None else Clock(clock.value)
     summary = _run(input, truth, chosen, out, clock=counts, force=force, inputs=inputs)
@@ -202,12 +202,6 @@ def _run(
     for remark in [*remarks, *summary["warnings"]]:
         warn(remark)
     return summary
-
-
-def default_out(table_path: Path) -> Path:
-    """Return `evermap-out/looks` for 'data/looks.csv.gz'."""
-    name = re.sub(r"(\.csv|\.gz|\.parquet)+$", "", table_path.name.lower())
-    return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name).strip("-.") or "persist")
 
 
 def _show(summary: Mapping[str, Any], out: Path) -> None:

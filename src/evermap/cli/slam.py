@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -11,7 +10,17 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict, Unpack
 
 import typer
 
-from evermap.cli.options import AsJson, ConfigFile, Force, Robot, Settings, ShowConfig, configured, priors_by_class
+from evermap.cli.options import (
+    AsJson,
+    ConfigFile,
+    Force,
+    Robot,
+    Settings,
+    ShowConfig,
+    configured,
+    default_out,
+    priors_by_class,
+)
 from evermap.cli.terminal import command_line, echo, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 from evermap.interrupts import held, kept
@@ -253,11 +262,6 @@ def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str 
         )
 
 
-def default_out(name: str) -> Path:
-    """Return `evermap-out/mrclam_dataset6-robot-1` for 'MRCLAM_Dataset6 robot 1'."""
-    return Path("evermap-out") / (re.sub(r"[^a-z0-9_.]+", "-", name.lower()).strip("-.") or "run")
-
-
 def _write_template(folder: Path) -> None:
     from evermap.io import write_template
 
@@ -303,9 +307,10 @@ class MapOptions(NamedTuple):
 
 def run_in_map(recording: Recording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
+    from evermap.existence.models import priors_of
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
-    from evermap.runs.sessions import at_time, enter_session, priors_of
+    from evermap.runs.sessions import at_time, enter_session
 
     map_file, priors, localize, realtime = options
     if realtime and not localize:

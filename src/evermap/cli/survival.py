@@ -16,7 +16,6 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.existence.models import Choice
-    from evermap.runs.persist.models import LearnedModels
     from evermap.runs.track.lifetimes import LifetimeEstimate, LifetimeGroup, LifetimeTable
     from evermap.survival import LifetimePrior
 
@@ -235,8 +234,7 @@ def learn(
 
         write_picture(figure, plot_presence_models(dict(zip(learned.models.names, learned.models.models, strict=True))))
     if as_json:
-        content = {"out": str(out), "per": learned.per, "models": _models(learned)}
-        print_json(content | {"config": {"persist": chosen.to_dict()}})
+        print_json({"out": str(out), **learned.to_dict(), "config": {"persist": chosen.to_dict()}})
         return
     for name, choice in zip(learned.models.names, learned.choices, strict=True):
         print_table(name or input.name, _learned_lines(choice))
@@ -317,14 +315,6 @@ def _lines(table: LifetimeTable, group: LifetimeGroup, found: LifetimeEstimate) 
     if len(found.text) < 80:
         lines.append(("prior", found.text))
     return [*lines, *lifetime_lines(lifetime_numbers(found.prior))]
-
-
-def _models(learned: LearnedModels) -> dict[str, Any]:
-    """For `--json`."""
-    return {
-        name or "all": {"kind": choice.kind, "held_out_s": choice.held_out_s, "scores": dict(choice.scores)}
-        for name, choice in zip(learned.models.names, learned.choices, strict=True)
-    }
 
 
 def _learned_lines(choice: Choice) -> list[tuple[str, str]]:

@@ -18,9 +18,9 @@ from evermap.cli.options import (
     ShowConfig,
     TableOut,
     configured,
+    default_out,
     priors_by_class,
 )
-from evermap.cli.persist import default_out
 from evermap.cli.terminal import command_line, print_json, print_table, progress_bar, say, warm_up, warn
 from evermap.errors import ConfigError
 
@@ -122,7 +122,7 @@ def track(
     chosen = configured(config, settings, given, within="track", show=show_config).track
     if input is None:
         raise ConfigError("a table is needed", field="input", hint="--init detections.csv writes an example")
-    out = out or default_out(input)
+    out = out or default_out(input.name)
     summary = _run(input, confusion, chosen, out, scene=scene, force=force, inputs=[input, confusion, config])
     if as_json:
         print_json(summary)

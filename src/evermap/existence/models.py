@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from evermap.errors import ConfigError, DataError, EvermapError, InputError
+from evermap.errors import ConfigError, DataError, EvermapError, InputError, suggestion
 from evermap.existence.lifetimes import Lifetimes
 from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.rhythm import WEEK_S
@@ -91,7 +91,7 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     if len(names) == 1:
         return Choice(names[0], KINDS[names[0]](looks), {}, 0.0)
     held_out = WEEK_S if last - first >= WEEKS_TO_HOLD_OUT_ONE * WEEK_S else HELD_OUT_PART * (last - first)
-    before = _until(looks, last - held_out)
+    before = looks.taken(looks.stamp_s < last - held_out)
     tell = progress or (lambda _: None)
     scores: dict[str, float] = {}
     for number, name in enumerate(names):
@@ -102,15 +102,6 @@ def choose(looks: Looks, kinds: Sequence[str] | None = None, *, progress: Progre
     choice = Choice(best, KINDS[best](looks), scores, held_out)
     tell(1.0)
     return choice
-
-
-def _until(looks: Looks, stamp_s: float) -> Looks:
-    """The looks before an instant, at the same features."""
-    kept = looks.stamp_s < stamp_s
-    counts = np.add.reduceat(np.append(kept, False).astype(np.int64), looks.first[:-1]) * (np.diff(looks.first) > 0)
-    first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    columns = (looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
-    return Looks(first, *(np.ascontiguousarray(column[kept]) for column in columns))
 
 
 SCHEMA_VERSION = 1
@@ -213,6 +204,30 @@ def lifetimes_of(source: str | Path) -> dict[str, Lifetimes]:
     if models.per == "feature":
         raise InputError("has models of features, not of classes", path=source, hint="learn with --per class or all")
     return models.lifetimes
+
+
+def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> dict[str, Lifetimes]:
+    """Read lifetimes that a user gives for a map or a tracker, by class; '' is for every class that is not named.
+
+    Args:
+        common: text of a prior for all classes, as `weibull:scale=3d,shape=1.5`, or a file of models, as
+            `survival fit`, `survival learn` and `map export --lifetimes` write it.
+        by_class: the same for single classes; goes before what a file says of them. None for none.
+
+    Raises:
+        ConfigError: the text of no prior.
+        InputError: a file that cannot be read, or that has no lifetime of the class.
+    """
+    try:
+        found = {} if common is None else lifetimes_of(common)
+        for name, source in (by_class or {}).items():
+            told = lifetimes_of(source)
+            if name not in told and "" not in told:
+                raise InputError(f"has no lifetime of class '{name}'", path=source, hint=suggestion(name, told))
+            found[name] = told[name if name in told else ""]
+    except ConfigError as error:
+        raise ConfigError(error.problem, field="prior", hint=error.hint) from None
+    return found
 
 
 def read_model_file(path: str | Path) -> dict[str, Any]:

@@ -170,6 +170,18 @@ def feature_of(first: IntArray) -> IntArray:
     return np.repeat(np.arange(len(first) - 1), np.diff(first))
 
 
+def firsts_of(feature: IntArray, n_features: int) -> IntArray:
+    """Return (F + 1,) where each of F features starts in rows sorted by feature (M,): the inverse of `feature_of`."""
+    return np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=n_features))]).astype(np.int64)
+
+
+def rows_at(first: IntArray, features: IntArray) -> tuple[IntArray, IntArray]:
+    """Return where each of some features (K,) starts in its rows laid behind each other (K + 1,), and these rows."""
+    length = first[features + 1] - first[features]
+    begin = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
+    return begin, np.arange(begin[-1]) - np.repeat(begin[:-1] - first[features], length)
+
+
 @dataclass(frozen=True, slots=True)
 class Looks(Shown):
     """Looks of a detector at F features, by feature and time.
@@ -211,8 +223,16 @@ class Looks(Shown):
 
     def of(self, feature: int) -> Looks:
         """Return the looks at one feature alone."""
-        rows = slice(int(self.first[feature]), int(self.first[feature + 1]))
-        first = np.array([0, rows.stop - rows.start])
+        return self.at(np.array([feature]))[0]
+
+    def at(self, features: IntArray) -> tuple[Looks, IntArray]:
+        """Return the looks at some features (K,), in that order, and the rows they are."""
+        first, rows = rows_at(self.first, features)
+        return self.taken(rows, first), rows
+
+    def taken(self, rows: IntArray | BoolArray, first: IntArray | None = None) -> Looks:
+        """Return some of the looks, in this order; of the same features where `first` does not say otherwise."""
+        first = firsts_of(self.feature[rows], self.n_features) if first is None else first
         return Looks(first, self.stamp_s[rows], self.detected[rows], self.p_miss[rows], self.p_false[rows])
 
     def likelihoods(self) -> tuple[FloatArray, FloatArray]:
@@ -268,6 +288,11 @@ class Instants(Shown):
 
     first: IntArray
     stamp_s: FloatArray
+
+    def at(self, features: IntArray) -> tuple[Instants, IntArray]:
+        """Return the instants of some features (K,), in that order, and the rows they are."""
+        first, rows = rows_at(self.first, features)
+        return Instants(first, self.stamp_s[rows]), rows
 
     @classmethod
     def of_looks(cls, looks: Looks) -> Instants:
@@ -356,5 +381,4 @@ def _grouped(feature: Any, n_features: int | None) -> tuple[IntArray, IntArray, 
     wrong = np.flatnonzero((index < 0) | (index >= count))
     if wrong.size:
         raise InputError(f"row {wrong[0]}: feature {index[wrong[0]]} of {count} does not exist", field="feature")
-    first = np.concatenate([[0], np.cumsum(np.bincount(index, minlength=count))]).astype(np.int64)
-    return index, np.argsort(index, kind="stable"), first
+    return index, np.argsort(index, kind="stable"), firsts_of(index, count)

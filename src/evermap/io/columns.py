@@ -76,6 +76,13 @@ class Columns:
         quantity.check(values, path=self.path, line=self.line)
         return values
 
+    def filled(self, quantity: Quantity, default: float) -> FloatArray:
+        """Return an optional column (R,), with what an empty cell, or no such column, means."""
+        if quantity.name not in self:
+            return np.full(len(self), float(default))
+        values = self.numbers(quantity)
+        return np.where(np.isnan(values), default, values)
+
     def clock(self, name: str = "stamp_s") -> Clock | None:
         """Return what the stamps of a column count, where they are dates; else None."""
         import pyarrow as pa

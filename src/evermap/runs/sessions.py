@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from evermap.errors import ConfigError, DataError, InputError, suggestion
+from evermap.errors import DataError, InputError
 from evermap.maps.store import Attachment, MapStore, Provenance, PrunedRevisionError, Revision, RevisionKind
 from evermap.types import Progress
 
@@ -198,32 +198,6 @@ def _enter_late(
     decisions = (config or Config()).living.decisions
     found = tuple(change.named(living.landmark_names) for change in net(told, newest, living, decisions))
     return Entered(session, newest, living, found, names, head, {RECORDING: data})
-
-
-def priors_of(common: str | None, by_class: Mapping[str, str] | None = None) -> dict[str, Lifetimes]:
-    """Read lifetimes that a user gives for a map, by class; '' is for every class that is not named.
-
-    Args:
-        common: text of a prior for all classes, as `weibull:scale=3d,shape=1.5`, or a file of models, as
-            `survival fit`, `survival learn` and `map export --lifetimes` write it.
-        by_class: the same for single classes; goes before what a file says of them. None for none.
-
-    Raises:
-        ConfigError: the text of no prior.
-        InputError: a file that cannot be read, or that says nothing of the class.
-    """
-    from evermap.existence.models import lifetimes_of
-
-    try:
-        found = {} if common is None else lifetimes_of(common)
-        for name, source in (by_class or {}).items():
-            told = lifetimes_of(source)
-            if name not in told and "" not in told:
-                raise InputError(f"says nothing of class '{name}'", path=source, hint=suggestion(name, told))
-            found[name] = told[name if name in told else ""]
-    except ConfigError as error:
-        raise ConfigError(error.problem, field="prior", hint=error.hint) from None
-    return found
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:

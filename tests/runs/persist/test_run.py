@@ -18,7 +18,7 @@ from evermap.existence.phase_type import PhaseType
 from evermap.existence.protocol import Instants
 from evermap.existence.run_length import RunLength
 from evermap.metrics.belief import belief_scores
-from evermap.runs.persist.models import ModelOfEach, looks_at, some_looks
+from evermap.runs.persist.models import ModelOfEach, some_looks
 from evermap.runs.persist.run import nice_step, run_persist
 from evermap.runs.persist.table import LookTable, read_looks
 from evermap.survival import Exponential, parse_prior
@@ -174,7 +174,7 @@ def test_learned_models_follow_their_class(tmp_path: Path) -> None:
     for number, name in enumerate(result.models.names):
         mine = np.flatnonzero(looks.class_of_feature == looks.class_names.index(name))
         np.testing.assert_array_equal(result.models.of_feature[mine], number)
-        part, rows = looks_at(result.looks, mine)
+        part, rows = result.looks.at(mine)
         expected = result.models.models[number].track(part, Instants.of_looks(part)).p_present
         np.testing.assert_allclose(result.p_at_looks[rows], expected, rtol=1e-12)
     assert not np.isnan(result.beliefs.p_exists).any()  # what comes back has no birth

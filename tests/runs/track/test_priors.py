@@ -47,7 +47,7 @@ def test_a_file_of_one_model_is_for_every_class(tmp_path: Path) -> None:
 
 def test_what_cannot_be_is_said(tmp_path: Path) -> None:
     one = file_of(tmp_path / "one.json", cart=OneStay(CART))
-    with pytest.raises(ConfigError, match="the file has no lifetime of class 'pallet'"):
+    with pytest.raises(InputError, match="has no lifetime of class 'pallet'"):
         _priors(TrackConfig(class_priors={"pallet": one}), NAMES)
     with pytest.raises(ConfigError, match="no detection is of class 'door'"):
         _priors(TrackConfig(class_priors={"door": one}), NAMES)

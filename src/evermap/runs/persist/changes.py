@@ -16,7 +16,7 @@ from evermap.errors import ConfigError
 from evermap.existence.one_stay import OneStay, births
 from evermap.existence.protocol import Looks, PresenceModel
 from evermap.existence.run_length import RunLength
-from evermap.runs.persist.models import ModelOfEach, looks_at
+from evermap.runs.persist.models import ModelOfEach
 from evermap.types import BoolArray, FloatArray, IntArray
 
 _SHORTEST_GAP_S = 1e-9
@@ -131,9 +131,7 @@ def _when(
 
 def _log_ratio(looks: Looks) -> FloatArray:
     """(M,) log likelihood of each look if there, minus that if not; certainties are cut to 700 nats."""
-    hit = looks.detected == 1.0
-    there = np.where(hit, 1.0 - looks.p_miss, looks.p_miss)
-    gone = np.where(hit, looks.p_false, 1.0 - looks.p_false)
+    there, gone = looks.likelihoods()
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.log(there) - np.log(gone)
     return np.where(np.isnan(ratio), 0.0, np.clip(ratio, -_CERTAIN, _CERTAIN))
@@ -190,7 +188,7 @@ def forecasts_of(models: ModelOfEach, looks: Looks, stamp_s: FloatArray, p_exist
     for k, model in enumerate(models.models):
         mine = np.flatnonzero(models.of_feature == k)
         if mine.size:
-            outlook[:, mine] = _outlook(model, looks_at(looks, mine)[0], float(stamp_s[0]))
+            outlook[:, mine] = _outlook(model, looks.at(mine)[0], float(stamp_s[0]))
     return Forecasts(stamp_s, p_exists, *outlook)
 
 
@@ -212,7 +210,7 @@ def _outlook(model: PresenceModel, looks: Looks, now_s: float) -> FloatArray:
 def _heard_of(looks: Looks, now_s: float) -> Looks:
     """The same looks and one at every feature now, which says nothing: it takes the filter there."""
     features = np.arange(looks.n_features)
-    old = (np.repeat(features, np.diff(looks.first)), looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
+    old = (looks.feature, looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
     nothing = np.full(looks.n_features, 0.5)
     new = (features, np.full(looks.n_features, now_s), np.ones(looks.n_features), nothing, nothing)
     return Looks.from_rows(*(np.concatenate(pair) for pair in zip(old, new, strict=True)))

@@ -15,11 +15,11 @@ from evermap.errors import ConfigError, DataError, EvermapError, InputError, Num
 from evermap.existence import models as storage
 from evermap.existence.models import KINDS, Choice, choose
 from evermap.existence.one_stay import OneStay
-from evermap.existence.protocol import Instants, Looks, PresenceFilter, PresenceModel, Track
+from evermap.existence.protocol import Instants, Looks, PresenceFilter, PresenceModel, Track, firsts_of
 from evermap.existence.rhythm import BIN_S
 from evermap.io.text import quote
 from evermap.runs.persist.table import LookTable
-from evermap.types import UNKNOWN, FloatArray, IntArray
+from evermap.types import UNKNOWN, FloatArray, IntArray, json_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class ModelOfEach:
             mine = np.flatnonzero(self.of_feature == k)
             if mine.size == 0:
                 continue
-            part, _ = looks_at(looks, mine)
-            asked_part, rows = instants_at(asked, mine)
+            part, _ = looks.at(mine)
+            asked_part, rows = asked.at(mine)
             track = model.track(part, asked_part)
             p_present[rows], evidence[mine], merged[mine] = track.p_present, track.log_evidence, track.merged_mass
         return Track(p_present, evidence, merged)
@@ -116,8 +116,7 @@ def ask(model: PresenceFilter, looks: Looks, *questions: tuple[IntArray, FloatAr
     feature = np.concatenate([features for features, _ in questions])
     stamp_s = np.concatenate([stamps for _, stamps in questions])
     order = np.lexsort((stamp_s, feature))
-    first = np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=looks.n_features))]).astype(np.int64)
-    track = model.track(looks, Instants(first, stamp_s[order]))
+    track = model.track(looks, Instants(firsts_of(feature, looks.n_features), stamp_s[order]))
     answers = np.empty(len(order))
     answers[order] = track.p_present
     ends = np.cumsum([len(features) for features, _ in questions])
@@ -129,38 +128,15 @@ def some_looks(looks: Looks, features: IntArray, most: int) -> tuple[Looks, IntA
 
     Of a single feature with more looks its latest are returned.
     """
-    part, rows = looks_at(looks, features)
+    part, rows = looks.at(features)
     if len(rows) <= most:
         return part, rows
     drawn = np.random.default_rng(0).permutation(part.n_features)
     enough = int(np.searchsorted(np.cumsum(np.diff(part.first)[drawn]), most, side="right"))
-    part, rows = looks_at(looks, features[np.sort(drawn[: max(enough, 1)])])
+    part, rows = looks.at(features[np.sort(drawn[: max(enough, 1)])])
     if len(rows) <= most:
         return part, rows
-    latest = rows[-most:]
-    columns = (looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
-    return Looks(np.array([0, most]), *(column[latest] for column in columns)), latest
-
-
-def looks_at(looks: Looks, features: IntArray) -> tuple[Looks, IntArray]:
-    """Return the looks at some features, and the rows they are."""
-    first, rows = _rows_of(looks.first, features)
-    columns = (looks.stamp_s, looks.detected, looks.p_miss, looks.p_false)
-    return Looks(first, *(column[rows] for column in columns)), rows
-
-
-def instants_at(instants: Instants, features: IntArray) -> tuple[Instants, IntArray]:
-    """Return the instants of some features, and the rows they are."""
-    first, rows = _rows_of(instants.first, features)
-    return Instants(first, instants.stamp_s[rows]), rows
-
-
-def _rows_of(first: IntArray, features: IntArray) -> tuple[IntArray, IntArray]:
-    """The rows of some features behind each other: where each feature starts, and the rows."""
-    length = first[features + 1] - first[features]
-    begin = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-    rows = np.arange(begin[-1]) - np.repeat(begin[:-1] - first[features], length)
-    return begin, rows
+    return looks.taken(rows[-most:], np.array([0, most])), rows[-most:]
 
 
 AUTO = "auto"
@@ -185,6 +161,18 @@ class LearnedModels:
     models: ModelOfEach
     per: str
     choices: tuple[Choice, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return, for JSON, what was grouped, and why each model is of its kind: scores of looks that were held out."""
+        models = {
+            name or "all": {
+                "kind": choice.kind,
+                "held_out_s": choice.held_out_s,
+                "scores": {kind: json_number(score) for kind, score in choice.scores.items()},
+            }
+            for name, choice in zip(self.models.names, self.choices, strict=True)
+        }
+        return {"per": self.per, "models": models}
 
 
 def learn_models(

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from evermap.existence.protocol import Instants
-from evermap.runs.persist.models import looks_at
 from evermap.runs.persist.run import PersistResult
 from evermap.stamps import stamp_text
 from evermap.survival.durations import duration_text
@@ -182,7 +181,7 @@ def _overview(result: PersistResult, clock: Clock) -> NamedFigure:
     start_s, end_s = _span(result)
     edge_s = np.linspace(start_s, end_s, _RASTER_COLUMNS + 1)
     middle_s = 0.5 * (edge_s[1:] + edge_s[:-1])
-    looks, _ = looks_at(result.looks, features)
+    looks, _ = result.looks.at(features)
     track = result.models.only(features).track(looks, Instants.same_for_all(len(features), middle_s))
     row = {feature: k for k, feature in enumerate(features.tolist())}
     changes = result.changes
@@ -224,7 +223,7 @@ def _feature(result: PersistResult, feature: int, clock: Clock, taken: set[str])
     from evermap.viz.presence_figures import plot_belief, stretches
 
     index = np.array([feature])
-    looks, look_rows = looks_at(result.looks, index)
+    looks, look_rows = result.looks.at(index)
     start_s, end_s = _span(result)
     pixel = np.floor((looks.stamp_s - start_s) / (end_s - start_s or 1.0) * _PIXELS)
     turn_s = looks.stamp_s[_extremes(pixel, result.p_at_looks[look_rows])]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import ConfigError, InputError
-from evermap.existence.protocol import Looks, feature_of
+from evermap.existence.protocol import Looks, feature_of, firsts_of
 from evermap.io.columns import Columns, read_columns
 from evermap.io.text import counted, quote
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
@@ -123,14 +123,14 @@ class LookTable:
         """Return the looks by feature and time; `order` is `self.order()`."""
         rows = order[self.looked[order]]
         columns = (self.stamp_s, self.detected, self.p_miss, self.p_false)
-        return Looks(_firsts(self.feature[rows], self.n_features), *(column[rows] for column in columns))
+        return Looks(firsts_of(self.feature[rows], self.n_features), *(column[rows] for column in columns))
 
     def truth(self, order: IntArray) -> Truth | None:
         """Return what the column `present` says; None without any. `order` is `self.order()`."""
         if self.present is None:
             return None
         rows = order[~np.isnan(self.present[order])]
-        return Truth(_firsts(self.feature[rows], self.n_features), self.stamp_s[rows], self.present[rows])
+        return Truth(firsts_of(self.feature[rows], self.n_features), self.stamp_s[rows], self.present[rows])
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,8 +201,8 @@ def read_looks(path: str | Path, *, p_miss: float = 0.1, p_false: float = 0.1) -
         feature=feature,
         stamp_s=table.numbers(STAMP_S),
         detected=detected,
-        p_miss=_probabilities(table, _P_MISS, p_miss),
-        p_false=_probabilities(table, _P_FALSE, p_false),
+        p_miss=table.filled(_P_MISS, p_miss),
+        p_false=table.filled(_P_FALSE, p_false),
         class_names=class_names,
         class_of_feature=class_of_feature,
         present=None if present is None or np.isnan(present).all() else present,
@@ -235,13 +235,8 @@ def read_truth(path: str | Path, looks: LookTable) -> tuple[Truth, tuple[str, ..
         warnings.append(f"{Path(path).name}: {counted(strangers, 'feature')} without looks left out")
     rows = np.flatnonzero((ours[feature] != UNKNOWN) & ~np.isnan(present))
     rows = rows[np.lexsort((stamp_s[rows], ours[feature[rows]]))]
-    truth = Truth(_firsts(ours[feature[rows]], looks.n_features), stamp_s[rows], present[rows])
+    truth = Truth(firsts_of(ours[feature[rows]], looks.n_features), stamp_s[rows], present[rows])
     return truth, tuple(warnings)
-
-
-def _firsts(feature: IntArray, n_features: int) -> IntArray:
-    """(F + 1,) where each feature starts in rows sorted by feature."""
-    return np.concatenate([[0], np.cumsum(np.bincount(feature, minlength=n_features))]).astype(np.int64)
 
 
 def _explain_missing(table: Columns) -> None:
@@ -262,13 +257,6 @@ def _features(table: Columns) -> tuple[tuple[str, ...], IntArray]:
     if empty.size:
         raise table.error("is empty", row=int(empty[0]), field="feature_id", hint="a name or a number in every row")
     return tuple(names), feature
-
-
-def _probabilities(table: Columns, quantity: Quantity, default: float) -> FloatArray:
-    if quantity.name not in table:
-        return np.full(len(table), float(default))
-    values = table.numbers(quantity)
-    return np.where(np.isnan(values), default, values)
 
 
 def _classes(table: Columns, feature: IntArray, names: tuple[str, ...]) -> tuple[tuple[str, ...], IntArray]:

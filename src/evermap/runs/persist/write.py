@@ -81,7 +81,7 @@ def persist_summary(result: PersistResult, *, info: RunInfo, timing: dict[str, f
     return {
         **summary_head(info, config=config, source=table.source, timing=timing, warnings=result.warnings),
         "model": {name: model["kind"] for name, model in result.models.to_dict().items()},
-        "learning": _learning(result),
+        "learning": None if result.learned is None else result.learned.to_dict(),
         "counts": {
             "rows": len(table),
             "looks": int(looked.sum()),
@@ -152,22 +152,6 @@ def _changes(result: PersistResult) -> str:
         )
         rows.append(change_dict(change, stamp_s=float(changes.stamp_s[k]), decided_s=float(changes.decided_s[k])))
     return changes_text(rows)
-
-
-def _learning(result: PersistResult) -> dict[str, Any] | None:
-    """Whose looks were put together, and why each model is of its kind: evidence for looks that were held out."""
-    learned = result.learned
-    if learned is None:
-        return None
-    models = {
-        name or "all": {
-            "kind": choice.kind,
-            "held_out_s": choice.held_out_s,
-            "scores": {kind: json_number(score) for kind, score in choice.scores.items()},
-        }
-        for name, choice in zip(result.models.names, learned.choices, strict=True)
-    }
-    return {"per": learned.per, "models": models}
 
 
 def _never_leave(result: PersistResult) -> dict[str, float]:

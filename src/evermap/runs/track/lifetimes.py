@@ -106,9 +106,9 @@ def read_lifetimes(path: str | Path) -> LifetimeTable:
     if len(table) == 0:
         raise InputError("has no rows below its header", path=path, hint="one row a lifetime")
     left = table.numbers(LEFT)
-    right = _filled(table, RIGHT, np.inf)
-    entry = _filled(table, ENTRY, 0.0)
-    weight = _filled(table, WEIGHT, 1.0)
+    right = table.filled(RIGHT, np.inf)
+    entry = table.filled(ENTRY, 0.0)
+    weight = table.filled(WEIGHT, 1.0)
     _refuse(
         table, right < left, "right", lambda row: f"ends at {right[row]:g} s, before its left at {left[row]:g} s",
         "left <= right; equal where the end was watched",
@@ -207,14 +207,6 @@ def groups_of(table: LifetimeTable, by: Sequence[str], chunk_m: float) -> list[L
         )
         for key, rows in zip(different, parts, strict=True)
     ]
-
-
-def _filled(table: Columns, quantity: Quantity, default: float) -> FloatArray:
-    """An optional column, with what an empty cell or no column means."""
-    if quantity.name not in table:
-        return np.full(len(table), default)
-    values = table.numbers(quantity)
-    return np.where(np.isnan(values), default, values)
 
 
 def _refuse(table: Columns, bad: BoolArray, field: str, problem: Callable[[int], str], hint: str) -> None:

@@ -12,8 +12,7 @@ import numpy as np
 from evermap.config import TrackConfig
 from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, DataError
-from evermap.existence.lifetimes import Lifetimes
-from evermap.existence.models import lifetimes_of
+from evermap.existence.models import priors_of
 from evermap.io.text import counted, quote
 from evermap.runs.track.detections import DetectionTable, said_of
 from evermap.show import Shown, draw
@@ -161,24 +160,12 @@ def _priors(config: TrackConfig, class_names: Sequence[str]) -> tuple[LifetimePr
 
     Raises:
         ConfigError: text that is not a prior, or a class that no detection has.
-        InputError: a file that cannot be read.
+        InputError: a file that cannot be read, or that has no lifetime of its class.
     """
     _check_classes(config.class_priors, class_names, "class_priors")
-    try:
-        common = {name: found.stay for name, found in lifetimes_of(config.prior).items()}
-        own = {name: _for_class(lifetimes_of(text), name) for name, text in config.class_priors.items()}
-        rest = common.get("") or parse_prior(DEFAULT_PRIOR)  # a file may name some of the classes only
-        return tuple(own.get(name) or common.get(name) or rest for name in class_names)
-    except ConfigError as error:
-        raise ConfigError(error.problem, field="prior", hint=error.hint) from error
-
-
-def _for_class(found: Mapping[str, Lifetimes], name: str) -> LifetimePrior:
-    """Return the lifetime of a class from a text or file of its own."""
-    if name not in found and "" not in found:
-        hint = f"one of {', '.join(found)}, without CLASS=: the file names its classes"
-        raise ConfigError(f"the file has no lifetime of class {quote(name)}", field="prior", hint=hint)
-    return found[name if name in found else ""].stay
+    found = {name: lives.stay for name, lives in priors_of(config.prior, config.class_priors).items()}
+    rest = found.get("") or parse_prior(DEFAULT_PRIOR)  # a file may name some of the classes only
+    return tuple(found.get(name) or rest for name in class_names)
 
 
 def _speeds(config: TrackConfig, class_names: Sequence[str]) -> tuple[float, ...]:
