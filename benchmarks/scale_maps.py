@@ -26,16 +26,15 @@ import evermap as em
 from benchmarks.memory import ROOT, child_environment, peak_mb
 from benchmarks.scale import Ticks, spent
 from evermap.geometry import se2
+from evermap.geometry.chunked import ChunkedCovariance, JointCovariance
 from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
-from evermap.types import UNKNOWN, FloatArray, Recording, rows_of
+from evermap.types import UNKNOWN, FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim import BuildingConfig, WarehouseConfig, simulate_building, simulate_warehouse
 from evermap_studies.sim.warehouse import warehouse_landmarks
 
 SIZES = (1_000, 10_000, 100_000)
 """Places of the maps."""
-LARGEST_GB = 1.0
-"""A dense covariance beyond this is not run: it is copied several times, and inverted."""
 SESSION = WarehouseConfig(n_landmarks=SIZES[0], landmarks_per_aisle=20, aisles_driven=10)
 """The drive: ten aisles of twenty landmarks, and what it sees of the eleventh."""
 SMALL = WarehouseConfig(n_landmarks=60, landmarks_per_aisle=20, aisles_driven=1)
@@ -68,6 +67,7 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
     rng, count = np.random.default_rng([seed, 2]), len(landmark)
     position = se2.transform(MAP_POSE, landmark) + SIGMA_MAP_M * rng.normal(size=landmark.shape)
     name, no_class = np.arange(count), np.full(count, UNKNOWN)
+    most_stays = em.Config().living.decisions.most_stays  # a map keeps the newest
     seen, first = np.full(count, -SEEN_S), np.full(count, -10 * SEEN_S)
     never = np.full(count, np.inf)
     return em.LivingMap(
@@ -76,23 +76,25 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
         members=Members(name, no_class, name, np.zeros(count, np.bool_), np.zeros(count, np.bool_)),
         sites=Sites(name, name, np.full(count, 0.99), np.full(count, 0.99), first, seen),
         places=Places(name, name, position, np.full(count, 50), np.zeros(count, np.int64)),
-        stays=Stays(name, name, no_class, position, -never, first, seen, never, np.zeros(count)),
+        stays=Stays(name, name, no_class, position, -never, first, seen, never, np.zeros(count))[-most_stays:],
         covariance_m2=_covariance(position),
         n_cliques_ever=count,
         n_sites_ever=count,
     )
 
 
-def _covariance(position_m: FloatArray) -> FloatArray:
-    """(2 P, 2 P) of places with errors that are partly shared by those around."""
-    apart = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
-    shared = 0.5 * np.exp(-apart / CORRELATED_M) + 0.5 * np.eye(len(position_m))
-    return np.asarray(np.kron(SIGMA_MAP_M**2 * shared, np.eye(2)))
+def _covariance(position_m: FloatArray) -> JointCovariance:
+    """Of places with errors that are partly shared by those around, as a map of this size keeps it."""
 
+    def joint(a: IntArray, b: IntArray) -> FloatArray:
+        apart = np.linalg.norm(position_m[a][:, None] - position_m[b][None], axis=2)
+        shared = 0.5 * np.exp(-apart / CORRELATED_M) + 0.5 * (a[:, None] == b[None])
+        return np.asarray(np.kron(SIGMA_MAP_M**2 * shared, np.eye(2)))
 
-def dense_gb(n_places: int) -> float:
-    """Return the size of the joint covariance of a map of so many places, as a map holds it."""
-    return 8.0 * (2 * n_places) ** 2 / 1e9
+    rows = np.arange(len(position_m))
+    if len(rows) <= em.Config().living.whole_places:
+        return joint(rows, rows)
+    return ChunkedCovariance.of_points(position_m, joint)
 
 
 def bring_in(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
@@ -229,9 +231,6 @@ def measure(work: str, number: int, *, timeout_s: float | None = None) -> dict[s
         timeout_s: after which it is given up.
     """
     size = {"sessions" if work == "building" else "places": number}
-    needs_gb = 0.0 if work == "building" else dense_gb(number)
-    if needs_gb > LARGEST_GB:
-        return size | {"not_run": f"dense covariance needs {needs_gb:.3g} GB"}
     try:
         found: dict[str, Any] = json.loads(
             _child("-m", "benchmarks.scale_maps", work, str(number), timeout_s=timeout_s)

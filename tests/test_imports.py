@@ -36,7 +36,7 @@ RULES = {
     "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",
     "runs": "errors interrupts show types config stamps survival valid io metrics existence maps tracking viz pipeline",
-    "cli": "errors interrupts plugins types config stamps survival io existence slam maps viz pipeline runs",
+    "cli": "errors interrupts plugins types config geometry stamps survival io existence slam maps viz pipeline runs",
 }
 
 # loaded by the functions that need them, never by starting up

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from evermap.config import Config
 from evermap.types import Landmarks, Progress, Recording, SlamResult
 
@@ -123,25 +125,35 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 
     from evermap.maps.sessions import believe
     from evermap.maps.sessions import session as steps
+    from evermap.maps.vicinity import in_chunks
 
     visit = alone
-    _, living = steps.admitted(alone.recording, living)
+    _, whole = steps.admitted(alone.recording, living)
     with threadpool_limits(limits=1, user_api="blas"):
+        vicinity = steps.vicinity(whole, alone, config.living)
+        living = whole if vicinity is None else vicinity.part
         # over the map as it is believed to be by now, and solved again with the map as its prior
         aged = believe.aged(living, config.living, alone.start_s)
         where = steps.laid(living, aged.p_here, alone, config.living)
         if where is None and len(living.places):
-            return steps.lost(alone, living, config.living, steps.NOT_FOUND)
+            return steps.lost(alone, whole, config.living, steps.NOT_FOUND)
         if where is not None:
-            before = living
             living, where, visit = steps.refit(
-                living, aged.p_here, where, alone, config.living, robust=config.slam.robust
+                living,
+                aged.p_here,
+                where,
+                alone,
+                config.living,
+                robust=config.slam.robust,
+                part=vicinity is not None,
             )
             if config.living.search == "joint" and not steps.fits(visit, alone, config.living):
-                return steps.lost(alone, before, config.living, steps.CONTRADICTED)
+                return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
         # judged twice: the second time by the lifetimes that the first has learned
         known = steps.judged(living, where, visit, config.living)
-        return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
+        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
+        after = session.living if vicinity is None else vicinity.put_back(session.living)
+        return replace(session, living=in_chunks(after, config.living))
 
 
 def run_localization(
@@ -165,8 +177,8 @@ def run_localization(
         DataError: the map is empty, or the robot's place in it could not be found.
     """
     from evermap.errors import DataError
-    from evermap.maps.sessions.believe import predicted
     from evermap.maps.sessions.session import admitted
+    from evermap.maps.vicinity import predicted_of
     from evermap.slam.check import odd, valid
     from evermap.slam.intake import beliefs
     from evermap.slam.localize_recording import localize
@@ -177,7 +189,8 @@ def run_localization(
     recording = valid(recording, config.sensor)
     remarks = odd(recording, settings=config.slam.check)
     recording, living = admitted(recording, living)
-    p_site = predicted(living, config.living, float(recording.frames.stamp_s[0]))
+    named, start_s = np.unique(recording.detections.landmark_id), float(recording.frames.stamp_s[0])
+    p_site = predicted_of(living, named, config.living, start_s)
     prior, noise = beliefs(recording.sensor, config.slam)
     result = localize(
         recording,

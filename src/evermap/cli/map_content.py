@@ -75,14 +75,19 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
     """
     import numpy as np
 
+    from evermap.geometry.chunked import blocks
+    from evermap.maps.living import clique_rows
+
     members, site = living.members, living.site_of()
     place = living.place_row(members.landmark_id, site)
     p_exists = living.p_exists()
     at = np.searchsorted(living.sites.site_id, site)
+    own = blocks(living.covariance_m2)
+    cliques, row_of_site = clique_rows(living.sites)
+    n_sites = np.append(np.bincount(row_of_site), 0)[np.searchsorted(cliques, members.clique_id)]
     content = []
     for row in range(len(members)):
         placed = place[row] >= 0
-        k = 2 * int(place[row])
         content.append(
             {
                 "landmark": int(members.landmark_id[row]),
@@ -93,10 +98,10 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
                 "p_ahead": json_number(float(p_ahead[row])),
                 "x_m": float(living.places.position_m[place[row], 0]) if placed else None,
                 "y_m": float(living.places.position_m[place[row], 1]) if placed else None,
-                "sigma_m": float(np.sqrt(np.trace(living.covariance_m2[k : k + 2, k : k + 2]) / 2)) if placed else None,
+                "sigma_m": float(np.sqrt(np.trace(own[place[row]]) / 2)) if placed else None,
                 "since_s": json_number(float(living.sites.since_s[at[row]])) if placed else None,
                 "seen_s": json_number(float(living.sites.seen_s[at[row]])) if placed else None,
-                "sites": int(np.sum(living.sites.clique_id == members.clique_id[row])),
+                "sites": int(n_sites[row]) if placed else 0,
                 "hits": int(living.places.n_hits[place[row]]) if placed else 0,
                 "misses": int(living.places.n_misses[place[row]]) if placed else 0,
                 "pinned": bool(members.pinned[row]),

@@ -187,6 +187,13 @@ class LivingConfig(Section):
     learn_sight: bool = Field(
         default=True, description="learn from where to where the sensor sees; off: its nominal field of view"
     )
+    whole_places: Count = Field(
+        default=600,
+        description="places up to which a map is updated as one; of a larger one a session touches what is near",
+    )
+    near_m: Positive = Field(
+        default=10.0, description="beyond the sensor's range, what is near a session: all that it may move with [m]"
+    )
     most_sites: int = Field(default=3, ge=1, le=100, description="sites that are remembered of one clique, at most")
     fit: FitConfig = Field(default_factory=FitConfig, description="whether a session lies in the map")
     overlay: OverlayConfig = Field(default_factory=OverlayConfig, description="priors of what moved")

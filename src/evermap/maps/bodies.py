@@ -25,6 +25,7 @@ import numpy as np
 
 from evermap.config import GroupingConfig
 from evermap.geometry import se2
+from evermap.geometry.chunked import taken
 from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -275,7 +276,6 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
     order = np.lexsort((moved.landmark_id, moved.site_id))
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
-    corner = se2.xy_rows(order)
     no_more = np.setdiff1d(sites.clique_id, owner)
     lost, owners = set(no_more.tolist()), dict(zip(parted.site_id.tolist(), parted.clique_id.tolist(), strict=True))
     whose = zip(stays.clique_id.tolist(), stays.site_id.tolist(), strict=True)
@@ -286,7 +286,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
         members=replace(members, clique_id=clique_id),
         sites=parted,
         places=moved[order],
-        covariance_m2=living.covariance_m2[np.ix_(corner, corner)],
+        covariance_m2=taken(living.covariance_m2, order),
         stays=stays[~(np.isin(stays.clique_id, no_more) & (stays.gone_s == np.inf))],
         n_cliques_ever=max(living.n_cliques_ever, int(clique_id.max(initial=-1)) + 1),
         n_sites_ever=living.n_sites_ever + int(np.count_nonzero(~keeps)),

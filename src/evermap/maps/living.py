@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from evermap.errors import InputError
-from evermap.geometry import se2
+from evermap.geometry.chunked import JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, ShownTable, draw
@@ -165,15 +165,29 @@ class Evidence(_Rows):
 
 
 @dataclass(frozen=True, slots=True)
+class Dated(_Rows):
+    """Sites that no session was near of late: what is believed of them is told of an earlier instant than the map's.
+
+    Attributes:
+        site_id: (D,) sorted.
+        stamp_s: (D,) when their `Sites.p_here` and `p_kept` held.
+    """
+
+    site_id: IntArray
+    stamp_s: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
 class LivingMap(Shown):
     """All that is known of a place at one instant; what one session hands to the next.
 
     Attributes:
-        stamp_s: until when observations went in: beliefs are those of this instant. -inf before the first session.
+        stamp_s: until when observations went in: beliefs are those of this instant, but for `dated` ones. -inf before
+            the first session.
         session_start_s: begin of the newest session; one that begins earlier is late.
-        members, sites, places, stays: see there.
+        members, sites, places, stays, dated: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y interleaved, as if the map's size were known;
-            or (P, 2, 2) blocks, while the places are independent.
+            or (P, 2, 2) blocks, while the places are independent; in chunks where there are many.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
         lives: how long things of a class stay, stay away, and where they turn up again.
@@ -191,7 +205,8 @@ class LivingMap(Shown):
     sites: Sites = field(default_factory=Sites.empty)
     places: Places = field(default_factory=Places.empty)
     stays: Stays = field(default_factory=Stays.empty)
-    covariance_m2: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    dated: Dated = field(default_factory=Dated.empty)
+    covariance_m2: JointCovariance = field(default_factory=lambda: np.zeros((0, 0)))
     log_size_variance: float = 0.0
     log_size_information: float = np.inf
     lives: Lives = field(default_factory=Lives)
@@ -261,14 +276,24 @@ class LivingMap(Shown):
             problem = f"{at:g} s is before the map's newest look, {self.stamp_s:g} s"
             raise InputError(problem, field="at", hint="an older revision: store.load(number)")
         p_here = self.sites.p_here
-        if at is not None and np.isfinite(self.stamp_s):
+        if (at is not None or len(self.dated)) and np.isfinite(self.stamp_s):
             from evermap.config import LivingConfig
             from evermap.maps.sessions.believe import predicted
 
-            p_here = predicted(self, LivingConfig(), at)
+            p_here = predicted(self, LivingConfig(), self.stamp_s if at is None else at)
+        return self.p_of_sites(p_here)
+
+    def p_of_sites(self, p_here: FloatArray) -> FloatArray:
+        """Return (L,) what the sites of each landmark's clique have in sum, of (S,)."""
         cliques, row = np.unique(self.sites.clique_id, return_inverse=True)
         total = np.append(np.bincount(row, p_here, minlength=len(cliques)), 0.0)  # row -1 is the last
         return np.asarray(total[_rows_among(cliques, self.members.clique_id)], dtype=np.float64)
+
+    def believed_s(self) -> FloatArray:
+        """Return (S,) instants at which the beliefs in the sites held."""
+        stamp_s = np.full(len(self.sites), self.stamp_s)
+        stamp_s[np.searchsorted(self.sites.site_id, self.dated.site_id)] = self.dated.stamp_s
+        return stamp_s
 
     def site_of(self) -> IntArray:
         """Return (L,) the most probable `site_id` of each landmark's clique, `UNKNOWN` where it has none."""
@@ -284,7 +309,7 @@ class LivingMap(Shown):
 
         Of a clique without a stay, as in maps made by hand, its most probable site, if it more probably stands.
         """
-        site = np.where(self.p_exists() >= EXISTS, self.site_of(), UNKNOWN)
+        site = np.where(self.p_of_sites(self.sites.p_here) >= EXISTS, self.site_of(), UNKNOWN)
         known = np.isin(self.members.clique_id, self.stays.clique_id)
         goes_on = np.flatnonzero(self.stays.gone_s == np.inf)
         order = goes_on[np.argsort(self.stays.clique_id[goes_on], kind="stable")]
@@ -349,13 +374,10 @@ class LivingMap(Shown):
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
         """Return (K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
-        corner = 2 * row[:, None] + np.arange(2)
         middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(2)
         arm = self.places.position_m[row] - middle
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
-        own = self.covariance_m2
-        own = own[row] if own.ndim == 3 else own[corner[:, :, None], corner[:, None, :]]
-        return np.asarray(own + size)
+        return np.asarray(blocks(self.covariance_m2)[row] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
         """Return every place as a record of its own, in the order of `places`: what a robot may meet.
@@ -366,8 +388,8 @@ class LivingMap(Shown):
         site = np.searchsorted(self.sites.site_id, self.places.site_id)
         member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)
         rows = np.arange(len(self.places))
-        blocks = self.covariance_m2.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
-        return self._records(rows, blocks, np.where(self.members.deleted[member], 0.0, p_site[site]))
+        own = blocks(self.covariance_m2)
+        return self._records(rows, own, np.where(self.members.deleted[member], 0.0, p_site[site]))
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
         """Return the map with an operator's word on one landmark; None leaves it as it is.
@@ -388,14 +410,14 @@ class LivingMap(Shown):
         members = self.members[~np.isin(self.members.landmark_id, landmark_ids)]
         kept = np.flatnonzero(~np.isin(self.places.landmark_id, landmark_ids))
         places = self.places[kept]
-        corner = se2.xy_rows(kept)
         return replace(
             self,
             members=members,
             sites=self.sites[np.isin(self.sites.site_id, places.site_id)],
+            dated=self.dated[np.isin(self.dated.site_id, places.site_id)],
             places=places,
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
-            covariance_m2=self.covariance_m2[np.ix_(corner, corner)],
+            covariance_m2=taken(self.covariance_m2, kept),
         )
 
 

@@ -223,12 +223,18 @@ class SightLines:
 
 def pair_rows(known: tuple[IntArray, IntArray], asked: tuple[IntArray, IntArray]) -> IntArray:
     """Return (N,) rows of pairs among (P,) known ones, all different; -1 where there is none."""
-    both = (np.concatenate([np.asarray(one, dtype=np.int64), other]) for one, other in zip(known, asked, strict=True))
-    _, number = np.unique(np.column_stack(list(both)), axis=0, return_inverse=True)
-    number, count = number.ravel(), len(known[0])
-    row = np.full(int(number.max(initial=-1)) + 1, -1, dtype=np.int64)
-    row[number[:count]] = np.arange(count)
-    return np.asarray(row[number[count:]])
+    if not len(known[0]):
+        return np.full(len(asked[0]), -1, dtype=np.int64)
+    number, there = np.zeros(len(known[0]), dtype=np.int64), np.ones(len(asked[0]), dtype=np.bool_)
+    wanted = np.zeros(len(asked[0]), dtype=np.int64)
+    for one, other in zip(known, asked, strict=True):
+        ids, rank = np.unique(one, return_inverse=True)
+        at = np.minimum(np.searchsorted(ids, other), len(ids) - 1)
+        there &= ids[at] == other
+        number, wanted = number * len(ids) + rank.ravel(), wanted * len(ids) + at
+    order = np.argsort(number, kind="stable")
+    at = np.minimum(np.searchsorted(number[order], wanted), len(order) - 1)
+    return np.asarray(np.where(there & (number[order][at] == wanted), order[at], -1))
 
 
 def offsets(cell: IntArray, cell_m: float) -> FloatArray:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.streaming import sighted_at
 from evermap.types import FloatArray, IntArray, Landmarks
@@ -26,34 +27,48 @@ class KnownPlaces:
         position_m: (P, 2) in the map's frame.
         covariance_m2: (P, 2, 2) of each by itself.
         p_here: probability that the landmark stands there now; of one landmark they sum to 1 at most.
-        joint_m2: (2 P, 2 P) covariance of all together, x and y interleaved; None where they are independent. A map
-            that is bent as a whole is better than each of its places alone.
+        joint_m2: covariance of all together; None where they are independent. A map that is bent as a whole is better
+            than each of its places alone.
+        joint_row: (P,) rows of the places in that.
     """
 
     landmark_id: IntArray
     position_m: FloatArray
     covariance_m2: FloatArray
     p_here: FloatArray
-    joint_m2: FloatArray | None = None
+    joint_m2: JointCovariance | None = None
+    joint_row: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.landmark_id)
 
     @classmethod
     def of(
-        cls, landmark_id: IntArray, position_m: FloatArray, covariance_m2: FloatArray, p_here: FloatArray
+        cls, landmark_id: IntArray, position_m: FloatArray, covariance_m2: JointCovariance, p_here: FloatArray
     ) -> KnownPlaces:
-        """Return the places in any order; the covariance as blocks (P, 2, 2) or joint (2 P, 2 P)."""
+        """Return the places in any order; the covariance as blocks (P, 2, 2), joint (2 P, 2 P), or in chunks."""
         order = np.argsort(landmark_id, kind="stable")
-        joint = None
-        if covariance_m2.ndim == 2:
-            corner = se2.xy_rows(order)
-            joint = covariance_m2[np.ix_(corner, corner)] + LEAST_VARIANCE * np.eye(len(corner))
-            rows = np.arange(len(order))
-            blocks = joint.reshape(len(rows), 2, len(rows), 2)[rows, :, rows, :]
-        else:
-            blocks = covariance_m2[order] + LEAST_VARIANCE * np.eye(2)
-        return cls(landmark_id[order], position_m[order], np.ascontiguousarray(blocks), p_here[order], joint)
+        own = np.ascontiguousarray(blocks(covariance_m2)[order] + LEAST_VARIANCE * np.eye(2))
+        independent = not isinstance(covariance_m2, ChunkedCovariance) and covariance_m2.ndim == 3
+        joint = None if independent else covariance_m2
+        return cls(landmark_id[order], position_m[order], own, p_here[order], joint, order)
+
+    def existing(self) -> KnownPlaces:
+        """Return those of a probability above 0."""
+        rows = np.flatnonzero(self.p_here > 0.0)
+        return replace(
+            self,
+            landmark_id=self.landmark_id[rows],
+            position_m=self.position_m[rows],
+            covariance_m2=self.covariance_m2[rows],
+            p_here=self.p_here[rows],
+            joint_row=self.joint_row[rows],
+        )
+
+    def joint_of(self, rows: IntArray) -> FloatArray:
+        """Return (2 K, 2 K) covariance of some places together."""
+        assert self.joint_m2 is not None
+        return of_places(self.joint_m2, self.joint_row[rows]) + LEAST_VARIANCE * np.eye(2 * len(rows))
 
     @classmethod
     def from_landmarks(cls, landmarks: Landmarks) -> KnownPlaces:

@@ -27,7 +27,7 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 MOST_CONSIDERED = 256
 """Places whose errors are kept correlated with the pose's: those used last. Of a frame no more are used."""
 NEIGHBOURS = 8
-"""Places, the nearest, through which a new one is correlated with the pose where the map's errors are joint."""
+"""Places, the nearest, through which a new one is correlated with all else where errors of the map are joint."""
 EXPECTING_SIGMA_M = 0.5
 """No landmark is expected while the robot's position is less certain than this, along either axis."""
 HARDLY_EXPECTED = 0.01
@@ -259,17 +259,16 @@ class Localizer:
     def _put(self, row: int, slot: int) -> None:
         """One more place. Its error is known to be like its neighbours', as far as the map says that."""
         at = slice(AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 2)
-        covariance, places, joint = self._covariance, self.places, self.places.joint_m2
+        covariance, places = self._covariance, self.places
         covariance[:, at] = 0.0
         taken = np.flatnonzero(self._considered != UNKNOWN)
-        if joint is not None and len(taken):
-            others, own = self._considered[taken], _columns(np.array([row]))
-            covariance[AT_PLACES + _columns(taken), at] = joint[np.ix_(_columns(others), own)]
+        if places.joint_m2 is not None and len(taken):
+            others = self._considered[taken]
             away = ((places.position_m[others] - places.position_m[row]) ** 2).sum(axis=1)
             near = np.argsort(away, kind="stable")[:NEIGHBOURS]
-            rows = _columns(others[near])
-            by = np.linalg.solve(joint[np.ix_(rows, rows)], joint[np.ix_(rows, own)])
-            covariance[:AT_PLACES, at] = covariance[:AT_PLACES, AT_PLACES + _columns(taken[near])] @ by
+            joint = places.joint_of(np.append(others[near], row))
+            by = np.linalg.solve(joint[:-2, :-2], joint[:-2, -2:])
+            covariance[:, at] = covariance[:, AT_PLACES + _columns(taken[near])] @ by
         covariance[at] = covariance[:, at].T
         covariance[at, at] = places.covariance_m2[row]
         self._slot[row], self._considered[slot], self._used_at[slot] = slot, row, self._frame

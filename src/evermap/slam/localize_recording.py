@@ -11,6 +11,7 @@ import numpy as np
 
 from evermap.errors import DataError
 from evermap.geometry import se2
+from evermap.geometry.chunked import JointCovariance
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
@@ -40,7 +41,7 @@ def localize(
     prior: CalibrationPrior,
     noise: Noise,
     *,
-    joint_m2: FloatArray | None = None,
+    joint_m2: JointCovariance | None = None,
     realtime: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> SlamResult:
@@ -52,8 +53,7 @@ def localize(
             with `p_exists` the probability of each; those of probability 0 are not looked at.
         prior: of the calibration states.
         noise: standard deviations; they are not estimated.
-        joint_m2: (2 L, 2 L) covariance of all rows, x and y interleaved; None takes `covariance_m2`, and the rows
-            to be independent.
+        joint_m2: covariance of all rows together; None takes `covariance_m2`, and the rows to be independent.
         realtime: process at the recording's pace.
         progress: told after every frame. An interrupt (Ctrl-C) ends the run early, with what was done so far.
 
@@ -84,13 +84,11 @@ def localize(
     return _result(recording, run, localizer, prior, drive, landmarks, places)
 
 
-def _existing(landmarks: Landmarks, joint_m2: FloatArray | None) -> tuple[Landmarks, KnownPlaces]:
+def _existing(landmarks: Landmarks, joint_m2: JointCovariance | None) -> tuple[Landmarks, KnownPlaces]:
     """Return the landmarks that may exist, and the same as the localiser wants them."""
-    there = np.flatnonzero(landmarks.p_exists > 0.0)
-    landmarks = _rows(landmarks, there)
-    corner = se2.xy_rows(there)
-    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2[np.ix_(corner, corner)]
-    return landmarks, KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists)
+    covariance = landmarks.covariance_m2 if joint_m2 is None else joint_m2
+    places = KnownPlaces.of(landmarks.landmark_id, landmarks.position_m, covariance, landmarks.p_exists).existing()
+    return _rows(landmarks, np.flatnonzero(landmarks.p_exists > 0.0)), places
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,12 +22,11 @@ def dynamics_of(living: LivingMap, config: LivingConfig) -> SiteDynamics:
     cliques, row = clique_rows(sites)
     class_id = class_of(living, cliques)
     middle = site_middles(living)
-    lives = [_life(living, config, int(class_id[c]), middle[s]) for s, c in enumerate(row)]
+    lives = _lives(living, config, class_id[row], middle)
     seen = np.full(len(cliques), -np.inf)
     np.maximum.at(seen, row, sites.seen_s)
-    newest = np.zeros(len(cliques), dtype=np.int64)
-    for s in np.lexsort((sites.seen_s, row)):
-        newest[row[s]] = s
+    order = np.lexsort((sites.seen_s, row))
+    newest = order[np.flatnonzero(np.diff(row[order], append=-1))]  # the last of each clique
     of_clique = [lives[s] for s in newest]
     count = np.bincount(row, minlength=len(cliques))
     p_known = np.array([life.p_known for life in of_clique])
@@ -56,11 +55,12 @@ def aged(living: LivingMap, config: LivingConfig, until_s: float) -> Sites:
     """Return the sites of a map as they are believed in at a later instant, at which nobody has looked again."""
     if not config.existence or len(living.sites) == 0:
         return living.sites
+    start_s = living.believed_s()[np.unique(living.sites.clique_id, return_index=True)[1]]  # of a clique all are told
     until_s = max(until_s, living.stamp_s)
     none = np.zeros(0, dtype=np.int64)
     nothing = SiteLooks(np.zeros(0), none, none, none, np.zeros(0, dtype=np.bool_))
     lines = nominal_lines(np.zeros(0), living.sightlines.rules)
-    after = _followed(living, living.sites.p_here, nothing, lines, config, living.stamp_s, until_s, 0.01)
+    after = _followed(living, living.sites.p_here, nothing, lines, config, start_s, until_s, 0.01)
     return with_beliefs(living.sites, living.sites.p_here, after)
 
 
@@ -130,7 +130,7 @@ def _followed(
     rows: SiteLooks,
     lines: Lines,
     config: LivingConfig,
-    start_s: float,
+    start_s: FloatArray | float,
     until_s: float,
     p_false: float,
 ) -> SiteBeliefs:
@@ -152,6 +152,12 @@ def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
     return np.isin(cliques, living.members.clique_id[living.members.pinned])
 
 
-def _life(living: LivingMap, config: LivingConfig, class_id: int, position_m: FloatArray) -> Life:
-    life = living.lives.of(class_id, position_m) if config.learn_lifetimes else living.lives.said(class_id)
-    return life if config.returns else replace(life, absence=never_leaves())
+def _lives(living: LivingMap, config: LivingConfig, class_id: IntArray, position_m: FloatArray) -> list[Life]:
+    """(S,) lives at sites (S, 2) of classes (S,): what holds for one is the same object for all that it holds for."""
+    chunk = np.floor(position_m / living.lives.chunk_m).astype(np.int64)
+    _, first, which = np.unique(np.column_stack([class_id, chunk]), axis=0, return_index=True, return_inverse=True)
+    found = []
+    for kind, middle in zip(class_id[first].tolist(), position_m[first], strict=True):
+        life = living.lives.of(kind, middle) if config.learn_lifetimes else living.lives.said(kind)
+        found.append(life if config.returns else replace(life, absence=never_leaves()))
+    return [found[k] for k in which.ravel().tolist()]

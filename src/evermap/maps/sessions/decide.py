@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 
 from evermap.config import DecisionConfig
+from evermap.geometry.chunked import taken
 from evermap.maps.diff import motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
-from evermap.maps.sessions.gaussian import of_places
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
 from evermap.types import BoolArray, ChangeKind, FloatArray, IntArray, MapChange
 
@@ -387,7 +387,7 @@ def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConf
         members=members[~np.isin(members.clique_id, gone)],
         sites=sites[kept],
         places=living.places[rows],
-        covariance_m2=of_places(living.covariance_m2, rows),
+        covariance_m2=taken(living.covariance_m2, rows),
         stays=stays,
     )
 

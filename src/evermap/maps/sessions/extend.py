@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import LivingConfig
+from evermap.geometry.chunked import blocks, of_places
 from evermap.maps.bodies import Displacements, Fate, group, regrouped, relabelled
 from evermap.maps.living import LivingMap, Members, Places, Sites
-from evermap.maps.sessions.gaussian import blocks, of_places, with_session
+from evermap.maps.sessions.gaussian import with_session
 from evermap.types import BoolArray, FloatArray, IntArray
 
 
@@ -85,7 +86,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
     seen = found.place[found.place >= 0]
     position, covariance = with_session(
         living.places.position_m,
-        living.covariance_m2,
+        of_places(living.covariance_m2, np.arange(len(living.places))),
         seen,
         found.position_m[order],
         of_places(found.covariance_m2, order),

@@ -16,6 +16,7 @@ import numpy as np
 
 from evermap.config import FitConfig
 from evermap.geometry import se2
+from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.slam.streaming import Outcome
@@ -98,25 +99,10 @@ def resized(living: LivingMap, factor: float, log_size_variance: float, log_size
     return replace(
         living,
         places=replace(living.places, position_m=middle + factor * (position - middle)),
-        covariance_m2=factor**2 * living.covariance_m2,
+        covariance_m2=factor**2 * of_places(living.covariance_m2, np.arange(len(position))),
         log_size_variance=log_size_variance,
         log_size_information=log_size_information,
     )
-
-
-def blocks(covariance_m2: FloatArray) -> FloatArray:
-    """Return (P, 2, 2) covariance of every place by itself, of the joint one (2 P, 2 P)."""
-    count = len(covariance_m2) // 2
-    rows = np.arange(count)
-    return np.asarray(covariance_m2.reshape(count, 2, count, 2)[rows, :, rows, :])
-
-
-def of_places(covariance_m2: FloatArray, rows: IntArray) -> FloatArray:
-    """Return (2 K, 2 K) joint covariance of some places, in their order; of independent ones (P, 2, 2), (K, 2, 2)."""
-    if covariance_m2.ndim == 3:
-        return np.asarray(covariance_m2[rows])
-    at = se2.xy_rows(rows)
-    return np.asarray(covariance_m2[np.ix_(at, at)])
 
 
 USUAL = FitConfig()

@@ -10,9 +10,9 @@ from scipy import sparse
 
 from evermap.config import FitConfig, LivingConfig
 from evermap.geometry import se2
+from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
 from evermap.maps.living import LivingMap
-from evermap.maps.sessions.gaussian import of_places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem

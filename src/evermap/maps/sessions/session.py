@@ -8,6 +8,8 @@ import numpy as np
 
 from evermap.config import LivingConfig
 from evermap.errors import DataError
+from evermap.geometry import se2
+from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.bodies import without_missed
 from evermap.maps.learning import ClassLives
@@ -18,7 +20,6 @@ from evermap.maps.sessions.gaussian import (
     anchored,
     drifted,
     log_ratio,
-    of_places,
     of_unknown_size,
     own_landmarks,
     resized,
@@ -26,6 +27,7 @@ from evermap.maps.sessions.gaussian import (
 )
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, arrivals, looked_at, sensor_poses
 from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
+from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
 from evermap.slam.streaming import Outcome
@@ -125,17 +127,41 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
     return with_glimpsed(living, where, glimpsed)
 
 
+def vicinity(living: LivingMap, alone: Solved, config: LivingConfig) -> Vicinity | None:
+    """Return the part of a large map that a session can touch; None for the whole of a small one.
+
+    That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
+    """
+    if len(living.places) <= config.whole_places:
+        return None
+    own = own_landmarks(alone.outcome, config.fit)
+    named = cliques_of(living, alone.prepared.landmark_id[own.row])
+    seen = Vicinity.of(living, named, config)
+    where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
+    if where is None:
+        return seen
+    reach_m = alone.recording.sensor.range_max_m + config.near_m
+    if not np.isfinite(reach_m):  # all there is may be in view
+        return Vicinity.of(living, living.sites.clique_id, config, np.array([-np.inf, -np.inf, np.inf, np.inf]))
+    path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
+    beside, box = near(living, path, reach_m)
+    return Vicinity.of(living, np.union1d(named, beside), config, box)
+
+
 def refit(
-    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool
+    living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
 ) -> tuple[LivingMap, Laid, Solved]:
     """Return the session solved again, its landmarks held by the map's places at which they stand; and the map,
     resized.
 
-    A session that had to be straightened for that is asked again what stands where it stood.
+    A session that had to be straightened for that is asked again what stands where it stood. Where the map is only a
+    part of a larger one it keeps its size.
     """
     outcome, names = alone.outcome, alone.prepared.landmark_id
     size = outcome.scale
     if outcome.log_scale_sigma > 0.0:
+        # a part does not change the metre of the rest
+        information = np.inf if part else living.log_size_information
         own = own_landmarks(outcome, config.fit)
         _, mine, theirs = np.intersect1d(names[own.row], where.landmark_id[where.place >= 0], return_indices=True)
         places = where.place[where.place >= 0][theirs]
@@ -145,9 +171,9 @@ def refit(
             living.places.position_m[places],
             drifted(of_places(living.covariance_m2, places), where.drift_m),
         )
-        known = living.log_size_variance, living.log_size_information
-        found = settled(*shown, (0.0, outcome.log_scale_sigma), *known)
-        living = resized(living, found.map_factor, found.variance, found.information)
+        found = settled(*shown, (0.0, outcome.log_scale_sigma), living.log_size_variance, information)
+        if not part:
+            living = resized(living, found.map_factor, found.variance, found.information)
         size *= found.session_factor
 
     def in_map(where: Laid) -> tuple[Outcome, bool]:

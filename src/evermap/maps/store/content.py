@@ -7,13 +7,14 @@ whole map.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from operator import attrgetter
 from typing import Any
@@ -21,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evermap.errors import EvermapError
+from evermap.errors import EvermapError, InputError
+from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, Part, blocks
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
 from evermap.survival.base import LifetimePrior
@@ -32,6 +34,8 @@ FORMAT = 2
 """Of manifests; how columns are named and cut. Format 1 is read, see `_of_format_1`."""
 _CHUNK = 4096
 """Values a chunk: some 30 kB, so that one changed row costs little and a large map has some hundred chunks."""
+_PARTS = "covariance_m2.parts"
+"""Column of the values of a covariance in chunks: one piece a part, so that what changes shifts no other."""
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
@@ -39,7 +43,7 @@ NAME_BYTES = 32
 MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
 _LIFE = ("lives.life", "lives.prior")
-_PRIOR = ("lives.prior_class_id", "lives.prior")
+_NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s")
 """Not written where there is none, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -146,18 +150,71 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         chunks.update(zip(names, cut, strict=True))
         lower = len(flat) != array.size
         columns[column] = [dtype, shape, lower, [name.hex() for name in names]]
+    if isinstance(living.covariance_m2, ChunkedCovariance):
+        covariance = living.covariance_m2
+        parts = [_of_part(part) for part in covariance.parts]
+        chunks.update((part.name, part) for part in parts)
+        columns[_PARTS] = ["<f8", [int(covariance.sizes.sum())], False, [part.name.hex() for part in parts]]
     manifest = text_chunk(json.dumps({"format": FORMAT, "values": values, "columns": columns}, default=_scalar))
     return manifest.name, {**chunks, manifest.name: manifest}
 
 
-def unpack(name: bytes, fetch: Fetch) -> LivingMap:
+@dataclass(frozen=True, slots=True)
+class _PartChunk(Chunk):
+    """A part of a covariance under the name that it is kept by; its bytes are asked for only where they are missing.
+
+    Attributes:
+        part: of the covariance.
+    """
+
+    part: Part = field(default_factory=lambda: Part(np.zeros(0)))
+
+    @property
+    def name(self) -> bytes:
+        """As it was found."""
+        return self.part.name
+
+    def stored(self) -> bytes:
+        """Compress the values."""
+        return Chunk(self.dtype, self.part.values.tobytes()).stored()
+
+
+def _of_part(part: Part) -> Chunk:
+    part.name = part.name or Chunk("<f8", part.values.tobytes()).name
+    return _PartChunk("<f8", b"", part)
+
+
+def _read_part(name: bytes, stored: bytes) -> FloatArray:
+    try:
+        return np.frombuffer(Chunk.of_stored(name, "<f8", stored).raw, "<f8")
+    except DamagedError as error:
+        problem = f"the covariance of some of its places is damaged: {error}"
+        raise InputError(problem, hint="evermap map verify FILE, which tells what can be read") from None
+
+
+def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
     """Return the map of this name.
+
+    Args:
+        name: of its manifest.
+        fetch: of stored bytes.
+        lazily: unpack a covariance in chunks where it is asked for only; damage of it raises `InputError` then.
 
     Raises:
         DamagedError: a chunk is missing or is not what was written, or the content contradicts itself.
     """
     manifest = _manifest(name, fetch)
-    parts = {**manifest["values"], **_arrays(manifest["columns"], fetch)}
+    columns = manifest["columns"]
+    listed = columns.pop(_PARTS, None)
+    parts = {**manifest["values"], **_arrays(columns, fetch)}
+    if listed is not None:
+        names = [name_of(part) for part in listed[3]]
+        stored = fetch(set(names))
+        read = [functools.partial(_read_part, key, stored[key]) for key in names]
+        if not lazily:
+            for key in set(names):
+                Chunk.of_stored(key, "<f8", stored[key])
+        parts["covariance_m2.parts"] = tuple(Part(one, key) for one, key in zip(read, names, strict=True))
     if manifest["format"] == 1:
         _of_format_1(parts)
     living: LivingMap = _build(LivingMap(), "", parts)
@@ -207,6 +264,7 @@ _EQUALLY_LONG = {
     "sites": tuple(item.name for item in fields(Sites)),
     "places": tuple(item.name for item in fields(Places)),
     "stays": tuple(item.name for item in fields(Stays)),
+    "dated": ("site_id", "stamp_s"),
     "lives": ("class_id", "chunk", "life"),
     "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
     "views": ("cell", "heading", "stamp_s", "frames"),
@@ -223,7 +281,7 @@ _NEXT_FREE = {
 }  # fmt: skip
 """Columns of ids, and the next one that is free."""
 _FINITE = (
-    "places.position_m", "stays.position_m", "covariance_m2", "log_size_variance", "lives.chunk_m",
+    "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
     "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s", "sites.since_s", "sites.seen_s",
 )  # fmt: skip
@@ -252,20 +310,28 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     lines, places = living.sightlines, len(living.places)
     if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
         yield "'sightlines.hidden' of another length"
-    if living.covariance_m2.shape != (2 * places, 2 * places):
-        yield f"a covariance of shape {living.covariance_m2.shape} for {places} places"
+    covariance = living.covariance_m2
+    if isinstance(covariance, ChunkedCovariance):
+        if problem := covariance.flaw(places):
+            yield problem
+    elif covariance.shape != (2 * places, 2 * places):
+        yield f"a covariance of shape {covariance.shape} for {places} places"
 
 
 def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
     """Sorted unique ids, references that lead somewhere."""
-    for column in ("members.landmark_id", "sites.site_id"):
+    for column in ("members.landmark_id", "sites.site_id", "dated.site_id"):
         ids = attrgetter(column)(living)
         if np.any(ids[1:] <= ids[:-1]):
             yield f"'{column}' is not sorted, or not unique"
     site, name = living.places.site_id, living.places.landmark_id
     if np.any((site[1:] < site[:-1]) | ((site[1:] == site[:-1]) & (name[1:] <= name[:-1]))):
         yield "'places' are not sorted by site and landmark, or not unique"
-    for column, known in (("places.site_id", living.sites.site_id), ("places.landmark_id", living.members.landmark_id)):
+    for column, known in (
+        ("dated.site_id", living.sites.site_id),
+        ("places.site_id", living.sites.site_id),
+        ("places.landmark_id", living.members.landmark_id),
+    ):
         if not np.isin(attrgetter(column)(living), known).all():
             yield f"'{column}' names one that is not there"
     for column, least in _LEAST.items():
@@ -287,7 +353,15 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
             yield f"'{column}' is not a number"
     if living.lives.chunk_m <= 0.0 or living.sightlines.cell_m <= 0.0 or living.views.cell_m <= 0.0:
         yield "a cell without size"
-    if living.log_size_variance < 0.0 or np.any(np.diagonal(living.covariance_m2) < -1e-9):
+    covariance = living.covariance_m2
+    read = (
+        [part.values for part in covariance.parts if part.is_read] if isinstance(covariance, ChunkedCovariance) else []
+    )
+    whole = covariance.each_m2 if isinstance(covariance, ChunkedCovariance) else covariance
+    if not all(np.isfinite(values).all() for values in (whole, *read)):
+        yield "'covariance_m2' is not finite"
+        return
+    if living.log_size_variance < 0.0 or np.any(_variances(living.covariance_m2) < -1e-9):
         yield "a negative variance"
     for column in _PROBABILITIES:
         values = attrgetter(column)(living)
@@ -299,6 +373,10 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
         yield "a negative count in 'sightlines' or 'views'"
 
 
+def _variances(covariance_m2: JointCovariance) -> FloatArray:
+    return np.diagonal(blocks(covariance_m2), axis1=1, axis2=2)
+
+
 _NOT_STORED = {"sightlines.rules"}
 """Settings, which each session brings; a revision keeps them with its configuration."""
 
@@ -307,7 +385,7 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
-        if name in _NOT_STORED or (name in _PRIOR and not len(part)):
+        if name in {*_NOT_STORED, _PARTS} or (name in _NEWER and not len(part)):
             continue
         if name in _LIFE:
             text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
@@ -331,10 +409,14 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
         name, part = prefix + item.name, getattr(default, item.name)
         if name in _NOT_STORED:
             content[item.name] = part
+        elif name == "covariance_m2" and _PARTS in parts:
+            content[item.name] = _build(ChunkedCovariance.empty(), name + ".", parts)
         elif is_dataclass(part):
             content[item.name] = _build(part, name + ".", parts)
         elif name not in parts:
             content[item.name] = part
+        elif name == _PARTS:
+            content[item.name] = parts.pop(name)
         elif name in _LIFE:
             content[item.name] = _lives_from_bytes(parts.pop(name))
         elif isinstance(part, np.ndarray):
@@ -423,7 +505,7 @@ def _is_column(dtype: Any, shape: Any, lower: Any, names: Any) -> bool:
         and isinstance(lower, bool)
         and isinstance(names, list)
         and isinstance(shape, list)
-        and len(shape) in (1, 2)
+        and len(shape) in (1, 2, 3)
         and all(type(size) is int and 0 <= size < 2**31 for size in shape)
         and (not lower or (dtype == "<f8" and len(shape) == 2 and shape[0] == shape[1]))
     )

@@ -541,7 +541,7 @@ class SqlStore(Shown):
             read.update(found)
             return found
 
-        living = content.unpack(record.content, fetch)
+        living = content.unpack(record.content, fetch, lazily=True)
         self._checked |= read
         return living
 
@@ -685,7 +685,7 @@ def _told(provenance: Provenance, living: LivingMap, **numbers: int | None) -> d
         created_at=now_utc(),
         evermap_version=__version__,
         n_landmarks=len(living.members),
-        n_existing=int(np.sum((living.p_exists() >= 0.5) & ~living.members.deleted)),
+        n_existing=int(np.sum((living.p_of_sites(living.sites.p_here) >= 0.5) & ~living.members.deleted)),
     )
 
 

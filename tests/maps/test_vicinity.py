@@ -1,0 +1,157 @@
+"""Sessions in a large map: what is near them is worked out as on a small one, and put back."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import evermap as em
+from evermap.errors import InputError
+from evermap.geometry.chunked import ChunkedCovariance, of_places
+from evermap.maps.living import Dated, LivingMap
+from evermap.maps.store import Provenance, RevisionKind, open_store
+from evermap.maps.vicinity import Vicinity, in_chunks, predicted_of
+from evermap.types import Recording
+from evermap_studies.sim import BuildingConfig, simulate_building
+
+SMALL = {"whole_places": 8, "near_m": 1.5}
+
+
+def config(**living: float) -> em.Config:
+    whole = em.Config()
+    return whole.model_copy(update={"living": whole.living.model_copy(update=living)})
+
+
+@functools.cache
+def recordings() -> tuple[Recording, ...]:
+    building = simulate_building(BuildingConfig(days=4, patrol_s=100.0, change_rate=1.0), seed=5)
+    return tuple(replace(session, truth=None) for session in building.sessions)
+
+
+@functools.cache
+def lived(*, large: bool) -> tuple[em.Session, ...]:
+    sessions: list[em.Session] = []
+    settings = config(**SMALL) if large else config()
+    for recording in recordings():
+        before = sessions[-1].living if sessions else None
+        sessions.append(em.run_session(recording, before, settings))
+    return tuple(sessions)
+
+
+def test_the_same_changes_are_told_of_a_large_map() -> None:
+    n_dated = 0
+    for small, large in zip(lived(large=False), lived(large=True), strict=True):
+        assert isinstance(large.living.covariance_m2, ChunkedCovariance)
+        assert [(c.kind, c.landmark_ids) for c in large.changes] == [(c.kind, c.landmark_ids) for c in small.changes]
+        for own, other in zip(large.changes, small.changes, strict=True):
+            assert own.probability == pytest.approx(other.probability, abs=0.02)
+        np.testing.assert_array_equal(large.living.members.landmark_id, small.living.members.landmark_id)
+        np.testing.assert_allclose(large.living.p_exists(), small.living.p_exists(), atol=0.02)
+        n_dated += len(large.living.dated)
+    assert sum(len(session.changes) for session in lived(large=False)) >= 8
+    assert n_dated > 0  # some sites were too far from a patrol to be touched
+
+
+def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
+    living = lived(large=True)[-1].living
+    some = np.unique(living.members.clique_id)[::3]
+    vicinity = Vicinity.of(living, some, em.Config().living, np.array([0.0, 0.0, 8.0, 8.0]))
+    assert 0 < len(vicinity.part.places) < len(living.places)
+    again = vicinity.put_back(vicinity.part)
+    for table in ("members", "sites", "places", "stays", "sightlines", "views", "dated"):
+        for column in fields(getattr(living, table)):
+            before, after = (getattr(getattr(one, table), column.name) for one in (living, again))
+            if table == "sites" and column.name in ("p_here", "p_kept"):
+                continue  # those of the part are of the map's instant now
+            np.testing.assert_array_equal(after, before, err_msg=f"{table}.{column.name}") if isinstance(
+                before, np.ndarray
+            ) and table != "dated" else None
+    np.testing.assert_allclose(again.p_exists(), living.p_exists(), atol=1e-6)
+    assert isinstance(again.covariance_m2, ChunkedCovariance)
+    assert isinstance(living.covariance_m2, ChunkedCovariance)
+    np.testing.assert_allclose(again.covariance_m2.each_m2, living.covariance_m2.each_m2, atol=1e-9)
+
+
+def test_beliefs_age_from_when_somebody_was_near() -> None:
+    living = lived(large=False)[-1].living
+    later_s = living.stamp_s + 86_400.0
+    aged = living.p_exists(later_s)
+    sites = living.sites.site_id
+    dated = replace(living, stamp_s=later_s, dated=Dated(sites, np.full(len(sites), living.stamp_s)))
+    np.testing.assert_allclose(dated.p_exists(), aged, rtol=1e-9)
+    named = living.members.landmark_id[:10]
+    p_here = predicted_of(dated, named, config(whole_places=1).living, later_s)
+    touched = np.isin(sites, living.sites.site_id[np.isin(living.sites.clique_id, living.members.clique_id[:10])])
+    assert np.any(p_here[touched] != living.sites.p_here[touched])
+    np.testing.assert_array_equal(p_here[~touched], living.sites.p_here[~touched])
+
+
+def test_localisation_in_chunks_is_as_in_the_dense_map() -> None:
+    living = lived(large=False)[-1].living
+    recording = recordings()[-1]
+    dense = em.run_localization(recording, living)
+    chunked = em.run_localization(recording, in_chunks(living, config(**SMALL).living))
+    gap = np.linalg.norm(chunked.online.pose_world_robot[:, :2] - dense.online.pose_world_robot[:, :2], axis=1)
+    assert np.median(gap) < 0.005
+    assert chunked.landmarks.n_hits.tolist() == pytest.approx(dense.landmarks.n_hits.tolist(), abs=2)
+
+
+def large_map(side: int) -> LivingMap:
+    """A map of `side`^2 places 3 m apart."""
+    from benchmarks.scale_maps import living_map
+
+    from evermap_studies.sim import WarehouseConfig
+
+    return living_map(WarehouseConfig(n_landmarks=side * side, landmarks_per_aisle=20, aisles_driven=1))
+
+
+def test_a_store_keeps_what_changed_of_a_large_map(tmp_path: Path) -> None:
+    living = large_map(40)
+    covariance = living.covariance_m2
+    assert isinstance(covariance, ChunkedCovariance)
+    near = np.flatnonzero(covariance.chunk < 6)
+    vicinity = Vicinity.of(living, np.unique(living.sites.clique_id[near]), em.Config().living)
+    part = vicinity.part
+    part = replace(part, covariance_m2=0.5 * of_places(part.covariance_m2, np.arange(len(part.places))))
+    after = vicinity.put_back(part)
+    path = tmp_path / "map.evermap"
+    said = Provenance(RevisionKind.EDIT, note="made")
+    with open_store(path, create=True) as store:
+        store.commit(living, said, parent=0)
+        n_first = path.stat().st_size
+        store.commit(after, said, parent=1)
+    grown = path.stat().st_size - n_first
+    assert grown < 0.35 * n_first
+    with open_store(path) as store:
+        for revision, expected in ((1, living), (2, after)):
+            found = store.load(revision).covariance_m2
+            assert isinstance(found, ChunkedCovariance)
+            assert isinstance(expected.covariance_m2, ChunkedCovariance)
+            assert not any(part.is_read for part in found.parts)
+            np.testing.assert_array_equal(found.each_m2, expected.covariance_m2.each_m2)
+            np.testing.assert_array_equal(found.of(near), expected.covariance_m2.of(near))
+            assert any(part.is_read for part in found.parts)
+            assert not all(part.is_read for part in found.parts)
+
+
+def test_damage_of_a_covariance_is_told_where_it_is_read(tmp_path: Path) -> None:
+    import sqlite3
+
+    living = large_map(30)
+    assert isinstance(living.covariance_m2, ChunkedCovariance)
+    path = tmp_path / "map.evermap"
+    with open_store(path, create=True) as store:
+        store.commit(living, Provenance(RevisionKind.EDIT, note="made"), parent=0)
+    name = living.covariance_m2.parts[0].name
+    with sqlite3.connect(path) as connection:
+        data = connection.execute("select data from chunk where name = ?", (name,)).fetchone()[0]
+        connection.execute("update chunk set data = ? where name = ?", (data[:-9] + b"\0" * 9, name))
+    with open_store(path) as store:
+        loaded = store.load()
+        assert isinstance(loaded.covariance_m2, ChunkedCovariance)
+        with pytest.raises(InputError, match="covariance of some of its places is damaged"):
+            loaded.covariance_m2.of(np.flatnonzero(loaded.covariance_m2.chunk == 0))
