@@ -21,6 +21,12 @@ class FitConfig(Section):
     inlier: Share = Field(default=0.5, description="inlier probability from which on a sighting counts")
     sightings: Positive = Field(default=1.5, description="inliers that a landmark needs to be believed")
     sightings_in_place: Positive = Field(default=0.5, description="the same where it stands as in the map")
+    misread_m: Positive = Field(
+        default=0.3, description="a landmark this close to another one may be that one, its identity misread [m]"
+    )
+    misread_share: Share = Field(
+        default=0.2, description="it is, if it was seen so seldom beside it, and never in one frame with it"
+    )
     glimpse_m: Positive = Field(default=0.4, description="a landmark seen once this close to its place is there [m]")
     bent_m: Positive = Field(default=0.15, description="bodies that moved alike to within this are a bend [m]")
     bent_cliques: int = Field(default=3, ge=2, description="bodies that must have moved alike for that")

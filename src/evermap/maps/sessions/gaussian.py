@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from evermap.config import FitConfig
 from evermap.geometry import se2
@@ -20,7 +21,7 @@ from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.slam.streaming import Outcome
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 
 def with_session(
@@ -134,11 +135,36 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
     """
     estimate = outcome.graph_estimate
     landmark = outcome.problem.landmark_row[: len(outcome.inlier)]
-    least = np.full(len(estimate.known), settings.sightings)
-    least[[] if in_place is None else in_place] = settings.sightings_in_place
-    row = np.flatnonzero(estimate.known & (np.bincount(landmark, outcome.inlier, minlength=len(least)) >= least))
+    n_fit = np.bincount(landmark, outcome.inlier, minlength=len(estimate.known))
+    at_home = np.zeros(len(n_fit), dtype=np.bool_)
+    at_home[[] if in_place is None else in_place] = True
+    least = np.where(at_home, settings.sightings_in_place, settings.sightings)
+    believed = estimate.known & (n_fit >= least)
+    believed &= at_home | ~_misread(outcome, np.where(believed, n_fit, 0.0), settings)
+    row = np.flatnonzero(believed)
     position = estimate.landmark[row] * outcome.scale
     return OwnLandmarks(row, position, outcome.graph_marginals.joint(row) * outcome.scale**2)
+
+
+def _misread(outcome: Outcome, n_fit: FloatArray, settings: FitConfig) -> BoolArray:
+    """(L,) landmarks that are another one: detections of that with a wrong identity agree on a place, which is its.
+
+    Args:
+        outcome: of the session.
+        n_fit: (L,) inliers of each landmark; 0 for those that are not believed anyway.
+        settings: how near, and how seldom beside the other one.
+    """
+    seen = np.flatnonzero(n_fit > 0.0)
+    near = cKDTree(outcome.graph_estimate.landmark[seen] * outcome.scale).query_pairs(settings.misread_m)
+    a, b = seen[np.array(sorted(near), dtype=np.int64).reshape(-1, 2)].T
+    seldom, often = np.where(n_fit[a] < n_fit[b], (a, b), (b, a))
+    suspected = n_fit[seldom] <= settings.misread_share * n_fit[often]
+    misread = np.zeros(len(n_fit), dtype=np.bool_)
+    fits = outcome.inlier >= settings.inlier
+    landmark, frame = (rows[: len(fits)][fits] for rows in (outcome.problem.landmark_row, outcome.problem.pose_row))
+    for one, other in zip(seldom[suspected].tolist(), often[suspected].tolist(), strict=True):
+        misread[one] |= not np.isin(frame[landmark == one], frame[landmark == other]).any()
+    return misread
 
 
 def of_unknown_size(own: OwnLandmarks, log_sigma: float) -> FloatArray:
