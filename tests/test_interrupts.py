@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evermap.interrupts import held, sheltered, temporary, watched
+from evermap.interrupts import held, temporary, watched
 from evermap.pipeline import run_slam
 from evermap_studies.sim import BuildingConfig, simulate_building
+from evermap_studies.workers import sheltered
 
 INTERRUPT = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
 
@@ -233,9 +234,10 @@ def test_a_command_takes_its_workers_along(tmp_path: Path) -> None:
     code = f"""
 import multiprocessing, time
 from concurrent.futures import ProcessPoolExecutor
+from evermap_studies.workers import sheltered
 import work
 with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
-    with interrupts.sheltered():
+    with sheltered():
         futures = [pool.submit(work.work, k) for k in range(2)]
     while len(list(Path().glob("worker-*"))) < 2:
         time.sleep(0.05)

@@ -137,22 +137,6 @@ class temporary:  # noqa: N801 (used as a function)
             _cleanups.remove(self._remove)
 
 
-class sheltered:  # noqa: N801 (used as a function)
-    """Processes that are started in this block never see Ctrl-C, which reaches all processes of a terminal: the one
-    that started them decides.
-    """
-
-    def __enter__(self) -> Self:
-        self._mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]) if os.name == "posix" else None
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._mask is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
-
-
 def kept(place: str | os.PathLike[str], said: str) -> None:
     """Note what a command that is interrupted from now on has to say about a file or folder.
 

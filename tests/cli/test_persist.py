@@ -44,7 +44,7 @@ def done(example: Path) -> tuple[Path, dict[str, Any]]:
     out = example.parent / "out"
     result = run(example, "--out", out, "--json", "--prior", "cart=0.9*exponential:half-life=12h+0.1*never-leaves")
     assert result.exit_code == 0, result.stderr
-    assert "class 'cart': 10 % of the features never leave, says the prior" in result.stderr
+    assert "class 'cart': 10 % of the features never leave, by the prior" in result.stderr
     return out, json.loads(result.stdout)
 
 

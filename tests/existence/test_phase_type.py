@@ -279,7 +279,7 @@ def test_refusals() -> None:
         PhaseType(np.array([True, True]), np.zeros((2, 2)))
     with pytest.raises(ConfigError, match="rates"):
         PhaseType.two_state(-0.1, 0.1)
-    with pytest.raises(ConfigError, match="depends on the beginning"):
+    with pytest.raises(ConfigError, match="depends on the first one"):
         PhaseType(np.array([True, False]), np.zeros((2, 2))).stationary()
     gone = PhaseType(np.array([False, True]), np.zeros((2, 2)), np.array([1.0, 0.0]))
     looks = Looks.from_rows([0, 1, 1], [0.0, 0.0, 5.0], [0, 0, 1], 0.1, 0.0)

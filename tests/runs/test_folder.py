@@ -511,6 +511,6 @@ def test_a_single_output_file_is_no_input_and_no_map(tmp_path):
     (tmp_path / "site.png").write_bytes(b"SQLite format 3\0...")
     with pytest.raises(ConfigError, match="living map"):
         check_output_file(tmp_path / "site.png")
-    with pytest.raises(ConfigError, match=r"no \.json"):
+    with pytest.raises(ConfigError, match=r"not a \.json"):
         check_output_file(tmp_path / "looks.csv", ending=".json")
     check_output_file(tmp_path / "new.csv", inputs=[tmp_path / "looks.csv"], ending=".json")

@@ -126,7 +126,9 @@ class PhaseType(Shown):
         """
         if p_present is None and leave_hz > 0.0 and return_hz == 0.0:
             raise ConfigError(
-                "a feature that never returns is long gone", field="p_present", hint="its probability at the first look"
+                "a feature that never returns is gone in the long run",
+                field="p_present",
+                hint="its probability at the first look",
             )
         if p_present is None and leave_hz == return_hz == 0.0:
             p_present = 0.5
@@ -279,7 +281,7 @@ class PhaseType(Shown):
             power /= power.sum(1, keepdims=True)
         if np.ptp(power, axis=0).max() > _UNIQUE:
             raise ConfigError(
-                "how it is in the long run depends on the beginning", field="start", hint="probabilities to start with"
+                "the state in the long run depends on the first one", field="start", hint="probabilities to start with"
             )
         rows = [power.mean(0)]
         for matrix in chain.whole[:-1]:

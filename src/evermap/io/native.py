@@ -113,7 +113,7 @@ NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (o
 
 def _read_settings(files: FileSet, warnings: list[str]) -> Settings:
     if SENSOR_FILE not in files:
-        warnings.append(f"no {SENSOR_FILE}: the sensor is taken to see all around, at the robot's centre")
+        warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
         return Settings()
     return parse_sensor_toml(files.read(SENSOR_FILE), files.path_of(SENSOR_FILE))
 

@@ -112,7 +112,7 @@ class Table:
             if names.setdefault(landmark_id_of(text), text) != text:
                 other = names[landmark_id_of(text)]
                 problem = f"{quote(text)} and {quote(other)} have the same hash"
-                raise self.error(problem, row=cells.index(text), field=name, hint="call one of them otherwise")
+                raise self.error(problem, row=cells.index(text), field=name, hint="rename one of them")
         plain = [str(landmark_id_of(cell)) if cell in texts else cell for cell in cells]
         return Table(self.path, {name: plain}, self.line, self.header_line).ids(name, optional=optional)
 

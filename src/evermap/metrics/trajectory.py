@@ -6,7 +6,7 @@ one planar motion, `pose_truth_estimate`, without scale. It serves evaluation on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -63,13 +63,6 @@ def rotate_covariance(covariance: FloatArray, angle_rad: FloatArray | float) -> 
     """Turn covariances (..., 2, 2) by `angle_rad` (broadcast): `R P R^T`."""
     turn = se2.rotation(angle_rad)
     return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2), dtype=np.float64)
-
-
-def moved(trajectory: Trajectory, pose_target_world: FloatArray, frame: str = "truth") -> Trajectory:
-    """Return the trajectory in another frame; covariances are in the robot's own frame and stay as they are."""
-    return replace(
-        trajectory, pose_world_robot=se2.compose(pose_target_world, trajectory.pose_world_robot), frame=frame
-    )
 
 
 def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

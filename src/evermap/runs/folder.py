@@ -240,7 +240,7 @@ def check_output_file(path: str | Path, *, inputs: Iterable[str | Path | None] =
         if any(_is_within(place, path) for place in _real_places(Path(read))):
             raise ConfigError("is what this command reads", path=path, hint="another name")
     if not path.name.endswith(ending) and os.path.lexists(path):
-        raise ConfigError(f"exists, and is no {ending} file", path=path, hint=f"a name ending in {ending}")
+        raise ConfigError(f"exists, and is not a {ending} file", path=path, hint=f"a name ending in {ending}")
     if _is_living_map(path):
         raise ConfigError("is a living map, which is not replaced", path=path, hint="another name")
 

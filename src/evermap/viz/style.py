@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -335,13 +335,6 @@ def save_svg(figure: Figure, path: Path | BinaryIO) -> None:
         path.write_bytes(content)
     else:
         path.write(content)
-
-
-def save_all(figures: Mapping[str, Figure], path: Callable[[str], Path]) -> None:
-    """Write every figure as PNG and SVG, to where `path` puts a file of its name."""
-    for name, figure in figures.items():
-        save_png(figure, path(f"{name}.png"), dpi=130)
-        save_svg(figure, path(f"{name}.svg"))
 
 
 def inline_svg(figure: Figure, name: str) -> str:

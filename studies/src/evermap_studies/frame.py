@@ -1,4 +1,4 @@
-"""What the tables of studies have in common: the machine, the time, the settings."""
+"""What studies have in common: the head of their tables (machine, time, settings), and how figures are written."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from evermap import __version__
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
+    from matplotlib.figure import Figure
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables that must be 1 before numpy is loaded for timings on one core; the command sets them."""
@@ -68,3 +70,12 @@ def _processor() -> str:
         return platform.processor() or platform.machine()
     names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     return next(names, platform.machine())
+
+
+def save_all(figures: Mapping[str, Figure], path: Callable[[str], Path]) -> None:
+    """Write every figure as PNG and SVG, to where `path` puts a file of its name."""
+    from evermap.viz.style import save_png, save_svg
+
+    for name, figure in figures.items():
+        save_png(figure, path(f"{name}.png"), dpi=130)
+        save_svg(figure, path(f"{name}.svg"))

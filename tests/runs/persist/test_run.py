@@ -75,7 +75,7 @@ def test_each_class_has_its_own_lifetime(tmp_path: Path) -> None:
         prior = config.class_priors["wall"] if looks.feature[row] % 2 == 0 else PRIOR
         expected = by_hand(looks, looks.feature[row], looks.stamp_s[row], prior)
         np.testing.assert_allclose(result.beliefs.p_exists[row], expected, rtol=1e-9)
-    assert "class 'wall': 50 % of the features never leave, says the prior" in result.warnings
+    assert "class 'wall': 50 % of the features never leave, by the prior" in result.warnings
     last = result.forecasts.p_exists[:, -1]
     for feature in range(looks.n_features):
         prior = config.class_priors["wall"] if feature % 2 == 0 else PRIOR

@@ -72,7 +72,7 @@ def test_appearances_of_some(tmp_path: Path) -> None:
             f"{HEAD},cov_xx_m2,cov_xy_m2,cov_xz_m2,cov_yy_m2,cov_yz_m2,cov_zz_m2\n1,2,0,0,1,2,0,1,0,1\n",
             ":2: field 'cov_xx_m2': is not a covariance",
         ),
-        (f"{HEAD},cov_xx_m2,sigma_m\n1,2,0,0,1,1\n", "says the same as sigma_m"),
+        (f"{HEAD},cov_xx_m2,sigma_m\n1,2,0,0,1,1\n", "duplicates sigma_m"),
         (f"{HEAD},sigma_m\n1,2,0,0,0\n", ":2: field 'sigma_m': 0 where a number greater than zero is needed"),
         (f"{HEAD},appearance_1\n1,2,0,0,1\n", "field 'appearance_0': missing column"),
         (f"{HEAD},sensor_x_m\n1,2,0,0,1\n", "field 'sensor_y_m': missing column"),

@@ -205,12 +205,10 @@ def _remarks(config: PersistConfig, models: ModelOfEach, looks: Looks, beliefs: 
         stay = getattr(getattr(model, "prior", None), "p_never_leaves", 0.0)
         if stay > 0.0:
             whose = f"class {quote(name)}: " if name else ""
-            remarks.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, says the prior")
+            remarks.append(f"{whose}{100.0 * stay:.3g} % of the features never leave, by the prior")
     unborn = int(np.isnan(beliefs.p_exists).sum())
     if unborn and config.stays_once:
-        remarks.append(
-            f"{counted(unborn, 'belief')} left empty: before the feature's first detection nothing is believed"
-        )
+        remarks.append(f"{counted(unborn, 'belief')} left empty: a feature has no belief before its first detection")
     back = len(np.unique(changes.feature[changes.returned]))
     if back and config.stays_once:
         remarks.append(f"{counted(back, 'feature')} came back, which lifetimes of one stay rule out: try `recurrent`")

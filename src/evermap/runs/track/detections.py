@@ -154,7 +154,7 @@ def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
     """(M, 3, 3), nan where a detection has none."""
     named = [name for name in COVARIANCE if name in table]
     if named and SIGMA.name in table:
-        raise table.error("says the same as sigma_m", row=None, field=named[0], hint="keep one of the two")
+        raise table.error("duplicates sigma_m", row=None, field=named[0], hint="keep one of the two")
     if SIGMA.name in table:
         return np.asarray(np.square(table.numbers(SIGMA))[rows, None, None] * np.eye(3))
     if not named:

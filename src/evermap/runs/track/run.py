@@ -266,13 +266,13 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     remarks = said_of(table)
     step_s = _usual_step_s(table)
     if step_s > _SLOW_STEP_S:
-        remarks.append(f"frames are {step_s:.3g} s apart: what moves is hardly followed at that pace")
+        remarks.append(f"frames are {step_s:.3g} s apart: moving objects are hardly tracked at that rate")
     if config.range_m is None and table.sensor_m is not None:
-        remarks.append("without `range_m`, what should be seen and is not counts for nothing")
+        remarks.append("without `range_m`, a missed detection is no evidence")
     unknown = int((~_bounded(spells)).sum())
     if unknown:
         what = f"{counted(unknown, 'spell')} whose beginning has no bound"
-        remarks.append(f"{what}, as the place had not been looked at before: in spells.csv, not in lifetimes.csv")
+        remarks.append(f"{what}, since the place was not observed before: in spells.csv, not in lifetimes.csv")
     return remarks
 
 

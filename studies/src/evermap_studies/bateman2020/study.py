@@ -49,7 +49,7 @@ def reproduce(
     """
     from evermap.runs.folder import RunFolder
     from evermap.runs.summary import versions
-    from evermap.viz.style import save_all
+    from evermap_studies.frame import save_all
 
     settings = settings or default_settings()
     with RunFolder(out, force=force) as folder:

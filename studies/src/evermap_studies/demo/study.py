@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.interrupts import sheltered
 from evermap.types import IntArray, MapChange, Progress, Recording, SlamResult, Trajectory
 from evermap_studies.demo.methods import METHODS, Method
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.scores import Snapshot
 from evermap_studies.demo.truth import Truth, truth_of
 from evermap_studies.sim import BuildingSimulation
+from evermap_studies.workers import sheltered
 
 if TYPE_CHECKING:
     from evermap.config import Config, LivingConfig

@@ -7,7 +7,7 @@ error is that.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -113,11 +113,10 @@ def _common(estimate: Landmarks, truth: Landmarks) -> tuple[FloatArray, FloatArr
 
 def _fixed(session: Session, world: World, number: int, pose_truth_map: FloatArray) -> float | None:
     """Pose RMSE in the map's frame."""
-    from evermap.metrics.trajectory import moved
-
     truth = world.recordings[number].truth
     assert truth is not None
-    placed = moved(session.slam.trajectory, pose_truth_map)
+    path = session.slam.trajectory
+    placed = replace(path, pose_world_robot=se2.compose(pose_truth_map, path.pose_world_robot), frame="truth")
     errors = evaluate_trajectory(placed, truth, rate_hz=RATE_HZ, align=False)
     return None if errors is None else errors.rmse_m
 

@@ -112,7 +112,7 @@ def reproduce(
         ConfigError: `out` must not be replaced.
     """
     from evermap.runs.folder import RunFolder
-    from evermap.viz.style import save_all
+    from evermap_studies.frame import save_all
 
     settings = settings or Settings()
     if set(settings.parts) != {SIMULATED_PART}:

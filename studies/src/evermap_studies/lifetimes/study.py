@@ -86,7 +86,7 @@ def reproduce(
     """
     from evermap.runs.folder import RunFolder
     from evermap.runs.summary import versions
-    from evermap.viz.style import save_all
+    from evermap_studies.frame import save_all
 
     settings = settings or Settings()
     total = settings.moving_runs + settings.repetitions + 1.0

@@ -19,9 +19,9 @@ from evermap.viz.style import (
     ONLINE,
     house_style,
     new_figure,
-    save_all,
     settle,
 )
+from evermap_studies.frame import save_all
 from evermap_studies.nielsen2024.expected import Row, Rows, chosen, mean, weights
 
 if TYPE_CHECKING:

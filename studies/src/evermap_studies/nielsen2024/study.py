@@ -19,7 +19,7 @@ import numpy as np
 
 from evermap.compiled import find_place
 from evermap.errors import EvermapError
-from evermap.interrupts import sheltered, watched
+from evermap.interrupts import watched
 from evermap.types import Progress, SlamResult
 from evermap_studies.frame import Stopwatch
 from evermap_studies.nielsen2024.figures import draw_all
@@ -27,6 +27,7 @@ from evermap_studies.nielsen2024.plan import METHODS, PARTS, QUICK, Settings, jo
 from evermap_studies.nielsen2024.runs import NOTHING, Job, Reference, reference_of, run_job, warm_up
 from evermap_studies.nielsen2024.simulation import BUDGET_NOISE_M2, budget_rows, selector_rows, slam_rows
 from evermap_studies.nielsen2024.table import as_markdown, verdicts
+from evermap_studies.workers import sheltered
 
 Row = dict[str, Any]
 

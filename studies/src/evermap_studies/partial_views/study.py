@@ -111,7 +111,7 @@ def reproduce(
         ConfigError: `out` must not be replaced.
     """
     from evermap.runs.folder import RunFolder
-    from evermap.viz.style import save_all
+    from evermap_studies.frame import save_all
     from evermap_studies.partial_views.figures import draw_false_changes, draw_reliability
 
     settings = settings or Settings()

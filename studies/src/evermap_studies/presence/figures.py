@@ -19,10 +19,10 @@ from evermap.viz.style import (
     ODOMETRY,
     house_style,
     new_figure,
-    save_all,
     settle,
 )
 from evermap.viz.time_axis import TimeAxis
+from evermap_studies.frame import save_all
 from evermap_studies.presence.models import DOOR_DEFAULT, PERIODIC, ROOM_DEFAULT, RUN_LENGTH_RHYTHM, TWO_STATE
 from evermap_studies.presence.tasks import TASKS, RoomFeature
 

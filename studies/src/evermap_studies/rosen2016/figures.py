@@ -16,9 +16,9 @@ from evermap.viz.style import (
     ODOMETRY,
     house_style,
     new_figure,
-    save_all,
     settle,
 )
+from evermap_studies.frame import save_all
 from evermap_studies.rosen2016.examples import draw_belief_example, draw_prior_example
 from evermap_studies.rosen2016.table import LIMIT, NAMES
 
