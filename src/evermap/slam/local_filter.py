@@ -12,11 +12,13 @@ Those that were met before the last relinearisation are tied as the batch smooth
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from evermap.compiled import kept
 from evermap.slam.frame_factor import linearise_frame, spread_of_frame, turn_pose
 from evermap.slam.kernels import (
     AT_PLACES,
@@ -124,12 +126,13 @@ class LocalFilter:
         self._activate(rows, landmark)
         if motion is not None:
             drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
-        place = self._position[self._active]
         _update(
             self._pose,
             self._states,
-            place,
+            self._position,
             self._covariance,
+            self._active,
+            rows,
             self._slot[rows],
             problem.reading[detections],
             self._noise.of_detections(problem.sigma_given[detections]),
@@ -137,7 +140,6 @@ class LocalFilter:
             problem.prior.free,
             self._robust,
         )
-        self._position[self._active] = place
         self._new_pose.append(self._pose.copy())
 
     def last_pose(self) -> FloatArray:
@@ -283,71 +285,97 @@ def drive_on(
 
 @kernel
 def _update(
-    pose: FloatArray,
-    states: FloatArray,
-    place: FloatArray,
-    covariance: FloatArray,
-    slot: Any,
-    reading: FloatArray,
-    sigma: FloatArray,
-    mount: FloatArray,
-    free: Any,
-    robust: bool,
-) -> None:
-    """All detections of a frame at once, relinearised and re-weighted until nothing moves; all in place."""
-    size, count = len(covariance), len(reading)
+    pose: FloatArray, states: FloatArray, position: FloatArray, covariance: FloatArray, active: Any, seen: Any,
+    slot: Any, reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any, robust: bool,
+) -> None:  # fmt: skip
+    """All detections of a frame at once, relinearised and re-weighted until nothing moves; all in place.
+
+    Only pose, calibration and the places that are `seen` take part in that; the other `active` places follow at last.
+    """
+    count, size = len(reading), AT_PLACES + 2 * len(reading)
     if count == 0:
         return
+    place, where, own = position[seen], np.arange(size), np.arange(count)
+    where[AT_PLACES::2], where[AT_PLACES + 1 :: 2] = AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 1
+    part = np.ascontiguousarray(covariance[where][:, where])
     start, start_states, start_place = pose.copy(), states.copy(), place.copy()
-    step, weight = np.zeros(size), np.ones(count)
-    residual = np.zeros(2 * count)
+    step, weight, innovation, pull = np.zeros(size), np.ones(count), np.zeros(2 * count), np.zeros(2 * count)
     jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
-    spread, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
+    root, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
     for iteration in range(ITERATIONS):
-        linearise_frame(pose, states, place, slot, reading, mount, free, step[2], residual, jacobian, column)
-        spread_of_frame(covariance, jacobian, column, gain, spread)
-        for m in range(count if iteration > 0 and robust else 0):
-            squared = (residual[2 * m] / sigma[m, 0]) ** 2 + (residual[2 * m + 1] / sigma[m, 1]) ** 2
-            weight[m] = inlier_weight(squared, 0.0, True)
-        if iteration == 0 and robust:
+        linearise_frame(pose, states, place, own, reading, mount, free, step[2], innovation, jacobian, column)
+        spread_of_frame(part, jacobian, column, gain, root)
+        for m in range(count if robust else 0):
+            x, y = innovation[2 * m], innovation[2 * m + 1]
             # before anything is known of this frame: as surprising as its innovation is
-            for m in range(count):
-                a = spread[2 * m, 2 * m] + sigma[m, 0] ** 2
-                b = spread[2 * m, 2 * m + 1]
-                d = spread[2 * m + 1, 2 * m + 1] + sigma[m, 1] ** 2
-                x, y = residual[2 * m], residual[2 * m + 1]
-                weight[m] = inlier_weight((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b), 0.0, True)
-        for m in range(count):
-            for k in range(2):
-                spread[2 * m + k, 2 * m + k] += sigma[m, k] ** 2 / weight[m]
-        # innovation at the step so far, told at the start
+            unknown = 1.0 if iteration == 0 else 0.0
+            a = unknown * root[2 * m, 2 * m] + sigma[m, 0] ** 2
+            b = unknown * root[2 * m, 2 * m + 1]
+            d = unknown * root[2 * m + 1, 2 * m + 1] + sigma[m, 1] ** 2
+            weight[m] = inlier_weight((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b), 0.0, True)
         for row in range(2 * count):
+            root[row, row] += sigma[row // 2, row % 2] ** 2 / weight[row // 2]
+            # innovation at the step so far, told at the start
             for a in range(10):
-                residual[row] -= jacobian[row, a] * step[column[row // 2, a]]
-        pull: Any = np.linalg.solve(spread, residual)
-        moved = 0.0
-        for k in range(size):
-            total = 0.0
-            for row in range(2 * count):
-                total -= gain[row, k] * pull[row]
-            moved = max(moved, abs(total - step[k]))
-            step[k] = total
-        c, s = np.cos(start[2]), np.sin(start[2])
+                innovation[row] -= jacobian[row, a] * step[column[row // 2, a]]
+        _solve(root, innovation, pull)
+        before, step = step, -(pull @ gain)
+        c, s = math.cos(start[2]), math.sin(start[2])
         pose[0] = start[0] + c * step[0] - s * step[1]
         pose[1] = start[1] + s * step[0] + c * step[1]
         pose[2] = wrapped(start[2] + step[2])
         states[:] = start_states + step[3:AT_PLACES]
         place[:] = start_place + step[AT_PLACES:].reshape(-1, 2)
-        if moved < SMALL_STEP:
+        if np.abs(step - before).max() < SMALL_STEP:
             break
-    root: Any = np.linalg.cholesky(spread)
-    white: Any = np.linalg.solve(root, gain)
-    for i in range(size):
-        for k in range(i, size):
-            total = 0.0
-            for row in range(2 * count):
-                total += white[row, i] * white[row, k]
-            covariance[i, k] -= total
-            if k > i:
-                covariance[k, i] = covariance[i, k]
+    column[:, 8], column[:, 9] = where[AT_PLACES::2], where[AT_PLACES + 1 :: 2]
+    white = np.zeros((2 * count, len(covariance) + 1))
+    white[:, -1] = innovation
+    _condition(covariance, jacobian, column, root, white)
+    for k in range(len(active)):
+        for row in range(2 * count):
+            for a in range(2):
+                position[active[k], a] -= white[row, AT_PLACES + 2 * k + a] * white[row, -1]
     turn_pose(covariance, step[2])
+
+
+@kernel
+def _solve(matrix: FloatArray, right: FloatArray, x: FloatArray) -> None:
+    """Solve by Cholesky's factor, which takes the place of the lower triangle of the matrix."""
+    for i in range(len(matrix)):
+        for k in range(i + 1):
+            total = matrix[i, k]
+            for a in range(k):
+                total -= matrix[i, a] * matrix[k, a]
+            matrix[i, k] = math.sqrt(total) if k == i else total / matrix[k, k]
+        x[i] = right[i]
+        for a in range(i):
+            x[i] -= matrix[i, a] * x[a]
+        x[i] /= matrix[i, i]
+    for i in range(len(matrix) - 1, -1, -1):
+        x[i] /= matrix[i, i]
+        for a in range(i):
+            x[a] -= matrix[i, a] * x[i]
+
+
+@kept(effort=3, error_model="numpy", fastmath={"contract"})
+def _condition(covariance: FloatArray, jacobian: FloatArray, column: Any, root: FloatArray, white: FloatArray) -> None:
+    """Condition on detections, with the lower root of `H P H' + R`.
+
+    `white`, zeros and the innovations in its last column, becomes `root^-1 (H P, innovations)`.
+    """
+    for row in range(len(white)):
+        for a in range(10):
+            by, at = jacobian[row, a], column[row // 2, a]
+            for k in range(len(covariance) if by != 0.0 else 0):
+                white[row, k] += by * covariance[at, k]
+        for other in range(row):
+            for k in range(white.shape[1]):
+                white[row, k] -= root[row, other] * white[other, k]
+        for k in range(white.shape[1]):
+            white[row, k] /= root[row, row]
+    for i in range(len(covariance)):
+        for row in range(len(white)):
+            by = white[row, i]
+            for k in range(len(covariance)):
+                covariance[i, k] -= by * white[row, k]

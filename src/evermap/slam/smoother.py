@@ -27,7 +27,7 @@ HELD = 1e-9
 """Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
 POSES_A_SLICE = 500
 """Poses that are linearised, with their detections, in about a millisecond."""
-POSES_A_LEAF = 5
+POSES_A_LEAF = 8
 """Consecutive poses that are eliminated in one front: fewer make more fronts, more make larger ones."""
 
 
@@ -107,23 +107,28 @@ class Smoother:
         Raises:
             NumericalError: no finite optimum.
         """
-        return exhausted(self.optimum_in_slices(start, iterations=iterations, tolerance=tolerance, settled=settled))
+        return exhausted(self.solved_in_slices(start, iterations=iterations, tolerance=tolerance, settled=settled))[0]
 
-    def optimum_in_slices(
+    def solved_in_slices(
         self, start: Estimate, *, iterations: int = 30, tolerance: float = 1e-6, settled: float = 0.0
-    ) -> Slices[Estimate]:
-        """Return what `optimum` does, in slices."""
+    ) -> Slices[tuple[Estimate, Marginals]]:
+        """Return what `optimum` does, in slices, and the covariances that its last step was made with."""
         estimate = start
         now = yield from self.linearised_in_slices(estimate)
         damping = 0.0
+        undamped: Factorised | None = None
         for _ in range(iterations):
             solved = yield from self._eliminated(estimate, now, damping)
             step = yield from solved.solution()
             trial = self._moved(estimate, step)
             following = yield from self.linearised_in_slices(trial)
+            if damping == 0.0:
+                undamped = solved
             if np.isfinite(following.cost) and following.cost <= now.cost + COST_SLACK:
                 gain = now.cost - following.cost
                 estimate, now = trial, following
+                if damping > 0.0:
+                    undamped = None
                 if np.abs(step).max() < tolerance or (damping == 0.0 and abs(gain) < settled):
                     break
                 damping = 0.0 if damping < 1e-6 else damping / 10.0
@@ -134,7 +139,9 @@ class Smoother:
         if not np.isfinite(now.cost):
             raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
         self._last = (estimate, now)  # the last trial need not be the best
-        return estimate
+        if undamped is None:
+            undamped = yield from self._eliminated(estimate, now, 0.0)
+        return estimate, self._marginals(estimate, undamped)
 
     def cost(self, estimate: Estimate) -> float:
         """Return the negative log posterior up to a constant."""
@@ -156,6 +163,9 @@ class Smoother:
         """Return what `marginals` does, in slices."""
         now = yield from self.linearised_in_slices(estimate)
         solved = yield from self._eliminated(estimate, now, 0.0)
+        return self._marginals(estimate, solved)
+
+    def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
 
     def stepped(self, estimate: Estimate, marginals: Marginals) -> Estimate:

@@ -50,22 +50,24 @@ class Motion:
         cls, drive: Drive, start_s: float, stop_s: float, states: FloatArray, free: BoolArray, noise: Noise
     ) -> Motion:
         """Return between two instants, with (9,) calibration states of which some are `free`."""
-        increment, by_states = np.zeros(3), np.zeros((3, 4))
-        kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
-        integrate_odometry(
-            drive.stamp_s,
-            drive.velocity,
-            drive.unknown,
-            start_s,
-            stop_s,
-            states,
-            increment,
-            by_states,
-            kinds,
-            covariance,
-        )
-        odometry_covariance(kinds, covariance, noise.odometry**2, covariance)
-        return cls(increment, by_states * free[5:], covariance)
+        odometry = drive.stamp_s, drive.velocity, drive.unknown
+        return cls(*_driven(*odometry, start_s, stop_s, states, free, noise.odometry))
+
+
+@kernel
+def _driven(
+    stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, start_s: float, stop_s: float, states: FloatArray,
+    free: Any, sigma: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Increment, derivatives by states that are free, and covariance of the motion between two instants."""
+    increment, by_states = np.zeros(3), np.zeros((3, 4))
+    kinds, covariance = np.zeros((N_NOISE, 3, 3)), np.zeros((3, 3))
+    integrate_odometry(stamp, velocity, unknown, start_s, stop_s, states, increment, by_states, kinds, covariance)
+    odometry_covariance(kinds, covariance, sigma**2, covariance)
+    for k in range(4):
+        if not free[5 + k]:
+            by_states[:, k] = 0.0
+    return increment, by_states, covariance
 
 
 class IncrementalSolver(Protocol):
@@ -150,21 +152,10 @@ def compare(
     nis, log_det = np.empty(len(detections)), np.empty(len(detections))
     joint, place, column = solver.around(places)
     _innovations(
-        joint,
-        solver.last_pose(),
-        motion.increment,
-        solver.states(),
-        place,
-        column,
-        motion.by_states,
-        motion.covariance,
-        problem.reading[detections],
-        noise.of_detections(problem.sigma_given[detections]),
-        problem.mount,
-        problem.prior.free,
-        nis,
-        log_det,
-    )
+        joint, solver.last_pose(), motion.increment, solver.states(), place, column, motion.by_states,
+        motion.covariance, problem.reading[detections], noise.of_detections(problem.sigma_given[detections]),
+        problem.mount, problem.prior.free, nis, log_det,
+    )  # fmt: skip
     return nis, log_det
 
 

@@ -31,7 +31,7 @@ FIRST_RELINEARISATION = 40
 SHORTEST_SPELL = 5
 LONGEST_SPELL = 1 / 8
 """Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
-SETTLED_AT, SETTLED_SPELL = 4000, 1 / 2
+SETTLED_AT, SETTLED_SPELL = 1000, 1 / 2
 """Poses from which most of what is new lies where nothing was before, and the share from then on."""
 SURPRISING_NIS = 50.0
 DISPUTED_AT = (2, 4, 8, 16)
@@ -46,10 +46,10 @@ SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
 CAUGHT_UP_MS = 0.15
 """What a frame takes that is processed again."""
-STEPS_BETWEEN = 2
-"""Gauss-Newton steps where the noise is not learned."""
 STEPS_A_ROUND = 3
-"""Gauss-Newton steps between two estimates of the noise."""
+"""Gauss-Newton steps of a relinearisation, or between two estimates of the noise, at most."""
+NEAR, NEAR_NOISE = 0.02, 1e-4
+"""Step (m, rad or 1) after which the stream goes on, or learns noise: the next step would be far smaller."""
 FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-3
 """Step (m, rad or 1), or what it gains (nats), at which the final optimum is reached."""
 NOISE_CONVERGED = 0.01
@@ -218,7 +218,7 @@ class StreamingSlam:
             smoother = smoother.under(noise, heavy=heavy)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
             if round_ in (0, 2):
-                estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=1e-4)
+                estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE)
             marginals = smoother.marginals(estimate)
             estimate = smoother.stepped(estimate, marginals)
             weights = smoother.inlier_probability(estimate)
@@ -268,12 +268,16 @@ class StreamingSlam:
     def _compare(self, motion: Motion, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
         known = np.isfinite(self._landmark[landmark, 0])
-        if not known.any():
+        if not known.all():
+            detections, landmark = detections[known], landmark[known]
+        if not len(detections):
             return
-        detections, landmark = detections[known], landmark[known]
-        self.nis[detections], _ = compare(self._solver, self._noise, motion, detections, landmark)
+        nis, _ = compare(self._solver, self._noise, motion, detections, landmark)
+        self.nis[detections] = nis
         np.add.at(self._n_compared, landmark, 1)
-        np.add.at(self._n_surprising, landmark, self.nis[detections] > SURPRISING_NIS)
+        surprising = nis > SURPRISING_NIS
+        if surprising.any():
+            np.add.at(self._n_surprising, landmark[surprising], 1)
 
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
@@ -288,9 +292,10 @@ class StreamingSlam:
         self, solver: IncrementalSolver, landmark: FloatArray, motion: Motion | None, detections: IntArray
     ) -> None:
         """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
-        for m in detections:
+        new = np.isnan(landmark[self._problem.landmark_row[detections], 0])
+        for m in detections[new] if new.any() else ():
             j = self._problem.landmark_row[m]
-            if np.isfinite(landmark[j, 0]):
+            if np.isfinite(landmark[j, 0]):  # twice in this frame
                 continue
             if self._problem.mapped[j]:
                 prior = self._problem.conditional_prior(j, np.isfinite(landmark[:, 0]))
@@ -316,13 +321,15 @@ class StreamingSlam:
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
             estimate = voted
-        steps, tolerance = (STEPS_A_ROUND, 1e-4) if learn else (STEPS_BETWEEN, 1e-6)
-        estimate = yield from smoother.optimum_in_slices(estimate, iterations=steps, tolerance=tolerance)
+        estimate, marginals = yield from smoother.solved_in_slices(
+            estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE if learn else NEAR
+        )
         if learn and self._method.revises(problem):
             revision = self._method.revise(problem, estimate, self._noise, heavy=True, final=False)
             if revision.problem is not problem:
                 problem, estimate = revision.problem, revision.estimate
                 smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
+                marginals = yield from smoother.marginals_in_slices(estimate)
                 coming = self._problem.landmark_row[len(problem.landmark_row) :]
                 whole = replace(
                     self._problem,
@@ -331,7 +338,6 @@ class StreamingSlam:
                     landmark_information=problem.landmark_information,
                 )
                 self._adopt(whole, estimate.landmark)
-        marginals = yield from smoother.marginals_in_slices(estimate)
         if learn and self._estimate_noise:
             yield from marginals.in_slices()
             weights = smoother.inlier_probability(estimate)

@@ -21,7 +21,7 @@ TINY = 1e-12
 BLOCK = 4
 """Rows that are eliminated at once: as many as fit into registers beside what they change."""
 
-kernel = kept(effort=3, error_model="numpy")
+kernel = kept(effort=3, error_model="numpy", fastmath={"contract"})
 
 
 class Spread(NamedTuple):
