@@ -131,15 +131,9 @@ def detection_residuals(problem: Problem, estimate: Estimate) -> FloatArray:
 
 @kernel
 def _detection_residuals(
-    pose: FloatArray,
-    landmark: FloatArray,
-    states: FloatArray,
-    pose_row: Any,
-    landmark_row: Any,
-    reading: FloatArray,
-    mount: FloatArray,
-    out: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, states: FloatArray, pose_row: Any, landmark_row: Any, reading: FloatArray,
+    mount: FloatArray, out: FloatArray,
+) -> None:  # fmt: skip
     jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     for m in range(len(pose_row)):
         detection_residual(

@@ -127,19 +127,10 @@ class LocalFilter:
         if motion is not None:
             drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
         _update(
-            self._pose,
-            self._states,
-            self._position,
-            self._covariance,
-            self._active,
-            rows,
-            self._slot[rows],
-            problem.reading[detections],
-            self._noise.of_detections(problem.sigma_given[detections]),
-            problem.mount,
-            problem.prior.free,
-            self._robust,
-        )
+            self._pose, self._states, self._position, self._covariance, self._active, rows, self._slot[rows],
+            problem.reading[detections], self._noise.of_detections(problem.sigma_given[detections]), problem.mount,
+            problem.prior.free, self._robust,
+        )  # fmt: skip
         self._new_pose.append(self._pose.copy())
 
     def last_pose(self) -> FloatArray:

@@ -89,17 +89,9 @@ def _integrate(
 ) -> None:
     for i in range(first, last):
         integrate_odometry(
-            odometry_stamp,
-            velocity,
-            unknown,
-            stamp[i],
-            stamp[i + 1],
-            states,
-            out.increment[i],
-            out.by_states[i],
-            out.noise[i],
-            out.floor[i],
-        )
+            odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, out.increment[i], out.by_states[i],
+            out.noise[i], out.floor[i],
+        )  # fmt: skip
 
 
 @kernel

@@ -284,10 +284,6 @@ class Marginals:
         """Compute all that the factorised equations hold, in slices."""
         self._held = yield from self._solved.spread(self._n - 1)
 
-    def step(self) -> FloatArray:
-        """Return the Gauss-Newton step (numbers,) from where the equations were linearised."""
-        return exhausted(self._solved.solution())
-
     @cached_property
     def _held(self) -> Spread:
         return exhausted(self._solved.spread(self._n - 1))

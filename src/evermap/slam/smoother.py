@@ -168,12 +168,6 @@ class Smoother:
     def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
 
-    def stepped(self, estimate: Estimate, marginals: Marginals) -> Estimate:
-        """Return where a Gauss-Newton step with these marginals leads, or the estimate itself if that is worse."""
-        trial = self._moved(estimate, marginals.step())
-        better = self.cost(trial) <= self.cost(estimate) + COST_SLACK
-        return trial if better else estimate
-
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return what is known of some poses, the known landmarks and the states, all other poses marginalised.
 

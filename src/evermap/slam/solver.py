@@ -161,21 +161,10 @@ def compare(
 
 @kernel
 def _innovations(
-    joint: FloatArray,
-    pose_before: FloatArray,
-    increment: FloatArray,
-    states: FloatArray,
-    places: FloatArray,
-    column: Any,
-    by_states: FloatArray,
-    odometry_covariance: FloatArray,
-    reading: FloatArray,
-    sigma: FloatArray,
-    mount: FloatArray,
-    free: Any,
-    nis: FloatArray,
-    log_det: FloatArray,
-) -> None:
+    joint: FloatArray, pose_before: FloatArray, increment: FloatArray, states: FloatArray, places: FloatArray,
+    column: Any, by_states: FloatArray, odometry_covariance: FloatArray, reading: FloatArray, sigma: FloatArray,
+    mount: FloatArray, free: Any, nis: FloatArray, log_det: FloatArray,
+) -> None:  # fmt: skip
     """Distance and log determinant of every detection by itself; `joint` belongs to the pose before."""
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
     h, h_part, part, rows = np.zeros((2, 14)), np.zeros((2, 14)), np.zeros((14, 14)), np.arange(14)

@@ -23,7 +23,7 @@ from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.smoother import Smoother
 from evermap.slam.solver import IncrementalSolver, Motion, compare
-from evermap.slam.sparse.system import Slices
+from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
 FIRST_RELINEARISATION = 40
@@ -46,14 +46,16 @@ SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
 CAUGHT_UP_MS = 0.15
 """What a frame takes that is processed again."""
-STEPS_A_ROUND = 3
+STEPS_A_ROUND = 4
 """Gauss-Newton steps of a relinearisation, or between two estimates of the noise, at most."""
 NEAR, NEAR_NOISE = 0.02, 1e-4
 """Step (m, rad or 1) after which the stream goes on, or learns noise: the next step would be far smaller."""
 FINAL_TOLERANCE, FINAL_GAIN = 1e-5, 1e-3
 """Step (m, rad or 1), or what it gains (nats), at which the final optimum is reached."""
-NOISE_CONVERGED = 0.01
-"""Relative change of every noise level below which the final rounds stop."""
+NEAR_NOISE_GAIN = 1e-4
+"""Or what a step gains (nats) for each detection: by so little do noise levels change with it."""
+NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.01
+"""Relative change of every noise level below which it is decided what is an outlier, and the final rounds stop."""
 FINAL_REVISIONS = 3
 """Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
@@ -206,31 +208,32 @@ class StreamingSlam:
             problem = revision.problem
             smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
         smoother = smoother.under(fit.noise, heavy=False)
-        estimate = smoother.optimum(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
-        return self._divided(revision, estimate, smoother.marginals(estimate), fit, smoother)
+        solved = smoother.solved_in_slices(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
+        estimate, marginals = exhausted(solved)
+        return self._divided(revision, estimate, marginals, fit, smoother)
 
     def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Smoother, Estimate, NoiseFit]:
         """The optimum and its noise levels, in turns until neither changes."""
         fit, ahead = None, Extrapolation()
         smoother = Smoother(problem, noise, robust=self._robust)
+        heavy = True  # come close with the kernel that never lets go, then decide what is an outlier
+        steps, settled = STEPS_A_ROUND, NEAR_NOISE_GAIN * len(problem.pose_row)
         for round_ in range(FINAL_ROUNDS):
-            heavy = round_ < 2  # come close with the kernel that never lets go, then decide what is an outlier
             smoother = smoother.under(noise, heavy=heavy)
             # values and noise levels settle together: no need for the optimum of levels that will not stay
-            if round_ in (0, 2):
-                estimate = smoother.optimum(estimate, iterations=STEPS_A_ROUND, tolerance=NEAR_NOISE)
-            marginals = smoother.marginals(estimate)
-            estimate = smoother.stepped(estimate, marginals)
+            solved = smoother.solved_in_slices(estimate, iterations=steps, tolerance=NEAR_NOISE, settled=settled)
+            estimate, marginals = exhausted(solved)
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, noise, self._start_noise)
-            if not self._estimate_noise:
-                if not heavy:
-                    break
-                continue
-            if not heavy and _settled(noise, fit.noise):
-                noise = fit.noise
+            before, steps = noise, 1
+            if self._estimate_noise:
+                noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
+            if heavy:
+                heavy = round_ == 0 and not _settled(before, noise, NOISE_NEAR)
+                steps = 1 if heavy else STEPS_A_ROUND
+            elif _settled(before, fit.noise, NOISE_CONVERGED) or not self._estimate_noise:
+                noise = fit.noise if self._estimate_noise else noise
                 break
-            noise = fit.noise if heavy else ahead.ahead(noise, fit.noise)
         assert fit is not None
         return smoother, estimate, replace(fit, noise=noise)
 
@@ -447,11 +450,11 @@ def _solver(name: Literal["arrow", "gtsam"], problem: Problem, noise: Noise, *, 
     return solver
 
 
-def _settled(before: Noise, after: Noise) -> bool:
-    """True where no noise level changed by more than `NOISE_CONVERGED` of itself."""
+def _settled(before: Noise, after: Noise, within: float) -> bool:
+    """True where no noise level changed by more than this share of itself."""
     old = np.concatenate([before.detection, before.odometry])
     new = np.concatenate([after.detection, after.odometry])
-    return bool(np.all(np.abs(new / old - 1.0) < NOISE_CONVERGED))
+    return bool(np.all(np.abs(new / old - 1.0) < within))
 
 
 MIN_SIGHTINGS = 3
