@@ -29,6 +29,7 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance
 from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
+from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim import BuildingConfig, WarehouseConfig, simulate_building, simulate_warehouse
 from evermap_studies.sim.warehouse import warehouse_landmarks
@@ -59,9 +60,10 @@ COMPLETE_AFTER = 10
 
 
 def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
-    """Return a map of the warehouse as sessions would have left it, without lines of sight.
+    """Return a map of the warehouse as sessions would have left it.
 
-    The places are `SIGMA_MAP_M` off; the covariance is full, as that of a map that grew by sessions.
+    The places are `SIGMA_MAP_M` off, with errors that those around share. Every place was seen from either side of it
+    along the middle of its aisle, and the robot looked both ways from everywhere there.
     """
     landmark = warehouse_landmarks(config, seed=seed)
     rng, count = np.random.default_rng([seed, 2]), len(landmark)
@@ -78,9 +80,35 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
         places=Places(name, name, position, np.full(count, 50), np.zeros(count, np.int64)),
         stays=Stays(name, name, no_class, position, -never, first, seen, never, np.zeros(count))[-most_stays:],
         covariance_m2=_covariance(position),
+        sightlines=_lines(name, position),
+        views=_views(position),
         n_cliques_ever=count,
         n_sites_ever=count,
     )
+
+
+def _aisle(position_m: FloatArray, along_m: FloatArray) -> FloatArray:
+    """(P, K, 2) points beside each place, along the middle of its aisle."""
+    turn = se2.rotation(MAP_POSE[2])
+    return np.asarray(position_m[:, None] + along_m[:, None] * turn[:, 0] - 0.5 * SESSION.aisle_m * turn[:, 1])
+
+
+def _lines(name: IntArray, position_m: FloatArray) -> SightLines:
+    """Along which every place was seen."""
+    lines = SightLines.empty()
+    beside = _aisle(position_m, np.arange(-4.75, 5.0, lines.cell_m))
+    place, count = np.repeat(np.arange(len(name)), beside.shape[1]), beside.shape[0] * beside.shape[1]
+    cell = lines.cells(beside.reshape(-1, 2), position_m[place])
+    hit = np.ones(count, dtype=np.bool_)
+    return lines.learned((name, name), place, cell, hit, np.full(count, 20.0))
+
+
+def _views(position_m: FloatArray) -> Views:
+    """From where the robot looked."""
+    views = Views.empty()
+    eye = _aisle(position_m, np.arange(0.0, SESSION.spacing_m, views.cell_m)).reshape(-1, 2)
+    poses = [np.column_stack([eye, np.full(len(eye), heading)]) for heading in (MAP_POSE[2], MAP_POSE[2] + np.pi)]
+    return views.seen_from(np.vstack(poses), -SEEN_S)
 
 
 def _covariance(position_m: FloatArray) -> JointCovariance:
@@ -254,7 +282,7 @@ def _entered(store: Any, recording: Recording) -> em.Entered:
 
 def _loaded(path: Path) -> em.LivingMap:
     with em.open_store(path) as store:
-        return store.load()
+        return store.load(sight=False)
 
 
 def _begin(store: Any, config: WarehouseConfig) -> None:

@@ -17,7 +17,7 @@ from evermap.config import LivingConfig
 from evermap.geometry.chunked import ChunkedCovariance, Update, of_places
 from evermap.maps.living import Dated, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.sensing.sightlines import SightLines, Views
+from evermap.sensing.sightlines import HEADINGS, SightLines, Views
 from evermap.types import BoolArray, FloatArray, IntArray
 
 Table = TypeVar("Table")
@@ -145,7 +145,7 @@ def in_chunks(living: LivingMap, config: LivingConfig) -> LivingMap:
     return replace(living, covariance_m2=ChunkedCovariance.of_dense(living.places.position_m, covariance))
 
 
-def _rows(table: Table, rows: IntArray | BoolArray) -> Table:
+def _rows(table: Table, rows: BoolArray) -> Table:
     """Some rows of a table whose other fields are of the whole."""
     columns: dict[str, Any] = {name: getattr(table, name)[rows] for name in _columns(table)}
     return replace(table, **columns)  # type: ignore[type-var]
@@ -172,8 +172,14 @@ def _spliced(table: Table, key: str, gone: IntArray, new: Table) -> Table:
 
 def _views(others: Views, near: Views) -> Views:
     """Views of two places, sorted by cell and heading."""
+    lowest = np.minimum(others.cell.min(axis=0, initial=0), near.cell.min(axis=0, initial=0))
+    height = int(max(others.cell[:, 1].max(initial=0), near.cell[:, 1].max(initial=0)) - lowest[1]) + 1
+    key, own = (
+        ((views.cell[:, 0] - lowest[0]) * height + views.cell[:, 1] - lowest[1]) * HEADINGS + views.heading
+        for views in (others, near)
+    )
+    at = np.searchsorted(key, own)
     columns: dict[str, Any] = {
-        name: np.concatenate([getattr(others, name), getattr(near, name)]) for name in _columns(near)
+        name: np.insert(getattr(others, name), at, getattr(near, name), axis=0) for name in _columns(near)
     }
-    order = np.lexsort((columns["heading"], columns["cell"][:, 1], columns["cell"][:, 0]))
-    return _rows(replace(near, **columns), order)
+    return replace(near, **columns)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import json
 import math
 import zlib
@@ -33,12 +34,17 @@ from evermap.types import UNKNOWN, FloatArray
 FORMAT = 2
 """Of manifests; how columns are named and cut. Format 1 is read, see `_of_format_1`."""
 _CHUNK = 4096
-"""Values a chunk: some 30 kB, so that one changed row costs little and a large map has some hundred chunks."""
+"""Values a chunk, as a rule: some 30 kB, so that one changed row costs little, and a large map has some hundred."""
+_SHORTEST, _LONGEST = _CHUNK // 4, 4 * _CHUNK
+_HASH = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio (Knuth 1973, 6.4)."""
 _PARTS = "covariance_m2.parts"
 """Column of the values of a covariance in chunks: one piece a part, so that what changes shifts no other."""
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
+SIGHT = ("sightlines.", "views.")
+"""Columns of lines of sight and of views."""
 NAME_BYTES = 32
 MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
@@ -145,7 +151,8 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         shape = list(array.shape)
         flat = _flat(column, array)
         dtype = _KINDS[flat.dtype.kind]
-        cut = [Chunk(dtype, flat[at : at + _CHUNK].astype(dtype).tobytes()) for at in range(0, len(flat), _CHUNK)]
+        flat = flat.astype(dtype)
+        cut = [Chunk(dtype, flat[a:b].tobytes()) for a, b in itertools.pairwise(_cuts(flat))]
         names = [chunk.name for chunk in cut]
         chunks.update(zip(names, cut, strict=True))
         lower = len(flat) != array.size
@@ -192,19 +199,36 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
         raise InputError(problem, hint="evermap map verify FILE, which tells what can be read") from None
 
 
-def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
+def _cuts(flat: NDArray[Any]) -> list[int]:
+    """Where a column is cut: before values whose hash says so, so that rows put in shift no cut behind them."""
+    if len(flat) <= _LONGEST:
+        return [*range(0, len(flat), _CHUNK), len(flat)] if len(flat) else []
+    wide = np.ascontiguousarray(flat).view(np.uint64 if flat.itemsize == 8 else np.uint8).astype(np.uint64)
+    with np.errstate(over="ignore"):
+        marked = np.flatnonzero((wide * _HASH) >> np.uint64(52) == 0)  # one in 4,096
+    cuts = [0]
+    for at in [*marked.tolist(), len(flat)]:
+        while at - cuts[-1] > _LONGEST:
+            cuts.append(cuts[-1] + _CHUNK)
+        if at - cuts[-1] >= _SHORTEST or at == len(flat):
+            cuts.append(at)
+    return cuts
+
+
+def unpack(name: bytes, fetch: Fetch, without: tuple[str, ...] = (), *, lazily: bool = False) -> LivingMap:
     """Return the map of this name.
 
     Args:
         name: of its manifest.
         fetch: of stored bytes.
+        without: beginnings of the names of columns that are left out.
         lazily: unpack a covariance in chunks where it is asked for only; damage of it raises `InputError` then.
 
     Raises:
         DamagedError: a chunk is missing or is not what was written, or the content contradicts itself.
     """
     manifest = _manifest(name, fetch)
-    columns = manifest["columns"]
+    columns = {column: told for column, told in manifest["columns"].items() if not column.startswith(without)}
     listed = columns.pop(_PARTS, None)
     parts = {**manifest["values"], **_arrays(columns, fetch)}
     if listed is not None:
