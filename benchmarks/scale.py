@@ -185,7 +185,7 @@ def by_evermap(drive: Drive) -> dict[str, Any]:
 
 
 def by_evermap_mapped(drive: Drive) -> dict[str, Any]:
-    """Measure the same into a map that begins with it, whose covariance is dense."""
+    """Measure the same into a map that begins with it."""
     done = spent(lambda: em.run_session(drive.recording))
     return {"wall_s": done.wall_s, "cpu_s": done.cpu_s}
 

@@ -88,7 +88,7 @@ def _claims_of_maps(shown: dict[str, Any]) -> list[list[str]]:
     return [
         _claim(f"time of a session of 200 landmarks brought into a map, {over}", 1.2, _grows(into, "cpu_s")),
         _claim(f"memory of such a session, {over}", 1.2, _grows(into, "grown_mb")),
-        _claim("a map's file grows in a session of 200 landmarks by", 1.0, _worst(into, "file_grown_mb"), "MB"),
+        _claim("a map's file grows in a session of 200 landmarks by, recording apart", 1.0, _growth_mb(into), "MB"),
         _claim("localisation: start from an unknown pose", 0.5, _worst(localised, "start_s"), "s"),
         _claim("localisation: 99 % of steps below", 3.0, _worst(localised, "p99_ms"), "ms"),
         _claim(f"localisation: median step, {over}", 1.3, _grows(localised, "median_ms")),
@@ -112,6 +112,14 @@ def _over(building: dict[str, Any], name: str) -> float | str:
 def _grows(rows: Sequence[dict[str, Any]], name: str) -> float | str:
     """Largest value over the smallest, over all sizes; why not, where one was not run."""
     return _each(rows, name, lambda values: max(values) / min(values))
+
+
+def _growth_mb(rows: Sequence[dict[str, Any]]) -> float | str:
+    """Largest growth of a file, without the recording that is kept in it, which is that of the session alone."""
+    without = [
+        row | {"map_mb": row["file_grown_mb"] - row["recording_mb"]} if "not_run" not in row else row for row in rows
+    ]
+    return _worst(without, "map_mb")
 
 
 def _worst(rows: Sequence[dict[str, Any]], name: str) -> float | str:
