@@ -24,6 +24,8 @@ EXPONENT = 600.0
 """Cut of log likelihood ratios: far from what a double holds, and certain either way."""
 
 kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
+exact = kept(nogil=True, error_model="numpy")
+"""Without contractions: the same probability whichever kernel asks."""
 inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
 
@@ -337,17 +339,9 @@ def collect(
 
 @kernel
 def witnessed(
-    order: Any,
-    frame: Any,
-    clique: Any,
-    hit: Any,
-    place: FloatArray,
-    range_m: FloatArray,
-    bearing: FloatArray,
-    limits: tuple[float, float, float],
-    beside: Any,
-    along: Any,
-) -> None:
+    order: Any, frame: Any, clique: Any, hit: Any, place: FloatArray, range_m: FloatArray, bearing: FloatArray,
+    limits: tuple[float, float, float], beside: Any, along: Any,
+) -> None:  # fmt: skip
     """Find looks in whose frame another clique was seen beside or behind the place, or along the very line.
 
     Args:
@@ -388,3 +382,79 @@ def witnessed(
                 if angle * range_m[one] < along_m and angle < 0.25 * math.pi and beyond > range_m[one] + along_m:
                     along[one] = True
         begin = end
+
+
+@exact
+def in_view(dx: float, dy: float, heading: float, limits: tuple[float, ...]) -> float:
+    """Return the probability to detect what is this far from a sensor; see `visibility.NominalField.limits`."""
+    p, nearest, farthest, first, last, margin_m, margin_rad = limits
+    range_m = math.sqrt(dx * dx + dy * dy)
+    p *= _below((range_m - nearest) / margin_m) * _below((farthest - range_m) / margin_m)
+    if first > -math.inf and p > 0.0:
+        bearing = math.atan2(dy, dx) - heading
+        bearing -= 2.0 * math.pi * math.floor((bearing + math.pi) / (2.0 * math.pi))
+        p *= _below((bearing - first) / margin_rad) * _below((last - bearing) / margin_rad)
+    return p
+
+
+@exact
+def _below(z: float) -> float:
+    """`P(x < z)` of a standard normal, to the last digit."""
+    return 1.0 if z > 9.0 else 0.5 * math.erfc(-z * 0.7071067811865476)
+
+
+@exact
+def looks(
+    eye: FloatArray, position: FloatArray, limits: tuple[float, ...], reach: tuple[float, float, int],
+    first_seen: Any, seen: Any,
+) -> tuple[IntArray, IntArray, FloatArray, BoolArray]:  # fmt: skip
+    """List (N,) pose, landmark, probability and whether it was detected, by pose, then by landmark.
+
+    Args:
+        eye: (F, 3) sensor poses.
+        position: (L, 2) landmarks.
+        limits: as for `in_view`.
+        reach: least probability, largest distance, and consecutive poses that are compared at once.
+        first_seen: (F + 1,) where the detections of each pose begin in `seen`.
+        seen: landmarks that are detected, whether in reach or not.
+    """
+    least, away, at_once = reach
+    pose, landmark, p, hit = np.empty(64, np.int64), np.empty(64, np.int64), np.empty(64), np.empty(64, np.bool_)
+    around, marked, count = np.empty(len(position), np.int64), np.full(len(position), -1), 0
+    for i in range(len(eye)):
+        if i % at_once == 0:
+            # consecutive poses are near each other: what none of them reaches is not worth a look of any
+            end, n_around = min(i + at_once, len(eye)), 0
+            for k in range(first_seen[i], first_seen[end]):
+                marked[seen[k]] = len(eye)
+            x, y = eye[i:end, 0], eye[i:end, 1]
+            x0, x1, y0, y1 = x.min() - away, x.max() + away, y.min() - away, y.max() + away
+            for j in range(len(position)):
+                if marked[j] == len(eye) or (x0 <= position[j, 0] <= x1 and y0 <= position[j, 1] <= y1):
+                    around[n_around] = j
+                    n_around += 1
+        for k in range(first_seen[i], first_seen[i + 1]):
+            marked[seen[k]] = i
+        if count + n_around > len(pose):
+            more = count + n_around
+            pose, landmark = np.append(pose, np.empty(more, np.int64)), np.append(landmark, np.empty(more, np.int64))
+            p, hit = np.append(p, np.empty(more)), np.append(hit, np.empty(more, np.bool_))
+        for k in range(n_around):
+            j = around[k]
+            p[count] = in_view(position[j, 0] - eye[i, 0], position[j, 1] - eye[i, 1], eye[i, 2], limits)
+            if p[count] >= least or marked[j] == i:
+                pose[count], landmark[count], hit[count] = i, j, marked[j] == i
+                count += 1
+    return pose[:count].copy(), landmark[:count].copy(), p[:count].copy(), hit[:count].copy()
+
+
+@exact
+def cells(sensor: FloatArray, place: FloatArray, cell_m: float, reach: int) -> tuple[IntArray, int]:
+    """Return (N,) cells of sensors counted from places, see `sightlines`, and the first row that has none, or -1."""
+    out = np.empty(len(sensor), np.int64)
+    for k in range(len(sensor)):
+        dx, dy = np.floor((sensor[k, 0] - place[k, 0]) / cell_m), np.floor((sensor[k, 1] - place[k, 1]) / cell_m)
+        if not (abs(dx) < reach // 2 and abs(dy) < reach // 2):  # also what is not a number
+            return out, k
+        out[k] = (int(dx) + reach // 2) * reach + int(dy) + reach // 2
+    return out, -1

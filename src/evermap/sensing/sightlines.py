@@ -108,15 +108,14 @@ class SightLines:
         Raises:
             InputError: a position that is not finite, or 1,000 m and more from the sensor.
         """
+        from evermap.sensing.kernels import cells
+
         sensor, place = np.asarray(sensor_m, dtype=np.float64), np.asarray(place_m, dtype=np.float64)
-        offset = np.floor((sensor - place) / self.cell_m)
-        fine = (np.abs(offset) < _REACH / 2).all(axis=1)  # False for nan
-        if not fine.all():
-            row = int(np.argmin(fine))
+        cell, row = cells(sensor, place, self.cell_m, _REACH)
+        if row >= 0:
             problem = f"row {row}: no line of sight from {sensor[row]} to {place[row]}"
             raise InputError(problem, field="place_m", hint="finite metres, both in one frame")
-        dx, dy = offset.astype(np.int64).T + _REACH // 2
-        return np.asarray(dx * _REACH + dy, dtype=np.int64)
+        return cell
 
     def lines(
         self, places: tuple[IntArray, IntArray], place: IntArray, cell: IntArray, p_detect: FloatArray
@@ -326,13 +325,17 @@ def _p_clear(hits: FloatArray, looks: FloatArray, prior: float, free: FloatArray
     """(N,) probability that lines are clear, given hits and looks along them (beta-binomial)."""
     from scipy.special import expit, gammaln
 
+    known = looks > 0.0  # of others the prior is all that is known
+    hits, misses = hits[known], np.maximum(looks - hits, 0.0)[known]
+
     def log_likelihood(rate: FloatArray | float) -> FloatArray:
         a, b = rules.strength * np.asarray(rate), rules.strength * (1.0 - np.asarray(rate))
-        return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + np.maximum(looks - hits, 0.0)) - gammaln(b))
+        return np.asarray(gammaln(a + hits) - gammaln(a) + gammaln(b + misses) - gammaln(b))
 
-    return np.asarray(
-        expit(np.log(prior / (1.0 - prior)) + log_likelihood(free) - log_likelihood(rules.p_blocked_detect))
-    )
+    p_clear = np.full(len(known), prior)
+    odds = log_likelihood(free[known]) - log_likelihood(rules.p_blocked_detect)
+    p_clear[known] = expit(np.log(prior / (1.0 - prior)) + odds)
+    return p_clear
 
 
 def _length(cell: IntArray) -> IntArray:

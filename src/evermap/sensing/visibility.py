@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
@@ -57,11 +56,28 @@ class NominalField:
 
     def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
         """Return (F, L) probabilities of landmarks (L, 2) from robot poses (F, 3) in the same frame."""
-        eye = se2.compose(pose, np.asarray(self.sensor.mount_robot_sensor))
-        offset = position_m[None, :, :] - eye[:, None, :2]
-        range_m = np.hypot(offset[..., 0], offset[..., 1])
-        bearing = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - eye[:, None, 2])
-        return self.sensor.p_detect * np.exp(log_in_view(range_m, bearing, self.sensor))
+        none = np.zeros(0, dtype=np.int64)
+        return self.looks(pose, position_m, (none, none), -1.0, math.inf).p_detect.reshape(len(pose), len(position_m))
+
+    def looks(
+        self, pose: FloatArray, position_m: FloatArray, seen: tuple[IntArray, IntArray], least: float, reach_m: float
+    ) -> LooksAt:
+        """Return what was `seen` (see `looks_at`), and what is in reach and detected with some probability at least."""
+        from evermap.sensing.kernels import looks
+
+        eye = se2.compose(pose, np.asarray(self.sensor.mount_robot_sensor)).reshape(-1, 3)
+        by_pose = np.argsort(seen[0], kind="stable")
+        first = np.searchsorted(seen[0][by_pose], np.arange(len(eye) + 1))
+        position = np.asarray(position_m, dtype=np.float64)
+        return LooksAt(*looks(eye, position, self.limits, (least, reach_m, AT_ONCE), first, seen[1][by_pose]))
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """As `kernels.in_view` takes them; a sensor that sees all around has no limits of the bearing."""
+        of, all_around = self.sensor, self.sensor.bearing_max_rad - self.sensor.bearing_min_rad >= 2 * math.pi - 1e-6
+        bearing = (-math.inf, math.inf) if all_around else (float(of.bearing_min_rad), float(of.bearing_max_rad))
+        ranges = float(of.range_min_m), float(of.range_max_m)
+        return (float(of.p_detect), *ranges, *bearing, RANGE_MARGIN_M, BEARING_MARGIN_RAD)
 
     def worth_a_look(self, p_detect: FloatArray) -> BoolArray:
         """Return which probabilities of any shape are large enough for a look."""
@@ -96,57 +112,5 @@ def looks_at(sensor: Sensor, pose: FloatArray, position_m: FloatArray, seen: tup
         position_m: (L, 2) landmarks in the same frame, taken to be there.
         seen: (H,) rows of poses and (H,) rows of landmarks: the detections.
     """
-    field = NominalField(sensor)
-    eye = se2.compose(pose, np.asarray(sensor.mount_robot_sensor))[:, :2]
-    reach = sensor.range_max_m + 3.0 * RANGE_MARGIN_M
-    by_pose = np.argsort(seen[0], kind="stable")
-    first_seen = np.searchsorted(seen[0][by_pose], np.arange(0, max(len(pose), 1) + AT_ONCE, AT_ONCE))
-    parts = []
-    for k, start in enumerate(range(0, max(len(pose), 1), AT_ONCE)):
-        some = pose[start : start + AT_ONCE]
-        mine = by_pose[first_seen[k] : first_seen[k + 1]]
-        # consecutive poses are near each other: what none of them reaches is not worth a look of any
-        low = eye[start : start + AT_ONCE].min(axis=0, initial=np.inf) - reach
-        high = eye[start : start + AT_ONCE].max(axis=0, initial=-np.inf) + reach
-        near = ((position_m >= low) & (position_m <= high)).all(axis=1)
-        near[seen[1][mine]] = True
-        rows = np.flatnonzero(near)
-        p = field.p_detect(some, position_m[rows])
-        hit = np.zeros(p.shape, dtype=np.bool_)
-        hit[seen[0][mine] - start, np.searchsorted(rows, seen[1][mine])] = True
-        row, column = np.nonzero(field.worth_a_look(p) | hit)
-        parts.append((row + start, rows[column], p[row, column], hit[row, column]))
-    return LooksAt(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def log_in_view(
-    range_m: FloatArray,
-    bearing_rad: FloatArray,
-    sensor: Sensor,
-    *,
-    range_margin_m: FloatArray | float = RANGE_MARGIN_M,
-    bearing_margin_rad: FloatArray | float = BEARING_MARGIN_RAD,
-) -> FloatArray:
-    """Return `log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
-
-    Args:
-        range_m: from the sensor, of any shape.
-        bearing_rad: from the sensor's x axis, in [-pi, pi), of the same shape.
-        sensor: limits.
-        range_margin_m: standard deviation of the range, of the same shape or a number.
-        bearing_margin_rad: standard deviation of the bearing, likewise.
-    """
-    inside = _log_within(range_m, sensor.range_min_m, sensor.range_max_m, range_margin_m)
-    if sensor.bearing_max_rad - sensor.bearing_min_rad < 2 * math.pi - 1e-6:
-        inside += _log_within(bearing_rad, sensor.bearing_min_rad, sensor.bearing_max_rad, bearing_margin_rad)
-    return inside
-
-
-def _log_within(value: FloatArray, low: float, high: float, margin: FloatArray | float) -> FloatArray:
-    """Return `log P(low < x) + log P(x < high)` of a value known to `margin`."""
-    inside = np.zeros_like(value)
-    if low > -math.inf:
-        inside += log_ndtr((value - low) / margin)
-    if high < math.inf:
-        inside += log_ndtr((high - value) / margin)
-    return inside
+    reach_m = sensor.range_max_m + 3.0 * RANGE_MARGIN_M
+    return NominalField(sensor).looks(pose, position_m, seen, WORTH_A_LOOK * sensor.p_detect, float(reach_m))

@@ -17,18 +17,9 @@ from evermap.types import FloatArray, IntArray
 
 @kernel
 def linearise_frame(
-    pose: FloatArray,
-    states: FloatArray,
-    place: FloatArray,
-    slot: IntArray,
-    reading: FloatArray,
-    mount: FloatArray,
-    free: Any,
-    turned: float,
-    residual: FloatArray,
-    jacobian: FloatArray,
-    column: IntArray,
-) -> None:
+    pose: FloatArray, states: FloatArray, place: FloatArray, slot: IntArray, reading: FloatArray, mount: FloatArray,
+    free: Any, turned: float, residual: FloatArray, jacobian: FloatArray, column: IntArray,
+) -> None:  # fmt: skip
     """Compute residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
 
     The step of the pose is told in the frame of where it started, from which it has `turned` by now.

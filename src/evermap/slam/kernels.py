@@ -108,17 +108,9 @@ def adjoint(a: FloatArray) -> FloatArray:
 
 @kernel
 def integrate_odometry(
-    stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
-    start: float,
-    stop: float,
-    states: FloatArray,
-    increment: FloatArray,
-    jacobian: FloatArray,
-    noise: FloatArray,
-    floor: FloatArray,
-) -> None:
+    stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, start: float, stop: float, states: FloatArray,
+    increment: FloatArray, jacobian: FloatArray, noise: FloatArray, floor: FloatArray,
+) -> None:  # fmt: skip
     """Integrate the motion between two instants, its derivatives and noise; velocities hold between odometry stamps.
 
     Args:
@@ -313,17 +305,9 @@ def residual_by_states(motion: FloatArray, residual: FloatArray, free: Any) -> N
 
 @kernel
 def detection_residual(
-    pose: FloatArray,
-    landmark: FloatArray,
-    states: FloatArray,
-    mount: FloatArray,
-    range_m: float,
-    bearing_rad: float,
-    residual: FloatArray,
-    j_pose: FloatArray,
-    j_landmark: FloatArray,
-    j_states: FloatArray,
-) -> None:
+    pose: FloatArray, landmark: FloatArray, states: FloatArray, mount: FloatArray, range_m: float, bearing_rad: float,
+    residual: FloatArray, j_pose: FloatArray, j_landmark: FloatArray, j_states: FloatArray,
+) -> None:  # fmt: skip
     """Compute (range, bearing) measured minus predicted, derivatives by pose (2, 3), landmark (2, 2), states (2, 5)."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     lever_x, lever_y = c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]

@@ -46,19 +46,9 @@ def root_of(information: FloatArray, root: FloatArray) -> None:
 
 @kernel
 def linearise(
-    pose: FloatArray,
-    place: FloatArray,
-    states: FloatArray,
-    driven: Intervals,
-    variance: FloatArray,
-    seen: Readings,
-    values: FloatArray,
-    weight: FloatArray,
-    begin: int,
-    end: int,
-    first: int,
-    last: int,
-) -> float:
+    pose: FloatArray, place: FloatArray, states: FloatArray, driven: Intervals, variance: FloatArray, seen: Readings,
+    values: FloatArray, weight: FloatArray, begin: int, end: int, first: int, last: int,
+) -> float:  # fmt: skip
     """Linearise the odometry from poses `begin` to `end - 1`, and the detections from `first` to `last - 1`.
 
     Args:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from evermap.errors import InputError
-from evermap.sensing.visibility import log_in_view
+from evermap.sensing.visibility import BEARING_MARGIN_RAD, RANGE_MARGIN_M
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 MOST_CERTAIN = 1.0 - 1e-6
@@ -177,3 +179,36 @@ def hit_probabilities(detected: FloatArray, first: IntArray) -> tuple[float, flo
     hits = values[after]
     after_hit, after_miss = ((hits[state].sum() + 1.0) / (state.sum() + 2.0) for state in (before, ~before))
     return float(after_hit), float(after_miss)
+
+
+def log_in_view(
+    range_m: FloatArray,
+    bearing_rad: FloatArray,
+    sensor: Sensor,
+    *,
+    range_margin_m: FloatArray | float = RANGE_MARGIN_M,
+    bearing_margin_rad: FloatArray | float = BEARING_MARGIN_RAD,
+) -> FloatArray:
+    """Return `log P(inside the limits of the sensor)` of landmarks whose range and bearing are known to some margin.
+
+    Args:
+        range_m: from the sensor, of any shape.
+        bearing_rad: from the sensor's x axis, in [-pi, pi), of the same shape.
+        sensor: limits.
+        range_margin_m: standard deviation of the range, of the same shape or a number.
+        bearing_margin_rad: standard deviation of the bearing, likewise.
+    """
+    inside = _log_within(range_m, sensor.range_min_m, sensor.range_max_m, range_margin_m)
+    if sensor.bearing_max_rad - sensor.bearing_min_rad < 2 * math.pi - 1e-6:
+        inside += _log_within(bearing_rad, sensor.bearing_min_rad, sensor.bearing_max_rad, bearing_margin_rad)
+    return inside
+
+
+def _log_within(value: FloatArray, low: float, high: float, margin: FloatArray | float) -> FloatArray:
+    """Return `log P(low < x) + log P(x < high)` of a value known to `margin`."""
+    inside = np.zeros_like(value)
+    if low > -math.inf:
+        inside += log_ndtr((value - low) / margin)
+    if high < math.inf:
+        inside += log_ndtr((high - value) / margin)
+    return inside
