@@ -28,6 +28,7 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance
 from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
+from evermap.maps.vicinity import in_chunks
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim import BuildingConfig, WarehouseConfig, simulate_building, simulate_warehouse
@@ -71,7 +72,7 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
     most_stays = em.Config().living.decisions.most_stays  # a map keeps the newest
     seen, first = np.full(count, -SEEN_S), np.full(count, -10 * SEEN_S)
     never = np.full(count, np.inf)
-    return em.LivingMap(
+    living = em.LivingMap(
         stamp_s=-SEEN_S,
         session_start_s=-SEEN_S,
         members=Members(name, no_class, name, np.zeros(count, np.bool_), np.zeros(count, np.bool_)),
@@ -84,6 +85,7 @@ def living_map(config: WarehouseConfig, seed: int = 0) -> em.LivingMap:
         n_cliques_ever=count,
         n_sites_ever=count,
     )
+    return in_chunks(living, em.Config().living)
 
 
 def _aisle(position_m: FloatArray, along_m: FloatArray) -> FloatArray:
@@ -286,7 +288,7 @@ def _entered(store: Any, recording: Recording) -> em.Entered:
 
 def _loaded(path: Path) -> em.LivingMap:
     with em.open_store(path) as store:
-        return store.load(sight=False)
+        return store.load()
 
 
 def _begin(store: Any, config: WarehouseConfig) -> None:

@@ -87,7 +87,7 @@ def _claims_of_maps(shown: dict[str, Any]) -> list[list[str]]:
     over = f"{into[-1]['places']:,} over {into[0]['places']:,} places"
     return [
         _claim(f"time of a session of 200 landmarks brought into a map, {over}", 1.2, _grows(into, "cpu_s")),
-        _claim(f"memory of such a session, {over}", 1.2, _grows(into, "grown_mb")),
+        _claim(f"memory of such a session, {over}", 1.2, _grows(into, "peak_mb")),
         _claim("a map's file grows in a session of 200 landmarks by, recording apart", 1.0, _growth_mb(into), "MB"),
         _claim("localisation: start from an unknown pose", 0.5, _worst(localised, "start_s"), "s"),
         _claim("localisation: 99 % of steps below", 3.0, _worst(localised, "p99_ms"), "ms"),

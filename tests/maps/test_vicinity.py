@@ -8,13 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import evermap as em
 from evermap.errors import InputError
 from evermap.geometry.chunked import ChunkedCovariance, of_places
 from evermap.maps.living import Dated, LivingMap
+from evermap.maps.shelves import ROWS, Shelves, columns, spliced
 from evermap.maps.store import Provenance, RevisionKind, open_store
 from evermap.maps.vicinity import Vicinity, in_chunks, predicted_of
+from evermap.sensing.sightlines import SightLines
 from evermap.types import Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -62,14 +66,18 @@ def test_a_part_that_nothing_happened_to_is_put_back_as_it_was() -> None:
     vicinity = Vicinity.of(living, some, em.Config().living, np.array([0.0, 0.0, 8.0, 8.0]))
     assert 0 < len(vicinity.part.places) < len(living.places)
     again = vicinity.put_back(vicinity.part)
-    for table in ("members", "sites", "places", "stays", "sightlines", "views", "dated"):
+    for table in ("members", "sites", "places", "stays"):
         for column in fields(getattr(living, table)):
-            before, after = (getattr(getattr(one, table), column.name) for one in (living, again))
-            if table == "sites" and column.name in ("p_here", "p_kept"):
+            if column.name in ("p_here", "p_kept"):
                 continue  # those of the part are of the map's instant now
-            np.testing.assert_array_equal(after, before, err_msg=f"{table}.{column.name}") if isinstance(
-                before, np.ndarray
-            ) and table != "dated" else None
+            before, after = (getattr(getattr(one, table), column.name) for one in (living, again))
+            np.testing.assert_array_equal(after, before, err_msg=f"{table}.{column.name}")
+    assert living.sight is not None
+    assert again.sight is not None
+    for old, new in ((living.sight.lines, again.sight.lines), (living.sight.views, again.sight.views)):
+        assert len(old) > 100
+        for column in columns(old.like):
+            np.testing.assert_array_equal(getattr(new.table(), column), getattr(old.table(), column))
     np.testing.assert_allclose(again.p_exists(), living.p_exists(), atol=1e-6)
     assert isinstance(again.covariance_m2, ChunkedCovariance)
     assert isinstance(living.covariance_m2, ChunkedCovariance)
@@ -153,5 +161,31 @@ def test_damage_of_a_covariance_is_told_where_it_is_read(tmp_path: Path) -> None
     with open_store(path) as store:
         loaded = store.load()
         assert isinstance(loaded.covariance_m2, ChunkedCovariance)
-        with pytest.raises(InputError, match="covariance of some of its places is damaged"):
+        with pytest.raises(InputError, match="of what it holds of its places is damaged"):
             loaded.covariance_m2.of(np.flatnonzero(loaded.covariance_m2.chunk == 0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**16))
+def test_shelves_are_the_table_that_is_on_them(seed: int) -> None:
+    """Whatever comes and goes, against one table that is sorted again."""
+    rng = np.random.default_rng(seed)
+
+    def lines(site: np.ndarray) -> SightLines:
+        site = np.sort(site)
+        count = len(site)
+        return SightLines(site, site % 7, np.arange(count), rng.random(count), rng.random(count))
+
+    table = lines(rng.integers(0, 300, int(rng.integers(0, 12_000))))
+    shelves = Shelves.of(table)
+    for _ in range(3):
+        gone = np.unique(rng.integers(0, 300, int(rng.integers(0, 20))))
+        new = lines(rng.choice(np.append(gone, [400, 401]), int(rng.integers(0, 200))))
+        table = spliced(table, np.append(gone, [400, 401]), new)
+        shelves = shelves.replaced(np.append(gone, [400, 401]), new)
+        for column in columns(table):
+            np.testing.assert_array_equal(getattr(shelves.table(), column), getattr(table, column))
+        some = np.unique(rng.integers(0, 402, 5))
+        near = shelves.near(some)
+        np.testing.assert_array_equal(near.hits[np.isin(near.site_id, some)], table.hits[np.isin(table.site_id, some)])
+        assert shelves.count.max(initial=0) <= 2 * ROWS

@@ -21,6 +21,7 @@ import numpy as np
 from evermap.errors import InputError
 from evermap.geometry.chunked import JointCovariance, blocks, taken
 from evermap.maps.lives import Lives
+from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views, pair_rows
 from evermap.show import Shown, ShownTable, draw
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray, Landmarks, landmark_id_of
@@ -193,6 +194,7 @@ class LivingMap(Shown):
         lives: how long things of a class stay, stay away, and where they turn up again.
         sightlines: from where each place can be seen.
         views: from where the robot looked, and when.
+        sight: both of a large map, whose `sightlines` and `views` have no rows; None in a small one.
         class_names: names of the classes.
         landmark_texts: texts that landmarks were called by, for those that have no number (`types.landmark_id_of`).
         clock: of all stamps.
@@ -212,6 +214,7 @@ class LivingMap(Shown):
     lives: Lives = field(default_factory=Lives)
     sightlines: SightLines = field(default_factory=SightLines.empty)
     views: Views = field(default_factory=Views.empty)
+    sight: Sight | None = None
     class_names: tuple[str, ...] = ()
     landmark_texts: tuple[str, ...] = ()
     clock: Clock = Clock.RECORDING

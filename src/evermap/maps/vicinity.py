@@ -1,14 +1,14 @@
 """The part of a large map that a session can touch, as a map of its own, and what becomes of it put back.
 
 A session sees a few hundred places, however many there are. What it says is worked out on these and on what is near,
-with their joint covariance, as on a small map; the rest keeps what is believed of it, told of the time when somebody
+with their joint covariance, as on a small map; the rest keeps what is believed of it, told of the time when a session
 was last near (`LivingMap.dated`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,10 +17,8 @@ from evermap.config import LivingConfig
 from evermap.geometry.chunked import ChunkedCovariance, Update, of_places
 from evermap.maps.living import Dated, LivingMap
 from evermap.maps.sessions.believe import aged
-from evermap.sensing.sightlines import HEADINGS, SightLines, Views
-from evermap.types import BoolArray, FloatArray, IntArray
-
-Table = TypeVar("Table")
+from evermap.maps.shelves import Sight, key_of, rows, spliced
+from evermap.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,13 +30,13 @@ class Vicinity:
         part: some of its cliques with all their places, believed as of `whole.stamp_s`, and all stays; ids are those of
             the whole.
         place: (P,) rows of the whole's places that the part has.
-        views: (V,) views of the whole that the part has.
+        cells: (N,) columns of the floor of which the part has the views.
     """
 
     whole: LivingMap
     part: LivingMap
     place: IntArray
-    views: BoolArray
+    cells: IntArray
 
     @classmethod
     def of(
@@ -53,16 +51,22 @@ class Vicinity:
             views_within: (4,) `(x_min, y_min, x_max, y_max)` of the views that matter; None for none of them.
         """
         part, place = _of_cliques(living, cliques)
-        lines = living.sightlines
-        views: BoolArray = np.zeros(len(living.views), dtype=np.bool_)
+        lines, views = _sight(living).lines, _sight(living).views
+        cells = np.zeros(0, dtype=np.int64)
         if views_within is not None:
-            eye = living.views.pose[:, :2]
-            views = np.asarray(((eye >= views_within[:2]) & (eye <= views_within[2:])).all(axis=1))
-        lines = _rows(lines, np.isin(lines.site_id, part.sites.site_id))
-        part = replace(part, sightlines=lines, views=_rows(living.views, views))
+            low, high = np.floor(views_within[[0, 2]] / views.like.cell_m)
+            known = views.first
+            cells = np.arange(max(low, known.min(initial=0)), min(high, views.last) + 1).astype(np.int64)
+        near_lines, near_views = lines.near(part.sites.site_id), views.near(cells)
+        part = replace(
+            part,
+            sight=None,
+            sightlines=rows(near_lines, np.isin(near_lines.site_id, part.sites.site_id)),
+            views=rows(near_views, np.isin(key_of(near_views), cells)),
+        )
         if len(part.dated):
             part = replace(part, sites=aged(part, config, living.stamp_s), dated=Dated.empty())
-        return cls(living, replace(part, covariance_m2=of_places(living.covariance_m2, place)), place, views)
+        return cls(living, replace(part, covariance_m2=of_places(living.covariance_m2, place)), place, cells)
 
     def put_back(self, part: LivingMap) -> LivingMap:
         """Return the whole map with what a session made of the part."""
@@ -70,18 +74,22 @@ class Vicinity:
         elsewhere = ~np.isin(whole.sites.site_id, before.sites.site_id)
         dated = Dated(whole.sites.site_id[elsewhere], whole.believed_s()[elsewhere])
         at_site = before.sites.site_id
-        places = _spliced(whole.places, "site_id", at_site, part.places)
+        places = spliced(whole.places, at_site, part.places)
+        before_sight = _sight(whole)
+        lines = before_sight.lines.replaced(at_site, part.sightlines)
+        sight = Sight(lines, before_sight.views.replaced(self.cells, part.views))
         return replace(
             part,
-            members=_spliced(whole.members, "landmark_id", before.members.landmark_id, part.members),
-            sites=_spliced(whole.sites, "site_id", at_site, part.sites),
+            members=spliced(whole.members, before.members.landmark_id, part.members),
+            sites=spliced(whole.sites, at_site, part.sites),
             places=places,
             dated=dated[dated.stamp_s < part.stamp_s],
             covariance_m2=self._covariance(part, places),
             log_size_variance=whole.log_size_variance,
             log_size_information=whole.log_size_information,
-            sightlines=_spliced(whole.sightlines, "site_id", at_site, part.sightlines),
-            views=_views(_rows(whole.views, ~self.views), part.views),
+            sightlines=sight.lines.like,
+            views=sight.views.like,
+            sight=sight,
         )
 
     def _covariance(self, part: LivingMap, places: Any) -> ChunkedCovariance:
@@ -113,7 +121,7 @@ def cliques_of(living: LivingMap, landmark_id: IntArray) -> IntArray:
 
 def predicted_of(living: LivingMap, landmark_id: IntArray, config: LivingConfig, until_s: float) -> FloatArray:
     """Return (S,) probability of every site to be where its clique stands at a later instant; of a large map only what
-    is believed of the cliques of some landmarks is told of that instant, the rest of when somebody was last near.
+    is believed of the cliques of some landmarks is told of that instant, the rest of when a session was last near.
     """
     if len(living.places) <= config.whole_places:
         return aged(living, config, until_s).p_here
@@ -138,48 +146,21 @@ def _of_cliques(living: LivingMap, cliques: IntArray) -> tuple[LivingMap, IntArr
 
 
 def in_chunks(living: LivingMap, config: LivingConfig) -> LivingMap:
-    """Return the map with its covariance in chunks, if it is a large one."""
-    if isinstance(living.covariance_m2, ChunkedCovariance) or len(living.places) <= config.whole_places:
+    """Return the map with its covariance in chunks and its sight on shelves, if it is a large one."""
+    if len(living.places) <= config.whole_places:
         return living
-    covariance = of_places(living.covariance_m2, np.arange(len(living.places)))
-    return replace(living, covariance_m2=ChunkedCovariance.of_dense(living.places.position_m, covariance))
-
-
-def _rows(table: Table, rows: BoolArray) -> Table:
-    """Some rows of a table whose other fields are of the whole."""
-    columns: dict[str, Any] = {name: getattr(table, name)[rows] for name in _columns(table)}
-    return replace(table, **columns)  # type: ignore[type-var]
-
-
-def _columns(table: Any) -> list[str]:
-    """Fields with a row for each of the table's: of lines of sight and of views some are of the whole."""
-    if isinstance(table, SightLines):
-        return ["site_id", "landmark_id", "cell", "hits", "looks"]
-    if isinstance(table, Views):
-        return ["cell", "heading", "stamp_s", "frames"]
-    return [item.name for item in fields(table)]
-
-
-def _spliced(table: Table, key: str, gone: IntArray, new: Table) -> Table:
-    """A table sorted by a key without some keys and with the rows of another one, which keeps its other fields."""
-    kept = np.flatnonzero(~np.isin(getattr(table, key), gone))
-    at = np.searchsorted(getattr(table, key)[kept], getattr(new, key))
-    columns: dict[str, Any] = {
-        name: np.insert(getattr(table, name)[kept], at, getattr(new, name), axis=0) for name in _columns(table)
-    }
-    return replace(new, **columns)  # type: ignore[type-var]
-
-
-def _views(others: Views, near: Views) -> Views:
-    """Views of two places, sorted by cell and heading."""
-    lowest = np.minimum(others.cell.min(axis=0, initial=0), near.cell.min(axis=0, initial=0))
-    height = int(max(others.cell[:, 1].max(initial=0), near.cell[:, 1].max(initial=0)) - lowest[1]) + 1
-    key, own = (
-        ((views.cell[:, 0] - lowest[0]) * height + views.cell[:, 1] - lowest[1]) * HEADINGS + views.heading
-        for views in (others, near)
+    sight = _sight(living)
+    return replace(
+        living, covariance_m2=_chunked(living), sightlines=sight.lines.like, views=sight.views.like, sight=sight
     )
-    at = np.searchsorted(key, own)
-    columns: dict[str, Any] = {
-        name: np.insert(getattr(others, name), at, getattr(near, name), axis=0) for name in _columns(near)
-    }
-    return replace(near, **columns)
+
+
+def _chunked(living: LivingMap) -> ChunkedCovariance:
+    covariance = living.covariance_m2
+    if isinstance(covariance, ChunkedCovariance):
+        return covariance
+    return ChunkedCovariance.of_dense(living.places.position_m, of_places(covariance, np.arange(len(living.places))))
+
+
+def _sight(living: LivingMap) -> Sight:
+    return Sight.of(living.sightlines, living.views) if living.sight is None else living.sight

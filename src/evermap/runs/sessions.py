@@ -201,18 +201,18 @@ def _enter_late(
 
 
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:
-    """Return the map of a store as it was at a time, as far as localisation looks at it: of the last revision whose
-    sessions had all begun; the first for earlier.
+    """Return the map of a store as it was at a time: of the last revision whose sessions had all begun; the first for
+    earlier.
 
     Args:
         store: the map.
         stamp_s: seconds of its clock.
     """
-    living = store.load(sight=False)
+    living = store.load()
     if not stamp_s < living.session_start_s:
         return living
     for number in reversed(store.lineage()):
-        older = store.load(number, sight=False)
+        older = store.load(number)
         if len(older.places):
             living = older
             if not stamp_s < older.session_start_s:

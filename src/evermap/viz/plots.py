@@ -51,7 +51,8 @@ def plot_result(result: SlamResult, recording: Recording | None = None) -> Figur
 
 def plot_map(living: Any, *, title: str = "") -> Figure:
     """Draw a `LivingMap`: landmarks, their other places, what is gone, and from where the robot looked."""
-    landmarks, places, views = living.landmarks(), living.places, living.views
+    landmarks, places = living.landmarks(), living.places
+    views = living.views if living.sight is None else living.sight.views.table()
     here = living.place_row(living.members.landmark_id, living.site_of())
     other = np.setdiff1d(np.flatnonzero(np.isin(places.landmark_id, landmarks.landmark_id)), here)
     view = MapView(

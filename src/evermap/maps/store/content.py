@@ -27,6 +27,8 @@ from evermap.errors import EvermapError, InputError
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, Part, blocks
 from evermap.maps.lives import Life
 from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
+from evermap.maps.shelves import Sight
+from evermap.sensing.sightlines import SightLines, Views
 from evermap.survival.base import LifetimePrior
 from evermap.survival.text import prior_from_dict, prior_to_dict
 from evermap.types import UNKNOWN, FloatArray
@@ -38,13 +40,11 @@ _CHUNK = 4096
 _SHORTEST, _LONGEST = _CHUNK // 4, 4 * _CHUNK
 _HASH = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio (Knuth 1973, 6.4)."""
-_PARTS = "covariance_m2.parts"
-"""Column of the values of a covariance in chunks: one piece a part, so that what changes shifts no other."""
+_PARTS = ("covariance_m2.parts", "sight.lines.parts", "sight.views.parts")
+"""Columns of large maps: one piece a part, so that what changes shifts no other."""
 _KINDS = {"b": "|b1", "i": "<i8", "f": "<f8", "u": "|u1"}
 DTYPES = tuple(_KINDS.values())
 """Types of the values of a chunk."""
-SIGHT = ("sightlines.", "views.")
-"""Columns of lines of sight and of views."""
 NAME_BYTES = 32
 MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
@@ -157,11 +157,10 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         chunks.update(zip(names, cut, strict=True))
         lower = len(flat) != array.size
         columns[column] = [dtype, shape, lower, [name.hex() for name in names]]
-    if isinstance(living.covariance_m2, ChunkedCovariance):
-        covariance = living.covariance_m2
-        parts = [_of_part(part) for part in covariance.parts]
-        chunks.update((part.name, part) for part in parts)
-        columns[_PARTS] = ["<f8", [int(covariance.sizes.sum())], False, [part.name.hex() for part in parts]]
+    for column, parts in _parts_of(living).items():
+        kept = [_of_part(part) for part in parts]
+        chunks.update((chunk.name, chunk) for chunk in kept)
+        columns[column] = ["<f8", [len(kept)], False, [chunk.name.hex() for chunk in kept]]
     manifest = text_chunk(json.dumps({"format": FORMAT, "values": values, "columns": columns}, default=_scalar))
     return manifest.name, {**chunks, manifest.name: manifest}
 
@@ -195,7 +194,7 @@ def _read_part(name: bytes, stored: bytes) -> FloatArray:
     try:
         return np.frombuffer(Chunk.of_stored(name, "<f8", stored).raw, "<f8")
     except DamagedError as error:
-        problem = f"the covariance of some of its places is damaged: {error}"
+        problem = f"a part of what it holds of its places is damaged: {error}"
         raise InputError(problem, hint="evermap map verify FILE, which tells what can be read") from None
 
 
@@ -215,30 +214,38 @@ def _cuts(flat: NDArray[Any]) -> list[int]:
     return cuts
 
 
-def unpack(name: bytes, fetch: Fetch, without: tuple[str, ...] = (), *, lazily: bool = False) -> LivingMap:
+def _parts_of(living: LivingMap) -> dict[str, tuple[Part, ...]]:
+    found = {}
+    if isinstance(living.covariance_m2, ChunkedCovariance):
+        found["covariance_m2.parts"] = living.covariance_m2.parts
+    if living.sight is not None:
+        found |= {"sight.lines.parts": living.sight.lines.parts, "sight.views.parts": living.sight.views.parts}
+    return found
+
+
+def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
     """Return the map of this name.
 
     Args:
         name: of its manifest.
         fetch: of stored bytes.
-        without: beginnings of the names of columns that are left out.
-        lazily: unpack a covariance in chunks where it is asked for only; damage of it raises `InputError` then.
+        lazily: unpack parts of large maps where they are asked for only; damage of them raises `InputError` then.
 
     Raises:
         DamagedError: a chunk is missing or is not what was written, or the content contradicts itself.
     """
     manifest = _manifest(name, fetch)
-    columns = {column: told for column, told in manifest["columns"].items() if not column.startswith(without)}
-    listed = columns.pop(_PARTS, None)
+    columns = manifest["columns"]
+    in_parts = {column: columns.pop(column) for column in _PARTS if column in columns}
     parts = {**manifest["values"], **_arrays(columns, fetch)}
-    if listed is not None:
+    for column, listed in in_parts.items():
         names = [name_of(part) for part in listed[3]]
         stored = fetch(set(names))
         read = [functools.partial(_read_part, key, stored[key]) for key in names]
         if not lazily:
             for key in set(names):
                 Chunk.of_stored(key, "<f8", stored[key])
-        parts["covariance_m2.parts"] = tuple(Part(one, key) for one, key in zip(read, names, strict=True))
+        parts[column] = tuple(Part(one, key) for one, key in zip(read, names, strict=True))
     if manifest["format"] == 1:
         _of_format_1(parts)
     living: LivingMap = _build(LivingMap(), "", parts)
@@ -329,6 +336,8 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     for table, names in _EQUALLY_LONG.items():
         if len({len(getattr(getattr(living, table), name)) for name in names}) > 1:
             yield f"columns of different lengths in '{table}'"
+    if living.sight is not None and (problem := living.sight.flaw()):
+        yield problem
     if len(living.lives.prior_class_id) != len(living.lives.prior):
         yield "columns of different lengths in 'lives'"
     lines, places = living.sightlines, len(living.places)
@@ -401,7 +410,7 @@ def _variances(covariance_m2: JointCovariance) -> FloatArray:
     return np.diagonal(blocks(covariance_m2), axis1=1, axis2=2)
 
 
-_NOT_STORED = {"sightlines.rules"}
+_NOT_STORED = {"sightlines.rules", "sight.lines.like.rules"}
 """Settings, which each session brings; a revision keeps them with its configuration."""
 
 
@@ -409,7 +418,7 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
-        if name in {*_NOT_STORED, _PARTS} or (name in _NEWER and not len(part)):
+        if name in {*_NOT_STORED, *_PARTS} or part is None or (name in _NEWER and not len(part)):
             continue
         if name in _LIFE:
             text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
@@ -433,13 +442,16 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
         name, part = prefix + item.name, getattr(default, item.name)
         if name in _NOT_STORED:
             content[item.name] = part
-        elif name == "covariance_m2" and _PARTS in parts:
+        elif name == "covariance_m2" and "covariance_m2.parts" in parts:
             content[item.name] = _build(ChunkedCovariance.empty(), name + ".", parts)
+        elif name == "sight":
+            large = "sight.lines.parts" in parts
+            content[item.name] = _build(Sight.of(SightLines.empty(), Views.empty()), "sight.", parts) if large else None
         elif is_dataclass(part):
             content[item.name] = _build(part, name + ".", parts)
         elif name not in parts:
             content[item.name] = part
-        elif name == _PARTS:
+        elif name in _PARTS:
             content[item.name] = parts.pop(name)
         elif name in _LIFE:
             content[item.name] = _lives_from_bytes(parts.pop(name))

@@ -159,13 +159,8 @@ class MapStore(Protocol):
         """
         ...
 
-    def load(self, revision: int | None = None, *, sight: bool = True) -> LivingMap:
+    def load(self, revision: int | None = None) -> LivingMap:
         """Return the map as it was committed, bit by bit; revision 0 is the empty map.
-
-        Args:
-            revision: which.
-            sight: with lines of sight and views, most of a large map; localisation does not look at them. A map
-                without them is not one to commit.
 
         Raises:
             PrunedRevisionError: its content was pruned.

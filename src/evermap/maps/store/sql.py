@@ -159,8 +159,8 @@ class SqlStore(Shown):
         with self._reading() as connection:
             return self._lineage(connection, revision)
 
-    def load(self, revision: int | None = None, *, sight: bool = True) -> LivingMap:
-        """Return the map as it was committed, or without lines of sight and views."""
+    def load(self, revision: int | None = None) -> LivingMap:
+        """Return the map as it was committed."""
         with self._reading() as connection:
             number = self._known(connection, revision)
             if number == 0:
@@ -169,7 +169,7 @@ class SqlStore(Shown):
             pruned = self._pruned(connection)
             if number in pruned:
                 raise self._gone(number, pruned[number], self._chain(connection)[0].keys() - pruned.keys())
-            return self._unpacked(connection, record, () if sight else content.SIGHT)
+            return self._unpacked(connection, record)
 
     def members(self, revision: int | None = None) -> Members:
         """Return the landmarks of a revision."""
@@ -533,7 +533,7 @@ class SqlStore(Shown):
         wanted = lineage({k: r.origin for k, r in records.items()}, head) if revisions is None else sorted(revisions)
         return [records[number] for number in wanted if number in records]
 
-    def _unpacked(self, connection: Connection, record: Record, without: tuple[str, ...] = ()) -> LivingMap:
+    def _unpacked(self, connection: Connection, record: Record) -> LivingMap:
         read: set[bytes] = set()
 
         def fetch(names: Iterable[bytes]) -> Mapping[bytes, bytes]:
@@ -541,7 +541,7 @@ class SqlStore(Shown):
             read.update(found)
             return found
 
-        living = content.unpack(record.content, fetch, without, lazily=True)
+        living = content.unpack(record.content, fetch, lazily=True)
         self._checked |= read
         return living
 

@@ -1,0 +1,183 @@
+"""A sorted table of many rows, cut into shelves that are read and kept by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Generic, Self, TypeVar
+
+import numpy as np
+
+from evermap.geometry.chunked import Part
+from evermap.sensing.sightlines import SightLines, Views
+from evermap.types import IntArray
+
+Table = TypeVar("Table", bound=Any)
+
+ROWS = 2048
+"""Of a shelf, about."""
+_COLUMNS = {
+    SightLines: ("site_id", "landmark_id", "cell", "hits", "looks"),
+    Views: ("cell", "heading", "stamp_s", "frames"),
+}
+"""Fields with a row for each of the table's, of tables that have others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shelves(Generic[Table]):
+    """A table that is sorted by its first column, of which only what is asked for is read.
+
+    Attributes:
+        like: the table without rows.
+        first: (B,) key of the first row of each shelf: its first column, or the first of several in it.
+        count: (B,) rows of each.
+        parts: the values of each shelf, column after column, as their bits.
+    """
+
+    like: Table
+    first: IntArray
+    count: IntArray
+    parts: tuple[Part, ...]
+
+    @classmethod
+    def of(cls, table: Table) -> Self:
+        """Put a table on shelves."""
+        first, count, parts = _shelved(table)
+        return cls(rows(table, np.zeros(0, dtype=np.int64)), first, count, tuple(parts))
+
+    def __len__(self) -> int:
+        return int(self.count.sum())
+
+    @property
+    def last(self) -> int:
+        """Return the largest key; -1 where there is none."""
+        return int(key_of(self._read(np.array([len(self.parts) - 1])))[-1]) if self.parts else -1
+
+    def table(self) -> Table:
+        """Return all of it."""
+        return self._read(np.arange(len(self.parts)))
+
+    def near(self, keys: IntArray) -> Table:
+        """Return the rows of the shelves that may have some keys (sorted)."""
+        return self._read(self._with(keys))
+
+    def replaced(self, keys: IntArray, new: Table) -> Self:
+        """Return the shelves without the rows of some keys (sorted), and with those of another table, which keeps its
+        other fields.
+        """
+        touched = self._with(np.union1d(keys, key_of(new)))
+        parts: list[Part] = []
+        firsts: list[IntArray] = []
+        counts: list[IntArray] = []
+        own = key_of(new)
+        runs = np.split(touched, np.flatnonzero(np.diff(touched) != 1) + 1) if len(touched) else []
+        at, begin = 0, 0
+        for run in runs:
+            parts += self.parts[at : run[0]]
+            firsts.append(self.first[at : run[0]])
+            counts.append(self.count[at : run[0]])
+            at = int(run[-1]) + 1
+            end = len(own) if at >= len(self.parts) else int(np.searchsorted(own, self.first[at]))
+            first, count, made = _shelved(spliced(self._read(run), keys, rows(new, np.arange(begin, end))))
+            firsts.append(first)
+            counts.append(count)
+            parts += made
+            begin = end
+        parts += self.parts[at:]
+        if begin < len(own):  # there were no shelves
+            first, count, made = _shelved(rows(new, np.arange(begin, len(own))))
+            firsts.append(first)
+            counts.append(count)
+            parts += made
+        firsts.append(self.first[at:])
+        counts.append(self.count[at:])
+        like = rows(new, np.zeros(0, dtype=np.int64))
+        return type(self)(like, np.concatenate(firsts), np.concatenate(counts), tuple(parts))
+
+    def _with(self, keys: IntArray) -> IntArray:
+        """Shelves that may have some keys, or between which these would be."""
+        if not len(self.parts):
+            return np.zeros(0, dtype=np.int64)
+        low = np.searchsorted(self.first, keys, side="left") - 1
+        high = np.searchsorted(self.first, keys, side="right") - 1
+        some = np.zeros(len(self.parts) + 1, dtype=np.int64)
+        np.add.at(some, np.maximum(low, 0), 1)
+        np.add.at(some, np.maximum(high, 0) + 1, -1)
+        return np.flatnonzero(np.cumsum(some[:-1]))
+
+    def _read(self, shelves: IntArray) -> Table:
+        """The rows of some shelves."""
+        found: dict[str, list[Any]] = {name: [] for name in columns(self.like)}
+        for k in shelves.tolist():
+            values, at = self.parts[k].values.view(np.int64), 0
+            for name, listed in found.items():
+                like = getattr(self.like, name)
+                size = int(self.count[k]) * (like.shape[1] if like.ndim == 2 else 1)
+                listed.append(values[at : at + size].view(like.dtype).reshape(-1, *like.shape[1:]))
+                at += size
+        told = {name: np.concatenate([getattr(self.like, name), *listed]) for name, listed in found.items()}
+        return replace(self.like, **told)
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """Lines of sight and views of a large map.
+
+    Attributes:
+        lines: by site.
+        views: by column of the floor.
+    """
+
+    lines: Shelves[SightLines]
+    views: Shelves[Views]
+
+    @classmethod
+    def of(cls, lines: SightLines, views: Views) -> Self:
+        """Put both on shelves."""
+        return cls(Shelves.of(lines), Shelves.of(views))
+
+    def flaw(self) -> str:
+        """Tell in what this contradicts itself; '' if it is consistent."""
+        for shelves in (self.lines, self.views):
+            n = len(shelves.parts)
+            if not len(shelves.first) == len(shelves.count) == n or (np.diff(shelves.first) < 0).any():
+                return "shelves of lines of sight or of views that do not fit together"
+        return ""
+
+
+def columns(table: Any) -> tuple[str, ...]:
+    """Return the fields of a table with a row for each of its rows."""
+    return _COLUMNS.get(type(table)) or tuple(item.name for item in fields(table))
+
+
+def key_of(table: Any) -> IntArray:
+    """Return (N,) what a table is sorted by."""
+    first = getattr(table, columns(table)[0])
+    return np.asarray(first if first.ndim == 1 else first[:, 0])
+
+
+def rows(table: Table, some: Any) -> Table:
+    """Return some rows of a table, by number or by a mask."""
+    return replace(table, **{name: getattr(table, name)[some] for name in columns(table)})
+
+
+def spliced(table: Table, gone: IntArray, new: Table) -> Table:
+    """Return a sorted table without the rows of some keys and with those of another one, which keeps its other
+    fields. Of one key there are rows of one of them only.
+    """
+    kept = np.flatnonzero(~np.isin(key_of(table), gone))
+    at = np.searchsorted(key_of(table)[kept], key_of(new))
+    told = {name: np.insert(getattr(table, name)[kept], at, getattr(new, name), axis=0) for name in columns(table)}
+    return replace(new, **told)
+
+
+def _shelved(table: Any) -> tuple[IntArray, IntArray, list[Part]]:
+    """First keys, numbers of rows, and values of the shelves of a table."""
+    key = key_of(table)
+    total = len(key)
+    begins = (np.arange(max(round(total / ROWS), 1)) * total) // max(round(total / ROWS), 1) if total else key
+    count = np.diff(np.append(begins, total))
+    parts = []
+    for begin, n in zip(begins.tolist(), count.tolist(), strict=True):
+        raw = [np.ascontiguousarray(getattr(table, name)[begin : begin + n]).ravel() for name in columns(table)]
+        parts.append(Part(np.concatenate([values.view(np.int64) for values in raw]).view(np.float64)))
+    return key[begins], count, parts
