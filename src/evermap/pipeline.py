@@ -130,11 +130,12 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
     visit = alone
     _, whole = steps.admitted(alone.recording, living)
     with threadpool_limits(limits=1, user_api="blas"):
-        vicinity = steps.vicinity(whole, alone, config.living)
+        large = len(whole.places) > config.living.whole_places
+        vicinity, where = steps.near_session(whole, alone, config.living) if large else (None, None)
         living = whole if vicinity is None else vicinity.part
         # over the map as it is believed to be by now, and solved again with the map as its prior
         aged = believe.aged(living, config.living, alone.start_s)
-        where = steps.laid(living, aged.p_here, alone, config.living)
+        where = where if large else steps.laid(living, aged.p_here, alone, config.living)
         if where is None and len(living.places):
             return steps.lost(alone, whole, config.living, steps.NOT_FOUND)
         if where is not None:

@@ -127,25 +127,28 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
     return with_glimpsed(living, where, glimpsed)
 
 
-def vicinity(living: LivingMap, alone: Solved, config: LivingConfig) -> Vicinity | None:
-    """Return the part of a large map that a session can touch; None for the whole of a small one.
+def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
+    """Return the part of a large map that a session can touch, and where the session lies in it; None as of `laid`.
 
     That is what the sensor may have seen on its way, once the session is laid over those that it names, and some more.
     """
-    if len(living.places) <= config.whole_places:
-        return None
     own = own_landmarks(alone.outcome, config.fit)
     named = cliques_of(living, alone.prepared.landmark_id[own.row])
     seen = Vicinity.of(living, named, config)
     where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
     if where is None:
-        return seen
+        return seen, None
     reach_m = alone.recording.sensor.range_max_m + config.near_m
-    if not np.isfinite(reach_m):  # all there is may be in view
-        return Vicinity.of(living, living.sites.clique_id, config, np.array([-np.inf, -np.inf, np.inf, np.inf]))
-    path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
-    beside, box = near(living, path, reach_m)
-    return Vicinity.of(living, np.union1d(named, beside), config, box)
+    cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
+    if np.isfinite(reach_m):  # else all there is may be in view
+        path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
+        cliques, box = near(living, path, reach_m)
+    vicinity = Vicinity.of(living, np.union1d(named, cliques), config, box)
+    at = where.place >= 0
+    place = where.place.copy()
+    places = seen.part.places[place[at]]
+    place[at] = vicinity.part.place_row(places.landmark_id, places.site_id)
+    return vicinity, replace(where, place=place)
 
 
 def refit(
