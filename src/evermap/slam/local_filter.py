@@ -168,7 +168,7 @@ class LocalFilter:
             self._slot = np.pad(self._slot, (0, new), constant_values=-1)
         now, slots = len(self._old_pose) + len(self._new_pose), self._slot[rows]
         here = slots >= 0
-        if here.all():
+        if np.count_nonzero(here) == len(here):
             self._used_at[slots] = now
             return
         self._used_at[slots[here]] = now
@@ -290,7 +290,13 @@ def _update(
     where[AT_PLACES::2], where[AT_PLACES + 1 :: 2] = AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 1
     part = np.ascontiguousarray(covariance[where][:, where])
     start, start_states, start_place = pose.copy(), states.copy(), place.copy()
-    step, weight, innovation, pull = np.zeros(size), np.ones(count), np.zeros(2 * count), np.zeros(2 * count)
+    before, step, weight, innovation, pull = (
+        np.zeros(size),
+        np.zeros(size),
+        np.ones(count),
+        np.zeros(2 * count),
+        np.zeros(2 * count),
+    )
     jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
     root, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
     for iteration in range(ITERATIONS):
@@ -310,14 +316,22 @@ def _update(
             for a in range(10):
                 innovation[row] -= jacobian[row, a] * step[column[row // 2, a]]
         _solve(root, innovation, pull)
-        before, step = step, -(pull @ gain)
+        before[:], step[:] = step, 0.0
+        for row in range(2 * count):
+            for k in range(size):
+                step[k] -= pull[row] * gain[row, k]
         c, s = math.cos(start[2]), math.sin(start[2])
         pose[0] = start[0] + c * step[0] - s * step[1]
         pose[1] = start[1] + s * step[0] + c * step[1]
         pose[2] = wrapped(start[2] + step[2])
-        states[:] = start_states + step[3:AT_PLACES]
-        place[:] = start_place + step[AT_PLACES:].reshape(-1, 2)
-        if np.abs(step - before).max() < SMALL_STEP:
+        moved = 0.0
+        for k in range(size):
+            moved = max(moved, abs(step[k] - before[k]))
+            if k >= AT_PLACES:
+                place[(k - AT_PLACES) // 2, k % 2] = start_place[(k - AT_PLACES) // 2, k % 2] + step[k]
+            elif k >= 3:
+                states[k - 3] = start_states[k - 3] + step[k]
+        if moved < SMALL_STEP:
             break
     column[:, 8], column[:, 9] = where[AT_PLACES::2], where[AT_PLACES + 1 :: 2]
     white = np.zeros((2 * count, len(covariance) + 1))
@@ -366,7 +380,9 @@ def _condition(covariance: FloatArray, jacobian: FloatArray, column: Any, root: 
         for k in range(white.shape[1]):
             white[row, k] /= root[row, row]
     for i in range(len(covariance)):
-        for row in range(len(white)):
-            by = white[row, i]
+        mine = covariance[i]
+        for row in range(0, len(white), 2):
+            one, two = white[row], white[row + 1]
+            a, b = one[i], two[i]
             for k in range(len(covariance)):
-                covariance[i, k] -= by * white[row, k]
+                mine[k] -= a * one[k] + b * two[k]

@@ -78,15 +78,9 @@ class Preintegration:
 
 @kernel
 def _integrate(
-    stamp: FloatArray,
-    odometry_stamp: FloatArray,
-    velocity: FloatArray,
-    unknown: FloatArray,
-    states: FloatArray,
-    out: Intervals,
-    first: int,
-    last: int,
-) -> None:
+    stamp: FloatArray, odometry_stamp: FloatArray, velocity: FloatArray, unknown: FloatArray, states: FloatArray,
+    out: Intervals, first: int, last: int,
+) -> None:  # fmt: skip
     for i in range(first, last):
         integrate_odometry(
             odometry_stamp, velocity, unknown, stamp[i], stamp[i + 1], states, out.increment[i], out.by_states[i],
@@ -96,15 +90,9 @@ def _integrate(
 
 @kernel
 def linearise_interval(
-    intervals: Intervals,
-    i: int,
-    pose: FloatArray,
-    variance: FloatArray,
-    free: Any,
-    residual: FloatArray,
-    jacobian: FloatArray,
-    information: FloatArray,
-) -> None:
+    intervals: Intervals, i: int, pose: FloatArray, variance: FloatArray, free: Any, residual: FloatArray,
+    jacobian: FloatArray, information: FloatArray,
+) -> None:  # fmt: skip
     """Linearise the odometry of interval `i` at poses `i` and `i + 1`.
 
     Args:

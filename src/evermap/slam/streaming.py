@@ -166,9 +166,11 @@ class StreamingSlam:
         self._work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
-        stretch = np.array([self._scale, self._scale, 1.0])
-        self.online_pose[row] = self._solver.last_pose() * stretch
-        self.online_covariance[row] = self._solver.last_covariance() * np.outer(stretch, stretch)
+        pose, covariance = self._solver.last_pose(), self._solver.last_covariance()
+        pose[:2] *= self._scale
+        covariance[:2] *= self._scale
+        covariance[:, :2] *= self._scale
+        self.online_pose[row], self.online_covariance[row] = pose, covariance
 
     def _motion(self, solver: IncrementalSolver, row: int) -> Motion | None:
         return Motion.between(self._problem, self._noise, row, solver.states()) if row > 0 else None
@@ -249,7 +251,7 @@ class StreamingSlam:
 
         before = self._problem.landmark_row[detections]
         places = self._method.assign(self._problem, row, detections, distances)
-        if (places == before).all():
+        if not np.count_nonzero(places != before):
             return
         landmark_row = self._problem.landmark_row.copy()
         landmark_row[detections] = places
@@ -271,7 +273,7 @@ class StreamingSlam:
     def _compare(self, motion: Motion, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
         known = np.isfinite(self._landmark[landmark, 0])
-        if not known.all():
+        if np.count_nonzero(known) < len(known):
             detections, landmark = detections[known], landmark[known]
         if not len(detections):
             return
@@ -279,15 +281,15 @@ class StreamingSlam:
         self.nis[detections] = nis
         np.add.at(self._n_compared, landmark, 1)
         surprising = nis > SURPRISING_NIS
-        if surprising.any():
+        if np.count_nonzero(surprising):
             np.add.at(self._n_surprising, landmark[surprising], 1)
 
     def _is_disputed(self, detections: IntArray) -> bool:
         """True where a young landmark surprises at most of its sightings: its first may have been another's."""
         seen = self._problem.landmark_row[detections]
-        doubted = seen[2 * self._n_surprising[seen] > self._n_compared[seen]]
-        if not len(doubted):
+        if not np.count_nonzero(self._n_surprising[seen]):
             return False
+        doubted = seen[2 * self._n_surprising[seen] > self._n_compared[seen]]
         mapped = self._problem.mapped  # the map is believed: no vote moves its landmarks
         return any(not mapped[j] and self._n_compared[j] in DISPUTED_AT for j in doubted)
 
@@ -296,7 +298,7 @@ class StreamingSlam:
     ) -> None:
         """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
         new = np.isnan(landmark[self._problem.landmark_row[detections], 0])
-        for m in detections[new] if new.any() else ():
+        for m in detections[new] if np.count_nonzero(new) else ():
             j = self._problem.landmark_row[m]
             if np.isfinite(landmark[j, 0]):  # twice in this frame
                 continue

@@ -91,8 +91,8 @@ class Joint(Method):
     def assign(self, problem: Problem, row: int, detections: IntArray, compare: Compare) -> IntArray:
         """Return the place where the landmark is by now."""
         del row, compare
-        current: IntArray = self._current()[problem.landmark_row[detections]]
-        return current
+        mine: IntArray = problem.landmark_row[detections]
+        return mine if len(self._landmark) == self._count else self._current()[mine]
 
     def revises(self, problem: Problem) -> bool:
         """Return False where there is neither a map nor, for so many landmarks, more than one window."""

@@ -295,15 +295,9 @@ def spread_room(tree: Tree, factors: Factors, border: FloatArray, n_pairs: int) 
 
 @kernel
 def spread(
-    tree: Tree,
-    factors: Factors,
-    values: FloatArray,
-    stored: FloatArray,
-    border: FloatArray,
-    out: Spread,
-    low: int,
+    tree: Tree, factors: Factors, values: FloatArray, stored: FloatArray, border: FloatArray, out: Spread, low: int,
     high: int,
-) -> None:
+) -> None:  # fmt: skip
     """Find the covariances that the fronts from `low` to `high - 1` hold, those before being done.
 
     Args:

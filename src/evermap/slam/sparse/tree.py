@@ -347,15 +347,9 @@ def _fronts(
 
 @kernel
 def _positions(
-    first: Any,
-    variable: Any,
-    at: Any,
-    factor_first: Any,
-    factor: Any,
-    variable_first: Any,
-    of_factor: Any,
+    first: Any, variable: Any, at: Any, factor_first: Any, factor: Any, variable_first: Any, of_factor: Any,
     n_variables: int,
-) -> IntArray:
+) -> IntArray:  # fmt: skip
     """Where the variables of each factor begin in its front."""
     position, place = np.empty(len(of_factor), np.int64), np.zeros(n_variables, np.int64)
     for node in range(len(first) - 1):
