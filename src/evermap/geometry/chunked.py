@@ -297,7 +297,7 @@ class ChunkedCovariance:
 
     def _between(self, a: int, b: int) -> FloatArray:
         """The block of two neighbouring chunks in either order."""
-        block = self._block(self._index.pair_of[min(a, b), max(a, b)])
+        block = self._block(self._index.pair_of(min(a, b), max(a, b)))
         return block if a <= b else block.T
 
     def _connected(self, chunks: IntArray) -> IntArray:
@@ -451,8 +451,7 @@ class _Index:
         order: (P,) points by chunk; `start` (C + 1,) where chunks begin in it.
         first: (Q + 1,) where the blocks of pairs begin.
         group: (G + 1,) pairs at which parts begin.
-        pair_of: row of a pair by its chunks.
-        graph: (C, C) neighbours.
+        pair: (Q, 2) the pairs; graph: (C, C) which are neighbours.
     """
 
     chunk: IntArray
@@ -477,9 +476,13 @@ class _Index:
         """Return rows of the points of a chunk."""
         return self.order[self.start[c] : self.start[c + 1]]
 
+    def pair_of(self, a: int, b: int) -> int:
+        """Return the row of a pair."""
+        return int(np.searchsorted(self._code, a * (len(self.start) - 1) + b))
+
     @functools.cached_property
-    def pair_of(self) -> dict[tuple[int, int], int]:
-        return {(a, b): q for q, (a, b) in enumerate(self.pair.tolist())}
+    def _code(self) -> IntArray:
+        return np.asarray(self.pair @ [len(self.start) - 1, 1])
 
     @functools.cached_property
     def graph(self) -> csr_array:

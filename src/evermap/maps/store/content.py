@@ -204,7 +204,7 @@ def _cuts(flat: NDArray[Any]) -> list[int]:
         return [*range(0, len(flat), _CHUNK), len(flat)] if len(flat) else []
     wide = np.ascontiguousarray(flat).view(np.uint64 if flat.itemsize == 8 else np.uint8).astype(np.uint64)
     with np.errstate(over="ignore"):
-        marked = np.flatnonzero((wide * _HASH) >> np.uint64(52) == 0)  # one in 4,096
+        marked = np.flatnonzero((wide * _HASH) >> np.uint64(52) == 1)  # one in 4,096, but no zero
     cuts = [0]
     for at in [*marked.tolist(), len(flat)]:
         while at - cuts[-1] > _LONGEST:
