@@ -18,7 +18,7 @@ from evermap.slam.linearise import DETECTION, ODOMETRY, Readings, linearise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.sparse.elimination import curvature
 from evermap.slam.sparse.system import Factorised, Slices, System, exhausted
-from evermap.slam.sparse.tree import Factors
+from evermap.slam.sparse.tree import MS, Factors, tree_of
 from evermap.types import BoolArray, FloatArray, IntArray
 
 COST_SLACK = 0.5
@@ -192,7 +192,7 @@ class Smoother:
         """Return what `linearised` does, in slices."""
         if self._last is not None and self._last[0] is estimate:
             return self._last[1]
-        problem, noise, structure = self.problem, self.noise, self._structure_of(estimate)
+        problem, noise, structure = self.problem, self.noise, (yield from self._structured(estimate))
         values, weights = np.zeros(structure.system.tree.value_first[-1]), np.zeros(len(problem.pose_row))
         driven = yield from problem.drive.in_slices(problem.stamp_s, estimate.states)
         place, variance, cost = estimate.landmark[structure.known], noise.odometry**2, 0.0
@@ -251,6 +251,9 @@ class Smoother:
         return extra
 
     def _structure_of(self, estimate: Estimate) -> _Structure:
+        return exhausted(self._structured(estimate))
+
+    def _structured(self, estimate: Estimate) -> Slices[_Structure]:
         known, kept = estimate.known, self._structure
         if kept is not None and np.array_equal(kept.known, known):
             return kept
@@ -266,6 +269,7 @@ class Smoother:
             np.zeros((1, 1), dtype=np.int64),
             *(n + rank[row][None] for row in rows),
         ]
+        yield MS * len(place)
         leaf_of_pose = np.minimum(np.arange(n), max(n - 2, 0)) // POSES_A_LEAF
         first_seen = np.full(count, -1)
         first_seen[place[::-1]] = leaf_of_pose[problem.pose_row[::-1]]
@@ -284,6 +288,7 @@ class Smoother:
             ).astype(np.int64),
             np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], prior_leaf]).astype(np.int64),
         )
+        yield MS * len(place)
         dim = np.concatenate([np.full(n, 3), np.full(count, 2), [5, 4]])
         at = np.zeros((n_leaves, 3))
         at[:, 0] = np.arange(n_leaves)
@@ -295,7 +300,10 @@ class Smoother:
             if weight[leaf] == 0:
                 at[leaf, 0] = 0.5 * n_leaves
                 at[leaf, 1:] = estimate.landmark[row].mean(axis=0)
-        self._structure = _Structure(known, rank, System(dim, factors, at, np.array([sensor, motion])), at, roots, rows)
+        yield MS * n
+        border = np.array([sensor, motion])
+        tree = yield from tree_of(dim, factors, at, border)
+        self._structure = _Structure(known, rank, System(dim, factors, at, border, tree), at, roots, rows)
         return self._structure
 
     def _moved(self, estimate: Estimate, step: FloatArray) -> Estimate:

@@ -141,14 +141,17 @@ class System:
         factors: what ties them.
         coordinate: (leaves, axes), see `tree_of`.
         border: (B,) variables that are kept to the last, for example what all factors share.
+        tree: of all these, if it is known; see `tree_of`.
 
     Raises:
         DataError: a factor that does not fit into memory.
     """
 
-    def __init__(self, dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray) -> None:
+    def __init__(
+        self, dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray, tree: Tree | None = None
+    ) -> None:
         self.factors = factors
-        self.tree: Tree = tree_of(dim, factors, coordinate, border)
+        self.tree: Tree = exhausted(tree_of(dim, factors, coordinate, border)) if tree is None else tree
         size_gb = 8e-9 * (self.tree.stored[-1] + self.tree.most_waiting)
         if size_gb > MEMORY_LIMIT_GB:
             problem = f"{len(dim)} poses and landmarks tied by {len(factors.rows)} measurements need {size_gb:.0f} GB"

@@ -11,6 +11,7 @@ Some variables, the *border*, are kept above the root: calibration states, or wh
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,10 @@ import numpy as np
 from evermap.compiled import kept
 from evermap.types import FloatArray, IntArray
 
+MS = 2e-5
+"""Milliseconds for each variable of a leaf or a front that is looked at."""
+AT_ONCE = 50_000
+"""Of these, in a slice."""
 LEAST_SHARE = 0.3
 """Of the leaves, on the smaller side of a cut: lopsided cuts make deep trees."""
 
@@ -86,8 +91,8 @@ class Tree(NamedTuple):
     most_held: int
 
 
-def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray) -> Tree:
-    """Return the elimination tree of a least-squares problem.
+def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: IntArray) -> Generator[float, None, Tree]:
+    """Return the elimination tree of a least-squares problem, in slices of some milliseconds.
 
     Args:
         dim: (V,) numbers of each variable.
@@ -98,21 +103,32 @@ def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: Int
     dim = np.ascontiguousarray(dim, dtype=np.int64)
     border = np.ascontiguousarray(border, dtype=np.int64)
     leaf_first, leaf_variable = _leaves(factors.first, factors.variable, factors.leaf, len(coordinate), len(dim))
+    yield MS * len(factors.rows)
     owner = np.full(len(dim), FREE)
     owner[border] = ABOVE
-    parent, node_of_leaf, leaf_of_node = _dissected(
-        leaf_first, leaf_variable, np.ascontiguousarray(coordinate, dtype=np.float64), dim, owner
-    )
+    coordinate, n = np.ascontiguousarray(coordinate, dtype=np.float64), len(coordinate)
+    parent, node_of_leaf, leaf_of_node = np.full(2 * n - 1, -1), np.empty(n, np.int64), np.full(2 * n - 1, -1)
+    span, todo, at = np.full((3, len(dim)), -1), np.zeros((2 * n, 3), np.int64), np.array([1, 0])
+    todo[0, 1:], order = (n, -1), np.arange(n)
+    while at[0] > 0:
+        yield MS * _dissect(
+            leaf_first, leaf_variable, coordinate, dim, owner, parent, node_of_leaf, leaf_of_node, order, span, todo, at
+        )
     node = node_of_leaf[factors.leaf]
     count = np.bincount(node, minlength=len(parent))
     factor = np.argsort(node, kind="stable")
     fronts = _fronts(parent, leaf_of_node, leaf_first, leaf_variable, owner, dim, border)
     first, variable, at, up, n_own, own, size, most_waiting, way = fronts
+    yield MS * len(variable)
     factor_first = np.append(0, np.cumsum(count))
     factor_at = _positions(first, variable, at, factor_first, factor, factors.first, factors.variable, len(dim))
+    yield MS * len(factors.rows)
+    yield MS * len(factors.rows)
     in_border = np.full(len(dim), -1)
     in_border[border] = np.cumsum(dim[border]) - dim[border]
-    width = np.add.reduceat(np.append(dim[factors.variable], 0), factors.first[:-1])
+    width = np.diff(np.append(0, np.cumsum(dim[factors.variable]))[factors.first])
+    value_first = np.append(0, np.cumsum(factors.rows * (width + 1)))
+    yield MS * len(factors.rows)
     return Tree(
         parent,
         first,
@@ -126,7 +142,7 @@ def tree_of(dim: IntArray, factors: Factors, coordinate: FloatArray, border: Int
         factor_first,
         factor,
         factor_at,
-        np.append(0, np.cumsum(factors.rows * (width + 1))),
+        value_first,
         dim,
         np.append(0, np.cumsum(dim)),
         border,
@@ -169,24 +185,18 @@ def _leaves(
 
 
 @kernel
-def _dissected(
-    leaf_first: Any, leaf_variable: Any, coordinate: FloatArray, dim: Any, owner: Any
-) -> tuple[IntArray, IntArray, IntArray]:
-    """Bisect the leaves; fills `owner` with the node at which each variable is eliminated.
+def _dissect(
+    leaf_first: Any, leaf_variable: Any, coordinate: FloatArray, dim: Any, owner: Any, parent: Any, node_of_leaf: Any,
+    leaf_of_node: Any, order: Any, span: Any, todo: Any, progress: Any,
+) -> int:  # fmt: skip
+    """Bisect some leaves; return how many of their variables were looked at.
 
-    Returns:
-        Parents of the nodes (2 leaves - 1,), each node before its children; nodes of the leaves; leaves of the nodes,
-        -1 for others.
+    Fills in the node that eliminates each variable (`owner`), the parents of the nodes (2 leaves - 1,), each node
+    before its children, the nodes of the leaves, and the leaves of the nodes, -1 for others. `order`, `span` and `todo`
+    are scratch that is kept; `progress` is how much there is to do, and how many nodes are done.
     """
-    n, axes = coordinate.shape
-    parent = np.empty(2 * n - 1, np.int64)
-    node_of_leaf, leaf_of_node = np.empty(n, np.int64), np.full(2 * n - 1, -1)
-    order = np.arange(n)
-    start, stop, stamp = np.zeros(len(dim), np.int64), np.zeros(len(dim), np.int64), np.full(len(dim), -1)
-    todo = np.empty((2 * n, 3), np.int64)
-    todo[0, 0], todo[0, 1], todo[0, 2] = 0, n, -1
-    waiting, node = 1, 0
-    while waiting > 0:
+    axes, work, (waiting, node), (start, stop, stamp) = coordinate.shape[1], 0, progress, span
+    while waiting > 0 and work < AT_ONCE:
         waiting -= 1
         low, high = todo[waiting, 0], todo[waiting, 1]
         parent[node] = todo[waiting, 2]
@@ -230,6 +240,8 @@ def _dissected(
                 if cut >= least and cost < best - 1e-9:
                     best, best_cut, best_order = cost, cut, leaves
         order[low:high] = best_order
+        for r in range(low, high):
+            work += leaf_first[order[r] + 1] - leaf_first[order[r]]
         mark = (node + 1) * axes * -1 - 2
         for r in range(m):
             leaf = order[low + r]
@@ -244,7 +256,8 @@ def _dissected(
         todo[waiting + 1, 0], todo[waiting + 1, 1], todo[waiting + 1, 2] = low, middle, node
         waiting += 2
         node += 1
-    return parent, node_of_leaf, leaf_of_node
+    progress[0], progress[1] = waiting, node
+    return work
 
 
 @kernel
