@@ -112,24 +112,31 @@ def laid_over(
 
 
 def unbent(
-    living: LivingMap, p_site: FloatArray, where: Laid, position_m: FloatArray, settings: FitConfig = USUAL
+    living: LivingMap,
+    p_site: FloatArray,
+    where: Laid,
+    position_m: FloatArray,
+    together: sparse.csr_array,
+    settings: FitConfig = USUAL,
 ) -> Laid:
     """Return where a session lies in the map, if it is bent: a part of it fits the map, too, but by another rigid
     motion.
 
     One wrong identity after a blind stretch may turn all that follows. Then everything seen there seems to have moved,
     by one and the same motion, which things that really move do not. Such landmarks are laid at their places again, and
-    the session is straightened when it is solved with the map.
+    the session is straightened when it is solved with the map. What moved alike in the midst of things that stand has
+    moved: a bend takes all that is in view along.
 
     Args:
         living: the map.
         p_site: (S,) belief in its sites.
         where: as most landmarks have it.
         position_m: (K, 2) landmarks of `where` in the session's frame.
+        together: (K, K) frames in which two of them were seen.
         settings: which bodies moved alike.
     """
     home = _homes(living, p_site, where)
-    moved = np.flatnonzero((where.place < 0) & (home >= 0))
+    moved, stands = np.flatnonzero((where.place < 0) & (home >= 0)), np.flatnonzero(where.place >= 0)
     places, body = living.places, living.members.clique_id[_members(living, where)]
     place, probability = where.place.copy(), where.probability.copy()
     while len(moved):
@@ -146,7 +153,9 @@ def unbent(
         fits = moved[agree]
         if len(np.unique(body[fits])) < settings.bent_cliques:
             break
-        place[fits], probability[fits] = home[fits], 1.0
+        beside = together[fits]
+        if beside[:, stands].sum() <= beside[:, fits].sum() - together.diagonal()[fits].sum():
+            place[fits], probability[fits] = home[fits], 1.0
         moved = moved[~agree]
     return replace(where, place=place, probability=probability, assumed=(where.place < 0) & (place >= 0))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import sparse
 
 from evermap.config import LivingConfig
 from evermap.errors import DataError
@@ -122,9 +123,22 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
-        where = unbent(living, p_site, where, own.position_m, config.fit)
+        where = unbent(living, p_site, where, own.position_m, _seen_together(alone, own.row), config.fit)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, where, glimpsed)
+
+
+def _seen_together(alone: Solved, row: IntArray) -> sparse.csr_array:
+    """(K, K) frames in which two landmarks of a session, rows of its problem, were seen where they are."""
+    fits = alone.outcome.inlier >= 0.5
+    problem = alone.outcome.problem
+    landmark, pose = (rows[: len(fits)][fits] for rows in (problem.landmark_row, problem.pose_row))
+    rank = np.full(len(problem.landmark_mean), -1, dtype=np.int64)
+    rank[row] = np.arange(len(row))
+    known = rank[landmark] >= 0
+    ones = np.ones(int(known.sum()))
+    seen = sparse.csr_array((ones, (rank[landmark[known]], pose[known])), shape=(len(row), len(problem.stamp_s)))
+    return sparse.csr_array(seen @ seen.T)
 
 
 def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tuple[Vicinity, Laid | None]:
