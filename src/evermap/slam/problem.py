@@ -341,6 +341,11 @@ class Marginals:
         joint[np.ix_(kept, kept)] = found
         return joint
 
+    def product(self, landmarks: IntArray, matrix: FloatArray) -> FloatArray:
+        """Return (2 L, K) the joint covariance of known landmarks (L,) times a matrix (2 L, K), without the former."""
+        rank = np.cumsum(self.known) - 1
+        return self._solved.product(self._n + rank[np.asarray(landmarks, dtype=np.int64)], matrix)
+
     @cached_property
     def shared(self) -> FloatArray:
         """(G, G) of all landmarks and the states: dense, for few landmarks."""

@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from evermap.geometry import se2
+from evermap.geometry.chunked import ChunkedCovariance, blocks, of_places
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.gaussian import anchored, own_landmarks
 from evermap.maps.sessions.session import laid
@@ -82,3 +83,20 @@ def test_two_sessions_one_after_the_other_are_both_at_once(seed: int) -> None:
     assert np.sqrt(np.mean(off**2)) < 0.15
     mine = np.sqrt(np.diag(after.covariance_m2)).reshape(-1, 2)[order]
     np.testing.assert_allclose(mine / sigma, 1.0, atol=0.1)
+
+
+def test_a_large_map_begins_in_chunks_without_the_joint_covariance_of_all() -> None:
+    world = building(3, days=1, change_rate=0.0)
+    outcome = solve_alone(world.sessions[0], LivingMap(clock=world.sessions[0].clock), settings()).outcome
+    found = own_landmarks(outcome)
+    columns = np.random.default_rng(0).normal(size=(2 * len(found.row), 4))
+    np.testing.assert_allclose(
+        outcome.graph_marginals.product(found.row, columns) * outcome.scale**2, found.covariance_m2 @ columns, rtol=1e-9
+    )
+    rows = np.arange(len(found.row))[1:]
+    dense, chunked = (found.begun(rows, most_dense) for most_dense in (len(rows), 0))
+    assert isinstance(chunked, ChunkedCovariance)
+    np.testing.assert_allclose(chunked.each_m2, blocks(dense), rtol=1e-9, atol=1e-15)
+    for c in range(len(chunked.parent)):
+        mine = np.flatnonzero(chunked.chunk == c)
+        np.testing.assert_allclose(chunked.of(mine), of_places(dense, mine), rtol=1e-6, atol=1e-12)

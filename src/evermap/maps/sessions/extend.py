@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.config import LivingConfig
-from evermap.geometry.chunked import blocks, of_places
+from evermap.geometry.chunked import JointCovariance, blocks, of_places, taken
 from evermap.maps.bodies import Displacements, Fate, group, regrouped, relabelled
 from evermap.maps.living import LivingMap, Members, Places, Sites
 from evermap.maps.sessions.gaussian import with_session
@@ -23,7 +23,7 @@ class Found:
         place: (K,) row of the old map's places, -1 where it stands at none of its own.
         probability: (K,) of that.
         position_m: (K, 2) posterior.
-        covariance_m2: (2 K, 2 K) joint covariance of it.
+        covariance_m2: joint covariance of it.
         object_id: (K,) object that it is on, as an object detector says; -1 for none.
         first_s: (K,) first sighting.
         last_s: (K,) last sighting.
@@ -34,7 +34,7 @@ class Found:
     place: IntArray
     probability: FloatArray
     position_m: FloatArray
-    covariance_m2: FloatArray
+    covariance_m2: JointCovariance
     object_id: IntArray
     first_s: FloatArray
     last_s: FloatArray
@@ -84,14 +84,16 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
 
     order = np.concatenate([np.flatnonzero(found.place >= 0), new])
     seen = found.place[found.place >= 0]
-    position, covariance = with_session(
-        living.places.position_m,
-        of_places(living.covariance_m2, np.arange(len(living.places))),
-        seen,
-        found.position_m[order],
-        of_places(found.covariance_m2, order),
-        drift_m,
-    )
+    position, covariance = found.position_m[order], taken(found.covariance_m2, order)
+    if len(living.places):
+        position, covariance = with_session(
+            living.places.position_m,
+            of_places(living.covariance_m2, np.arange(len(living.places))),
+            seen,
+            position,
+            of_places(covariance, np.arange(len(order))),
+            drift_m,
+        )
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
     places = replace(places, position_m=position)
@@ -108,7 +110,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
             members=members,
             sites=sites,
             places=places[sorted_rows],
-            covariance_m2=of_places(covariance, sorted_rows),
+            covariance_m2=taken(covariance, sorted_rows),
             n_cliques_ever=cliques_ever,
             n_sites_ever=living.n_sites_ever + len(fresh),
         ),

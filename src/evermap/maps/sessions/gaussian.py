@@ -10,6 +10,7 @@ metre over the session's, how much longer the map is than the session shows `g +
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,9 +18,10 @@ from scipy.spatial import cKDTree
 
 from evermap.config import FitConfig
 from evermap.geometry import se2
-from evermap.geometry.chunked import of_places
+from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, of_places
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
+from evermap.slam.problem import Marginals
 from evermap.slam.streaming import Outcome
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -79,13 +81,18 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
     """
     if len(position_m) == 0:  # all that was seen was taken for mistakes
         return covariance_m2
-    direction, size, _ = np.linalg.svd(se2.rigid_directions(position_m - position_m.mean(axis=0)), full_matrices=False)
-    motion = direction[:, size > 1e-12 * size[0]]  # places that are one have no heading
+    motion = _motions(position_m)
     onto = covariance_m2
     for _ in range(2):  # the second time takes what rounding has left
         onto = onto - motion @ (motion.T @ onto)
         onto = onto - (onto @ motion) @ motion.T
     return np.asarray(0.5 * (onto + onto.T))
+
+
+def _motions(position_m: FloatArray) -> FloatArray:
+    """(2 K, 3) orthonormal directions in which places move when all of them shift and turn."""
+    direction, size, _ = np.linalg.svd(se2.rigid_directions(position_m - position_m.mean(axis=0)), full_matrices=False)
+    return np.asarray(direction[:, size > 1e-12 * size[0]])  # places that are one have no heading
 
 
 def drifted(covariance_m2: FloatArray, drift_m: float) -> FloatArray:
@@ -109,19 +116,45 @@ def resized(living: LivingMap, factor: float, log_size_variance: float, log_size
 USUAL = FitConfig()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OwnLandmarks:
     """Landmarks of a session.
 
     Attributes:
         row: (K,) rows of the problem's landmarks: those that were seen often enough to be believed.
         position_m: (K, 2) in the frame of the first pose.
-        covariance_m2: (2 K, 2 K), as if its size were known.
+        marginals: of the graph; `scale` of its metre.
     """
 
     row: IntArray
     position_m: FloatArray
-    covariance_m2: FloatArray
+    marginals: Marginals
+    scale: float
+
+    @functools.cached_property
+    def covariance_m2(self) -> FloatArray:
+        """(2 K, 2 K), as if its size were known."""
+        return np.asarray(self.marginals.joint(self.row) * self.scale**2)
+
+    def begun(self, rows: IntArray, most_dense: int) -> JointCovariance:
+        """Return the covariance of some of them (N,) as the places of a new map, see `anchored`; more than `most_dense`
+        in chunks, without the joint covariance of all.
+        """
+        position = self.position_m[rows]
+        if len(rows) <= most_dense:
+            return anchored(position, of_places(self.covariance_m2, rows))
+        motion, row = _motions(position), self.row[rows]
+        told = self.marginals.product(row, motion)
+        both = motion.T @ told
+
+        def joint(a: IntArray, b: IntArray) -> FloatArray:
+            every, at = np.unique(np.append(a, b), return_inverse=True)
+            found = self.marginals.joint(row[every])[np.ix_(se2.xy_rows(at[: len(a)]), se2.xy_rows(at[len(a) :]))]
+            i, j = se2.xy_rows(a), se2.xy_rows(b)
+            onto = found - motion[i] @ told[j].T - told[i] @ motion[j].T + motion[i] @ both @ motion[j].T
+            return np.asarray(onto * self.scale**2)
+
+        return ChunkedCovariance.of_points(position, joint)
 
 
 def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntArray | None = None) -> OwnLandmarks:
@@ -143,7 +176,7 @@ def own_landmarks(outcome: Outcome, settings: FitConfig = USUAL, in_place: IntAr
     believed &= at_home | ~_misread(outcome, np.where(believed, n_fit, 0.0), settings)
     row = np.flatnonzero(believed)
     position = estimate.landmark[row] * outcome.scale
-    return OwnLandmarks(row, position, outcome.graph_marginals.joint(row) * outcome.scale**2)
+    return OwnLandmarks(row, position, outcome.graph_marginals, outcome.scale)
 
 
 def _misread(outcome: Outcome, n_fit: FloatArray, settings: FitConfig) -> BoolArray:

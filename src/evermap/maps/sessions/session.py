@@ -18,7 +18,6 @@ from evermap.maps.living import EXISTS, Evidence, LivingMap, clique_rows
 from evermap.maps.sessions import believe, decide
 from evermap.maps.sessions.extend import Extended, Found, extended
 from evermap.maps.sessions.gaussian import (
-    anchored,
     drifted,
     log_ratio,
     of_unknown_size,
@@ -241,6 +240,7 @@ class Judged:
         evidence: what was seen of every clique, frame by frame.
         misses: of landmarks at the places where they most probably stand, as the map counts them.
         classes: what was learned of the lifetimes of classes; None where nothing is.
+        found: landmarks of the session.
     """
 
     living: LivingMap
@@ -248,6 +248,7 @@ class Judged:
     evidence: Evidence
     misses: Misses
     classes: ClassLives | None
+    found: Found
 
 
 def judged(
@@ -269,22 +270,30 @@ def judged(
     living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
     aged = believe.aged(living, config, visit.start_s)
     living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
-    entry = entered(living, aged.p_here, where, visit, config)
+    found = found_in(where, visit, config) if known is None else known.found
+    entry = entered(living, aged.p_here, where, found, visit, config)
     seen, eye = looks(entry, visit, config)
     now = believed(entry, seen, visit, config)
     after, changes = decided(entry.before, now, seen, visit, config, known.classes if known is not None else None)
     after, classes = learned(after, seen, replace(entry, living=now.living), eye, config)
-    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes)
+    return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes, found)
 
 
-def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: Solved, config: LivingConfig) -> Extended:
+def entered(
+    living: LivingMap, p_site: FloatArray, where: Laid | None, found: Found, visit: Solved, config: LivingConfig
+) -> Extended:
     """Return the map with the places and sites that the session found."""
-    in_place = None
     if where is None:
         variance = visit.outcome.log_scale_sigma**2
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
-    else:
+    return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
+
+
+def found_in(where: Laid | None, visit: Solved, config: LivingConfig) -> Found:
+    """Return the landmarks of a session, in the frame of the map; None for `where` begins one."""
+    begins, in_place = where is None, None
+    if where is not None:
         in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
     own = own_landmarks(visit.outcome, config.fit, in_place)
     detection, landmark = _inliers(visit, config.fit.inlier)
@@ -302,14 +311,11 @@ def entered(living: LivingMap, p_site: FloatArray, where: Laid | None, visit: So
     if where is not None:
         _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
         place[here], probability[here] = where.place[there], where.probability[there]
-    covariance = of_places(own.covariance_m2, seen)
-    if where is None:
-        covariance = anchored(own.position_m[seen], covariance)
+    covariance = own.begun(seen, config.whole_places) if begins else of_places(own.covariance_m2, seen)
     body = np.full(len(names), UNKNOWN, dtype=np.int64)
     _, here, there = np.intersect1d(names, visit.recording.objects[:, 0], return_indices=True)
     body[here] = visit.recording.objects[there, 1]
-    found = Found(names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row])
-    return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
+    return Found(names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row])
 
 
 def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:

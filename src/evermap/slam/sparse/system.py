@@ -110,6 +110,36 @@ class Factorised:
             joint += rest.T @ rest
         return np.asarray(joint)
 
+    def product(self, variables: IntArray, matrix: FloatArray) -> FloatArray:
+        """Return (n, K) the joint covariance of different variables, of n numbers, times a matrix (n, K).
+
+        It is never formed: variables are taken some at a time.
+        """
+        tree = self.system.tree
+        begin = np.cumsum(tree.own) - tree.own
+        some = [variables[at : at + BATCH] for at in range(0, len(variables), BATCH)]
+        first = np.concatenate([[0], np.cumsum([tree.dim[part].sum() for part in some])]).astype(np.int64)
+        told, told_border = (
+            np.zeros((int(tree.own.sum()), matrix.shape[1])),
+            np.zeros((len(self.right), matrix.shape[1])),
+        )
+        found = np.empty(matrix.shape)
+        for summing in (True, False):  # `L^-1` of all, times the matrix; then each of them, times that
+            for k, part in enumerate(some):
+                ways, rest, reached = self._ways(part)
+                rows = np.concatenate(
+                    [begin[node] + np.arange(tree.own[node]) for node in np.flatnonzero(reached >= 0)]
+                )
+                own = slice(int(first[k]), int(first[k + 1]))
+                if summing:
+                    told[rows] += ways @ matrix[own]
+                    told_border += rest @ matrix[own]
+                else:
+                    found[own] = ways.T @ told[rows]
+                    if len(rest):
+                        found[own] += rest.T @ cho_solve(self._border(), told_border)
+        return found
+
     def columns(self, variables: IntArray) -> FloatArray:
         """Return (numbers, n) covariance of everything with some variables; the cost is that of n solutions."""
         ways, rest, reached = self._ways(variables)
@@ -131,6 +161,8 @@ class Factorised:
 
 
 MEMORY_LIMIT_GB = 8.0
+BATCH = 64
+"""Variables whose ways to the root are held at a time."""
 
 
 class System:
