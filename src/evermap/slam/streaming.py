@@ -31,7 +31,7 @@ FIRST_RELINEARISATION = 40
 SHORTEST_SPELL = 5
 LONGEST_SPELL = 1 / 8
 """Poses between two relinearisations: a share of all poses, so that the whole costs a constant factor, but some."""
-SETTLED_AT, SETTLED_SPELL = 1000, 1 / 2
+SETTLED_AT, SETTLED_SPELL = 2000, 1 / 2
 """Poses from which most of what is new lies where nothing was before, and the share from then on."""
 SURPRISING_NIS = 50.0
 DISPUTED_AT = (2, 4, 8, 16)
