@@ -202,6 +202,9 @@ class StreamingSlam:
             self._enter_map()
         self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._solver.estimate())
+        if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
+            now = exhausted(Smoother(problem, self._noise, heavy=True).linearised_in_slices(estimate))
+            estimate = outvoted(problem, estimate, now.weights)
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
