@@ -10,8 +10,11 @@ from judged import arrays_of, judge, judged, recording_of, surveyed
 from recordings import building, with_detections, with_ids, without_odometry_between
 
 from evermap.errors import DataError
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
 from evermap.pipeline import run_slam
 from evermap.types import UNKNOWN
+from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 
 
 def test_an_interrupt_leaves_the_finished_part():
@@ -142,3 +145,22 @@ def test_a_clock_that_was_set_forward_is_a_pause_and_costs_no_more_than_one(paus
     assert result.trajectory.stamp_s[-1] == pytest.approx(
         run_slam(recording).trajectory.stamp_s[-1] + pause_s, abs=1e-3
     )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_landmark_whose_first_sighting_was_misread_is_where_all_others_say(seed):
+    """One identity in a hundred is wrong: many a landmark is named minutes before it comes into view."""
+    warehouse = WarehouseConfig(
+        n_landmarks=240,
+        p_wrong_identity=0.01,
+        range_bias_m=0.03,
+        bearing_bias_rad=0.01,
+        forward_scale=1.01,
+        turn_scale=1.005,
+    )
+    recording = simulate_warehouse(warehouse, seed=seed)
+    found = run_slam(replace(recording, truth=None)).landmarks
+    truth = recording.true_landmarks.position_m[found.landmark_id]
+    off_m = np.linalg.norm(se2.transform(rigid(found.position_m, truth), found.position_m) - truth, axis=1)
+    assert off_m.max() < 0.5

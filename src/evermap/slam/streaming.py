@@ -134,6 +134,7 @@ class StreamingSlam:
         self._solver_name: Literal["arrow", "gtsam"] = solver
         self._solver = _solver(solver, self._problem, noise, robust=robust)
         self._job: Slices[None] | None = None
+        self._disputed = False
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
         self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
@@ -177,13 +178,14 @@ class StreamingSlam:
 
     def _plan(self, detections: IntArray) -> None:
         """Begin to relinearise if it is time."""
+        self._disputed |= self._robust and self._is_disputed(detections)
         since = self._n_poses - self._relinearised_at
         share = LONGEST_SPELL if self._n_poses < SETTLED_AT else SETTLED_SPELL
         if self._n_poses == self._next_relinearisation:
             self._job = self._relinearised(learn=True)
             self._next_relinearisation *= 2
-        elif self._robust and self._is_disputed(detections):
-            self._job = self._relinearised(learn=True)
+        elif self._disputed and self._job is None:
+            self._job, self._disputed = self._relinearised(learn=True), False
         elif self._job is None and since >= max(SHORTEST_SPELL, int(share * self._relinearised_at)):
             self._job = self._relinearised(learn=False)
 
