@@ -279,3 +279,11 @@ def test_neither_tiny_nor_denormal_turns_make_a_warning(angle):
         twist = np.array([1.0, 2.0, 3.0, *(angle * axis)])
         with np.errstate(all="raise", under="ignore"):
             assert se3.log(se3.exp(twist)) == pytest.approx(twist, rel=1e-15, abs=1e-300)
+
+
+def test_an_angle_that_is_rounded_to_the_open_end_is_at_the_closed_one():
+    turn = 0.0013888888917217457
+    there = se2.compose([0.0, 0.0, turn], [0.0, 0.0, -np.pi])
+    back = se2.compose([0.0, 0.0, -turn], there)
+    assert -np.pi < back[2] <= np.pi
+    assert abs(se2.wrap(np.nextafter(-np.pi, -4.0))) <= np.pi

@@ -31,7 +31,8 @@ def normalised(pose: ArrayLike) -> FloatArray:
 def wrap(angle_rad: ArrayLike) -> FloatArray:
     """Return angles wrapped to (-pi, pi]."""
     angle = np.asarray(angle_rad, dtype=np.float64)
-    return np.asarray(np.pi - np.mod(np.pi - angle, 2.0 * np.pi), dtype=np.float64)
+    wrapped = np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
+    return np.asarray(np.where(wrapped > -np.pi, wrapped, np.pi), dtype=np.float64)  # rounding may reach the open end
 
 
 def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
