@@ -73,21 +73,26 @@ def check_all(path: Path) -> int:
     return head
 
 
+def die_at(fatal: int) -> None:
+    """Have this process killed before the statement or the commit of this number, whichever comes."""
+    count = 0
+
+    def step(*_: object) -> None:
+        nonlocal count
+        if count == fatal:
+            os.kill(os.getpid(), signal.SIGKILL)
+        count += 1
+
+    event.listen(Engine, "before_cursor_execute", step)
+    event.listen(Engine, "commit", step)
+
+
 def test_killed_at_every_statement_of_a_commit(tmp_path: Path) -> None:
     """Before each statement and each commit in turn, the first opening of the file included."""
     path = tmp_path / "m.evermap"
 
     def work(fatal: int) -> None:
-        count = 0
-
-        def step(*_: object) -> None:
-            nonlocal count
-            if count == fatal:
-                os.kill(os.getpid(), signal.SIGKILL)
-            count += 1
-
-        event.listen(Engine, "before_cursor_execute", step)
-        event.listen(Engine, "commit", step)
+        die_at(fatal)
         with open_store(path, create=True) as store:
             commit_next(store)
 
@@ -167,16 +172,7 @@ def test_killed_at_every_statement_of_pruning(tmp_path: Path) -> None:
     data = path.read_bytes()
 
     def work(fatal: int) -> None:
-        count = 0
-
-        def step(*_: object) -> None:
-            nonlocal count
-            if count == fatal:
-                os.kill(os.getpid(), signal.SIGKILL)
-            count += 1
-
-        event.listen(Engine, "before_cursor_execute", step)
-        event.listen(Engine, "commit", step)
+        die_at(fatal)
         with open_store(path) as store:
             store.prune(1)
 

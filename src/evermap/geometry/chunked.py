@@ -196,11 +196,6 @@ class ChunkedCovariance:
             parts.append(Part(np.concatenate(blocks)))
         return tuple(parts)
 
-    def around(self, chunks: IntArray) -> IntArray:
-        """Return chunks and their neighbours, sorted."""
-        mine = np.isin(self.pair, chunks).any(axis=1)
-        return np.unique(np.concatenate([np.asarray(chunks, dtype=np.int64), self.pair[mine].ravel()]))
-
     def updated(self, new: Update) -> Self:
         """Return the covariance after some points were learned anew, others came and others went.
 
@@ -257,7 +252,7 @@ class ChunkedCovariance:
         across = np.zeros((2 * len(new.rows), 2 * len(rest)))
         own = np.zeros((2 * len(rest), 2 * len(rest)))
         if len(rest):
-            beside = old[np.isin(index.chunk[old], index.chunk[_neighbours_of(pair, index, rest)])]
+            beside = old[np.isin(index.chunk[old], pair[np.isin(pair, index.chunk[rest]).any(axis=1)])]
             joint = self.of(of_old[np.concatenate([beside, rest])])
             n = 2 * len(beside)
             own = joint[n:, n:]
@@ -577,12 +572,3 @@ def _joined(new: Update, before: ChunkedCovariance) -> tuple[IntArray, IntArray]
             waiting += [c, len(parents)]
             parents.append(c)
     return chunk, np.array(parents, dtype=np.int64)
-
-
-def _neighbours_of(pair: IntArray, index: _Index, points: IntArray) -> IntArray:
-    """A point of every chunk that has one of the points, or a neighbour that has."""
-    mine = np.zeros(len(index.start) - 1, dtype=np.bool_)
-    mine[index.chunk[points]] = True
-    near = np.unique(pair[mine[pair].any(axis=1)])
-    near = near[index.start[near + 1] > index.start[near]]
-    return index.order[index.start[near]]

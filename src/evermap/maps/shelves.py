@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, Self, TypeVar
 
@@ -41,8 +42,7 @@ class Shelves(Generic[Table]):
     @classmethod
     def of(cls, table: Table) -> Self:
         """Put a table on shelves."""
-        first, count, parts = _shelved(table)
-        return cls(rows(table, np.zeros(0, dtype=np.int64)), first, count, tuple(parts))
+        return cls._of(table, _shelved(table))
 
     def __len__(self) -> int:
         return int(self.count.sum())
@@ -64,34 +64,25 @@ class Shelves(Generic[Table]):
         """Return the shelves without the rows of some keys (sorted), and with those of another table, which keeps its
         other fields.
         """
-        touched = self._with(np.union1d(keys, key_of(new)))
-        parts: list[Part] = []
-        firsts: list[IntArray] = []
-        counts: list[IntArray] = []
-        own = key_of(new)
-        runs = np.split(touched, np.flatnonzero(np.diff(touched) != 1) + 1) if len(touched) else []
+        if not self.parts:
+            return type(self).of(new)
+        own, shelves = key_of(new), list(zip(self.first.tolist(), self.count.tolist(), self.parts, strict=True))
+        touched = self._with(np.union1d(keys, own))
+        made: list[tuple[int, int, Part]] = []
         at, begin = 0, 0
-        for run in runs:
-            parts += self.parts[at : run[0]]
-            firsts.append(self.first[at : run[0]])
-            counts.append(self.count[at : run[0]])
+        for run in np.split(touched, np.flatnonzero(np.diff(touched) != 1) + 1) if len(touched) else ():
+            made += shelves[at : run[0]]
             at = int(run[-1]) + 1
-            end = len(own) if at >= len(self.parts) else int(np.searchsorted(own, self.first[at]))
-            first, count, made = _shelved(spliced(self._read(run), keys, rows(new, np.arange(begin, end))))
-            firsts.append(first)
-            counts.append(count)
-            parts += made
+            end = int(np.searchsorted(own, self.first[at])) if at < len(shelves) else len(own)
+            made += _shelved(spliced(self._read(run), keys, rows(new, np.arange(begin, end))))
             begin = end
-        parts += self.parts[at:]
-        if begin < len(own):  # there were no shelves
-            first, count, made = _shelved(rows(new, np.arange(begin, len(own))))
-            firsts.append(first)
-            counts.append(count)
-            parts += made
-        firsts.append(self.first[at:])
-        counts.append(self.count[at:])
-        like = rows(new, np.zeros(0, dtype=np.int64))
-        return type(self)(like, np.concatenate(firsts), np.concatenate(counts), tuple(parts))
+        return type(self)._of(new, made + shelves[at:])
+
+    @classmethod
+    def _of(cls, table: Table, shelves: list[tuple[int, int, Part]]) -> Self:
+        first, count, parts = zip(*shelves, strict=True) if shelves else ((), (), ())
+        like = rows(table, np.zeros(0, dtype=np.int64))
+        return cls(like, np.array(first, dtype=np.int64), np.array(count, dtype=np.int64), parts)
 
     def _with(self, keys: IntArray) -> IntArray:
         """Shelves that may have some keys, or between which these would be."""
@@ -170,14 +161,14 @@ def spliced(table: Table, gone: IntArray, new: Table) -> Table:
     return replace(new, **told)
 
 
-def _shelved(table: Any) -> tuple[IntArray, IntArray, list[Part]]:
-    """First keys, numbers of rows, and values of the shelves of a table."""
+def _shelved(table: Any) -> list[tuple[int, int, Part]]:
+    """First key, number of rows, and values of each shelf of a table."""
     key = key_of(table)
-    total = len(key)
-    begins = (np.arange(max(round(total / ROWS), 1)) * total) // max(round(total / ROWS), 1) if total else key
-    count = np.diff(np.append(begins, total))
-    parts = []
-    for begin, n in zip(begins.tolist(), count.tolist(), strict=True):
-        raw = [np.ascontiguousarray(getattr(table, name)[begin : begin + n]).ravel() for name in columns(table)]
-        parts.append(Part(np.concatenate([values.view(np.int64) for values in raw]).view(np.float64)))
-    return key[begins], count, parts
+    total, shelves = len(key), max(round(len(key) / ROWS), 1)
+    bounds = np.arange(shelves + 1) * total // shelves
+    made = []
+    for begin, end in itertools.pairwise(bounds.tolist() if total else ()):
+        raw = [np.ascontiguousarray(getattr(table, name)[begin:end]).ravel() for name in columns(table)]
+        part = Part(np.concatenate([values.view(np.int64) for values in raw]).view(np.float64))
+        made.append((int(key[begin]), end - begin, part))
+    return made

@@ -51,7 +51,8 @@ class Vicinity:
             views_within: (4,) `(x_min, y_min, x_max, y_max)` of the views that matter; None for none of them.
         """
         part, place = _of_cliques(living, cliques)
-        lines, views = _sight(living).lines, _sight(living).views
+        sight = _sight(living)
+        lines, views = sight.lines, sight.views
         cells = np.zeros(0, dtype=np.int64)
         if views_within is not None:
             low, high = np.floor(views_within[[0, 2]] / views.like.cell_m)
@@ -75,9 +76,8 @@ class Vicinity:
         dated = Dated(whole.sites.site_id[elsewhere], whole.believed_s()[elsewhere])
         at_site = before.sites.site_id
         places = spliced(whole.places, at_site, part.places)
-        before_sight = _sight(whole)
-        lines = before_sight.lines.replaced(at_site, part.sightlines)
-        sight = Sight(lines, before_sight.views.replaced(self.cells, part.views))
+        sight = _sight(whole)
+        lines, views = sight.lines.replaced(at_site, part.sightlines), sight.views.replaced(self.cells, part.views)
         return replace(
             part,
             members=spliced(whole.members, before.members.landmark_id, part.members),
@@ -87,9 +87,9 @@ class Vicinity:
             covariance_m2=self._covariance(part, places),
             log_size_variance=whole.log_size_variance,
             log_size_information=whole.log_size_information,
-            sightlines=sight.lines.like,
-            views=sight.views.like,
-            sight=sight,
+            sightlines=lines.like,
+            views=views.like,
+            sight=Sight(lines, views),
         )
 
     def _covariance(self, part: LivingMap, places: Any) -> ChunkedCovariance:
@@ -97,13 +97,8 @@ class Vicinity:
         whole = self.whole
         row = LivingMap.place_row(replace(part, places=places), part.places.landmark_id, part.places.site_id)
         was = whole.place_row(places.landmark_id, places.site_id)
-        before = whole.covariance_m2
-        if not isinstance(before, ChunkedCovariance):
-            before = ChunkedCovariance.of_dense(
-                whole.places.position_m, of_places(before, np.arange(len(whole.places)))
-            )
         learned = of_places(part.covariance_m2, np.arange(len(part.places)))
-        return before.updated(Update(places.position_m, was, row, learned))
+        return _chunked(whole).updated(Update(places.position_m, was, row, learned))
 
 
 def near(living: LivingMap, path_m: FloatArray, reach_m: float) -> tuple[IntArray, FloatArray]:

@@ -205,8 +205,7 @@ class StreamingSlam:
         self._job = None
         problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._solver.estimate())
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
-            now = exhausted(Smoother(problem, self._noise, heavy=True).linearised_in_slices(estimate))
-            estimate = outvoted(problem, estimate, now.weights)
+            estimate = exhausted(_voted(Smoother(problem, self._noise, heavy=True), estimate))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
@@ -325,8 +324,7 @@ class StreamingSlam:
         problem, estimate = self._problem.until(n), self._solver.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
-            now = yield from smoother.linearised_in_slices(estimate)
-            voted = outvoted(problem, estimate, now.weights)
+            voted = yield from _voted(smoother, estimate)
             # what was compared with a place that was never the landmark's own says nothing about consistency
             misplaced = np.any(voted.landmark != estimate.landmark, axis=1) & estimate.known
             self.nis[: len(problem.pose_row)][misplaced[problem.landmark_row]] = np.nan
@@ -478,6 +476,12 @@ def sighted_at(pose: FloatArray, reading: FloatArray, states: FloatArray, mount:
     range_m = (reading[..., 0] - states[0]) / gain
     in_sensor = np.stack([range_m * np.cos(bearing), range_m * np.sin(bearing)], axis=-1)
     return se2.transform(se2.compose(pose, mount), in_sensor)
+
+
+def _voted(smoother: Smoother, estimate: Estimate) -> Slices[Estimate]:
+    """Return what `outvoted` does, by the weights that the detections have there."""
+    now = yield from smoother.linearised_in_slices(estimate)
+    return outvoted(smoother.problem, estimate, now.weights)
 
 
 def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estimate:

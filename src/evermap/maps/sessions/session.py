@@ -122,14 +122,15 @@ def laid(living: LivingMap, p_site: FloatArray, alone: Solved, config: LivingCon
     if where is None or np.sum(where.place >= 0) < 2:  # one landmark says nothing of a heading
         return None
     if config.search == "joint":
-        where = unbent(living, p_site, where, own.position_m, _seen_together(alone, own.row), config.fit)
+        together = _seen_together(alone, own.row, config.fit.inlier)
+        where = unbent(living, p_site, where, own.position_m, together, config.fit)
     glimpsed = alone.prepared.landmark_id[np.setdiff1d(np.flatnonzero(alone.outcome.estimate.known), own.row)]
     return with_glimpsed(living, where, glimpsed)
 
 
-def _seen_together(alone: Solved, row: IntArray) -> sparse.csr_array:
+def _seen_together(alone: Solved, row: IntArray, least: float) -> sparse.csr_array:
     """(K, K) frames in which two landmarks of a session, rows of its problem, were seen where they are."""
-    fits = alone.outcome.inlier >= 0.5
+    fits = alone.outcome.inlier >= least
     problem = alone.outcome.problem
     landmark, pose = (rows[: len(fits)][fits] for rows in (problem.landmark_row, problem.pose_row))
     rank = np.full(len(problem.landmark_mean), -1, dtype=np.int64)

@@ -167,10 +167,10 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
 
 @dataclass(frozen=True, slots=True)
 class _PartChunk(Chunk):
-    """A part of a covariance under the name that it is kept by; its bytes are asked for only where they are missing.
+    """A part of a large map under the name that it is kept by; its bytes are asked for only where they are missing.
 
     Attributes:
-        part: of the covariance.
+        part: of its covariance, lines of sight or views.
     """
 
     part: Part = field(default_factory=lambda: Part(np.zeros(0)))
@@ -190,9 +190,14 @@ def _of_part(part: Part) -> Chunk:
     return _PartChunk("<f8", b"", part)
 
 
+def _part_values(name: bytes, stored: bytes) -> FloatArray:
+    return np.frombuffer(Chunk.of_stored(name, "<f8", stored).raw, "<f8")
+
+
 def _read_part(name: bytes, stored: bytes) -> FloatArray:
+    """What `_part_values` returns, long after the map was unpacked."""
     try:
-        return np.frombuffer(Chunk.of_stored(name, "<f8", stored).raw, "<f8")
+        return _part_values(name, stored)
     except DamagedError as error:
         problem = f"a part of what it holds of its places is damaged: {error}"
         raise InputError(problem, hint="evermap map verify FILE, which tells what can be read") from None
@@ -241,11 +246,10 @@ def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
     for column, listed in in_parts.items():
         names = [name_of(part) for part in listed[3]]
         stored = fetch(set(names))
-        read = [functools.partial(_read_part, key, stored[key]) for key in names]
-        if not lazily:
-            for key in set(names):
-                Chunk.of_stored(key, "<f8", stored[key])
-        parts[column] = tuple(Part(one, key) for one, key in zip(read, names, strict=True))
+        parts[column] = tuple(
+            Part(functools.partial(_read_part, key, stored[key]) if lazily else _part_values(key, stored[key]), key)
+            for key in names
+        )
     if manifest["format"] == 1:
         _of_format_1(parts)
     living: LivingMap = _build(LivingMap(), "", parts)
