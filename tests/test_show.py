@@ -35,6 +35,10 @@ from evermap.types import (
     Recording,
     RobotSightings,
     SlamResult,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
     Trajectory,
 )
 
@@ -79,6 +83,28 @@ RESULT = SlamResult(
     changes=(FEW,) * 2,
     alternatives=(Alternative((NAMED,), 0.1, LANDMARKS),),
 )
+POSES = np.tile([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0], (N, 1))
+SPATIAL = SpatialRecording(
+    name="a hall",
+    odometry=SpatialOdometry(STAMPS, POSES, np.full((N, 6), np.nan)),
+    frames=Frames(STAMPS),
+    detections=SpatialDetections(
+        frame=IDS,
+        sensor=WHOLE,
+        landmark_id=IDS % 9 - 1,
+        position_sensor_m=POSES[:, :3],
+        rotation=POSES[:, 3:],
+        covariance_sensor_m2=np.tile(np.eye(3), (N, 1, 1)),
+        sigma_rad=STAMPS,
+        corner_px=np.zeros((N, 4, 2)),
+        tag_size_m=STAMPS,
+        size_m=POSES[:, :3],
+        class_id=WHOLE,
+        score=STAMPS,
+        source_line=WHOLE,
+    ),
+    sensors=(SpatialSensor(),),
+)
 LIFETIMES = CensoredLifetimes.of(STAMPS[:200], np.where(IDS[:200] % 3 > 0, STAMPS[:200] + 2.0, np.inf))
 EXACT = CensoredLifetimes.of(STAMPS[1:200], STAMPS[1:200])
 EDGES = tuple(STAMPS.tolist())
@@ -90,6 +116,10 @@ OBJECTS: dict[str, Any] = {
         LANDMARKS,
         NAMED,
         RECORDING.odometry,
+        SPATIAL,
+        SPATIAL.odometry,
+        SPATIAL.detections,
+        SPATIAL.sensors[0],
         RECORDING.frames,
         RECORDING.detections,
         RECORDING.truth,

@@ -16,13 +16,23 @@ LONGEST = 900
 """Characters of a text; the rest is left out."""
 _TEXT, _ITEMS = 60, 4
 """Characters of a name, and items of a list, that are shown in full."""
+_AXES = {(2, 2): "xy", (3, 3): ("x", "y", "{t}"), (6, 6): ("x", "y", "z", "rx", "ry", "rz")}
 _PARTS: Mapping[tuple[int, ...], tuple[tuple[str, tuple[int, ...]], ...]] = {
     (2,): (("x{unit}", (0,)), ("y{unit}", (1,))),
-    (3,): (("x_m", (0,)), ("y_m", (1,)), ("theta_rad", (2,))),
-    (2, 2): (("cov_xx{unit}", (0, 0)), ("cov_xy{unit}", (0, 1)), ("cov_yy{unit}", (1, 1))),
-    (3, 3): tuple((f"cov_{a}{b}", (i, j)) for i, a in enumerate("xyt") for j, b in enumerate("xyt") if i <= j),
+    (3,): (("x{unit}", (0,)), ("y{unit}", (1,)), ("z{unit}", (2,))),
+    (4,): tuple((f"q{axis}", (k,)) for k, axis in enumerate("xyzw")),
+    (6,): tuple((f"{axis}{{unit}}", (k,)) for k, axis in enumerate(_AXES[6, 6])),
+    (7,): tuple((name, (k,)) for k, name in enumerate(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw"))),
+    (4, 2): tuple((f"{axis}{k}{{unit}}", (k, i)) for k in range(4) for i, axis in enumerate("uv")),
+    **{
+        shape: tuple((f"cov_{a}{b}{{unit}}", (i, j)) for i, a in enumerate(on) for j, b in enumerate(on) if i <= j)
+        for shape, on in _AXES.items()
+    },
 }
 """Columns of a data frame that positions, poses and their covariances become, by their shape after the first axis."""
+_PLAIN = ("position", "pose", "covariance", "rotation", "corner")
+_POINTS = ("position_m", "position_sensor_m", "size_m")
+"""Three numbers of these are a point's; of others a pose in the plane."""
 
 
 class Shown:
@@ -77,10 +87,13 @@ class ShownTable(Shown):
             if values.ndim == 1:
                 found[name] = values
                 continue
-            unit = "_m2" if name.endswith("_m2") else "_m" if name.endswith("_m") else ""
-            prefix = "" if name.startswith(("position", "pose", "covariance")) else name.removesuffix(unit) + "_"
-            for part, place in _PARTS[values.shape[1:]]:
-                found[prefix + part.format(unit=unit)] = values[(slice(None), *place)]
+            unit = next((end for end in ("_m2", "_m", "_px") if name.endswith(end)), "")
+            prefix = "" if name.startswith(_PLAIN) else name.removesuffix(unit) + "_"
+            parts = _PARTS[values.shape[1:]]
+            if values.shape[1:] == (3,) and name not in _POINTS:
+                parts = (("x_m", (0,)), ("y_m", (1,)), ("theta_rad", (2,)))
+            for part, place in parts:
+                found[prefix + part.format(unit=unit, t="z" if unit else "t")] = values[(slice(None), *place)]
         return found
 
 

@@ -1,5 +1,7 @@
 """The nouns of evermap: frozen dataclasses of arrays, one row an item, which show themselves briefly.
 
+Poses, landmarks and results are in the plane or in space; what a robot drives and sees has a form for each.
+
 Conventions that hold everywhere:
 
 * units are seconds, metres and radians, and stand in the name (`stamp_s`, `range_m`, `bearing_rad`);
@@ -58,22 +60,40 @@ class _Columns(ShownTable):
         for name, item in self.__dataclass_fields__.items():
             if item.type not in _KINDS:
                 continue
-            given, owner, kind, rest = getattr(self, name), type(self).__name__, _KINDS[item.type], _WIDE.get(name, ())
+            given, owner, kind, rest = (
+                getattr(self, name),
+                type(self).__name__,
+                _KINDS[item.type],
+                _WIDE.get(name, ((),)),
+            )
             array = given if isinstance(given, np.ndarray) else np.asarray(_numbers(given, owner, name))
             if array.dtype != kind:
                 array = _as_kind(array, owner, name, whole=kind is np.int64)
             if not first:
                 first, count = name, len(array) if array.ndim else -1
-            if array.shape != (count, *rest):
-                wanted = f"({count}, {', '.join(map(str, rest))})" if rest else f"({max(count, 0)},), as {first}"
+            if array.ndim == 0 or array.shape[0] != count or array.shape[1:] not in rest:
+                more = " or ".join(f"({count}, {', '.join(map(str, shape))})" for shape in rest if shape)
+                wanted = more or f"({max(count, 0)},), as {first}"
                 raise InputError(f"{owner} of shape {array.shape} instead of {wanted}", field=name)
             if array is not given:
                 object.__setattr__(self, name, array)
 
 
 _KINDS: dict[Any, Any] = {"FloatArray": np.float64, "IntArray": np.int64}
-_WIDE = {"pose_world_robot": (3,), "covariance": (3, 3), "position_m": (2,), "covariance_m2": (2, 2)}
-"""Columns that hold more than a number a row, and what of their shape follows the first axis."""
+_WIDE: dict[str, tuple[tuple[int, ...], ...]] = {
+    "pose_world_robot": ((3,), (7,)),
+    "covariance": ((3, 3), (6, 6)),
+    "position_m": ((2,), (3,)),
+    "covariance_m2": ((2, 2), (3, 3)),
+    "position_sensor_m": ((3,),),
+    "rotation": ((4,),),
+    "covariance_sensor_m2": ((3, 3),),
+    "corner_px": ((4, 2),),
+    "size_m": ((3,),),
+    "variance": ((6,),),
+}
+"""Columns that hold more than a number a row, and what of their shape may follow the first axis: in the plane, in
+space."""
 
 
 def _numbers(given: Any, owner: str, name: str) -> Any:
@@ -244,12 +264,13 @@ class RobotSightings(_Columns):
 
 @dataclass(frozen=True, slots=True)
 class Trajectory(_Columns):
-    """Stamped planar poses.
+    """Stamped poses, in the plane or in space.
 
     Attributes:
         stamp_s: (N,) strictly increasing.
-        pose_world_robot: (N, 3) x [m], y [m], theta [rad, wrapped to (-pi, pi]].
-        covariance: (N, 3, 3) in the robot's frame (right perturbation); zeros where the poses are exact.
+        pose_world_robot: (N, 3) x [m], y [m], theta [rad, wrapped to (-pi, pi]]; in space (N, 7) x, y, z [m] and a unit
+            quaternion qx, qy, qz, qw.
+        covariance: (N, 3, 3) or (N, 6, 6) in the robot's frame (right perturbation); zeros where the poses are exact.
         frame: what 'world' is: 'first_pose', 'prior_map' or 'truth'.
     """
 
@@ -262,7 +283,8 @@ class Trajectory(_Columns):
     @property
     def length_m(self) -> float:
         """Return the length of the path between the poses [m]."""
-        return float(np.hypot(*np.diff(self.pose_world_robot[:, :2], axis=0).T).sum())
+        at = self.pose_world_robot[:, : 3 if self.pose_world_robot.shape[1] == 7 else 2]
+        return float(np.linalg.norm(np.diff(at, axis=0), axis=1).sum())
 
     def _facts(self) -> dict[str, Any]:
         stamps = span(self.stamp_s)
@@ -280,14 +302,17 @@ class Landmarks(_Columns):
 
     Attributes:
         landmark_id: (L,) unique.
-        position_m: (L, 2) in the map's frame.
-        covariance_m2: (L, 2, 2); zeros where exact.
+        position_m: (L, 2) in the map's frame, in space (L, 3).
+        covariance_m2: (L, 2, 2) or (L, 3, 3); zeros where exact.
         class_id: (L,) row of `class_names`, or `UNKNOWN`.
         p_exists: (L,) probability that it is there now.
         n_hits, n_misses: (L,) detections used, and expected detections that did not come.
         first_seen_s, last_seen_s: (L,) stamps, nan where never seen.
         frame: what the coordinates refer to, as in `Trajectory.frame`.
         names: texts behind ids that were given as such (`landmark_id_of`), perhaps of other landmarks too.
+        rotation: (L, 4) in space, quaternions of landmarks that have an orientation, nan of points; None of points.
+        rotation_covariance: (L, 3, 3) [rad^2] in the landmark's own frame; None of points.
+        size_m: (L, 3) length, width and height of boxes, nan of others; None where nothing has a size.
     """
 
     landmark_id: IntArray
@@ -303,6 +328,9 @@ class Landmarks(_Columns):
     frame: str = "first_pose"
     clock: Clock = Clock.RECORDING
     names: Mapping[int, str] = field(default_factory=dict)
+    rotation: FloatArray | None = None
+    rotation_covariance: FloatArray | None = None
+    size_m: FloatArray | None = None
 
     def _facts(self) -> dict[str, Any]:
         return {
@@ -414,6 +442,152 @@ class Recording(Shown):
         """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
         figure: Figure = draw("plot_recording", self)
         return figure
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialOdometry(_Columns):
+    """Poses of the robot in a frame that drifts, as visual-inertial odometry gives them.
+
+    Attributes:
+        stamp_s: (N,) strictly increasing.
+        pose_world_robot: (N, 7) x, y, z [m], quaternion qx, qy, qz, qw.
+        variance: (N, 6) of each pose as the source states it, along and about x, y, z of the robot, [m^2], [rad^2]; nan
+            where it does not.
+    """
+
+    stamp_s: FloatArray
+    pose_world_robot: FloatArray
+    variance: FloatArray
+    clock: Clock = Clock.RECORDING
+
+    def _facts(self) -> dict[str, Any]:
+        return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialDetections(_Columns):
+    """Hits in space: one row a detection, sorted by frame; what a detector does not give is nan.
+
+    Attributes:
+        frame: (M,) row of `Frames`.
+        sensor: (M,) row of `SpatialRecording.sensors`.
+        landmark_id: (M,) identity given by the front end, or `UNKNOWN`.
+        position_sensor_m: (M, 3) in the sensor's frame; of a camera x is right, y down, z ahead.
+        rotation: (M, 4) quaternion of the landmark in the sensor's frame.
+        covariance_sensor_m2: (M, 3, 3) of the position.
+        sigma_rad: (M,) standard deviation of the orientation about every axis.
+        corner_px: (M, 4, 2) corners of a square tag in the image (u right, v down), in the order (-1, 1), (1, 1),
+            (1, -1), (-1, -1) times half of the tag's size in the tag's own x and y.
+        tag_size_m: (M,) edge of a square tag.
+        size_m: (M, 3) length, width and height of a box, whose frame has x along its length and z up.
+        class_id: (M,) row of `SpatialRecording.class_names`, or `UNKNOWN`.
+        score: (M,) as the detector gives it.
+        source_line: (M,) line in the input file, for messages; 0 where there is none.
+    """
+
+    frame: IntArray
+    sensor: IntArray
+    landmark_id: IntArray
+    position_sensor_m: FloatArray
+    rotation: FloatArray
+    covariance_sensor_m2: FloatArray
+    sigma_rad: FloatArray
+    corner_px: FloatArray
+    tag_size_m: FloatArray
+    size_m: FloatArray
+    class_id: IntArray
+    score: FloatArray
+    source_line: IntArray
+
+    def _facts(self) -> dict[str, Any]:
+        known = self.landmark_id[self.landmark_id != UNKNOWN]
+        return {"rows": len(self), "landmarks": len(np.unique(known))}
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialSensor(Shown):
+    """A sensor in space: where it is on the robot, how it projects, how far it sees.
+
+    Attributes:
+        name: as detections call it.
+        mount_robot_sensor: (x, y, z, qx, qy, qz, qw), the sensor's pose in the robot's frame.
+        intrinsics: (fx, fy, cx, cy) of a camera [px]; None of other sensors.
+        distortion: coefficients: none for a pinhole, (k1, k2, p1, p2) or with k3 of 'radtan' (Brown 1966), (k1 .. k4)
+            of 'equidistant' (Kannala and Brandt 2006).
+        distortion_model: 'pinhole', 'radtan' or 'equidistant'.
+        resolution_px: (width, height) of the image; None where it is not known.
+        range_min_m, range_max_m: limits of the range.
+        sigma_m, sigma_rad, sigma_px: nominal noise of positions, orientations and corners, where noise is estimated a
+            starting value; None = unknown.
+        p_detect: probability of detecting a landmark in view; p_false: probability of a false detection a frame.
+    """
+
+    name: str = "sensor"
+    mount_robot_sensor: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    intrinsics: tuple[float, float, float, float] | None = None
+    distortion: tuple[float, ...] = ()
+    distortion_model: str = "pinhole"
+    resolution_px: tuple[int, int] | None = None
+    range_min_m: float = 0.0
+    range_max_m: float = float("inf")
+    sigma_m: float | None = None
+    sigma_rad: float | None = None
+    sigma_px: float | None = None
+    p_detect: float = 0.9
+    p_false: float = 0.01
+
+    def _facts(self) -> dict[str, Any]:
+        return {"name": self.name, "camera": self.intrinsics is not None, "mount": self.mount_robot_sensor}
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialRecording(Shown):
+    """One robot's session in space; as `Recording`, but for poses and landmarks in three dimensions.
+
+    Attributes:
+        name: short label.
+        odometry: poses in a drifting frame; None for a sensor that is carried by hand.
+        frames: every instant at which a sensor looked, also when it saw nothing.
+        detections: what it saw.
+        sensors: at least one.
+        truth: reference trajectory, for evaluation only; None where unknown.
+        true_landmarks: surveyed landmarks, for evaluation or as a prior map; None where unknown.
+        class_names: what the rows of `class_id` mean.
+        warnings: counted, human-readable remarks of the reader.
+        source: where it was read from.
+        landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
+    """
+
+    name: str
+    odometry: SpatialOdometry | None
+    frames: Frames
+    detections: SpatialDetections
+    sensors: tuple[SpatialSensor, ...]
+    truth: Trajectory | None = None
+    true_landmarks: Landmarks | None = None
+    class_names: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    source: str = ""
+    clock: Clock = Clock.RECORDING
+    landmark_names: Mapping[int, str] = field(default_factory=dict)
+
+    @property
+    def robot_sightings(self) -> None:
+        """Return None: robots do not see each other in recordings in space."""
+
+    def _facts(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            **span(self.frames.stamp_s),
+            "odometry": 0 if self.odometry is None else len(self.odometry),
+            "frames": len(self.frames),
+            "detections": len(self.detections),
+            "landmarks": self.detections._facts()["landmarks"],
+            "truth": self.truth is not None,
+            "true_landmarks": 0 if self.true_landmarks is None else len(self.true_landmarks),
+            "warnings": len(self.warnings),
+            "source": self.source,
+        }
 
 
 @dataclass(frozen=True, slots=True)
