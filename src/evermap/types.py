@@ -476,8 +476,8 @@ class SpatialDetections(_Columns):
         rotation: (M, 4) quaternion of the landmark in the sensor's frame.
         covariance_sensor_m2: (M, 3, 3) of the position.
         sigma_rad: (M,) standard deviation of the orientation about every axis.
-        corner_px: (M, 4, 2) corners of a square tag in the image (u right, v down), in the order (-1, 1), (1, 1),
-            (1, -1), (-1, -1) times half of the tag's size in the tag's own x and y.
+        corner_px: (M, 4, 2) corners of a square tag in the image (u right, v down), in the order (-1, -1), (1, -1),
+            (1, 1), (-1, 1) times half of the tag's size in the tag's own x and y.
         tag_size_m: (M,) edge of a square tag.
         size_m: (M, 3) length, width and height of a box, whose frame has x along its length and z up.
         class_id: (M,) row of `SpatialRecording.class_names`, or `UNKNOWN`.
