@@ -339,49 +339,81 @@ def collect(
 
 @kernel
 def witnessed(
-    order: Any, frame: Any, clique: Any, hit: Any, place: FloatArray, range_m: FloatArray, bearing: FloatArray,
-    limits: tuple[float, float, float], beside: Any, along: Any,
-) -> None:  # fmt: skip
-    """Find looks in whose frame another clique was seen beside or behind the place, or along the very line.
+    pose: Any, landmark: Any, hit: Any, body: Any, eye: FloatArray, position: FloatArray,
+    limits: tuple[float, float, float],
+) -> tuple[BoolArray, BoolArray]:  # fmt: skip
+    """Find looks in whose frame another body was seen beside or behind the place, and those along the very line.
 
     Args:
-        order: (N,) looks by frame.
-        frame: (N,) of each.
-        clique: (N,) that is looked at.
+        pose: (N,) from which is looked, in order.
+        landmark: (N,) that is looked at.
         hit: (N,) whether it was detected.
-        place: (N, 2) where it is looked for [m].
-        range_m: (N,) how far that is from the sensor.
-        bearing: (N,) in which direction, in the map's frame.
+        body: (L,) what each landmark belongs to.
+        eye: (F, 2) where the sensor is in each pose [m].
+        position: (L, 2) where landmarks are looked for [m].
         limits: distance [m] and angle [rad] that are beside, and distance [m] from the line that is along it.
-        beside: (N,) out.
-        along: (N,) out, behind the place and close to the line.
     """
     beside_m, beside_rad, along_m = limits
-    begin, hits = 0, np.empty(len(order), np.int64)
-    while begin < len(order):
-        end, n_hits = begin, 0
-        while end < len(order) and frame[order[end]] == frame[order[begin]]:
-            if hit[order[end]]:
-                hits[n_hits] = order[end]
+    beside, along = np.zeros(len(pose), np.bool_), np.zeros(len(pose), np.bool_)
+    begin, hits, away, bearing = 0, np.empty(len(body), np.int64), np.empty(len(body)), np.empty(len(body))
+    while begin < len(pose):
+        end, n_hits, i = begin, 0, pose[begin]
+        while end < len(pose) and pose[end] == i:
+            if hit[end]:
+                j = landmark[end]
+                x, y = position[j, 0] - eye[i, 0], position[j, 1] - eye[i, 1]
+                hits[n_hits], away[n_hits], bearing[n_hits] = j, math.hypot(x, y), math.atan2(y, x)
                 n_hits += 1
             end += 1
-        for k in range(begin, end):
-            one = order[k]
+        for k in range(begin, end if n_hits > 0 else begin):
+            j = landmark[k]
+            x, y = position[j, 0] - eye[i, 0], position[j, 1] - eye[i, 1]
+            range_m, direction = math.hypot(x, y), math.atan2(y, x)
             for h in range(n_hits):
                 other = hits[h]
-                if clique[one] == clique[other]:
+                if body[j] == body[other]:
                     continue
-                dx, dy = place[one, 0] - place[other, 0], place[one, 1] - place[other, 1]
-                angle = abs(bearing[one] - bearing[other])
+                dx, dy = position[j, 0] - position[other, 0], position[j, 1] - position[other, 1]
+                angle = abs(direction - bearing[h])
                 angle = min(angle, 2.0 * math.pi - angle)
-                beyond = range_m[other]
                 if dx * dx + dy * dy < beside_m * beside_m or (
-                    angle < beside_rad and beyond > range_m[one] - 0.5 * beside_m
+                    angle < beside_rad and away[h] > range_m - 0.5 * beside_m
                 ):
-                    beside[one] = True
-                if angle * range_m[one] < along_m and angle < 0.25 * math.pi and beyond > range_m[one] + along_m:
-                    along[one] = True
+                    beside[k] = True
+                if angle * range_m < along_m and angle < 0.25 * math.pi and away[h] > range_m + along_m:
+                    along[k] = True
         begin = end
+    return beside, along
+
+
+@kernel
+def grouped(group: Any, n_groups: int) -> Any:
+    """Return (N,) rows sorted by their group, 0 to `n_groups` - 1, in their order within each."""
+    first = np.zeros(n_groups + 1, np.int64)
+    for k in range(len(group)):
+        first[group[k] + 1] += 1
+    for k in range(n_groups):
+        first[k + 1] += first[k]
+    order = np.empty(len(group), np.int64)
+    for k in range(len(group)):
+        order[first[group[k]]] = k
+        first[group[k]] += 1
+    return order
+
+
+@kernel
+def close_to_hits(stamp: FloatArray, site: Any, hit: Any, n_sites: int, within_s: float) -> BoolArray:
+    """Return (N,) looks, those at a site in order of time, with a hit of the same site so shortly before or after."""
+    close, last = np.zeros(len(stamp), np.bool_), np.empty(n_sites)
+    for back in (False, True):
+        last[:] = np.nan
+        for each in range(len(stamp)):
+            k = len(stamp) - 1 - each if back else each
+            if hit[k]:
+                last[site[k]] = stamp[k]
+            if abs(stamp[k] - last[site[k]]) <= within_s:
+                close[k] = True
+    return close
 
 
 @exact
@@ -449,11 +481,16 @@ def looks(
 
 
 @exact
-def cells(sensor: FloatArray, place: FloatArray, cell_m: float, reach: int) -> tuple[IntArray, int]:
-    """Return (N,) cells of sensors counted from places, see `sightlines`, and the first row that has none, or -1."""
-    out = np.empty(len(sensor), np.int64)
-    for k in range(len(sensor)):
-        dx, dy = np.floor((sensor[k, 0] - place[k, 0]) / cell_m), np.floor((sensor[k, 1] - place[k, 1]) / cell_m)
+def cells(
+    sensor: FloatArray, pose: Any, place: FloatArray, landmark: Any, cell_m: float, reach: int
+) -> tuple[IntArray, int]:
+    """Return (N,) cells of sensors `pose` counted from places `landmark`, see `sightlines`, and the first row that has
+    none, or -1.
+    """
+    out = np.empty(len(pose), np.int64)
+    for k in range(len(pose)):
+        i, j = pose[k], landmark[k]
+        dx, dy = np.floor((sensor[i, 0] - place[j, 0]) / cell_m), np.floor((sensor[i, 1] - place[j, 1]) / cell_m)
         if not (abs(dx) < reach // 2 and abs(dy) < reach // 2):  # also what is not a number
             return out, k
         out[k] = (int(dx) + reach // 2) * reach + int(dy) + reach // 2

@@ -102,18 +102,24 @@ class SightLines:
         none = np.zeros(0, dtype=np.int64)
         return cls(none, none, none, np.zeros(0), np.zeros(0), cell_m=cell_m)
 
-    def cells(self, sensor_m: FloatArray, place_m: FloatArray) -> IntArray:
-        """Return (N,) cells of sensors (N, 2), counted from places (N, 2).
+    def cells(
+        self, sensor_m: FloatArray, place_m: FloatArray, pairs: tuple[IntArray, IntArray] | None = None
+    ) -> IntArray:
+        """Return (N,) cells of sensors (N, 2), counted from places (N, 2); or for N pairs of rows of both.
 
         Raises:
             InputError: a position that is not finite, or 1,000 m and more from the sensor.
         """
         from evermap.sensing.kernels import cells
 
-        sensor, place = np.asarray(sensor_m, dtype=np.float64), np.asarray(place_m, dtype=np.float64)
-        cell, row = cells(sensor, place, self.cell_m, _REACH)
+        sensor, place = (
+            np.ascontiguousarray(sensor_m, dtype=np.float64),
+            np.ascontiguousarray(place_m, dtype=np.float64),
+        )
+        one, other = (np.arange(len(sensor)),) * 2 if pairs is None else pairs
+        cell, row = cells(sensor, one, place, other, self.cell_m, _REACH)
         if row >= 0:
-            problem = f"row {row}: no line of sight from {sensor[row]} to {place[row]}"
+            problem = f"row {row}: no line of sight from {sensor[one[row]]} to {place[other[row]]}"
             raise InputError(problem, field="place_m", hint="finite metres, both in one frame")
         return cell
 
@@ -267,7 +273,7 @@ class LearnedField:
         nominal = self.nominal.p_detect(pose, position_m)
         eye = se2.compose(pose, np.asarray(self.nominal.sensor.mount_robot_sensor))
         frame, place = np.nonzero(nominal >= OUT_OF_VIEW)
-        cell = self.lines.cells(eye[frame, :2], position_m[place])
+        cell = self.lines.cells(eye[:, :2], position_m, (frame, place))
         along = nominal[frame, place]
         lines, p_clear, _ = self.lines.lines(self.places, place, cell, along)
         p = np.zeros(nominal.shape)

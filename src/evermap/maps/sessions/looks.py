@@ -14,6 +14,7 @@ known of a class). Without a look the map grew, and nothing has changed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -57,7 +58,9 @@ class PlaceLooks:
         cell: (N,) cell of the sensor, see `SightLines.cells`.
         lines: (K,) what is known of the different lines of sight.
         counts: (N,) whether it says anything: a hit, or a miss along a line that is known to be clear.
-        settled: (N,) whether the place was seen shortly before or after.
+        settled: (N,) whether the site was seen shortly before or after: what was missed there is hidden, not gone. Such
+            looks teach lines of sight before anything is judged by these, so that a robot on a way that it never took
+            does not take what stands behind a wall for gone.
         sight: (C,) what is known of the lines to each clique, as a row of `SightConfig.p_hidden`.
         unwitnessed: (2,) cliques that stood there, but were hidden, or shown, along lines that were unknown before.
     """
@@ -84,29 +87,27 @@ def looked_at(
         sensor: its nominal field of view.
         config: `looks`; without `learn_sight` that is taken for the truth, whatever is in the way.
     """
+    from evermap.sensing.kernels import close_to_hits, grouped, witnessed
+
     places = living.places
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
     listed = looks_at(sensor, sighting.pose_map_robot, places.position_m, (sighting.frame, sighting.place))
-    listed = listed.rows(used[listed.landmark])
-    site = np.searchsorted(living.sites.site_id, places.site_id[listed.landmark])
-    order = np.lexsort((listed.landmark, site, listed.pose, clique_rows(living.sites)[1][site]))
-    (frame, place, nominal, hit), site = listed.rows(order), site[order]
-    clique = clique_rows(living.sites)[1][site]
+    if not used.all():
+        listed = listed.rows(used[listed.landmark])
+    cliques, clique_of_site = clique_rows(living.sites)
+    site_of_place = np.searchsorted(living.sites.site_id, places.site_id)
+    clique_of_place = clique_of_site[site_of_place]
+    order = grouped(clique_of_place[listed.landmark], len(cliques))  # places are sorted by site: so are those of a pose
+    frame, place, nominal, hit = listed.rows(order)
     eye = sensor_poses(sighting, sensor)
-    cell = living.sightlines.cells(eye[frame, :2], places.position_m[place])
-    lowest = int(cell.min(initial=0))
-    span = int(cell.max(initial=0)) - lowest + 1
-    both, key = np.unique(place * span + (cell - lowest), return_inverse=True)
-    line = np.column_stack([both // span, both % span + lowest])
-    p_nominal = np.bincount(key, np.maximum(nominal, 1e-3), minlength=len(line)) / np.maximum(
-        np.bincount(key, minlength=len(line)), 1
-    )
-    rows = SiteLooks(sighting.stamp_s[frame], clique, site, key, hit)
+    cell = living.sightlines.cells(eye[:, :2], places.position_m, (frame, place))
+    line, key, p_nominal = _different(place, cell, nominal)
+    rows = SiteLooks(sighting.stamp_s[frame], clique_of_place[place], site_of_place[place], key, hit)
     settings, rules = config.looks, living.sightlines.rules
-    settled = surely_there(rows, settings.settled_s)
+    settled = close_to_hits(rows.stamp_s, rows.site, hit, len(living.sites), settings.settled_s)
     if not config.learn_sight:
         everything = np.ones(len(rows), dtype=np.bool_)
-        sight = np.zeros(len(np.unique(living.sites.clique_id)), dtype=np.int64)
+        sight = np.zeros(len(cliques), dtype=np.int64)
         return PlaceLooks(rows, place, cell, nominal_lines(p_nominal, rules), everything, settled, sight, np.zeros(2))
     names = places.site_id, places.landmark_id
     now = living.sightlines.learned(
@@ -114,35 +115,46 @@ def looked_at(
     )
     lines, p_clear, seen = now.lines(names, line[:, 0], line[:, 1], p_nominal)
     _, p_before, seen_before = living.sightlines.lines(names, line[:, 0], line[:, 1], p_nominal)
-    clear = ((p_clear >= rules.clear) & seen)[key]
-    beside, behind = _beside(rows, frame, places.position_m[place], eye[frame], settings)
-    unknown = behind & ~clear & (p_clear > rules.blocked)[key]
-    was_unknown = behind & ~((p_before >= rules.clear) & seen_before)[key] & (p_before > rules.blocked)[key]
-    tried, found = (np.bincount(rows.clique[was_unknown & some], minlength=len(np.unique(living.sites.clique_id)))
-                    for some in (np.ones(len(rows), dtype=np.bool_), rows.hit))  # fmt: skip
-    there = (np.bincount(rows.clique[rows.hit], minlength=len(tried)) > 0) & (tried >= settings.witnesses)
-    unwitnessed = np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
+    line_is_clear, was_clear = (p_clear >= rules.clear) & seen, (p_before >= rules.clear) & seen_before
+    clear = line_is_clear[key]
+    beside, behind = (some[order] for some in witnessed(
+        listed.pose, listed.landmark, listed.hit, clique_of_place, np.ascontiguousarray(eye[:, :2]),
+        np.ascontiguousarray(places.position_m), (settings.beside_m, settings.beside_rad, settings.along_m),
+    ))  # fmt: skip
+    unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
+    was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
+    unwitnessed = _unwitnessed(rows, was_unknown, len(cliques), settings.witnesses)
     counts, sight, p_hidden = _hidden(
-        living, p_start, rows, _Seen(clear, beside & clear, unknown), eye[frame], places.position_m[place], settings
+        living,
+        p_start,
+        rows,
+        _Seen(clear, beside & clear, unknown),
+        lambda some: (eye[frame[some], :2], places.position_m[place[some]]),
+        settings,
     )
-    lines = lines._replace(p_free=1.0 - p_hidden[clique_rows(living.sites)[1]][
-        np.searchsorted(living.sites.site_id, places.site_id[line[:, 0]])])  # fmt: skip
+    lines = lines._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
     return PlaceLooks(rows, place, cell, lines, counts, settled, sight, unwitnessed)
 
 
-def _beside(
-    rows: SiteLooks, frame: IntArray, place_m: FloatArray, eye: FloatArray, settings: LooksConfig
-) -> tuple[BoolArray, BoolArray]:
-    """(N,) looks in whose frame another clique was seen beside or behind the place; (N,) close to the very line."""
-    from evermap.sensing.kernels import witnessed
+def _different(place: IntArray, cell: IntArray, nominal: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """(K, 2) different lines, place and cell of each, (N,) which of them a look is along, (K,) mean nominal rates."""
+    lowest = int(cell.min(initial=0))
+    span = int(cell.max(initial=0)) - lowest + 1
+    both = place * span + (cell - lowest)
+    # looks along one line mostly follow each other
+    first = np.flatnonzero(np.append(True, both[1:] != both[:-1])[: len(both)])
+    every, row = np.unique(both[first], return_inverse=True)
+    key = np.repeat(row.ravel(), np.diff(np.append(first, len(both)))).astype(np.int64)
+    total = np.bincount(key, np.maximum(nominal, 1e-3), minlength=len(every))
+    mean = total / np.maximum(np.bincount(key, minlength=len(every)), 1)
+    return np.column_stack([every // span, every % span + lowest]), key, mean
 
-    beside, along = np.zeros((2, len(rows)), dtype=np.bool_)
-    away = place_m - eye[:, :2]
-    witnessed(
-        np.argsort(frame, kind="stable"), frame, rows.clique, rows.hit, place_m, np.hypot(*away.T),
-        np.arctan2(away[:, 1], away[:, 0]), (settings.beside_m, settings.beside_rad, settings.along_m), beside, along,
-    )  # fmt: skip
-    return beside, along
+
+def _unwitnessed(rows: SiteLooks, was_unknown: BoolArray, n: int, least: int) -> FloatArray:
+    """(2,) of `n` cliques that were seen, how many were hidden, and shown, along lines that were unknown before."""
+    tried, found = (np.bincount(rows.clique[some], minlength=n) for some in (was_unknown, was_unknown & rows.hit))
+    there = (np.bincount(rows.clique[rows.hit], minlength=n) > 0) & (tried >= least)
+    return np.array([np.sum(there & (found == 0)), np.sum(there & (found > 0))], dtype=np.float64)
 
 
 class _Seen(NamedTuple):
@@ -158,8 +170,7 @@ def _hidden(
     p_start: FloatArray,
     rows: SiteLooks,
     seen: _Seen,
-    eye: FloatArray,
-    place_m: FloatArray,
+    ends: Callable[[IntArray], tuple[FloatArray, FloatArray]],
     settings: LooksConfig,
 ) -> tuple[BoolArray, IntArray, FloatArray]:
     """Looks that count, (C,) what is known of the lines to each clique, and (C,) probability that it cannot be seen.
@@ -179,33 +190,34 @@ def _hidden(
     p_gone = np.clip(1.0 - np.bincount(row, p_start, minlength=n), 0.01, 0.99)
     p_hidden = _p_hidden(living.sightlines, sight, known & (n_clear >= least), hits > 0, p_gone)
     counts = rows.hit | clear | (unknown & (sight[rows.clique] > 0))
-    of_clique = p_hidden[sight] ** _sides(rows, counts & ~rows.hit, eye[:, :2] - place_m, n, settings)
+    missed = np.flatnonzero(counts & ~rows.hit)
+    eye, place_m = ends(missed)
+    of_clique = p_hidden[sight] ** _sides(rows.clique[missed], eye - place_m, n, settings)
     alone = np.flatnonzero((hits == 0) & (sight == 0) & (n_clear > 0))
-    looks = clear & np.isin(rows.clique, alone)
-    middle = np.column_stack(
-        [np.bincount(rows.clique[looks], eye[looks, k], minlength=n) for k in (0, 1)]
-    ) / np.maximum(np.bincount(rows.clique[looks], minlength=n), 1)[:, None]  # fmt: skip
-    for clique in alone:
-        others = alone[(alone != clique) & known[alone]]
-        others = others[np.hypot(*(middle[others] - middle[clique]).T) < settings.together_m]
+    looks = np.flatnonzero(clear)
+    clique, eye = rows.clique[looks], ends(looks)[0]
+    total = np.column_stack([np.bincount(clique, eye[:, k], minlength=n) for k in (0, 1)])
+    middle = total / np.maximum(n_clear, 1)[:, None]
+    for one in alone:
+        others = alone[(alone != one) & known[alone]]
+        others = others[np.hypot(*(middle[others] - middle[one]).T) < settings.together_m]
         together = float(np.prod(p_gone[others]))
-        of_clique[clique] /= of_clique[clique] + (1.0 - of_clique[clique]) * together
+        of_clique[one] /= of_clique[one] + (1.0 - of_clique[one]) * together
     return counts, sight, of_clique
 
 
-def _sides(rows: SiteLooks, missed: BoolArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
+def _sides(clique: IntArray, away: FloatArray, n: int, settings: LooksConfig) -> IntArray:
     """(C,) from how many sides each clique was looked at, one at least: what hides it from one need not from others.
 
     Args:
-        rows: (N,) looks.
-        missed: (N,) those that count, and missed.
+        clique: (N,) of the looks that count, and missed.
         away: (N, 2) from the places to the sensor.
         n: number of cliques.
         settings: what is a side.
     """
     every = settings.sides
     side = np.floor(np.mod(np.arctan2(away[:, 1], away[:, 0]), 2.0 * np.pi) * (every / (2.0 * np.pi))).astype(np.int64)
-    count = np.bincount(rows.clique[missed] * every + side[missed] % every, minlength=n * every).reshape(n, every)
+    count = np.bincount(clique * every + side % every, minlength=n * every).reshape(n, every)
     sides: IntArray = np.sum(count >= settings.witnesses, axis=1)
     return np.asarray(np.clip(sides, 1, settings.most_sides))
 
@@ -226,24 +238,6 @@ def _p_hidden(lines: SightLines, sight: IntArray, looked: BoolArray, seen: BoolA
 def sensor_poses(sighting: Sighting, sensor: Sensor) -> FloatArray:
     """Return (F, 3) poses of the sensor in the map."""
     return np.asarray(se2.compose(sighting.pose_map_robot, np.asarray(sensor.mount_robot_sensor)))
-
-
-def surely_there(rows: SiteLooks, settled_s: float) -> BoolArray:
-    """Return (N,) looks at sites that were seen shortly before or after: what they miss is hidden, not gone.
-
-    They teach lines of sight before anything is judged by these, so that a robot on a way that it never took does not
-    take what stands behind a wall for gone.
-    """
-    order = np.lexsort((rows.stamp_s, rows.site))
-    site, stamp = rows.site[order], np.where(rows.hit, rows.stamp_s, np.nan)[order]
-    near = np.zeros(len(rows), dtype=np.bool_)
-    for step, sign in ((order, 1.0), (order[::-1], -1.0)):
-        along, times = (site, stamp) if sign > 0 else (site[::-1], stamp[::-1])
-        last = np.maximum.accumulate(np.where(np.isfinite(times), np.arange(len(times)), -1))
-        seen = (last >= 0) & (along[last] == along)
-        gap = np.abs(rows.stamp_s[step] - times[last])
-        near[step[seen]] |= gap[seen] <= settled_s
-    return near
 
 
 @dataclass(frozen=True, slots=True)
