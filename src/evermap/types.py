@@ -590,6 +590,10 @@ class SpatialRecording(Shown):
         }
 
 
+AnyRecording = Recording | SpatialRecording
+"""A session in the plane or in space."""
+
+
 @dataclass(frozen=True, slots=True)
 class ParameterEstimate(Shown):
     """One calibration state or noise level: what was assumed, what the recording says.
@@ -621,8 +625,9 @@ class Innovations(_Columns):
         stamp_s: (K,) frame stamps.
         detection: (K,) row of `Recording.detections`.
         landmark_id: (K,) landmark it was compared with.
-        nis: (K,) squared Mahalanobis distance of the innovation, chi-square with 2 degrees of freedom if consistent.
+        nis: (K,) squared Mahalanobis distance of the innovation, chi-square with `dof` degrees of freedom if honest.
         p_inlier: (K,) final probability that it is not an outlier, after smoothing.
+        dof: (K,) numbers that each detection measured; None where all measured two, as in the plane.
     """
 
     stamp_s: FloatArray
@@ -630,6 +635,7 @@ class Innovations(_Columns):
     landmark_id: IntArray
     nis: FloatArray
     p_inlier: FloatArray
+    dof: IntArray | None = None
 
 
 class ChangeKind(StrEnum):

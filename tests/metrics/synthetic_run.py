@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.types import (
     Alternative,
     ChangeKind,
@@ -21,7 +22,12 @@ from evermap.types import (
     Recording,
     RobotSightings,
     SlamResult,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
     Trajectory,
+    rows_of,
 )
 
 
@@ -176,3 +182,152 @@ def with_changes(result):
         Alternative((), 0.001, result.landmarks),
     )
     return replace(result, changes=changes, alternatives=alternatives)
+
+
+def spatial_trajectory(stamp_s, poses, sigma=(0.0,) * 6, frame="first_pose"):
+    covariance = np.broadcast_to(np.diag(np.square(sigma)), (len(stamp_s), 6, 6))
+    return Trajectory(np.asarray(stamp_s, float), np.asarray(poses, float), covariance.copy(), frame)
+
+
+def spiral_stair(stamp_s, width_m=4.0, period_s=40.0, climb_mps=0.06):
+    """Poses (N, 7) on a stair around a square shaft, swaying a little, looking ahead."""
+    phase = 2 * np.pi * stamp_s / period_s
+    xyz = np.stack([width_m * np.cos(phase), 0.7 * width_m * np.sin(phase), climb_mps * stamp_s + 1.5], axis=1)
+    yaw = np.unwrap(np.arctan2(0.7 * np.cos(phase), -np.sin(phase)))
+    sway = np.stack([0.1 * np.sin(5 * phase), 0.08 * np.cos(7 * phase)], axis=1)
+    quaternion = Rotation.from_euler("ZYX", np.column_stack([yaw, sway])).as_quat()
+    return se3.normalised(np.column_stack([xyz, quaternion]))
+
+
+LOOKING_AHEAD = (0.1, 0.0, 0.2, -0.5, 0.5, -0.5, 0.5)
+"""A camera on the robot: x right, y down, z ahead."""
+
+
+def walls_with_tags(rng, count, height_m):
+    """Poses (count, 7) of tags on four walls, z into the wall, and of three boxes that stand on the floor."""
+    side = np.arange(count) % 4
+    along, height = rng.uniform(-4.0, 4.0, count), rng.uniform(0.5, height_m, count)
+    at = np.select(
+        [(side == k)[:, None] for k in range(4)],
+        [
+            np.column_stack([np.full(count, 6.0), along, height]),
+            np.column_stack([along, np.full(count, 4.5), height]),
+            np.column_stack([np.full(count, -6.0), along, height]),
+            np.column_stack([along, np.full(count, -4.5), height]),
+        ],
+    )
+    turn = Rotation.from_euler("z", side[:, None] * np.pi / 2) * Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])
+    boxes = np.column_stack([[1.0, -1.5, 0.2], [0.5, -1.0, 1.6], np.full(3, 0.4)])
+    yaw = Rotation.from_euler("z", [[0.3], [1.2], [-0.7]]).as_quat()
+    tags = se3.normalised(np.column_stack([at, turn.as_quat()]))
+    return np.concatenate([tags, se3.normalised(np.column_stack([boxes, yaw]))])
+
+
+def make_spatial_run(seed=0, duration_s=80.0, n_tags=16, sigma=(0.03, 0.03, 0.03, 0.01, 0.01, 0.01)):
+    """(recording, result) in space: a stair, tags on walls, boxes and a lamp, with errors of `sigma`."""
+    rng = np.random.default_rng(seed)
+    stamps = np.arange(0.0, duration_s, 0.1)
+    true = spiral_stair(stamps)
+    truth = spatial_trajectory(stamps, true, frame="truth")
+    first = true[0]
+    noise = rng.normal(size=(len(stamps), 6)) * sigma
+    noise[0] = 0
+    smoothed = spatial_trajectory(stamps, se3.retract(se3.between(first, true), noise), sigma)
+    smoothed.covariance[0] = 0
+    wilder = se3.retract(smoothed.pose_world_robot, rng.normal(size=noise.shape) * sigma)
+    online = spatial_trajectory(stamps, wilder, 1.4 * np.array(sigma))
+    drifting = [se3.identity()]
+    for step in se3.between(true[:-1], true[1:]):
+        drifting.append(se3.compose(drifting[-1], se3.compose(step, se3.exp([0.002, 0, 0.001, 0, 0.0002, 0.0006]))))
+    places = np.concatenate([walls_with_tags(rng, n_tags, 5.5), [[*(0.0, 0.0, 6.0), *(np.nan,) * 4]]])
+    count = len(places)
+    ids = np.arange(1, count + 1) * 5
+    size = np.full((count, 3), np.nan)
+    size[n_tags : n_tags + 3] = [[1.2, 0.5, 0.8], [0.8, 0.8, 0.8], [1.0, 0.6, 0.5]]
+    kind = np.repeat([0, 1, 2], [n_tags, 3, 1])
+    detections = _spatial_detections(rng, ids, places, size, kind, se3.compose(true, LOOKING_AHEAD))
+    hits = np.bincount(np.searchsorted(ids, detections.landmark_id), minlength=count)
+    table = {
+        "landmark_id": ids, "class_id": kind, "p_exists": np.ones(count), "n_hits": hits,
+        "n_misses": np.zeros(count, int), "first_seen_s": rng.uniform(0, 9, count), "last_seen_s": np.full(count, 70.0),
+        "class_names": ("tag", "crate", "lamp"), "size_m": size,
+    }  # fmt: skip
+    spread = np.array([0.04, 0.02, 0.03])
+    surveyed = Landmarks(
+        position_m=places[:, :3], covariance_m2=np.zeros((count, 3, 3)), rotation=places[:, 3:],
+        rotation_covariance=np.zeros((count, 3, 3)), frame="truth", **table,
+    )  # fmt: skip
+    local = se3.between(first, np.nan_to_num(places) + np.where(np.isnan(places), [0, 0, 0, 0, 0, 0, 1.0], 0.0))
+    local = se3.retract(local, rng.normal(size=(count, 6)) * [0, 0, 0, 0.01, 0.01, 0.01])
+    local[:, :3] += rng.normal(size=(count, 3)) * spread
+    landmarks = Landmarks(
+        position_m=local[:, :3], covariance_m2=np.tile(np.diag(spread**2), (count, 1, 1)),
+        rotation=np.where(np.isnan(places[:, 3:]), np.nan, local[:, 3:]),
+        rotation_covariance=np.tile(1e-4 * np.eye(3), (count, 1, 1)), **table,
+    )  # fmt: skip
+    dof = np.where(detections.landmark_id == ids[-1], 3, 6)
+    innovations = Innovations(
+        stamps[detections.frame], np.arange(len(dof)), detections.landmark_id, rng.chisquare(dof),
+        (rng.random(len(dof)) > 0.02).astype(float), dof,
+    )  # fmt: skip
+    recording = SpatialRecording(
+        name="stair",
+        odometry=SpatialOdometry(stamps, np.array(drifting), np.full((len(stamps), 6), np.nan)),
+        frames=Frames(stamps),
+        detections=detections,
+        sensors=(SpatialSensor("camera", LOOKING_AHEAD),),
+        truth=truth,
+        true_landmarks=surveyed,
+        class_names=("tag", "crate", "lamp"),
+        source="/data/stair",
+    )
+    parameters = (
+        ParameterEstimate("camera_delay_s", 0.021, 0.001, 0.0, 0.1, "s", meaning="images are older than their stamps"),
+        ParameterEstimate("mount_roll_rad", -0.012, 0.002, 0.0, 0.05, "rad", meaning="camera turned on the robot"),
+        ParameterEstimate("sigma_px", 0.41, 0.01, 1.0, float("nan"), "px", meaning="noise of a corner"),
+    )
+    result = SlamResult(
+        trajectory=smoothed,
+        online=online,
+        landmarks=landmarks,
+        parameters=parameters,
+        innovations=innovations,
+        misses=Misses.empty(),
+        step_s=rng.lognormal(np.log(2e-3), 0.4, len(stamps)),
+        dead_reckoning=spatial_trajectory(stamps, drifting),
+    )
+    return recording, result
+
+
+def _spatial_detections(rng, ids, places, size, kind, camera):
+    """What a camera (F, 7) sees of landmarks (L, 7) within 7 m and 50 degrees of its axis, every third time."""
+    frame, which, seen = [], [], []
+    for row, pose in enumerate(camera):
+        at = se3.transform(se3.inverse(pose), places[:, :3])
+        near = (np.linalg.norm(at, axis=1) < 7.0) & (at[:, 2] > 0.6 * np.linalg.norm(at, axis=1))
+        for k in np.flatnonzero(near & (rng.random(len(ids)) < 0.3)):
+            frame.append(row)
+            which.append(k)
+            turned = se3.between(pose, places[k])[3:] if np.isfinite(places[k]).all() else np.full(4, np.nan)
+            seen.append([*(at[k] + rng.normal(0, 0.02, 3)), *turned])
+    count, seen, which = len(frame), np.array(seen), np.array(which)
+    return SpatialDetections(
+        np.array(frame), np.zeros(count, int), ids[which], seen[:, :3], seen[:, 3:],
+        np.tile(4e-4 * np.eye(3), (count, 1, 1)), np.full(count, 0.02), np.full((count, 4, 2), np.nan),
+        np.where(kind[which] == 0, 0.16, np.nan), size[which], kind[which], np.full(count, np.nan),
+        np.zeros(count, int),
+    )  # fmt: skip
+
+
+def with_spatial_changes(result):
+    """The result with a tag that moved up its wall, a crate that was turned, and two landmarks that are gone."""
+    ids, start_s = result.landmarks.landmark_id, float(result.trajectory.stamp_s[0])
+    nan = float("nan")
+    changes = (
+        MapChange((int(ids[0]),), ChangeKind.MOVED, nan, start_s, (0.2, 0.1, 0.9), 0.0, 0.98),
+        MapChange((int(ids[16]), int(ids[17])), ChangeKind.ROTATED, 20.0, 31.0, (0.7, -0.4, 0.0), 0.5, 0.9),
+        MapChange((int(ids[3]),), ChangeKind.VANISHED, nan, start_s, (nan, nan, nan), 0.0, 0.93),
+    )
+    rows = np.arange(len(ids))
+    kept, gone = (rows_of(result.landmarks, rows[mask]) for mask in (rows != 3, rows == 3))
+    return replace(result, landmarks=kept, gone=gone, changes=changes)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from evermap.geometry import se2, se3
@@ -75,3 +76,8 @@ class Group(Protocol):
 
 PLANE: Group = se2
 SPACE: Group = se3
+
+
+def group_of(pose: ArrayLike) -> Group:
+    """Return the group of poses (..., 3) or (..., 7), by how many numbers each has."""
+    return SPACE if np.shape(pose)[-1] == SPACE.size else PLANE

@@ -57,6 +57,26 @@ def share_in_band(values: FloatArray, dof: float = 2, confidence: float = CONFID
     return float(np.mean(finite <= chi2_quantile(confidence, dof))) if len(finite) else None
 
 
+def comparable_nis(innovations: Innovations) -> FloatArray:
+    """Return the NIS (K,) on the scale of two degrees of freedom: values with the same chi-square tail probability.
+
+    So detections of any kind have one mean (2) and one bound (5.99) if consistent. As they are where all have two.
+    """
+    nis, dof = innovations.nis, innovations.dof
+    if dof is None or np.all(dof == 2):
+        return nis
+    from scipy.special import gammainc, gammaincc, gammaln
+
+    half, shape = 0.5 * np.where(np.isfinite(nis), nis, 0.0), 0.5 * dof
+    beyond = gammaincc(shape, half)
+    safe = np.maximum(half, 1.0)
+    far = -safe + (shape - 1.0) * np.log(safe) - gammaln(shape) + np.log1p(np.maximum(shape - 1.0, 0.0) / safe)
+    with np.errstate(divide="ignore"):
+        log_tail = np.where(beyond > 0.5, np.log1p(-gammainc(shape, half)), np.log(beyond))
+    log_tail = np.where(beyond > 1e-280, log_tail, far)  # the asymptotic series, where the tail underflows
+    return np.asarray(np.where(np.isfinite(nis), -2.0 * log_tail, nis))
+
+
 def running_mean(values: FloatArray, window: int) -> FloatArray:
     """Return the mean (N,) over the last `window` values, nan until there are that many."""
     out = np.full(len(values), np.nan)
@@ -118,13 +138,17 @@ class NisSummary:
 
 
 def summarise_nis(innovations: Innovations) -> NisSummary:
-    """Summarise the NIS. Leaving out the outliers trims the tail a little, so both means are given."""
-    finite = np.isfinite(innovations.nis)
+    """Summarise the NIS, on the scale of two degrees of freedom (see `comparable_nis`).
+
+    Leaving out the outliers trims the tail a little, so both means are given.
+    """
+    values = comparable_nis(innovations)
+    finite = np.isfinite(values)
     inlier = finite & (innovations.p_inlier >= 0.5)
-    nis = innovations.nis[inlier]
+    nis = values[inlier]
     if not np.any(finite):
         return NisSummary(0, None, None, None, None, None, None, None, None)
-    everything = innovations.nis[finite]
+    everything = values[finite]
     if len(nis) == 0:
         return NisSummary(0, 1.0, None, float(everything.mean()), float(np.median(everything)), None, None, None, None)
     low, high = chi2_interval(2)

@@ -8,11 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from evermap.errors import DataError
-from evermap.geometry import se2
-from evermap.metrics.consistency import nees
+from evermap.geometry import se3
+from evermap.geometry.group import group_of
+from evermap.metrics.consistency import nees, share_in_band
 from evermap.metrics.trajectory import align_points, rotate_covariance
 from evermap.show import ShownTable
-from evermap.types import UNKNOWN, BoolArray, FloatArray, Innovations, IntArray, Landmarks, Recording, rows_of
+from evermap.types import UNKNOWN, AnyRecording, BoolArray, FloatArray, Innovations, IntArray, Landmarks, rows_of
 
 MIN_SIGHTINGS = 10
 
@@ -23,11 +24,12 @@ class LandmarkErrors(ShownTable):
 
     Attributes:
         landmark_id, n_hits: (L,) identities and how often each was seen.
-        estimate_m, truth_m: (L, 2) positions in the frame of the truth.
+        estimate_m, truth_m: (L, D) positions in the frame of the truth.
         error_m: (L,) distances.
-        nees: (L,) 2 degrees of freedom; see `PoseErrors` for what an alignment does to it. nan where exact.
+        orientation_error_rad: (L,) angles between the orientations; nan where either is a point.
+        nees: (L,) of positions, D degrees of freedom; nan where exact. An alignment lowers it, see `PoseErrors`.
         scored: (L,) seen often enough to count.
-        pose_truth_estimate: (3,) the alignment used.
+        pose_truth_estimate: (3,) or (7,) the alignment used.
         unmapped: surveyed landmarks that the map does not have.
     """
 
@@ -36,6 +38,7 @@ class LandmarkErrors(ShownTable):
     estimate_m: FloatArray
     truth_m: FloatArray
     error_m: FloatArray
+    orientation_error_rad: FloatArray
     nees: FloatArray
     scored: BoolArray
     pose_truth_estimate: FloatArray
@@ -47,9 +50,31 @@ class LandmarkErrors(ShownTable):
         return {**count, "rmse_m": self.rmse_m, "max_m": self.max_m}
 
     @property
+    def nees_in_band_share(self) -> float | None:
+        """Return the share of the scored landmarks whose NEES is below its 95 % quantile; None if there is none."""
+        return share_in_band(self.nees[self.scored], self.dof)
+
+    @property
+    def dof(self) -> int:
+        """Return the degrees of freedom of `nees`: 2 in the plane, 3 in space."""
+        return int(self.truth_m.shape[1])
+
+    @property
     def rmse_m(self) -> float | None:
         """Return the root mean square error [m] of the scored landmarks; None if there is none."""
         return float(np.sqrt(np.mean(self.error_m[self.scored] ** 2))) if np.any(self.scored) else None
+
+    @property
+    def median_m(self) -> float | None:
+        """Return the median error [m] of the scored landmarks; None if there is none."""
+        return float(np.median(self.error_m[self.scored])) if np.any(self.scored) else None
+
+    @property
+    def orientation_rmse_deg(self) -> float | None:
+        """Return the root mean square angle [degrees] of the scored landmarks with an orientation; None without any."""
+        angle = self.orientation_error_rad[self.scored]
+        known = angle[np.isfinite(angle)]
+        return float(np.degrees(np.sqrt(np.mean(known**2)))) if len(known) else None
 
     @property
     def max_m(self) -> float | None:
@@ -69,7 +94,7 @@ def evaluate_landmarks(
     Args:
         estimate: the map.
         truth: surveyed landmarks.
-        pose_truth_estimate: (3,) motion from the map's frame to the truth's; None aligns the scored landmarks
+        pose_truth_estimate: (3,) or (7,) motion from the map's frame to the truth's; None aligns the scored landmarks
             themselves, which needs no truth of poses and hides a rotation between poses and map.
         min_sightings: landmarks seen less often are listed but not scored.
 
@@ -87,14 +112,16 @@ def evaluate_landmarks(
             pose_truth_estimate = align_points(source[scored], target[scored])
         except DataError:
             return None
-    aligned = se2.transform(pose_truth_estimate, source)
-    covariance = rotate_covariance(estimate.covariance_m2[mine], float(pose_truth_estimate[2]))
+    group = group_of(pose_truth_estimate)
+    aligned = group.transform(pose_truth_estimate, source)
+    covariance = rotate_covariance(estimate.covariance_m2[mine], group.rotation_of(pose_truth_estimate))
     return LandmarkErrors(
         landmark_id=ids.astype(np.int64),
         n_hits=n_hits,
         estimate_m=aligned,
         truth_m=target,
         error_m=np.linalg.norm(aligned - target, axis=1),
+        orientation_error_rad=_angles(pose_truth_estimate, estimate, truth, mine, theirs),
         nees=nees(aligned - target, covariance + truth.covariance_m2[theirs]),
         scored=scored,
         pose_truth_estimate=np.asarray(pose_truth_estimate, dtype=np.float64),
@@ -102,7 +129,21 @@ def evaluate_landmarks(
     )
 
 
-def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recording: Recording) -> Landmarks:
+def _angles(
+    pose_truth_estimate: FloatArray, estimate: Landmarks, truth: Landmarks, mine: IntArray, theirs: IntArray
+) -> FloatArray:
+    """Angles (L,) between the orientations of the landmarks in rows `mine` and `theirs`, after the alignment."""
+    out = np.full(len(mine), np.nan)
+    if estimate.rotation is None or truth.rotation is None:
+        return out
+    turned, reference = (np.pad(r, ((0, 0), (3, 0))) for r in (estimate.rotation[mine], truth.rotation[theirs]))
+    known = np.isfinite(turned).all(axis=1) & np.isfinite(reference).all(axis=1)
+    wrong = se3.local(reference[known], se3.compose(pose_truth_estimate, turned[known]))
+    out[known] = np.linalg.norm(wrong[:, 3:], axis=1)
+    return out
+
+
+def by_recorded_identity(landmarks: Landmarks, innovations: Innovations, recording: AnyRecording) -> Landmarks:
     """Rename the landmarks of a map by the id that the recording gives to most of their detections, for scoring.
 
     Nothing changes where the run used the recording's ids. Where two landmarks claim one id, the one with more

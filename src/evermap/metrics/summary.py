@@ -11,7 +11,7 @@ from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.show import Shown
-from evermap.types import BoolArray, FloatArray, Recording, SlamResult, json_number
+from evermap.types import AnyRecording, BoolArray, FloatArray, SlamResult, json_number
 
 RATE_HZ = 2.0
 IN_VIEW_S = 1.0
@@ -46,7 +46,7 @@ class Evaluation(Shown):
     rate_hz: float = RATE_HZ
 
 
-def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> Evaluation:
+def compare_with_truth(recording: AnyRecording, result: SlamResult, *, rate_hz: float = RATE_HZ) -> Evaluation:
     """Compare a run with all that the recording knows of the truth, poses at `rate_hz`."""
     poses = online = dead_reckoning = landmarks = anchored = own = None
     if recording.truth is not None:
@@ -65,7 +65,7 @@ def compare_with_truth(recording: Recording, result: SlamResult, *, rate_hz: flo
     return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, view, rate_hz)
 
 
-def in_view(recording: Recording, stamp_s: FloatArray) -> BoolArray:
+def in_view(recording: AnyRecording, stamp_s: FloatArray) -> BoolArray:
     """Return (K,) whether a landmark was seen within `IN_VIEW_S` before or after each stamp.
 
     Elsewhere the pose rests on odometry alone, whose errors no map can correct.
@@ -84,22 +84,29 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
     """Return the stable keys of `metrics` in `summary.json`: plain floats, None without truth, no key missing."""
     poses, online, odometry = evaluation.poses, evaluation.online, evaluation.dead_reckoning
     landmarks, own, nis = evaluation.landmarks, evaluation.landmarks_own, evaluation.nis
-    anchored, view = evaluation.landmarks_anchored, evaluation.in_view
+    anchored, view, scored = evaluation.landmarks_anchored, evaluation.in_view, poses or landmarks or own
     return {
         "pose_rmse_m": json_number(poses and poses.rmse_m),
         "pose_mean_m": json_number(poses and poses.mean_m),
         "pose_median_m": json_number(poses and poses.median_m),
         "pose_max_m": json_number(poses and poses.max_m),
         "heading_rmse_deg": json_number(poses and poses.heading_rmse_deg),
+        "orientation_rmse_deg": json_number(poses and poses.orientation_rmse_deg),
         **_view(poses, view),
         "drift_m_per_m": json_number(poses and poses.drift_m_per_m),
         "online_pose_rmse_m": json_number(online and online.rmse_m),
         "online_heading_rmse_deg": json_number(online and online.heading_rmse_deg),
+        "online_orientation_rmse_deg": json_number(online and online.orientation_rmse_deg),
         "dead_reckoning_rmse_m": json_number(odometry and odometry.rmse_m),
         "dead_reckoning_heading_rmse_deg": json_number(odometry and odometry.heading_rmse_deg),
+        "dead_reckoning_orientation_rmse_deg": json_number(odometry and odometry.orientation_rmse_deg),
         "landmark_rmse_m": json_number(landmarks and landmarks.rmse_m),
+        "landmark_median_m": json_number(landmarks and landmarks.median_m),
         "landmark_max_m": json_number(landmarks and landmarks.max_m),
         "landmark_rmse_own_alignment_m": json_number(own and own.rmse_m),
+        "landmark_median_own_alignment_m": json_number(own and own.median_m),
+        "landmark_orientation_rmse_deg": json_number(landmarks and landmarks.orientation_rmse_deg),
+        "landmark_orientation_rmse_own_alignment_deg": json_number(own and own.orientation_rmse_deg),
         "landmarks_scored": int(own.scored.sum()) if own else None,
         "landmark_min_sightings": MIN_SIGHTINGS,
         "nis_mean": json_number(nis.mean),
@@ -112,11 +119,13 @@ def metrics_dict(evaluation: Evaluation) -> dict[str, Any]:
         "nis_count": nis.count,
         "outlier_share": json_number(nis.outlier_share),
         "pose_nees_mean": _mean(poses.nees if poses else None),
-        "pose_nees_in_band_share": share_in_band(poses.nees) if poses else None,
+        "pose_nees_in_band_share": share_in_band(poses.nees, poses.dof) if poses else None,
+        "whole_pose_nees_mean": _mean(poses.whole_nees if poses else None),
         "pose_nees_anchored_mean": _mean(poses.anchored_nees if poses else None),
         "landmark_nees_mean": _mean(landmarks.nees[landmarks.scored] if landmarks else None),
-        "landmark_nees_in_band_share": share_in_band(landmarks.nees[landmarks.scored]) if landmarks else None,
+        "landmark_nees_in_band_share": landmarks and landmarks.nees_in_band_share,
         "landmark_nees_anchored_mean": _mean(anchored.nees[anchored.scored] if anchored else None),
+        "nees_dof": scored and scored.dof,
         "alignment": _alignment(evaluation),
     }
 
@@ -157,7 +166,8 @@ def _alignment(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def _pose(pose: FloatArray) -> dict[str, float | None]:
-    return {"x_m": json_number(pose[0]), "y_m": json_number(pose[1]), "theta_rad": json_number(pose[2])}
+    names = ("x_m", "y_m", "theta_rad") if len(pose) == 3 else ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+    return dict(zip(names, map(json_number, pose), strict=True))
 
 
 def _mean(values: FloatArray | None) -> float | None:
@@ -168,10 +178,10 @@ def _mean(values: FloatArray | None) -> float | None:
 
 def _view(poses: PoseErrors | None, view: BoolArray | None) -> dict[str, float | None]:
     """Return the errors while landmarks were in view, and the share of that time."""
+    names = ("pose_rmse_in_view_m", "heading_rmse_in_view_deg", "orientation_rmse_in_view_deg", "in_view_share")
     if poses is None or view is None or not view.any():
-        return {"pose_rmse_in_view_m": None, "heading_rmse_in_view_deg": None, "in_view_share": None}
-    return {
-        "pose_rmse_in_view_m": float(np.sqrt(np.mean(poses.position_error_m[view] ** 2))),
-        "heading_rmse_in_view_deg": float(np.degrees(np.sqrt(np.mean(poses.heading_error_rad[view] ** 2)))),
-        "in_view_share": float(np.mean(view)),
-    }
+        return dict.fromkeys(names)
+    errors = (poses.position_error_m, poses.heading_error_rad, poses.orientation_error_rad)
+    distance, *angles = (np.sqrt(np.mean(error[view] ** 2)) for error in errors)
+    rmse = map(json_number, (distance, *np.degrees(angles)))
+    return dict(zip(names, (*rmse, float(np.mean(view))), strict=True))

@@ -1,7 +1,8 @@
 """Pose errors against a reference trajectory, and the alignment of frames that they need.
 
 A map made from an unknown start lives in the frame of its first pose. Comparing it with surveyed coordinates needs
-one planar motion, `pose_truth_estimate`, without scale. It serves evaluation only: nothing of it flows back.
+one rigid motion, `pose_truth_estimate`, without scale. It serves evaluation only: nothing of it flows back. Poses are
+(x, y, theta) in the plane and (x, y, z, qx, qy, qz, qw) in space; D is the number of coordinates, 2 or 3.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from evermap.errors import DataError
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
+from evermap.geometry.group import PLANE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.metrics.consistency import nees
 from evermap.show import ShownTable
@@ -24,66 +26,80 @@ DRIFT_DISTANCE_M = 10.0
 
 
 def align_points(source_m: FloatArray, target_m: FloatArray) -> FloatArray:
-    """Return the motion (x, y, theta) that brings points onto others with the least squared distance, without scale.
+    """Return the motion that brings points onto others with the least squared distance, without scale.
 
-    The planar case of Umeyama (PAMI 1991, equations 38 to 43), in closed form. As there, the rotation is undefined
-    where the cross-covariance vanishes.
+    Umeyama (PAMI 1991, equations 38 to 43), in closed form. As there, the rotation is undefined where the
+    cross-covariance has too low a rank.
 
     Args:
-        source_m: (N, 2) points, N >= 2.
-        target_m: (N, 2) where each should come to lie.
+        source_m: (N, D) points, N >= D.
+        target_m: (N, D) where each should come to lie.
 
     Raises:
-        DataError: fewer than two points, or all coincide.
+        DataError: too few points, or all coincide; in space also where all lie on one line.
     """
-    if len(source_m) < 2:
-        raise DataError("an SE(2) alignment needs at least two points", hint="evaluate over a longer stretch")
-    cross = (target_m - target_m.mean(axis=0)).T @ (source_m - source_m.mean(axis=0)) / len(source_m)
-    if np.linalg.norm(cross, 2) <= np.finfo(np.float64).eps:
-        raise DataError("all points coincide: their alignment has no rotation", hint="evaluate while moving")
+    count, size = source_m.shape
+    if count < size:
+        least = "two" if size == 2 else "three"
+        raise DataError(f"an SE({size}) alignment needs at least {least} points", hint="evaluate over a longer stretch")
+    cross = (target_m - target_m.mean(axis=0)).T @ (source_m - source_m.mean(axis=0)) / count
+    strength = np.linalg.svd(cross, compute_uv=False)
+    if strength[size - 2] <= max(np.finfo(np.float64).eps, 1e-12 * strength[0]):
+        what = "coincide: their alignment has no rotation" if size == 2 else "lie on a line: they may turn about it"
+        raise DataError(f"all points {what}", hint="evaluate while moving")
     return rigid(source_m, target_m)
 
 
 def align_poses(source: FloatArray, target: FloatArray) -> tuple[FloatArray, str]:
-    """Align the positions of poses (N, 3) as `align_points`; by their headings where the robot stands still.
+    """Align the positions of poses as `align_points`; by their orientations where the positions do not say how.
 
     Returns:
-        the motion (x, y, theta) and how it was found: 'umeyama_se2' or 'mean_heading'.
+        the motion and how it was found: 'umeyama_se2' or 'umeyama_se3', else 'mean_heading' or 'mean_orientation'.
     """
+    group = group_of(source)
+    size = group.point_dim
     try:
-        return align_points(source[:, :2], target[:, :2]), "umeyama_se2"
+        return align_points(source[:, :size], target[:, :size]), f"umeyama_se{size}"
     except DataError:
+        turn = _mean_turn(source, target)
+        turn[:size] = np.mean(target[:, :size] - source[:, :size] @ group.rotation_of(turn).T, axis=0)
+        return turn, "mean_heading" if group is PLANE else "mean_orientation"
+
+
+def _mean_turn(source: FloatArray, target: FloatArray) -> FloatArray:
+    """The mean rotation between the poses, about the origin; in space Markley et al. (JGCD 2007), equation 12."""
+    if group_of(source) is PLANE:
         turns = target[:, 2] - source[:, 2]
-        turn = float(np.arctan2(np.sin(turns).sum(), np.cos(turns).sum()))
-        shift = np.mean(target[:, :2] - source[:, :2] @ se2.rotation(turn).T, axis=0)
-        return np.array([shift[0], shift[1], turn]), "mean_heading"
+        return np.array([0.0, 0.0, np.arctan2(np.sin(turns).sum(), np.cos(turns).sum())])
+    quaternion = se3.compose(target, se3.inverse(source))[:, 3:]
+    return se3.normalised([0.0, 0.0, 0.0, *np.linalg.eigh(quaternion.T @ quaternion).eigenvectors[:, -1]])
 
 
-def rotate_covariance(covariance: FloatArray, angle_rad: FloatArray | float) -> FloatArray:
-    """Turn covariances (..., 2, 2) by `angle_rad` (broadcast): `R P R^T`."""
-    turn = se2.rotation(angle_rad)
-    return np.asarray(turn @ covariance @ np.swapaxes(turn, -1, -2), dtype=np.float64)
+def rotate_covariance(covariance: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Turn covariances (..., D, D) by rotation matrices (..., D, D), broadcast: `R P R^T`."""
+    return np.asarray(rotation @ covariance @ np.swapaxes(rotation, -1, -2), dtype=np.float64)
 
 
 def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Interpolate poses on the SE(2) geodesic between the two neighbours; exact at the stamps themselves.
+    """Interpolate poses on the geodesic between the two neighbours; exact at the stamps themselves.
 
     Args:
         trajectory: at least one pose.
         stamp_s: (K,) within the trajectory's span.
 
     Returns:
-        poses (K, 3); covariances (K, 3, 3), mixed linearly, which is fair only where the neighbours are close; and
-        the time between the two neighbours (K,) [s], 0 at the stamps themselves.
+        poses (K, 3) or (K, 7); covariances (K, 3, 3) or (K, 6, 6), mixed linearly, which is fair only where the
+        neighbours are close; and the time between the two neighbours (K,) [s], 0 at the stamps themselves.
     """
+    group = group_of(trajectory.pose_world_robot)
     knots = trajectory.stamp_s
     after = np.clip(np.searchsorted(knots, stamp_s, side="left"), 0, len(knots) - 1)
     before = np.where(knots[after] <= stamp_s, after, np.maximum(after - 1, 0))
     gap_s = knots[after] - knots[before]
     share = np.where(gap_s > 0, (stamp_s - knots[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0)
     start = trajectory.pose_world_robot[before]
-    twist = se2.log(se2.between(start, trajectory.pose_world_robot[after]))
-    poses = se2.compose(start, se2.exp(share[:, None] * twist))
+    twist = group.log(group.between(start, trajectory.pose_world_robot[after]))
+    poses = group.compose(start, group.exp(share[:, None] * twist))
     mix = share[:, None, None]
     covariance = (1.0 - mix) * trajectory.covariance[before] + mix * trajectory.covariance[after]
     return poses, covariance, gap_s
@@ -93,23 +109,26 @@ def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray
 class PoseErrors(ShownTable):
     """Errors of a trajectory at K stamps of the truth.
 
-    **Alignment and NEES.** `nees` uses the aligned errors. Alignment removes the three degrees of freedom of the
-    frame, while the covariances of a map made from an unknown start are those relative to its first pose and grow
-    with the distance from it; aligned NEES is therefore too small on average (looks cautious), and only values above
-    the band say anything. `anchored_nees` instead fixes the frame at the first scored pose, the gauge in which the
-    covariances hold: its expectation is 2, but it inherits the truth's own heading error at that one stamp times the
+    **Alignment and NEES.** `nees` uses the aligned errors. Alignment removes the degrees of freedom of the frame, while
+    the covariances of a map made from an unknown start are those relative to its first pose and grow with the distance
+    from it; aligned NEES is therefore too small on average (looks cautious), and only values above the band say
+    anything. `anchored_nees` instead fixes the frame at the first scored pose, the gauge in which the covariances hold:
+    its expectation is 2, in space 3, but it inherits the truth's own heading error at that one stamp times the
     distance, and its values are one draw rather than many, so its mean scatters widely. Without alignment (map frame
-    given) `nees` has expectation 2 and `anchored_nees` is None.
+    given) `nees` has expectation 2, in space 3, and `anchored_nees` is None.
 
     Attributes:
         stamp_s: (K,) stamps of the truth that were scored.
-        truth, estimate: (K, 3) poses, the estimate interpolated to the stamp and aligned.
-        covariance: (K, 3, 3) of the estimate, in the robot's frame (see `interpolate`).
-        position_error_m: (K,) distances; heading_error_rad: (K,) estimate minus truth, wrapped.
-        pose_truth_estimate: (3,) the alignment, identity if not aligned; align landmarks with this one too.
-        alignment: 'umeyama_se2', 'mean_heading' (robot stood still) or 'none'.
-        nees, anchored_nees: (K,) of the position (2 degrees of freedom), nan where the pose is exact.
-        pose_truth_anchor: (3,) the alignment that makes the first pose exact, None without one.
+        truth, estimate: (K, 3) or (K, 7) poses, the estimate interpolated to the stamp and aligned.
+        covariance: (K, 3, 3) or (K, 6, 6) of the estimate, in the robot's frame (see `interpolate`).
+        position_error_m: (K,) distances.
+        orientation_error_rad: (K,) angles between the orientations, never negative.
+        heading_error_rad: (K,) estimate minus truth, wrapped; nan in space.
+        pose_truth_estimate: (3,) or (7,) the alignment, identity if not aligned; align landmarks with this one too.
+        alignment: how it was found, see `align_poses`, or 'none'.
+        nees, anchored_nees: (K,) of the position (2 or 3 degrees of freedom), nan where the pose is exact.
+        whole_nees: (K,) of position and orientation together (3 or 6 degrees of freedom), aligned as `nees`.
+        pose_truth_anchor: (3,) or (7,) the alignment that makes the first pose exact, None without one.
         drift_m_per_m: median translation error over 10 m travelled, divided by 10 m; None on shorter runs.
         skipped: stamps left out because the estimate has no pose near them.
     """
@@ -119,10 +138,12 @@ class PoseErrors(ShownTable):
     estimate: FloatArray
     covariance: FloatArray
     position_error_m: FloatArray
+    orientation_error_rad: FloatArray
     heading_error_rad: FloatArray
     pose_truth_estimate: FloatArray
     alignment: str
     nees: FloatArray
+    whole_nees: FloatArray
     anchored_nees: FloatArray | None
     pose_truth_anchor: FloatArray | None
     drift_m_per_m: float | None
@@ -130,8 +151,13 @@ class PoseErrors(ShownTable):
     _besides: ClassVar = frozenset({"pose_truth_estimate", "pose_truth_anchor"})
 
     def _facts(self) -> dict[str, Any]:
-        error = {"rmse_m": self.rmse_m, "max_m": self.max_m, "heading_rmse_deg": self.heading_rmse_deg}
+        error = {"rmse_m": self.rmse_m, "max_m": self.max_m, "orientation_rmse_deg": self.orientation_rmse_deg}
         return {"stamps": len(self.stamp_s), **error, "drift_m_per_m": self.drift_m_per_m, "alignment": self.alignment}
+
+    @property
+    def dof(self) -> int:
+        """Return the degrees of freedom of `nees`: 2 in the plane, 3 in space."""
+        return group_of(self.truth).point_dim
 
     @property
     def rmse_m(self) -> float:
@@ -154,8 +180,13 @@ class PoseErrors(ShownTable):
         return float(np.max(self.position_error_m))
 
     @property
+    def orientation_rmse_deg(self) -> float:
+        """Return the root mean square angle between the orientations [degrees], mean offset included."""
+        return float(np.degrees(np.sqrt(np.mean(self.orientation_error_rad**2))))
+
+    @property
     def heading_rmse_deg(self) -> float:
-        """Return the root mean square heading error [degrees], mean offset included."""
+        """Return the root mean square heading error [degrees], mean offset included; nan in space."""
         return float(np.degrees(np.sqrt(np.mean(self.heading_error_rad**2))))
 
 
@@ -189,7 +220,7 @@ def evaluate_trajectory(
     align: bool = True,
     max_gap_s: float = float("inf"),
 ) -> PoseErrors | None:
-    """Compute pose errors at stamps of the truth, after an SE(2) alignment; None where fewer than two can be scored.
+    """Compute pose errors at stamps of the truth, after a rigid alignment; None where fewer than two can be scored.
 
     Args:
         estimate: poses with covariance, dense enough to be interpolated.
@@ -210,22 +241,28 @@ def evaluate_trajectory(
         return None
     stamps, reference = truth.stamp_s[rows], truth.pose_world_robot[rows]
 
-    pose_truth_estimate, how = align_poses(raw, reference) if align else (np.zeros(3), "none")
-    aligned = se2.compose(pose_truth_estimate, raw)
+    group = group_of(raw)
+    size = group.point_dim
+    pose_truth_estimate, how = align_poses(raw, reference) if align else (group.identity(), "none")
+    aligned = group.compose(pose_truth_estimate, raw)
     anchor = None
     if align and estimate.frame == "first_pose" and stamps[0] - estimate.stamp_s[0] <= ANCHOR_SLACK_S:
-        anchor = se2.compose(reference[0], se2.inverse(raw[0]))
+        anchor = group.compose(reference[0], group.inverse(raw[0]))
+    wrong = group.local(aligned, reference)
+    heading = se2.wrap(aligned[:, 2] - reference[:, 2]) if group is PLANE else np.full(len(rows), np.nan)
     return PoseErrors(
         stamp_s=stamps,
         truth=reference,
         estimate=aligned,
         covariance=covariance,
-        position_error_m=np.linalg.norm(aligned[:, :2] - reference[:, :2], axis=1),
-        heading_error_rad=se2.wrap(aligned[:, 2] - reference[:, 2]),
+        position_error_m=np.linalg.norm(aligned[:, :size] - reference[:, :size], axis=1),
+        orientation_error_rad=np.abs(heading) if group is PLANE else np.linalg.norm(wrong[:, size:], axis=1),
+        heading_error_rad=heading,
         pose_truth_estimate=pose_truth_estimate,
         alignment=how,
         nees=_position_nees(aligned, reference, covariance),
-        anchored_nees=None if anchor is None else _position_nees(se2.compose(anchor, raw), reference, covariance),
+        whole_nees=_whole_nees(wrong, covariance),
+        anchored_nees=None if anchor is None else _position_nees(group.compose(anchor, raw), reference, covariance),
         pose_truth_anchor=anchor,
         drift_m_per_m=drift_per_metre(aligned, reference),
         skipped=skipped,
@@ -234,9 +271,18 @@ def evaluate_trajectory(
 
 def _position_nees(estimate: FloatArray, truth: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the NEES (K,) of positions; the error is turned into the robot's frame, where the covariance is."""
-    error_world = estimate[:, :2] - truth[:, :2]
-    error_robot = np.einsum("kji,kj->ki", se2.rotation(estimate[:, 2]), error_world)
-    return nees(error_robot, covariance[:, :2, :2])
+    group = group_of(estimate)
+    size = group.point_dim
+    error_world = estimate[:, :size] - truth[:, :size]
+    error_robot = np.einsum("kji,kj->ki", group.rotation_of(estimate), error_world)
+    return nees(error_robot, covariance[:, :size, :size])
+
+
+def _whole_nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the NEES (K,) of twists, in units of their standard deviations: metres and radians are not compared."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    unit = np.where(sigma > 0.0, sigma, 1.0)
+    return nees(error / unit, covariance / (unit[:, :, None] * unit[:, None, :]))
 
 
 def drift_per_metre(estimate: FloatArray, truth: FloatArray, distance_m: float = DRIFT_DISTANCE_M) -> float | None:
@@ -244,11 +290,13 @@ def drift_per_metre(estimate: FloatArray, truth: FloatArray, distance_m: float =
 
     It needs no alignment. None if the path is shorter than the distance.
     """
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :2], axis=0), axis=1))])
+    group = group_of(truth)
+    size = group.point_dim
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(truth[:, :size], axis=0), axis=1))])
     end = np.searchsorted(travelled, travelled + distance_m)
     start = np.flatnonzero(end < len(travelled))
     if len(start) == 0:
         return None
     end = end[start]
-    wrong = se2.between(se2.between(truth[start], truth[end]), se2.between(estimate[start], estimate[end]))
-    return float(np.median(np.linalg.norm(wrong[:, :2], axis=1) / (travelled[end] - travelled[start])))
+    wrong = group.between(group.between(truth[start], truth[end]), group.between(estimate[start], estimate[end]))
+    return float(np.median(np.linalg.norm(wrong[:, :size], axis=1) / (travelled[end] - travelled[start])))

@@ -48,7 +48,7 @@ def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -
         replace(
             known,
             position_m=se2.transform(pose_truth_map, known.position_m),
-            covariance_m2=rotate_covariance(known.covariance_m2, float(pose_truth_map[2])),
+            covariance_m2=rotate_covariance(known.covariance_m2, se2.rotation_of(pose_truth_map)),
         )
         for known in (result.landmarks, result.gone)
     )
