@@ -392,6 +392,36 @@ class Landmarks(_Columns):
             frame=frame,
         )
 
+    @classmethod
+    def in_space(
+        cls,
+        landmark_id: Any,
+        position_m: Any,
+        *,
+        rotation: Any = None,
+        size_m: Any = None,
+        class_id: Any = None,
+        class_names: tuple[str, ...] = (),
+        names: Mapping[int, str] | None = None,
+        clock: Clock = Clock.RECORDING,
+    ) -> Landmarks:
+        """Return landmarks that are known exactly, at (L, 3) metres, perhaps with orientations (L, 4) and sizes
+        (L, 3).
+        """
+        ids = np.asarray(landmark_id, dtype=np.int64)
+        order, count = np.argsort(ids, kind="stable"), len(ids)
+        flat = cls.at(ids, np.zeros((count, 2)), class_id=class_id, class_names=class_names)
+        return replace(
+            flat,
+            position_m=np.asarray(position_m, dtype=np.float64).reshape(count, 3)[order],
+            covariance_m2=np.zeros((count, 3, 3)),
+            rotation=None if rotation is None else np.asarray(rotation, dtype=np.float64)[order],
+            rotation_covariance=None if rotation is None else np.zeros((count, 3, 3)),
+            size_m=None if size_m is None else np.asarray(size_m, dtype=np.float64)[order],
+            names=names or {},
+            clock=clock,
+        )
+
 
 @dataclass(frozen=True, slots=True)
 class Recording(Shown):

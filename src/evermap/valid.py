@@ -14,7 +14,19 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError
-from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording, Sensor, Trajectory
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Recording,
+    Sensor,
+    SpatialDetections,
+    SpatialRecording,
+    SpatialSensor,
+    Trajectory,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +92,13 @@ RANGE_M = Quantity("range_m", 0.0, 1e6, positive=True, hint="metres; leave out r
 BEARING_RAD = Quantity("bearing_rad", -2 * pi, 2 * pi, hint="radians, not degrees")
 X_M = Quantity("x_m", -1e8, 1e8, hint="metres")
 Y_M = Quantity("y_m", -1e8, 1e8, hint="metres")
+Z_M = Quantity("z_m", -1e8, 1e8, hint="metres")
 THETA_RAD = Quantity("theta_rad", -1e6, 1e6, hint="radians")
+QUATERNION = tuple(Quantity(f"q{axis}", -2.0, 2.0, hint="a unit quaternion, scalar last") for axis in "xyzw")
+TWIST = (
+    *(Quantity(f"v{axis}_mps", -1e3, 1e3, hint="metres per second") for axis in "xyz"),
+    *(Quantity(f"w{axis}_radps", -1e3, 1e3, hint="radians per second") for axis in "xyz"),
+)
 SIGMA_RANGE_M = Quantity("sigma_range_m", 0.0, 1e6, positive=True, optional=True, hint="leave empty where unknown")
 SIGMA_BEARING_RAD = Quantity(
     "sigma_bearing_rad", 0.0, 1e6, positive=True, optional=True, hint="leave empty where unknown"
@@ -111,18 +129,112 @@ def validate(recording: Any) -> None:
     _check_stamps(frames.stamp_s, "frames.stamp_s")
     for quantity in (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD):
         quantity.check_array(getattr(detections, quantity.name), f"detections.{quantity.name}")
-    _require((detections.frame >= 0) & (detections.frame < len(frames)), detections.frame, "detections.frame",
-             f"is not a row of {len(frames)} frames", "the row of frames in which it was made")  # fmt: skip
-    _require(np.diff(detections.frame, prepend=0) >= 0, detections.frame, "detections.frame",
-             "comes after a later frame", "sort the detections by frame")  # fmt: skip
+    _check_frames(detections.frame, len(frames))
     for name in ("landmark_id", "class_id"):
-        ids = getattr(detections, name)
-        _require(ids >= UNKNOWN, ids, f"detections.{name}", "is not an identity", "whole numbers from 0; -1: unknown")
+        _check_ids(getattr(detections, name), f"detections.{name}")
     _check_sensor(recording.sensor)
     if recording.truth is not None:
         _check_trajectory(recording.truth, "truth")
     if recording.true_landmarks is not None:
         check_landmarks(recording.true_landmarks, "true_landmarks")
+
+
+def validate_spatial(recording: Any) -> None:
+    """Check that something is a recording in space from which a session can be estimated.
+
+    Raises:
+        InputError: not a `SpatialRecording`, or a value that cannot be; the message names the array and the row.
+        DataError: no detection, or a single row of odometry.
+    """
+    if not isinstance(recording, SpatialRecording):
+        raise InputError(f"a SpatialRecording is needed, not {type(recording).__name__}", field="recording")
+    source = recording.source or None
+    if len(recording.frames) == 0 or len(recording.detections) == 0:
+        raise DataError("no landmark was seen in the whole recording", path=source, hint="look at the detections")
+    _check_stamps(recording.frames.stamp_s, "frames.stamp_s")
+    if recording.odometry is not None:
+        if len(recording.odometry) < 2:
+            raise DataError("the odometry needs at least two rows", path=source, field="odometry")
+        _check_stamps(recording.odometry.stamp_s, "odometry.stamp_s")
+        _check_poses(recording.odometry.pose_world_robot, "odometry.pose_world_robot")
+        variance = recording.odometry.variance
+        _require(~(variance < 0.0).any(axis=1), variance, "odometry.variance", "is negative", "nan where unknown")
+    _check_spatial_detections(recording.detections, len(recording.frames), len(recording.sensors))
+    for sensor in recording.sensors:
+        _check_spatial_sensor(sensor)
+    if recording.truth is not None:
+        _check_stamps(recording.truth.stamp_s, "truth.stamp_s")
+        _check_poses(recording.truth.pose_world_robot, "truth.pose_world_robot")
+    if recording.true_landmarks is not None:
+        check_landmarks(recording.true_landmarks, "true_landmarks")
+
+
+def _check_spatial_detections(detections: SpatialDetections, frames: int, sensors: int) -> None:
+    _check_frames(detections.frame, frames)
+    row, field = detections.sensor, "detections"
+    _require((row >= 0) & (row < sensors), row, f"{field}.sensor", f"is not one of {sensors} sensors", "count from 0")
+    for name in ("landmark_id", "class_id"):
+        _check_ids(getattr(detections, name), f"{field}.{name}")
+    position, corner = detections.position_sensor_m, detections.corner_px.reshape(len(row), -1)
+    placed, cornered = np.isfinite(position).all(axis=1), np.isfinite(corner).all(axis=1)
+    hint = "a position in the sensor's frame, or the four corners of a tag"
+    _require(placed | cornered, position, f"{field}.position_sensor_m", "is nowhere", hint)
+    turned = ~np.isnan(detections.rotation).all(axis=1)
+    _require(~turned | _is_unit(detections.rotation), detections.rotation, f"{field}.rotation",
+             "is not a unit quaternion", "x, y, z, w; nan of points")  # fmt: skip
+    covariance = detections.covariance_sensor_m2
+    given = ~np.isnan(covariance).all(axis=(1, 2))
+    _require(~given | is_covariance(covariance), row, f"{field}.covariance_sensor_m2", "has no covariance: not positive"
+             " semidefinite", "square metres; nan where unknown")  # fmt: skip
+    for name in ("sigma_rad", "tag_size_m"):
+        value = getattr(detections, name)
+        _require(np.isnan(value) | (value > 0.0), value, f"{field}.{name}", "is not positive", "nan where unknown")
+    size = detections.size_m
+    _require(~(size <= 0.0).any(axis=1), size, f"{field}.size_m", "is not positive", "nan where there is no box")
+
+
+def _check_spatial_sensor(sensor: SpatialSensor) -> None:
+    where = f"sensor '{sensor.name}'"
+    pose = np.asarray(sensor.mount_robot_sensor, dtype=np.float64)
+    if pose.shape != (7,) or not np.isfinite(pose).all() or abs(np.linalg.norm(pose[3:]) - 1.0) > 1e-3:
+        raise InputError(f"{where}: {sensor.mount_robot_sensor} is not a pose", field="sensors.mount_robot_sensor",
+                         hint="x, y, z, qx, qy, qz, qw")  # fmt: skip
+    if sensor.intrinsics is not None and not (
+        min(sensor.intrinsics[:2]) > 0.0 and np.isfinite(sensor.intrinsics).all()
+    ):
+        raise InputError(f"{where}: {sensor.intrinsics} are not focal lengths and a principal point",
+                         field="sensors.intrinsics", hint="fx, fy, cx, cy in pixels")  # fmt: skip
+    if not sensor.range_min_m < sensor.range_max_m:
+        problem = f"{where}: {sensor.range_min_m} is not below range_max_m = {sensor.range_max_m}"
+        raise InputError(problem, field="sensors.range_min_m")
+    for name in ("sigma_m", "sigma_rad", "sigma_px"):
+        sigma = getattr(sensor, name)
+        if sigma is not None and not 0.0 < sigma < inf:
+            problem = f"{where}: {sigma} is not a standard deviation"
+            raise InputError(problem, field=f"sensors.{name}", hint="None where unknown")
+
+
+def is_covariance(covariance: FloatArray) -> Any:
+    """Return which matrices (M, K, K) are symmetric and, but for rounding, positive semidefinite. Shape (M,)."""
+    size = covariance.shape[-1]
+    variance = covariance[:, range(size), range(size)]
+    with np.errstate(invalid="ignore"):
+        fine = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & (variance >= 0.0).all(axis=1))
+        least = 1e-12 * variance.max(axis=1, initial=0.0, keepdims=True) + 1e-30
+        scale = np.sqrt(np.maximum(variance, least))
+        scaled = np.where(fine[:, None, None], covariance / scale[:, :, None] / scale[:, None, :], 0.0)
+        same = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2), initial=0.0) <= 1e-6
+    return fine & same & (np.linalg.eigvalsh(scaled)[:, 0] >= -1e-6)
+
+
+def _is_unit(quaternion: FloatArray) -> BoolArray:
+    return np.asarray(np.abs(np.linalg.norm(quaternion, axis=-1) - 1.0) <= 1e-3)
+
+
+def _check_poses(pose: FloatArray, field: str) -> None:
+    for quantity, column in zip((X_M, Y_M, Z_M), pose.T, strict=False):
+        quantity.check_array(column, field)
+    _require(_is_unit(pose[:, 3:]), pose, field, "does not end in a unit quaternion", "x, y, z, qx, qy, qz, qw")
 
 
 def check_type(recording: Any) -> None:
@@ -137,19 +249,20 @@ def check_landmarks(landmarks: Any, field: str) -> None:
     if not isinstance(landmarks, Landmarks):
         hint = "evermap.io.read_prior_map(FILE)"
         raise InputError(f"Landmarks are needed, not {type(landmarks).__name__}", field=field, hint=hint)
-    for quantity, column in zip((X_M, Y_M), landmarks.position_m.T, strict=True):
+    for quantity, column in zip((X_M, Y_M, Z_M), landmarks.position_m.T, strict=False):
         quantity.check_array(column, f"{field}.position_m")
     P_EXISTS.check_array(landmarks.p_exists, f"{field}.p_exists")
     ids, covariance = landmarks.landmark_id, landmarks.covariance_m2
     again = np.ones(len(ids), dtype=bool)
     again[np.unique(ids, return_index=True)[1]] = False
     _require(~again, ids, f"{field}.landmark_id", "is listed twice", "one row a landmark")
-    variance = covariance[:, [0, 1], [0, 1]]
-    size = variance.prod(axis=1) - covariance[:, 0, 1] * covariance[:, 1, 0]
-    with np.errstate(invalid="ignore"):
-        fine = np.isfinite(covariance).all(axis=(1, 2)) & (variance >= 0.0).all(axis=1)
-        fine &= size >= -1e-6 * variance.prod(axis=1) - 1e-30
-    _require(fine, ids, f"{field}.covariance_m2", "is not a covariance: not positive semidefinite", "square metres")
+    _require(
+        is_covariance(covariance),
+        ids,
+        f"{field}.covariance_m2",
+        "is not a covariance: not positive semidefinite",
+        "square metres",
+    )
 
 
 def _check_trajectory(trajectory: Trajectory, field: str) -> None:
@@ -175,6 +288,17 @@ def _check_sensor(sensor: Sensor) -> None:
         raise InputError(
             f"{sensor.mount_robot_sensor} is not a pose", field="sensor.mount_robot_sensor", hint="x, y, theta"
         )
+
+
+def _check_frames(frame: IntArray, count: int) -> None:
+    _require((frame >= 0) & (frame < count), frame, "detections.frame", f"is not a row of {count} frames",
+             "the row of frames in which it was made")  # fmt: skip
+    _require(np.diff(frame, prepend=0) >= 0, frame, "detections.frame", "comes after a later frame",
+             "sort the detections by frame")  # fmt: skip
+
+
+def _check_ids(ids: IntArray, field: str) -> None:
+    _require(ids >= UNKNOWN, ids, field, "is not an identity", "whole numbers from 0; -1: unknown")
 
 
 def _check_stamps(stamp_s: FloatArray, field: str) -> None:

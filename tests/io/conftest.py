@@ -60,6 +60,53 @@ def native() -> Files:
 
 
 @pytest.fixture
+def tagslam() -> Files:
+    """Two cameras side by side, which see a tag head on, 2 m ahead; odometry, reference and survey."""
+    pose = "1.0,2.0,0.5,0,0,0,1"
+    corners = {"cam0": "370,290,430,290,430,230,370,230", "cam1": "330,290,390,290,390,230,330,230"}
+    mount = (
+        "{0}:\n  pose:\n    position: # in the rig\n      x: {1}\n      y: 0\n      z: 0\n"
+        "    rotation:\n      x: 0.0\n      y: 0.0\n      z: 0.0\n"
+    )
+    camera = (
+        "{0}:\n  camera_model: pinhole\n  intrinsics: [400.0, 400.0, 320, 240]\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [0.0, 0.0, 0.0, 0.0]\n  resolution: [640, 480]\n  tagtopic: /{0}/tags\n"
+    )
+    return {
+        "cameras.yaml": "".join(camera.format(name) for name in corners),
+        "camera_poses.yaml": mount.format("cam0", "0.1") + mount.format("cam1", "0.3"),
+        "tagslam.yaml": "default_body: hall\nbodies:\n - hall:\n     is_static: true\n     default_tag_size: 0.3\n"
+        '     tags:\n       - id: 7\n         size: 0.30\n - rig:\n     odom_topic: "/odom"\n     T_body_odom:\n'
+        "       position:\n         x: 0.5\n         y: 0.0\n         z: 0.0\n       rotation:\n         x: 0.0\n"
+        "         y: 0.0\n         z: 1.5707963267948966\n",
+        "detections.csv": "stamp_s,camera,tag_id,hamming,u0_px,v0_px,u1_px,v1_px,u2_px,v2_px,u3_px,v3_px\n"
+        f"0.5,cam0,7,0,{corners['cam0']}\n0.5,cam1,7,1,{corners['cam1']}\n1.0,cam0,7,2,{corners['cam0']}\n"
+        f"1.0,cam1,99,3,{corners['cam1']}\n",
+        "frames.csv": "stamp_s,camera,n_tags\n0,cam0,0\n0,cam1,0\n0.5,cam0,1\n0.5,cam1,1\n1.0,cam0,1\n1.0,cam1,1\n",
+        "odometry.csv": "stamp_s,x_m,y_m,z_m,qx,qy,qz,qw,cxx,cyy,czz,crr,cpp,cww\n"
+        + "".join(f"{0.25 * i},{0.1 * i},0,0,0,0,0,1,0.01,0.02,0.03,1e-4,2e-4,3e-4\n" for i in range(5)),
+        "reference.csv": f"stamp_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,{pose}\n0.5,{pose}\n",
+        "survey.csv": "tag_id,size_m,x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n7,0.3,3,2,0.5,0,0,1.5707963267948966\n",
+    }
+
+
+@pytest.fixture
+def ycbv() -> Files:
+    """A camera that moves along x past two objects; one is missed twice and has no truth."""
+    stamps = [0.1 * i for i in range(6)]
+    here, gone = "0.5 0.1 1 0.6 0 0 0.8", "0 0 0 0 0 0 0"
+    seen = "".join(f"{s:.1f} {1 - s:.1f} 0 2 0 0 0 1\n" for s in stamps)
+    path = "".join(f"{s:.6f} {s:.1f} 0 0 0 0 0 1\n" for s in stamps)
+    return {
+        "odometry.tum": path,
+        "detections_002_can.tum": seen,
+        "detections_001_box.tum": "".join(f"{s:.1f} {gone if i in (1, 4) else here}\n" for i, s in enumerate(stamps)),
+        "camera_truth.tum": path,
+        "object_truth_002_can.tum": seen,
+    }
+
+
+@pytest.fixture
 def lay_out(tmp_path: Path) -> Callable[..., Path]:
     """`lay_out(files, zipped=..., inside=...)` writes files into a folder or zip, `inside` a folder of it."""
 

@@ -11,7 +11,7 @@ import pytest
 
 from evermap.errors import InputError
 from evermap.io import READERS, Reader, list_robots, read_recording, reader_for
-from evermap.types import Recording
+from evermap.types import Recording, SpatialRecording
 
 
 @pytest.fixture(params=[reader.name for reader in READERS])
@@ -28,9 +28,10 @@ def test_protocol(reader_and_path: tuple[Reader, Path], check_recording: Callabl
     assert [other.name for other in READERS if other.matches(path)] == [reader.name]
     assert reader.looks_for
     recording = read_recording(path)
-    assert isinstance(recording, Recording)
+    assert isinstance(recording, Recording | SpatialRecording)
     assert recording.source == str(path)
-    check_recording(recording)
+    if isinstance(recording, Recording):
+        check_recording(recording)
     robots = list_robots(path)
     assert robots == tuple(sorted(robots))
     for robot in robots:
@@ -50,7 +51,7 @@ def test_unknown_paths_say_what_was_looked_for(tmp_path: Path, mrclam: dict[str,
         read_recording(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(
-        InputError, match=r"holds no files; looked for mrclam: .*Barcodes\.dat; native: .*detections\.csv"
+        InputError, match=r"holds no files; looked for mrclam: .*Barcodes\.dat; tagslam: .*; native: .*detections\.csv"
     ):
         read_recording(tmp_path / "empty")
     (tmp_path / "photos").mkdir()

@@ -34,10 +34,10 @@ def check(
       evermap check MRCLAM_Dataset6.zip --robot 1 --json
     """
     chosen = configured(config, settings, within="slam.check", show=show_config)
-    from evermap.io import read_recording
+    from evermap.io import read_planar
     from evermap.slam.check import check_recording
 
-    found = check_recording(read_recording(input, robot=robot), chosen)
+    found = check_recording(read_planar(input, robot=robot), chosen)
     if as_json:
         print_json(found.as_dict())
     else:

@@ -46,12 +46,13 @@ def convert(
         write_native(recording, folder.path("."), table_format.value)
     for remark in recording.warnings:
         warn(remark)
+    odometry = 0 if recording.odometry is None else len(recording.odometry)
     if as_json:
         print_json(
             {
                 "name": recording.name,
                 "out": str(out),
-                "odometry": len(recording.odometry),
+                "odometry": odometry,
                 "frames": len(recording.frames),
                 "detections": len(recording.detections),
                 "warnings": list(recording.warnings),
@@ -59,6 +60,6 @@ def convert(
         )
     else:
         say(
-            f"wrote {out}: {len(recording.odometry)} odometry rows, {len(recording.frames)} frames, "
+            f"wrote {out}: {odometry} odometry rows, {len(recording.frames)} frames, "
             f"{len(recording.detections)} detections"
         )

@@ -160,14 +160,14 @@ def slam(
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if shift and prior_map is None:
         raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
-    from evermap.io import parse_shift, read_recording, shifted
+    from evermap.io import parse_shift, read_planar, shifted
     from evermap.runs.folder import check_replaceable
 
     shifts = [parse_shift(text) for text in shift or []]
     inputs = [input, config, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force, inputs=inputs)
-    recording = read_recording(input, robot=robot)
+    recording = read_planar(input, robot=robot)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)

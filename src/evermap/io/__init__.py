@@ -7,7 +7,7 @@ from evermap.io.landmarks import read_landmarks, read_prior_map, write_map_geojs
 from evermap.io.mrclam import read_mrclam
 from evermap.io.native import read_native
 from evermap.io.native_write import write_native
-from evermap.io.registry import READERS, list_robots, read_recording, reader_for
+from evermap.io.registry import READERS, list_robots, read_planar, read_recording, reader_for
 from evermap.io.shifts import Shift, parse_shift, shifted
 from evermap.io.template import write_template
 from evermap.io.tum import read_tum, write_tum
@@ -21,6 +21,7 @@ __all__ = [
     "read_landmarks",
     "read_mrclam",
     "read_native",
+    "read_planar",
     "read_prior_map",
     "read_recording",
     "read_tum",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -11,11 +12,31 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se2
 from evermap.io.table import Table
 from evermap.io.text import counted
-from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, IntArray, Odometry, Recording, rows_of
-from evermap.valid import STAMP_S, validate
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    Clock,
+    Detections,
+    FloatArray,
+    Frames,
+    IntArray,
+    Odometry,
+    Recording,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    rows_of,
+)
+from evermap.valid import STAMP_S, validate, validate_spatial
+
+SAME_STAMP_S: float = 1e-6
+"""Stamps closer than this are the same instant when detections are put into frames."""
 
 ODOMETRY_GAP_S: float = 10.0
 """Pauses of the odometry beyond this are reported, and frames farther than this from any odometry are left out."""
+
+
+_Seen = TypeVar("_Seen", Detections, SpatialDetections)
 
 
 def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
@@ -57,6 +78,56 @@ def last_of_equal(stamp_s: FloatArray, *, path: Path, warnings: list[str]) -> Bo
     return np.asarray(keep, dtype=np.bool_)
 
 
+def frames_of(
+    table: Table,
+    frame_table: Table | None,
+    *,
+    complete: bool | None,
+    clock: Clock,
+    warnings: list[str],
+    several: bool = False,
+) -> tuple[Frames, IntArray]:
+    """Return the frames of a recording, and (M,) the one in which each detection was made.
+
+    Args:
+        table: the detections.
+        frame_table: every instant at which a sensor looked; None takes the distinct stamps of the detections.
+        complete: whether empty frames are listed; None: they are where there is a table of frames.
+        clock: of all stamps.
+        warnings: gets a remark on repeated frames.
+        several: whether several sensors may look at the same instant, which needs no remark.
+
+    Raises:
+        InputError: time runs backwards, or a detection lies in no frame.
+    """
+    stamp_s = forward_stamps(table)
+    complete = complete if complete is not None else frame_table is not None
+    looked_s = stamp_s if frame_table is None else forward_stamps(frame_table)
+    is_first = np.diff(looked_s, prepend=-np.inf) > SAME_STAMP_S
+    if frame_table is not None and not several and not is_first.all():
+        merged = counted(int(np.sum(~is_first)), "row")
+        warnings.append(f"{frame_table.path.name}: {merged} with the stamp of the row before left out")
+    frame_of_look = np.cumsum(is_first) - 1
+    frame = frame_of_look[_nearest_look(stamp_s, looked_s, table, frame_table)]
+    return Frames(looked_s[is_first], complete=complete, clock=clock), np.asarray(frame, dtype=np.int64)
+
+
+def finish_spatial(recording: SpatialRecording, *, warnings: list[str]) -> SpatialRecording:
+    """Return a recording in space as `finish_recording` does one of the plane; there may be no odometry at all."""
+    source = recording.source
+    validate_spatial(recording)
+    if recording.odometry is not None:
+        _warn_of_gaps(recording.odometry, warnings)
+        frames, detections = _without_far_frames(
+            recording.odometry, recording.frames, recording.detections, source, warnings
+        )
+        recording = replace(recording, frames=frames, detections=detections)
+    if len(recording.detections) == 0:
+        raise DataError("no landmark was seen while there was odometry", path=source)
+    _warn_of_repeats(recording.detections, warnings)
+    return replace(recording, warnings=tuple(warnings))
+
+
 def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
     """Return the recording with frames that have no odometry near them left out and all remarks counted.
 
@@ -66,14 +137,17 @@ def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
     source = recording.source
     validate(recording)
     _warn_of_gaps(recording.odometry, warnings)
-    recording = _without_far_frames(recording, warnings)
+    frames, detections = _without_far_frames(
+        recording.odometry, recording.frames, recording.detections, source, warnings
+    )
+    recording = replace(recording, frames=frames, detections=detections)
     if len(recording.detections) == 0:
         raise DataError("no landmark was seen while there was odometry", path=source)
     _warn_of_repeats(recording.detections, warnings)
     return replace(recording, warnings=tuple(warnings))
 
 
-def _warn_of_gaps(odometry: Odometry, warnings: list[str]) -> None:
+def _warn_of_gaps(odometry: Odometry | SpatialOdometry, warnings: list[str]) -> None:
     pause = np.diff(odometry.stamp_s)
     gaps = np.flatnonzero(pause > ODOMETRY_GAP_S)
     if len(gaps):
@@ -85,16 +159,17 @@ def _warn_of_gaps(odometry: Odometry, warnings: list[str]) -> None:
         )
 
 
-def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
-    odometry, frames, detections = recording.odometry, recording.frames, recording.detections
+def _without_far_frames(
+    odometry: Odometry | SpatialOdometry, frames: Frames, detections: _Seen, source: str, warnings: list[str]
+) -> tuple[Frames, _Seen]:
     first, last = odometry.stamp_s[0], odometry.stamp_s[-1]
     keep = (frames.stamp_s >= first - ODOMETRY_GAP_S) & (frames.stamp_s <= last + ODOMETRY_GAP_S)
     if keep.all():
-        return recording
+        return frames, detections
     if not keep.any():
         looked = f"{frames.stamp_s[0]:.3f} to {frames.stamp_s[-1]:.3f} s"
         problem = f"odometry ({first:.3f} to {last:.3f} s) and detections ({looked}) do not overlap in time"
-        raise DataError(problem, path=recording.source, hint="stamp both with the same clock, in seconds")
+        raise DataError(problem, path=source, hint="stamp both with the same clock, in seconds")
     seen = keep[detections.frame]
     new_frame = np.cumsum(keep) - 1
     warnings.append(
@@ -103,12 +178,13 @@ def _without_far_frames(recording: Recording, warnings: list[str]) -> Recording:
     )
     kept = rows_of(detections, seen)
     kept = replace(kept, frame=np.asarray(new_frame[kept.frame], dtype=np.int64))
-    return replace(recording, frames=replace(frames, stamp_s=frames.stamp_s[keep]), detections=kept)
+    return replace(frames, stamp_s=frames.stamp_s[keep]), kept
 
 
-def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:
+def _warn_of_repeats(detections: Detections | SpatialDetections, warnings: list[str]) -> None:
     known = np.flatnonzero(detections.landmark_id != UNKNOWN)
-    pairs = np.stack([detections.frame[known], detections.landmark_id[known]], axis=1)
+    sensor = detections.sensor if isinstance(detections, SpatialDetections) else np.zeros_like(detections.frame)
+    pairs = np.stack([detections.frame[known], detections.landmark_id[known], sensor[known]], axis=1)
     again = repeats(pairs)
     if len(again):
         row = known[again[0]]
@@ -116,3 +192,23 @@ def _warn_of_repeats(detections: Detections, warnings: list[str]) -> None:
             f"{counted(len(again), 'detection')} of a landmark that the same frame has already, kept "
             f"(first: landmark {detections.landmark_id[row]}, line {detections.source_line[row]})"
         )
+
+
+def _nearest_look(stamp_s: FloatArray, looked_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
+    """Row of `looked_s` at which each detection was made. Shape (M,).
+
+    Raises:
+        InputError: none of them is within `SAME_STAMP_S` of a detection.
+    """
+    padded_s = np.concatenate([[-np.inf], looked_s, [np.inf]])
+    after = np.searchsorted(looked_s, stamp_s) + 1
+    before_is_nearer = stamp_s - padded_s[after - 1] < padded_s[after] - stamp_s
+    nearest = np.where(before_is_nearer, after - 1, after)
+    lost = np.flatnonzero(np.abs(padded_s[nearest] - stamp_s) > SAME_STAMP_S)
+    if len(lost) and frame_table is not None:  # without frames, the detections' own stamps were the looks
+        row, file = int(lost[0]), frame_table.path.name
+        near = f"; the nearest is {float(padded_s[nearest[row]])!r}" if len(looked_s) else ""
+        problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
+        hint = f"list every instant at which the sensor looked, or leave {file} out"
+        raise table.error(problem, row=row, field="stamp_s", hint=hint)
+    return np.asarray(nearest - 1, dtype=np.int64)

@@ -6,9 +6,7 @@ line and cell at fault; both take the same files and give the same values.
 
 from __future__ import annotations
 
-import gzip
 import re
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import InputError
+from evermap.io.files import unpacked
 from evermap.io.table import Table, arrow_cells, dates_as_text, numbers_of, parse_csv, read_parquet
 from evermap.io.text import quote, reason
 from evermap.types import UNKNOWN, BoolArray, Clock, FloatArray, IntArray
@@ -230,12 +229,7 @@ def _content(path: Path) -> bytes:
         raise InputError("is a folder", path=path, hint="a .csv, .csv.gz or .parquet file") from None
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be read: {reason(error)}", path=path) from error
-    if data[:2] != b"\x1f\x8b":
-        return data
-    try:
-        return gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"damaged gzip file: {reason(error)}", path=path, hint="fetch or pack it again") from error
+    return unpacked(data, path)
 
 
 def _fast_csv(data: bytes, path: Path) -> Columns | None:

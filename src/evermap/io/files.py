@@ -6,6 +6,7 @@ not at all: bytes go to a temporary sibling first and then take the name in one 
 
 from __future__ import annotations
 
+import gzip
 import secrets
 import shutil
 import struct
@@ -19,7 +20,7 @@ from pathlib import Path, PurePosixPath
 from evermap.errors import InputError
 from evermap.interrupts import temporary
 from evermap.io.text import reason
-from evermap.types import Recording
+from evermap.types import Recording, SpatialRecording
 
 # What `zipfile` raises on damaged or encrypted archives, as found by corrupting them at random.
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, struct.error, EOFError, RuntimeError, ValueError, OverflowError)
@@ -56,11 +57,14 @@ class FileSet:
         return self.root / self.members.get(name, str(PurePosixPath(self.folder) / name))
 
     def read(self, name: str) -> bytes:
-        """Return the content of a file.
+        """Return the content of a file, unpacked where it is gzipped.
 
         Raises:
             InputError: it is missing, unreadable, or damaged inside the zip.
         """
+        return unpacked(self._content(name), self.path_of(name))
+
+    def _content(self, name: str) -> bytes:
         if name not in self.members:
             raise InputError("file is missing", path=self.path_of(name))
         try:
@@ -155,6 +159,20 @@ def _zip_sets(path: Path) -> list[FileSet]:
     return [FileSet(path, folder, members, zipped=True) for folder, members in folders.items()]
 
 
+def unpacked(data: bytes, path: Path) -> bytes:
+    """Return the content of a gzipped file, and that of any other as it is.
+
+    Raises:
+        InputError: it is gzipped and damaged.
+    """
+    if data[:2] != b"\x1f\x8b":
+        return data
+    try:
+        return gzip.decompress(data)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"damaged gzip file: {reason(error)}", path=path, hint="fetch or pack it again") from error
+
+
 @dataclass(frozen=True, slots=True)
 class Reader:
     """One format of recordings.
@@ -165,16 +183,20 @@ class Reader:
         holds: whether files look like this format, by their names.
         read: returns the recording of a path and a robot; None for the format's default robot.
         robots: robots in files that can be asked for; none where the format does not number them.
+        endings: of single files that are a recording of this format.
     """
 
     name: str
     looks_for: str
     holds: Callable[[FileSet], bool]
-    read: Callable[[str | Path, int | None], Recording]
+    read: Callable[[str | Path, int | None], Recording | SpatialRecording]
     robots: Callable[[FileSet], tuple[int, ...]] = lambda _: ()
+    endings: tuple[str, ...] = ()
 
     def matches(self, path: str | Path) -> bool:
         """Return whether the files of this format are there, at the top or one folder down."""
+        if self.endings and Path(path).is_file() and Path(path).name.endswith(self.endings):
+            return True
         return find_file_set(path, self.holds) is not None
 
 

@@ -13,6 +13,18 @@ import numpy as np
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
 from evermap.io.files import write_atomic
+from evermap.io.spatial import (
+    AT,
+    BOX,
+    COVARIANCE,
+    QUATERNION,
+    TURN_COVARIANCE,
+    boxes,
+    covariances,
+    positions,
+    quaternions,
+    upper_triangle,
+)
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
 from evermap.io.text import decode_text, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
@@ -21,6 +33,9 @@ from evermap.valid import STAMP_S, X_M, Y_M, Quantity
 MAP_SCHEMA_VERSION = 1
 
 COVARIANCE_COLUMNS = ("cov_xx_m2", "cov_xy_m2", "cov_yy_m2")
+_IN_SPACE = (
+    "z_m", *COVARIANCE, *QUATERNION, "sigma_rad", *TURN_COVARIANCE, *BOX, "tag_size_m",
+)  # fmt: skip
 _REQUIRED = ("landmark_id", "x_m", "y_m")
 _OPTIONAL = (
     "sigma_m", *COVARIANCE_COLUMNS, "class_id", "p_exists", "n_hits", "n_misses", "first_seen_s", "last_seen_s",
@@ -29,6 +44,7 @@ _OPTIONAL = (
 _MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "map.geojson")
 
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
+_SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
 _P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
@@ -97,7 +113,8 @@ def landmarks_from_table(
     Raises:
         InputError: a column or value is not what it must be, or an id appears twice.
     """
-    table.expect(_REQUIRED, _OPTIONAL)
+    in_space = "z_m" in table
+    table.expect(_REQUIRED, (*_OPTIONAL, *(_IN_SPACE if in_space else ())))
     names = {} if names is None else names
     ids = table.ids("landmark_id", optional=False, names=names)
     if "name" in table:
@@ -115,7 +132,7 @@ def landmarks_from_table(
     order = np.argsort(ids)
     landmarks = Landmarks(
         landmark_id=ids,
-        position_m=np.stack([table.numbers(X_M), table.numbers(Y_M)], axis=1),
+        position_m=positions(table) if in_space else np.stack([table.numbers(X_M), table.numbers(Y_M)], axis=1),
         covariance_m2=_covariance(table, sigma_m),
         class_id=class_ids(table, class_names),
         p_exists=table.numbers(_P_EXISTS) if "p_exists" in table else np.ones(count),
@@ -127,6 +144,7 @@ def landmarks_from_table(
         frame=frame,
         clock=clock,
         names=names,
+        **(_pose_columns(table) if in_space else {}),
     )
     return rows_of(landmarks, order)
 
@@ -169,15 +187,20 @@ def names_column(landmarks: Landmarks) -> dict[str, list[str]]:
 
 
 def survey_columns(landmarks: Landmarks) -> dict[str, Any]:
-    """Return ids, positions and covariances."""
-    return {
+    """Return ids, positions and covariances, in space also orientations and sizes where there are any."""
+    in_space = landmarks.position_m.shape[1] == 3
+    columns = {
         "landmark_id": landmarks.landmark_id,
-        "x_m": landmarks.position_m[:, 0],
-        "y_m": landmarks.position_m[:, 1],
-        "cov_xx_m2": landmarks.covariance_m2[:, 0, 0],
-        "cov_xy_m2": landmarks.covariance_m2[:, 0, 1],
-        "cov_yy_m2": landmarks.covariance_m2[:, 1, 1],
+        **dict(zip(AT, landmarks.position_m.T, strict=False)),
+        **upper_triangle(landmarks.covariance_m2, COVARIANCE if in_space else COVARIANCE_COLUMNS),
     }
+    if landmarks.rotation is not None:
+        columns |= dict(zip(QUATERNION, landmarks.rotation.T, strict=True))
+    if landmarks.rotation_covariance is not None:
+        columns |= upper_triangle(landmarks.rotation_covariance, TURN_COVARIANCE)
+    if landmarks.size_m is not None:
+        columns |= dict(zip(BOX, landmarks.size_m.T, strict=True))
+    return columns
 
 
 def about_map(landmarks: Landmarks) -> dict[str, Any]:
@@ -257,25 +280,34 @@ def class_ids(table: Table, class_names: tuple[str, ...]) -> IntArray:
 
 
 def _covariance(table: Table, sigma_m: float) -> FloatArray:
-    covariance = np.zeros((len(table), 2, 2))
-    if table.has_any(COVARIANCE_COLUMNS):
-        if "sigma_m" in table:
-            problem = "both sigma_m and cov_* columns are given"
-            raise table.error(problem, row=None, field="sigma_m", hint="keep one of them")
-        table.expect((*_REQUIRED, *COVARIANCE_COLUMNS), _OPTIONAL)
-        xx, xy, yy = (table.numbers(Quantity(name, -1e12, 1e12)) for name in COVARIANCE_COLUMNS)
-        # estimates of well-known landmarks may miss being positive by rounding
-        wrong = np.flatnonzero((xx < 0) | (yy < 0) | (xy**2 > xx * yy * (1 + 1e-6) + 1e-30))
-        if len(wrong):
-            problem = "is not a covariance: not positive semidefinite"
-            raise table.error(problem, row=int(wrong[0]), field="cov_xx_m2")
-        covariance[:, 0, 0], covariance[:, 1, 1] = xx, yy
-        covariance[:, 0, 1] = covariance[:, 1, 0] = xy
+    names = COVARIANCE if "z_m" in table else COVARIANCE_COLUMNS
+    if "sigma_m" in table and table.has_any(names):
+        problem = "both sigma_m and cov_* columns are given"
+        raise table.error(problem, row=None, field="sigma_m", hint="keep one of them")
+    covariance = covariances(table, names)
+    if covariance is not None:
         return covariance
     sigma = table.numbers(_SIGMA_M) if "sigma_m" in table else np.full(len(table), np.nan)
-    sigma = np.where(np.isnan(sigma), sigma_m, sigma)
-    covariance[:, 0, 0] = covariance[:, 1, 1] = sigma**2
-    return covariance
+    return np.where(np.isnan(sigma), sigma_m, sigma)[:, None, None] ** 2 * np.eye(3 if "z_m" in table else 2)
+
+
+def _pose_columns(table: Table) -> dict[str, FloatArray]:
+    """Orientations, their covariances and sizes, as far as a table in space has them."""
+    found: dict[str, FloatArray] = {}
+    if table.has_any(QUATERNION):
+        found["rotation"] = quaternions(table, optional=True)
+        turn = covariances(table, TURN_COVARIANCE, optional=True)
+        if turn is None:
+            sigma = table.numbers(_SIGMA_RAD) if "sigma_rad" in table else np.zeros(len(table))
+            turn = np.where(np.isnan(sigma), 0.0, sigma)[:, None, None] ** 2 * np.eye(3)
+        turn[np.isnan(found["rotation"]).any(axis=1)] = np.nan
+        found["rotation_covariance"] = turn
+    if table.has_any(BOX):
+        found["size_m"] = boxes(table)
+    elif "tag_size_m" in table:
+        edge = table.numbers(Quantity("tag_size_m", 0.0, 1e3, positive=True, optional=True, hint="metres"))
+        found["size_m"] = edge[:, None] * [1.0, 1.0, 0.0]
+    return found
 
 
 def _seen(name: str) -> Quantity:
@@ -300,17 +332,17 @@ def write_map_geojson(landmarks: Landmarks, path: str | Path) -> Path:
     """Write a map as GeoJSON: two features a landmark. Returns the path.
 
     The first is a point with all columns of `map.parquet` as properties and `"kind": "landmark"`; the second, where the
-    covariance is not zero, the polygon of its 2-sigma ellipse (Mahalanobis distance 2, 86.5 % of the probability) with
-    `"kind": "ellipse_2sigma"` and the same `landmark_id`. `read_landmarks` gives back equal arrays.
+    covariance is not zero, the polygon of its 2-sigma ellipse in x and y (Mahalanobis distance 2, 86.5 % of the
+    probability) with `"kind": "ellipse_2sigma"` and the same `landmark_id`. `read_landmarks` gives back equal arrays.
     """
     columns = {
         name: cells if isinstance(cells, list) else cells.tolist() for name, cells in map_columns(landmarks).items()
     }
-    ellipses = ellipse_polygons(landmarks.position_m, landmarks.covariance_m2)
+    ellipses = ellipse_polygons(landmarks.position_m[:, :2], landmarks.covariance_m2[:, :2, :2])
     features: list[dict[str, Any]] = []
     for row, identity in enumerate(columns["landmark_id"]):
         properties = {name: _plain(cells[row]) for name, cells in columns.items()}
-        point = [properties["x_m"], properties["y_m"]]
+        point = [properties[name] for name in AT if name in properties]
         features.append(_feature({"kind": "landmark", **properties}, "Point", point))
         if landmarks.covariance_m2[row].any():
             ellipse = {"kind": "ellipse_2sigma", "landmark_id": identity}

@@ -11,12 +11,14 @@ import numpy as np
 from evermap import valid as q
 from evermap.errors import DataError, InputError, similar
 from evermap.geometry import se2
-from evermap.io.assemble import finish_recording, forward_stamps, last_of_equal, wrap_far
+from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal, wrap_far
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.native_space import in_space, spatial_recording
+from evermap.io.rig_toml import CAMERA_FILE, SENSOR_FILE, read_rig
 from evermap.io.sensor_toml import Settings, parse_sensor_toml
 from evermap.io.table import Table, parse_csv, parse_parquet
-from evermap.io.text import counted
+from evermap.io.tagslam import is_tagslam
 from evermap.types import (
     Clock,
     Detections,
@@ -26,28 +28,29 @@ from evermap.types import (
     Odometry,
     Recording,
     RobotSightings,
+    SpatialRecording,
     Trajectory,
 )
 
 TABLES = ("odometry", "detections", "frames", "truth", "landmarks", "robot_sightings", "objects")
-ENDINGS = (".csv", ".parquet")
-SENSOR_FILE = "sensor.toml"
+ENDINGS = (".csv", ".csv.gz", ".parquet")
 
 _VELOCITIES = ("forward_mps", "angular_radps")
 _INCREMENTS = ("dx_m", "dy_m", "dtheta_rad")
 
 
-def read_native(path: str | Path, robot: int | None = None) -> Recording:
+def read_native(path: str | Path, robot: int | None = None) -> Recording | SpatialRecording:
     """Return a recording in the plain native format.
 
     Args:
-        path: folder, or zip of a folder, with `odometry` and `detections` as `.csv` or `.parquet`, and optionally
-            `frames`, `truth`, `landmarks`, `robot_sightings`, `objects` and `sensor.toml`.
+        path: folder, or zip of a folder, with `odometry` and `detections` as `.csv`, `.csv.gz` or `.parquet`, and
+            optionally `frames`, `truth`, `landmarks`, `robot_sightings`, `objects`, `sensor.toml` and `camera.toml`.
         robot: must be None; a native recording is of one robot.
 
     Returns:
         Odometry as body velocities: increments become the constant twist that makes them (SE(2) logarithm). Frames from
-        `frames`, else one for every distinct detection stamp with `complete=False`.
+        `frames`, else one for every distinct detection stamp with `complete=False`. A `SpatialRecording` where the
+        columns are those of space; its odometry may be missing.
 
     Raises:
         InputError: a file or value is malformed, with its line; or stamps contradict each other.
@@ -61,11 +64,26 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         raise InputError(problem, path=path, hint="leave the robot out")
     warnings: list[str] = []
     _warn_of_similar_names(files, warnings)
-    settings = _read_settings(files, warnings)
     tables = {name: _read_table(files, name, warnings) for name in TABLES}
-    odometry_table, detection_table = (_needed(name, tables, files) for name in ("odometry", "detections"))
-    clock = _clock(settings, tables, files)
-    settings = replace(settings, clock=clock)
+    detection_table = _needed("detections", tables, files)
+    if in_space(tables, files):
+        rig = read_rig(files, warnings)
+        settings = replace(rig.settings, clock=_clock(rig.settings, tables, files))
+        return spatial_recording(
+            tables, replace(rig, settings=settings), title=files.title, source=str(path), warnings=warnings
+        )
+    settings = _read_settings(files, warnings)
+    settings = replace(settings, clock=_clock(settings, tables, files))
+    tables = {**tables, "odometry": _needed("odometry", tables, files), "detections": detection_table}
+    return _planar_recording(tables, settings, title=files.title, source=str(path), warnings=warnings)
+
+
+def _planar_recording(
+    tables: Mapping[str, Table | None], settings: Settings, *, title: str, source: str, warnings: list[str]
+) -> Recording:
+    odometry_table, detection_table, clock = tables["odometry"], tables["detections"], settings.clock
+    assert odometry_table is not None
+    assert detection_table is not None
     names: dict[int, str] = {}
     class_names = settings.class_names
     if class_names is None:
@@ -76,7 +94,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
     )
     landmarks = tables["landmarks"]
     recording = Recording(
-        name=settings.name or files.title,
+        name=settings.name or title,
         odometry=odometry,
         frames=frames,
         detections=detections,
@@ -88,7 +106,7 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording:
         robot_sightings=_robot_sightings(tables["robot_sightings"], clock),
         objects=_objects(tables["objects"], names),
         class_names=class_names,
-        source=str(path),
+        source=source,
         clock=clock,
         landmark_names=names,
     )
@@ -105,7 +123,8 @@ def _needed(name: str, tables: Mapping[str, Table | None], files: FileSet) -> Ta
 
 def _is_native(files: FileSet) -> bool:
     """Return whether a file set holds odometry or detections under their native names."""
-    return any(f"{name}{ending}" in files for name in ("odometry", "detections") for ending in ENDINGS)
+    named = any(f"{name}{ending}" in files for name in ("odometry", "detections") for ending in ENDINGS)
+    return named and not is_tagslam(files)
 
 
 NATIVE = Reader("native", "folder or zip with odometry.csv and detections.csv (or .parquet)", _is_native, read_native)
@@ -122,11 +141,11 @@ def _read_table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
     present = [f"{name}{ending}" for ending in ENDINGS if f"{name}{ending}" in files]
     if not present:
         return None
-    if len(present) == 2:
+    if len(present) > 1:
         raise InputError(f"lies beside {present[1]}", path=files.path_of(present[0]), hint="remove one of them")
     file = present[0]
     data, path = files.read(file), files.path_of(file)
-    return parse_csv(data, path, warnings) if file.endswith(".csv") else parse_parquet(data, path)
+    return parse_parquet(data, path) if file.endswith(".parquet") else parse_csv(data, path, warnings)
 
 
 def _odometry(table: Table, clock: Clock, warnings: list[str]) -> Odometry:
@@ -232,15 +251,12 @@ def _objects(table: Table | None, names: dict[int, str]) -> IntArray:
 
 def _warn_of_similar_names(files: FileSet, warnings: list[str]) -> None:
     """A misspelt optional file would be missed in silence."""
-    known = [f"{name}{ending}" for name in TABLES for ending in ENDINGS] + [SENSOR_FILE]
+    known = [f"{name}{ending}" for name in TABLES for ending in ENDINGS] + [SENSOR_FILE, CAMERA_FILE]
     for name in files.members:
         meant = similar(name, known, cutoff=0.85)
         if name not in known and meant:
             warnings.append(f"file {name} is not read; did you mean {meant}?")
 
-
-SAME_STAMP_S: float = 1e-6
-"""Stamps closer than this are the same instant when detections are put into frames."""
 
 POLAR = ("range_m", "bearing_rad")
 _CARTESIAN = ("x_m", "y_m")
@@ -271,21 +287,15 @@ def frames_and_detections(
     """
     given = table.one_form(POLAR, _CARTESIAN)
     table.expect(("stamp_s", "landmark_id", *given), ("class_id", *_POLAR_SIGMAS, *_ROUND_SIGMAS))
-    stamp_s = forward_stamps(table)
-    complete = settings.frames_complete if settings.frames_complete is not None else frame_table is not None
-    looked_s = stamp_s
     if frame_table is not None:
         frame_table.expect(("stamp_s",))
-        looked_s = forward_stamps(frame_table)
-    is_first = np.diff(looked_s, prepend=-np.inf) > SAME_STAMP_S
-    if frame_table is not None and not is_first.all():
-        merged = counted(int(np.sum(~is_first)), "row")
-        warnings.append(f"{frame_table.path.name}: {merged} with the stamp of the row before left out")
-    frame_of_look = np.cumsum(is_first) - 1
+    frames, frame = frames_of(
+        table, frame_table, complete=settings.frames_complete, clock=settings.clock, warnings=warnings
+    )
     range_m, bearing_rad = polar(table) if given is POLAR else _polar_of_cartesian(table)
     sigma_range_m, sigma_bearing_rad = _sigmas(table, range_m)
     detections = Detections(
-        frame=frame_of_look[_nearest_look(stamp_s, looked_s, table, frame_table)],
+        frame=frame,
         landmark_id=table.ids("landmark_id", optional=True, names=names),
         range_m=range_m,
         bearing_rad=bearing_rad,
@@ -294,7 +304,7 @@ def frames_and_detections(
         sigma_bearing_rad=sigma_bearing_rad,
         source_line=np.asarray(table.line, dtype=np.int64),
     )
-    return Frames(looked_s[is_first], complete=complete, clock=settings.clock), detections
+    return frames, detections
 
 
 def polar(table: Table) -> tuple[FloatArray, FloatArray]:
@@ -325,23 +335,3 @@ def _sigmas(table: Table, range_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         table.numbers(q.SIGMA_RANGE_M) if "sigma_range_m" in table else unknown,
         table.numbers(q.SIGMA_BEARING_RAD) if "sigma_bearing_rad" in table else unknown.copy(),
     )
-
-
-def _nearest_look(stamp_s: FloatArray, looked_s: FloatArray, table: Table, frame_table: Table | None) -> IntArray:
-    """Row of `looked_s` at which each detection was made. Shape (M,).
-
-    Raises:
-        InputError: none of them is within `SAME_STAMP_S` of a detection.
-    """
-    padded_s = np.concatenate([[-np.inf], looked_s, [np.inf]])
-    after = np.searchsorted(looked_s, stamp_s) + 1
-    before_is_nearer = stamp_s - padded_s[after - 1] < padded_s[after] - stamp_s
-    nearest = np.where(before_is_nearer, after - 1, after)
-    lost = np.flatnonzero(np.abs(padded_s[nearest] - stamp_s) > SAME_STAMP_S)
-    if len(lost) and frame_table is not None:  # without frames, the detections' own stamps were the looks
-        row, file = int(lost[0]), frame_table.path.name
-        near = f"; the nearest is {float(padded_s[nearest[row]])!r}" if len(looked_s) else ""
-        problem = f"{float(stamp_s[row])!r} and {len(lost) - 1} more have no row in {file}{near}"
-        hint = f"list every instant at which the sensor looked, or leave {file} out"
-        raise table.error(problem, row=row, field="stamp_s", hint=hint)
-    return np.asarray(nearest - 1, dtype=np.int64)

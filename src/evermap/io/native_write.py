@@ -11,21 +11,24 @@ import numpy as np
 from evermap.errors import ConfigError
 from evermap.io.files import staged_folder
 from evermap.io.landmarks import labels_of, survey_columns
-from evermap.io.native import SENSOR_FILE
+from evermap.io.native_space import CORNERS, VARIANCES
+from evermap.io.rig_toml import SENSOR_FILE, rig_toml
 from evermap.io.sensor_toml import Settings, sensor_toml
+from evermap.io.spatial import AT, BOX, COVARIANCE, QUATERNION, upper_triangle
 from evermap.io.table import csv_text, parquet_bytes
-from evermap.types import UNKNOWN, IntArray, Recording
+from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording, Sensor, SpatialRecording
 
 
 def write_native(
-    recording: Recording,
+    recording: Recording | SpatialRecording,
     folder: str | Path,
     format: Literal["csv", "parquet"] = "csv",  # noqa: A002 (the word that callers expect)
 ) -> Path:
     """Write a recording as a native folder and returns the folder.
 
-    Odometry is written as velocities, detections as range and bearing. What is derived from files is not written:
-    `source`, `warnings` and the line numbers of detections.
+    Odometry is written as velocities, in space as poses; detections as range and bearing, in space as positions,
+    orientations and corners. What is derived from files is not written: `source`, `warnings` and the line numbers of
+    detections.
 
     Args:
         recording: what to write.
@@ -39,8 +42,14 @@ def write_native(
     if format not in ("csv", "parquet"):
         raise ConfigError(f"there is no native format '{format}'", field="format", hint="csv or parquet")
     with staged_folder(folder) as staging:
-        (staging / SENSOR_FILE).write_text(sensor_toml(_settings(recording)), encoding="utf-8")
-        for name, columns in native_tables(recording).items():
+        settings = _settings(recording)
+        if isinstance(recording, Recording):
+            texts, tables = {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
+        else:
+            texts, tables = rig_toml(recording.sensors, settings), spatial_tables(recording)
+        for name, text in texts.items():
+            (staging / name).write_text(text, encoding="utf-8")
+        for name, columns in tables.items():
             if format == "csv":
                 (staging / f"{name}.csv").write_text(csv_text(columns), encoding="utf-8", newline="\n")
             else:
@@ -73,13 +82,7 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
         pose = zip(("x_m", "y_m", "theta_rad"), recording.truth.pose_world_robot.T, strict=True)
         tables["truth"] = {"stamp_s": recording.truth.stamp_s, **dict(pose)}
     if recording.true_landmarks is not None:
-        landmarks = recording.true_landmarks
-        tables["landmarks"] = survey_columns(landmarks)
-        tables["landmarks"]["landmark_id"] = _called(
-            landmarks.landmark_id, {**recording.landmark_names, **landmarks.names}
-        )
-        if np.any(landmarks.class_id != UNKNOWN):
-            tables["landmarks"]["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or names)
+        tables["landmarks"] = _survey(recording.true_landmarks, recording.landmark_names, names)
     if recording.robot_sightings is not None:
         shown = ("stamp_s", "robot_id", "range_m", "bearing_rad")
         tables["robot_sightings"] = {name: getattr(recording.robot_sightings, name) for name in shown}
@@ -89,6 +92,59 @@ def native_tables(recording: Recording) -> dict[str, dict[str, Any]]:
     return tables
 
 
+def spatial_tables(recording: SpatialRecording) -> dict[str, dict[str, Any]]:
+    """Return columns as `native_tables`, of a recording in space; columns that hold nothing are left out."""
+    odometry, detections, names = recording.odometry, recording.detections, _class_names(recording)
+    tables: dict[str, dict[str, Any]] = {}
+    if odometry is not None:
+        variances = dict(zip(VARIANCES, odometry.variance.T, strict=True))
+        tables["odometry"] = {"stamp_s": odometry.stamp_s, **_pose(odometry.pose_world_robot), **_given(variances)}
+    sensors = [sensor.name for sensor in recording.sensors]
+    corner = detections.corner_px.reshape(-1, 8)
+    tables["detections"] = {
+        "stamp_s": recording.frames.stamp_s[detections.frame],
+        "sensor": [sensors[row] for row in detections.sensor.tolist()],
+        "landmark_id": _called(detections.landmark_id, recording.landmark_names),
+        **dict(zip(AT, detections.position_sensor_m.T, strict=True)),
+        **_given(
+            {
+                **dict(zip(QUATERNION, detections.rotation.T, strict=True)),
+                **upper_triangle(detections.covariance_sensor_m2, COVARIANCE),
+                "sigma_rad": detections.sigma_rad,
+                **dict(zip(CORNERS, corner.T, strict=True)),
+                "tag_size_m": detections.tag_size_m,
+                **dict(zip(BOX, detections.size_m.T, strict=True)),
+                "score": detections.score,
+            }
+        ),
+    }
+    if np.any(detections.class_id != UNKNOWN):
+        tables["detections"]["class_id"] = labels_of(detections.class_id, names)
+    tables["frames"] = {"stamp_s": recording.frames.stamp_s}
+    if recording.truth is not None:
+        tables["truth"] = {"stamp_s": recording.truth.stamp_s, **_pose(recording.truth.pose_world_robot)}
+    if recording.true_landmarks is not None:
+        tables["landmarks"] = _survey(recording.true_landmarks, recording.landmark_names, names)
+    return tables
+
+
+def _pose(pose: FloatArray) -> dict[str, FloatArray]:
+    return dict(zip((*AT, *QUATERNION), pose.T, strict=True))
+
+
+def _given(columns: dict[str, FloatArray]) -> dict[str, FloatArray]:
+    """The columns in which anything is known."""
+    return {name: column for name, column in columns.items() if not np.all(np.isnan(column))}
+
+
+def _survey(landmarks: Landmarks, names: Mapping[int, str], class_names: tuple[str, ...]) -> dict[str, Any]:
+    columns = survey_columns(landmarks)
+    columns["landmark_id"] = _called(landmarks.landmark_id, {**names, **landmarks.names})
+    if np.any(landmarks.class_id != UNKNOWN):
+        columns["class_id"] = labels_of(landmarks.class_id, landmarks.class_names or class_names)
+    return columns
+
+
 def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     """A column of ids: as they are, or as text where some have a text behind them."""
     if not names.keys() & set(landmark_id.tolist()):
@@ -96,17 +152,17 @@ def _called(landmark_id: IntArray, names: Mapping[int, str]) -> Any:
     return ["" if number == UNKNOWN else names.get(number, str(number)) for number in landmark_id.tolist()]
 
 
-def _settings(recording: Recording) -> Settings:
+def _settings(recording: Recording | SpatialRecording) -> Settings:
     return Settings(
         name=recording.name,
         clock=recording.clock,
         frames_complete=recording.frames.complete,
         class_names=_class_names(recording),
-        sensor=recording.sensor,
+        sensor=recording.sensor if isinstance(recording, Recording) else Sensor(),
     )
 
 
-def _class_names(recording: Recording) -> tuple[str, ...]:
+def _class_names(recording: Recording | SpatialRecording) -> tuple[str, ...]:
     """The recording's classes, those without a name called by their number, and those only on true landmarks."""
     landmarks = recording.true_landmarks
     largest = int(recording.detections.class_id.max(initial=UNKNOWN))

@@ -8,9 +8,11 @@ from evermap.errors import InputError
 from evermap.io.files import Reader, file_sets, find_file_set
 from evermap.io.mrclam import MRCLAM
 from evermap.io.native import NATIVE
-from evermap.types import Recording
+from evermap.io.tagslam import TAGSLAM
+from evermap.io.ycbv import YCBV
+from evermap.types import Recording, SpatialRecording
 
-READERS: tuple[Reader, ...] = (MRCLAM, NATIVE)
+READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, NATIVE)
 """All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
 
 
@@ -34,8 +36,8 @@ def reader_for(path: str | Path) -> Reader:
     raise InputError(f"no recording found, it holds {holds}; looked for {wanted}", path=path)
 
 
-def read_recording(path: str | Path, robot: int | None = None) -> Recording:
-    """Read a recording of any known format.
+def read_recording(path: str | Path, robot: int | None = None) -> Recording | SpatialRecording:
+    """Read a recording of any known format, in the plane or in space.
 
     Args:
         path: folder, zip or file.
@@ -48,8 +50,23 @@ def read_recording(path: str | Path, robot: int | None = None) -> Recording:
     return reader_for(path).read(Path(path), robot)
 
 
+def read_planar(path: str | Path, robot: int | None = None) -> Recording:
+    """Read a recording as `read_recording`, and refuse one that is in space.
+
+    Raises:
+        InputError: as `read_recording`, or the recording is in space.
+        DataError: well-formed, but nothing can be estimated from it.
+    """
+    recording = read_recording(path, robot)
+    if not isinstance(recording, Recording):
+        raise InputError("the recording is in space; this works in the plane", path=path)
+    return recording
+
+
 def list_robots(path: str | Path) -> tuple[int, ...]:
     """Return robots of a recording that can be read, in ascending order; empty where they have no numbers."""
     reader = reader_for(path)
+    if Path(path).is_file() and reader.endings and str(path).endswith(reader.endings):
+        return ()
     files = find_file_set(path, reader.holds)
     return () if files is None else reader.robots(files)

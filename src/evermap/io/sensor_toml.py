@@ -47,14 +47,8 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
     Raises:
         InputError: not TOML, an unknown section or key, a value of the wrong type or out of its limits.
     """
-    text = decode_text(data, path)
-    try:
-        document = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        line = getattr(error, "lineno", None)  # of Python 3.14; before, only the message tells
-        raise InputError(f"not valid TOML: {reason(error)}", path=path, line=line) from None
-    reader = _Reader(document, text, path)
-    reader.expect(("recording", *_LIMITS), document, section=None)
+    reader = TomlReader(data, path)
+    reader.expect(("recording", *_LIMITS), reader.document, section=None)
     values: dict[str, dict[str, float]] = {}
     for section, keys in _LIMITS.items():
         content = reader.section(section, tuple(keys))
@@ -76,6 +70,11 @@ def sensor_toml(settings: Settings) -> str:
         **{name: {key: getattr(sensor, key, None) for key in keys} for name, keys in _LIMITS.items()},
         "mount": dict(zip(_LIMITS["mount"], sensor.mount_robot_sensor, strict=True)),
     }
+    return toml_text(sections)
+
+
+def toml_text(sections: dict[str, dict[str, Any]]) -> str:
+    """Return sections of a TOML file; values that are None, and sections without any, are left out."""
     blocks = []
     for name, content in sections.items():
         lines = [f"{key} = {_toml_value(value)}" for key, value in content.items() if value is not None]
@@ -84,7 +83,7 @@ def sensor_toml(settings: Settings) -> str:
     return "\n".join(blocks)
 
 
-def _sensor(values: dict[str, dict[str, float]], reader: _Reader) -> Sensor:
+def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     mount = values.pop("mount")
     x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
     sensor = Sensor(
@@ -97,11 +96,16 @@ def _sensor(values: dict[str, dict[str, float]], reader: _Reader) -> Sensor:
     return sensor
 
 
-class _Reader:
+class TomlReader:
     """Checked access to a parsed document, with line numbers for the messages."""
 
-    def __init__(self, document: dict[str, Any], text: str, path: Path) -> None:
-        self.document, self.text, self.path = document, text, path
+    def __init__(self, data: bytes, path: Path) -> None:
+        self.path, self.text = path, decode_text(data, path)
+        try:
+            self.document: dict[str, Any] = tomllib.loads(self.text)
+        except (ValueError, RecursionError) as error:
+            line = getattr(error, "lineno", None)  # of Python 3.14; before, only the message tells
+            raise InputError(f"not valid TOML: {reason(error)}", path=path, line=line) from None
 
     def error(self, section: str | None, key: str, problem: str, hint: str | None = None) -> InputError:
         name = f"{section}.{key}" if section else key
@@ -114,7 +118,9 @@ class _Reader:
                 raise self.error(section, key, problem, suggestion(key, known))
 
     def section(self, name: str, known: tuple[str, ...]) -> dict[str, Any]:
-        content = self.document.get(name, {})
+        return self.checked(name, self.document.get(name, {}), known)
+
+    def checked(self, name: str, content: Any, known: tuple[str, ...]) -> dict[str, Any]:
         if not isinstance(content, dict):
             raise self.error(None, name, "must be a section", hint=f"[{name}]")
         self.expect(known, content, name)
@@ -131,6 +137,12 @@ class _Reader:
             hint = "angles in radians" if key.endswith("_rad") else None
             raise self.error(section, key, f"{number:g} is outside [{low:g}, {high:g}]", hint)
         return number
+
+    def numbers(self, section: str, key: str, value: Any, counts: tuple[int, ...]) -> tuple[float, ...]:
+        if not isinstance(value, list) or len(value) not in counts:
+            wanted = " or ".join(map(str, counts))
+            raise self.error(section, key, f"must be a list of {wanted} numbers")
+        return tuple(self.number(section, key, item, -1e9, 1e9) for item in value)
 
     def recording(self, sensor: Sensor) -> Settings:
         content = self.section("recording", _RECORDING)
@@ -163,7 +175,7 @@ class _Reader:
         """Line of `key = ...` or `[key]`; None where the document is written in another style."""
         current: str | None = None
         for number, line in enumerate(self.text.split("\n"), 1):
-            if match := re.match(r"\s*\[\s*([\w-]+)\s*\]", line):
+            if match := re.match(r"\s*\[\s*([\w.-]+)\s*\]", line):
                 current = match[1]
                 if section is None and current == key:
                     return number
@@ -176,13 +188,13 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return _toml_text(value)
+        return _quoted(value)
     if isinstance(value, tuple):
-        return f"[{', '.join(_toml_text(item) for item in value)}]"
+        return f"[{', '.join(_toml_value(item) for item in value)}]"
     return repr(float(value)) if isinstance(value, float) else repr(int(value))
 
 
-def _toml_text(value: str) -> str:
+def _quoted(value: str) -> str:
     escaped = value.replace("\\", "\\\\").replace('"', '\\"')
     printable = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" if ord(c) < 0x10000 else "?" for c in escaped)
     return f'"{printable}"'

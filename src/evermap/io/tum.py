@@ -8,29 +8,45 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import check_forward, last_of_equal
-from evermap.io.files import write_atomic
-from evermap.io.rows import parse_rows
+from evermap.io.files import unpacked, write_atomic
+from evermap.io.rows import Rows, parse_rows
+from evermap.io.spatial import unit
 from evermap.types import Clock, Trajectory
-from evermap.valid import STAMP_S, X_M, Y_M, Quantity
+from evermap.valid import QUATERNION, STAMP_S, X_M, Y_M, Z_M
 
-_QUATERNION = tuple(Quantity(f"q{axis}", -2.0, 2.0, hint="a unit quaternion, scalar last") for axis in "xyzw")
-_COLUMNS = (STAMP_S, X_M, Y_M, Quantity("z_m", -1e8, 1e8), *_QUATERNION)
+_COLUMNS = (STAMP_S, X_M, Y_M, Z_M, *QUATERNION)
 
 
 def write_tum(trajectory: Trajectory, path: str | Path) -> Path:
-    """Write a trajectory with z = 0 and rotations about z; covariances have no place in this format.
+    """Write a trajectory, one of the plane with z = 0 and rotations about z; covariances have no place in this format.
 
     Numbers are written in the shortest form that reads back the same.
     """
-    half = trajectory.pose_world_robot[:, 2] / 2.0
-    columns = (trajectory.stamp_s, *trajectory.pose_world_robot[:, :2].T, np.sin(half), np.cos(half))
+    pose = trajectory.pose_world_robot
+    if pose.shape[1] == 7:
+        lines = [
+            " ".join(map(repr, (stamp, *row))) + "\n"
+            for stamp, row in zip(trajectory.stamp_s.tolist(), pose.tolist(), strict=True)
+        ]
+        return write_atomic(path, "".join(lines))
+    half = pose[:, 2] / 2.0
+    columns = (trajectory.stamp_s, *pose[:, :2].T, np.sin(half), np.cos(half))
     rows = zip(*(column.tolist() for column in columns), strict=True)
     lines = [f"{stamp!r} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n" for stamp, x, y, qz, qw in rows]
     return write_atomic(path, "".join(lines))
 
 
-def read_tum(path: str | Path, *, frame: str = "truth", clock: Clock = Clock.RECORDING) -> Trajectory:
-    """Return a trajectory with its heading taken from the quaternion (z and tilt are left out) and zero covariance.
+def read_tum(
+    path: str | Path, *, frame: str = "truth", clock: Clock = Clock.RECORDING, in_space: bool = False
+) -> Trajectory:
+    """Return a trajectory with zero covariance, from a file that may be gzipped.
+
+    Args:
+        path: of the file.
+        frame: of the trajectory.
+        clock: of its stamps.
+        in_space: whether poses are kept as they are; else the heading is taken from the quaternion, and z and tilt are
+            left out.
 
     Raises:
         InputError: the file is missing or malformed, time runs backwards, or a quaternion is not of unit length.
@@ -38,19 +54,43 @@ def read_tum(path: str | Path, *, frame: str = "truth", clock: Clock = Clock.REC
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        data = unpacked(path.read_bytes(), path)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    rows = parse_rows(data, path, _COLUMNS, [])
+    rows = pose_rows(data, path, [])
     if len(rows) == 0:
         raise DataError("holds no pose", path=path)
     check_forward(rows.column(0), path=path, line=rows.line)
     values = rows.values[last_of_equal(rows.column(0), path=path, warnings=[])]
-    off_unit = np.flatnonzero(np.abs(np.linalg.norm(rows.values[:, 4:], axis=1) - 1.0) > 0.01)
-    if len(off_unit):
-        raise rows.error("is not a unit quaternion", row=int(off_unit[0]), field="qx qy qz qw")
+    stamps = np.ascontiguousarray(values[:, 0])
+    if in_space:
+        pose = np.ascontiguousarray(values[:, 1:])
+        return Trajectory(stamps, pose, np.zeros((len(values), 6, 6)), frame=frame, clock=clock)
     qx, qy, qz, qw = values[:, 4:].T
     theta = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
     pose = np.stack([values[:, 1], values[:, 2], theta], axis=1)
-    stamps = np.ascontiguousarray(values[:, 0])
     return Trajectory(stamps, pose, np.zeros((len(values), 3, 3)), frame=frame, clock=clock)
+
+
+def pose_rows(data: bytes, path: Path, warnings: list[str], *, zeros: bool = False) -> Rows:
+    """Return the rows of a TUM file, stamp and pose, with quaternions at unit length.
+
+    Args:
+        data: content of the file.
+        path: of the file, for messages.
+        warnings: gets a remark on an unfinished last line.
+        zeros: whether seven zeros may stand for no pose.
+
+    Raises:
+        InputError: a line is malformed, or a quaternion is not of unit length within a hundredth.
+    """
+    rows = parse_rows(data, path, _COLUMNS, warnings)
+    wrong = np.abs(np.linalg.norm(rows.values[:, 4:], axis=1) - 1.0) > 0.01
+    if zeros:
+        wrong &= rows.values[:, 1:].any(axis=1)
+    if wrong.any():
+        raise rows.error("is not a unit quaternion", row=int(np.argmax(wrong)), field="qx qy qz qw")
+    values = rows.values.copy()
+    given = values[:, 4:].any(axis=1)
+    values[given, 4:] = unit(values[given, 4:])
+    return Rows(path, values, rows.line)

@@ -130,12 +130,12 @@ def reproduce(
 
 
 def _jobs(data: Path, datasets: tuple[int, ...]) -> Iterator[Job]:
-    from evermap.io import list_robots, read_recording
+    from evermap.io import list_robots, read_planar
 
     for dataset in datasets:
         path = find_dataset(data, dataset)
         for robot in list_robots(path):
-            recording = read_recording(path, robot=robot)
+            recording = read_planar(path, robot=robot)
             yield Job(dataset, robot, recording)
 
 

@@ -132,9 +132,9 @@ def recording_of(data: Path, dataset: int, robot: int) -> Recording:
         from evermap_studies.sim import BuildingConfig, simulate_building
 
         return simulate_building(BuildingConfig(days=1, change_rate=0.0), seed=robot).sessions[0]
-    from evermap.io import read_recording
+    from evermap.io import read_planar
 
-    return read_recording(find_dataset(data, dataset), robot=robot)
+    return read_planar(find_dataset(data, dataset), robot=robot)
 
 
 def survey_of(recording: Recording) -> Landmarks:

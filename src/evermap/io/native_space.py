@@ -1,0 +1,368 @@
+"""The tables of a native recording in space, as `docs/formats.md` lays down; `native` reads the files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from evermap import valid as q
+from evermap.errors import DataError
+from evermap.geometry import se3
+from evermap.geometry.camera import unproject
+from evermap.io.assemble import finish_spatial, forward_stamps, frames_of, last_of_equal
+from evermap.io.files import FileSet
+from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
+from evermap.io.rig_toml import CAMERA_FILE, Rig
+from evermap.io.spatial import (
+    AT,
+    BOX,
+    COVARIANCE,
+    QUATERNION,
+    boxes,
+    covariances,
+    poses,
+    positions,
+    quaternions,
+    spatial_detections,
+    unit,
+    with_tag_poses,
+)
+from evermap.io.table import Table
+from evermap.io.text import counted
+from evermap.types import (
+    BoolArray,
+    Clock,
+    FloatArray,
+    IntArray,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    Trajectory,
+    rows_of,
+)
+from evermap.valid import Quantity
+
+TWIST = tuple(quantity.name for quantity in q.TWIST)
+VARIANCES = ("var_x_m2", "var_y_m2", "var_z_m2", "var_rx_rad2", "var_ry_rad2", "var_rz_rad2")
+CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "uv")
+"""Corners of a tag counter-clockwise from its lower left, as AprilTag detectors list them."""
+POINT = ("u_px", "v_px")
+RIGHT = ("u_right_px", "v_right_px")
+IMAGE_BOX = ("left_px", "top_px", "right_px", "bottom_px")
+"""A box in the image, as object detectors give it beside a box in space; not used."""
+_WHERE = ("sensor", "camera")
+
+_IN_SPACE = {
+    "odometry": ("z_m", *QUATERNION, *TWIST),
+    "detections": ("z_m", *QUATERNION, *CORNERS, *POINT),
+    "truth": ("z_m", *QUATERNION),
+}
+_PIXEL_LIMIT = 1e6
+
+
+def _pixel(name: str) -> Quantity:
+    return Quantity(name, -_PIXEL_LIMIT, _PIXEL_LIMIT, optional=True, hint="pixels")
+
+
+def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
+    """Return whether tables are those of a recording in space: their columns decide, and a `camera.toml`."""
+    found = {name: tables[name] for name in _IN_SPACE}
+    return CAMERA_FILE in files or any(
+        table is not None and table.has_any(_IN_SPACE[name]) for name, table in found.items()
+    )
+
+
+def spatial_recording(
+    tables: Mapping[str, Table | None], rig: Rig, *, title: str, source: str, warnings: list[str]
+) -> SpatialRecording:
+    """Return the recording that native tables hold.
+
+    Args:
+        tables: by name; `detections` is there.
+        rig: the sensors.
+        title: name of the recording where its settings give none.
+        source: where it was read from.
+        warnings: gets remarks.
+
+    Raises:
+        InputError: a value is malformed, with its line; or stamps contradict each other.
+        DataError: nothing to estimate from.
+    """
+    table, landmarks, settings = tables["detections"], tables["landmarks"], rig.settings
+    assert table is not None
+    names: dict[int, str] = {}
+    class_names = settings.class_names
+    if class_names is None:
+        class_names = distinct_labels(table, landmarks)
+    table = _by_sensor(table)
+    frame_table = tables["frames"]
+    if frame_table is not None:
+        frame_table.expect(("stamp_s",), _WHERE)
+    frames, frame = frames_of(
+        table,
+        frame_table,
+        complete=settings.frames_complete,
+        clock=settings.clock,
+        warnings=warnings,
+        several=len(rig.sensors) > 1,
+    )
+    detections = _detections(table, frame, rig, class_names, names, warnings)
+    surveyed = None
+    if landmarks is not None and len(landmarks):
+        landmarks.expect(AT, tuple(landmarks.columns))
+        surveyed = landmarks_from_table(
+            landmarks, sigma_m=0.0, class_names=class_names, clock=settings.clock, names=names
+        )
+    recording = SpatialRecording(
+        name=settings.name or title,
+        odometry=_odometry(tables["odometry"], settings.clock, warnings),
+        frames=frames,
+        detections=detections,
+        sensors=rig.sensors,
+        truth=_truth(tables["truth"], settings.clock, warnings),
+        true_landmarks=surveyed,
+        class_names=class_names,
+        source=source,
+        clock=settings.clock,
+        landmark_names=names,
+    )
+    return finish_spatial(recording, warnings=warnings)
+
+
+def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> SpatialOdometry | None:
+    if table is None:
+        return None
+    given = table.one_form((*AT, *QUATERNION), TWIST)
+    if given is TWIST:
+        table.expect(("stamp_s",), TWIST)
+    else:
+        table.expect(("stamp_s", *given), VARIANCES)
+    if len(table) == 0:
+        raise DataError("holds no odometry", path=table.path)
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    if given is TWIST:
+        zero = np.zeros(len(table))
+        twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
+        pose = _integrated(stamp_s[keep], twist[keep])
+        return SpatialOdometry(stamp_s[keep], pose, np.full((len(pose), 6), np.nan), clock=clock)
+    unknown = np.full(len(table), np.nan)
+    variance = [
+        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in VARIANCES
+    ]
+    return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=clock)
+
+
+def _integrated(stamp_s: FloatArray, twist: FloatArray) -> FloatArray:
+    """Poses (N, 7) from the origin, each velocity (N, 6) held until the next stamp."""
+    pose = se3.identity(len(stamp_s))
+    step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
+    for row in range(len(step)):
+        pose[row + 1] = se3.compose(pose[row], step[row])
+    return pose
+
+
+def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
+    if table is None:
+        return None
+    table.expect(("stamp_s", *AT, *QUATERNION))
+    if len(table) == 0:
+        warnings.append(f"{table.path.name}: holds no pose, taken as missing")
+        return None
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    pose = poses(table)[keep]
+    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=clock)
+
+
+def _by_sensor(table: Table) -> Table:
+    """The table with the column that names the sensor under one name."""
+    if all(name in table for name in _WHERE):
+        raise table.error("sensor and camera are both given", row=None, field="camera", hint="keep one of them")
+    columns = {"sensor" if name == "camera" else name: cells for name, cells in table.columns.items()}
+    return Table(table.path, columns, table.line, table.header_line)
+
+
+def _detections(
+    table: Table,
+    frame: IntArray,
+    rig: Rig,
+    class_names: tuple[str, ...],
+    names: dict[int, str],
+    warnings: list[str],
+) -> SpatialDetections:
+    form = _form(table)
+    optional = (
+        "landmark_id", "sensor", "class_id", "score", "sigma_rad", "sigma_m", *COVARIANCE, *BOX, *IMAGE_BOX,
+    )  # fmt: skip
+    table.expect(("stamp_s", *form), (*optional, *_also(form)))
+    columns: dict[str, FloatArray | IntArray] = {
+        "sensor": _sensor_rows(table, rig),
+        "class_id": class_ids(table, class_names),
+        "source_line": np.asarray(table.line, dtype=np.int64),
+    }
+    if "landmark_id" in table:
+        columns["landmark_id"] = table.ids("landmark_id", optional=True, names=names)
+    if "score" in table:
+        columns["score"] = table.numbers(Quantity("score", optional=True))
+    if "sigma_rad" in table:
+        columns["sigma_rad"] = table.numbers(Quantity("sigma_rad", positive=True, optional=True, hint="radians"))
+    if table.has_any(BOX):
+        columns["size_m"] = boxes(table)
+    if form is POINT:
+        columns |= _points(table, columns["sensor"], rig)  # type: ignore[arg-type]
+    else:
+        columns |= _placed(table)
+    detections = spatial_detections(frame, **columns)
+    if table.has_any(CORNERS):
+        detections = _cornered(table, detections, rig)
+    detections = with_tag_poses(detections, rig.sensors, warnings)
+    behind = np.asarray(np.isnan(detections.position_sensor_m).any(axis=1))
+    if behind.any():
+        seen = counted(int(behind.sum()), "detection")
+        warnings.append(f"{table.path.name}: {seen} left out: no disparity, or no depth ahead of the camera")
+        detections = rows_of(detections, ~behind)
+    return detections
+
+
+def _form(table: Table) -> tuple[str, ...]:
+    """The columns that say where a detection is, of the three ways to say it."""
+    forms = [form for form in (AT, CORNERS, POINT) if table.has_any(form)]
+    if not forms:
+        raise table.error(
+            "says nowhere where a landmark was seen", row=None, hint="x_m, y_m, z_m in the sensor's frame"
+        )
+    if POINT in forms and len(forms) > 1:
+        raise table.error(f"mixes u_px, v_px with {forms[0][0]}", row=None, hint="keep one form")
+    return forms[0]
+
+
+def _also(form: tuple[str, ...]) -> tuple[str, ...]:
+    """Further columns that may stand beside a form."""
+    return RIGHT if form is POINT else (*QUATERNION, "yaw_rad", *CORNERS, "tag_size_m")
+
+
+def _sensor_rows(table: Table, rig: Rig) -> IntArray:
+    known = {sensor.name: row for row, sensor in enumerate(rig.sensors)}
+    hint = "one of " + ", ".join(known)
+    if "sensor" not in table:
+        if len(known) > 1:
+            raise table.error("does not say which sensor saw it", row=None, field="sensor", hint=hint)
+        return np.zeros(len(table), dtype=np.int64)
+    labels = table.labels("sensor")
+    unknown = next((row for row, label in enumerate(labels) if label not in known), None)
+    if unknown is not None:
+        raise table.error(f"no sensor '{labels[unknown]}' in {CAMERA_FILE}", row=unknown, field="sensor", hint=hint)
+    return np.array([known[label] for label in labels], dtype=np.int64)
+
+
+def _placed(table: Table) -> dict[str, FloatArray]:
+    """Position, orientation and covariance where the table gives them."""
+    found: dict[str, FloatArray] = {}
+    if table.has_any(AT):
+        may_miss = table.has_any(CORNERS)
+        position = positions(table, optional=may_miss)
+        far = replace(q.RANGE_M, name="x_m, y_m, z_m", high=np.inf, optional=may_miss)
+        far.check(np.linalg.norm(position, axis=1), path=table.path, line=table.line)
+        found["position_sensor_m"] = position
+    if table.has_any(QUATERNION) and "yaw_rad" in table:
+        raise table.error("mixes qx, qy, qz, qw with yaw_rad", row=None, field="yaw_rad", hint="keep one form")
+    if table.has_any(QUATERNION):
+        found["rotation"] = quaternions(table, optional=True)
+    elif "yaw_rad" in table:
+        half = table.numbers(Quantity("yaw_rad", -1e6, 1e6, optional=True, hint="radians")) / 2.0
+        rotation = np.zeros((len(half), 4))
+        rotation[:, 2], rotation[:, 3] = np.sin(half), np.cos(half)
+        rotation[np.isnan(half)] = np.nan
+        found["rotation"] = unit(rotation)
+    covariance = covariances(table, COVARIANCE, optional=True)
+    if covariance is not None and "sigma_m" in table:
+        raise table.error("both sigma_m and cov_* columns are given", row=None, field="sigma_m", hint="keep one")
+    if "sigma_m" in table:
+        sigma = table.numbers(Quantity("sigma_m", high=1e6, positive=True, optional=True, hint="metres"))
+        covariance = sigma[:, None, None] ** 2 * np.eye(3)
+        covariance[np.isnan(sigma)] = np.nan
+    if covariance is not None:
+        found["covariance_sensor_m2"] = covariance
+    return found
+
+
+def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialDetections:
+    """The detections with the corners of tags, and the tags' sizes."""
+    table.expect(CORNERS, tuple(table.columns))
+    corner = np.stack([table.numbers(_pixel(name)) for name in CORNERS], axis=1)
+    given = np.isfinite(corner)
+    partly = np.flatnonzero(given.any(axis=1) & ~given.all(axis=1))
+    if len(partly):
+        raise table.error("a tag has four corners", row=int(partly[0]), field=CORNERS[0], hint="all eight, or none")
+    camera = np.array([sensor.intrinsics is not None for sensor in rig.sensors])[detections.sensor]
+    _need_camera(table, given[:, 0] & ~camera, CORNERS[0], rig)
+    size = rig.size_of(detections.landmark_id)
+    if "tag_size_m" in table:
+        stated = table.numbers(Quantity("tag_size_m", high=1e3, positive=True, optional=True, hint="metres"))
+        size = np.where(np.isnan(stated), size, stated)
+    sizeless = np.flatnonzero(given[:, 0] & np.isnan(size) & np.isnan(detections.position_sensor_m).any(axis=1))
+    if len(sizeless):
+        hint = f"a column tag_size_m, or size_m under [tags] of {CAMERA_FILE}"
+        raise table.error("the size of this tag is not known", row=int(sizeless[0]), field="tag_size_m", hint=hint)
+    nowhere = np.flatnonzero(~given[:, 0] & np.isnan(detections.position_sensor_m).any(axis=1))
+    if len(nowhere):
+        raise table.error("has neither corners nor a position", row=int(nowhere[0]), field=CORNERS[0])
+    return replace(detections, corner_px=corner.reshape(-1, 4, 2), tag_size_m=size)
+
+
+def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
+    """Positions (M, 3) and covariances of points that a stereo camera saw; nan where the point is not ahead.
+
+    The depth follows from the disparity of the undistorted pixels, its covariance from a pixel's to first order.
+    """
+    camera = np.array([one.intrinsics is not None for one in rig.sensors])[sensor]
+    baseline = np.array(rig.baseline_m)[sensor]
+    _need_camera(table, ~camera, POINT[0], rig)
+    if RIGHT[0] not in table:
+        hint = "u_right_px of a rectified stereo pair, x_m, y_m, z_m, or a tag's corners u0_px .. v3_px"
+        raise table.error("a pixel alone has no depth", row=None, field=POINT[0], hint=hint)
+    lone = np.flatnonzero(np.isnan(baseline))
+    if len(lone):
+        hint = f"baseline_m of the left camera in {CAMERA_FILE}"
+        raise table.error("the baseline is not known", row=int(lone[0]), field=RIGHT[0], hint=hint)
+    left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
+    right = left.copy()
+    right[:, 0] = table.numbers(replace(_pixel(RIGHT[0]), optional=False))
+    if RIGHT[1] in table:
+        right[:, 1] = table.numbers(replace(_pixel(RIGHT[1]), optional=False))
+    position, covariance = np.full((len(table), 3), np.nan), np.full((len(table), 3, 3), np.nan)
+    for number, one in enumerate(rig.sensors):
+        rows = np.flatnonzero(sensor == number)
+        if len(rows) and one.intrinsics is not None:
+            rays = unproject(np.stack([left[rows], right[rows]]), one)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                plane = rays[..., :2] / rays[..., 2:]
+            noise = (one.sigma_px or 1.0) / np.array(one.intrinsics[:2])
+            position[rows], covariance[rows] = _triangulated(plane, baseline[rows], noise)
+    return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
+
+
+def _triangulated(plane: FloatArray, baseline: FloatArray, noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Points from image coordinates (2, K, 2) left and right in units of the focal length, with noise (2,)."""
+    (x, y), (x_right, _) = plane[0].T, plane[1].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(x - x_right > 1e-9, baseline / (x - x_right), np.nan)
+    by_shift = -depth * depth / baseline
+    slope = np.zeros((len(x), 3, 3))  # by x, y and x_right
+    slope[:, 0, 0], slope[:, 0, 2] = depth + x * by_shift, -x * by_shift
+    slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2] = y * by_shift, depth, -y * by_shift
+    slope[:, 2, 0], slope[:, 2, 2] = by_shift, -by_shift
+    scaled = slope * noise[[0, 1, 0]]
+    position = np.stack([x * depth, y * depth, depth], axis=1)
+    return position, scaled @ np.swapaxes(scaled, 1, 2)
+
+
+def _need_camera(table: Table, lacking: BoolArray, column: str, rig: Rig) -> None:
+    rows = np.flatnonzero(lacking)
+    if len(rows):
+        names = ", ".join(sensor.name for sensor in rig.sensors if sensor.intrinsics is None)
+        hint = f"intrinsics = [fx, fy, cx, cy] under [camera.NAME] of {CAMERA_FILE}"
+        raise table.error(f"pixels of a sensor that is no camera ({names})", row=int(rows[0]), field=column, hint=hint)

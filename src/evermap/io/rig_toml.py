@@ -1,0 +1,193 @@
+"""Sensors of a recording in space: `sensor.toml`, and `camera.toml` where there are cameras or several sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import inf, pi
+from typing import Any
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.geometry.camera import COEFFICIENTS
+from evermap.io.files import FileSet
+from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_text
+from evermap.io.spatial import AT, QUATERNION
+from evermap.types import FloatArray, IntArray, Sensor, SpatialSensor, landmark_id_of
+
+SENSOR_FILE = "sensor.toml"
+CAMERA_FILE = "camera.toml"
+
+_LIMITS: dict[str, dict[str, tuple[float, float]]] = {
+    "limits": {"range_min_m": (0.0, 1e6), "range_max_m": (0.0, inf)},
+    "noise": {"sigma_m": (1e-9, 1e6), "sigma_rad": (1e-9, 1e3), "sigma_px": (1e-6, 1e4)},
+    "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
+}
+"""Of `sensor.toml`; the keys of all sections are those of a camera, too."""
+_OF_CAMERA = {key: limits for section in _LIMITS.values() for key, limits in section.items()}
+_ANGLES = ("roll_rad", "pitch_rad", "yaw_rad")
+_MOUNT = (*AT, *QUATERNION, *_ANGLES)
+_CAMERA = ("model", "intrinsics", "distortion", "resolution_px", "baseline_m", "mount", *_OF_CAMERA)
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """The sensors of a recording in space, and what is known of its tags.
+
+    Attributes:
+        settings: name, clock and the like.
+        sensors: at least one.
+        baseline_m: of each sensor that is the left camera of a rectified stereo pair, else nan.
+        tag_size_m: edge of tags whose size is not listed; nan where it is not known.
+        tag_sizes: edges of single tags, by id.
+    """
+
+    settings: Settings = field(default_factory=Settings)
+    sensors: tuple[SpatialSensor, ...] = (SpatialSensor(),)
+    baseline_m: tuple[float, ...] = (float("nan"),)
+    tag_size_m: float = float("nan")
+    tag_sizes: Mapping[int, float] = field(default_factory=dict)
+
+    def size_of(self, landmark_id: IntArray) -> FloatArray:
+        """Return the edge of each tag (M,), nan where it is not known."""
+        sizes = [self.tag_sizes.get(identity, self.tag_size_m) for identity in landmark_id.tolist()]
+        return np.array(sizes, dtype=np.float64)
+
+
+def read_rig(files: FileSet, warnings: list[str]) -> Rig:
+    """Return the sensors that the files of a recording describe; without any, one at the robot's centre.
+
+    Raises:
+        InputError: not TOML, an unknown section or key, a value of the wrong type or out of its limits.
+    """
+    settings, common = Settings(), SpatialSensor()
+    if SENSOR_FILE in files:
+        reader = TomlReader(files.read(SENSOR_FILE), files.path_of(SENSOR_FILE))
+        reader.expect(("recording", "mount", *_LIMITS), reader.document, section=None)
+        settings = reader.recording(Sensor())
+        values: dict[str, Any] = {}
+        for section, keys in _LIMITS.items():
+            content = reader.section(section, tuple(keys))
+            values |= {key: reader.number(section, key, content[key], *keys[key]) for key in content}
+        mount = _mount(reader, "mount", reader.section("mount", _MOUNT))
+        common = replace(common, mount_robot_sensor=mount, **values)
+        _check_range(reader, "limits", common)
+    if CAMERA_FILE not in files:
+        if SENSOR_FILE not in files:
+            warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
+        return Rig(settings, (common,))
+    return _cameras(TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE)), settings, common)
+
+
+def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, str]:
+    """Return the texts of the files, by name, from which `read_rig` makes sensors and settings again."""
+    about = {
+        "format_version": FORMAT_VERSION,
+        "name": settings.name,
+        "clock": settings.clock.value,
+        "frames_complete": settings.frames_complete,
+        "class_names": settings.class_names or None,
+    }
+    sections: dict[str, dict[str, Any]] = {}
+    for sensor in sensors:
+        is_camera = sensor.intrinsics is not None
+        sections[f"camera.{sensor.name}"] = {
+            "model": sensor.distortion_model if is_camera else None,
+            "intrinsics": None if sensor.intrinsics is None else tuple(map(float, sensor.intrinsics)),
+            "distortion": tuple(map(float, sensor.distortion)) or None,
+            "resolution_px": sensor.resolution_px,
+            **{key: getattr(sensor, key) for key in _OF_CAMERA},
+        }
+        pose = map(float, sensor.mount_robot_sensor)
+        sections[f"camera.{sensor.name}.mount"] = dict(zip((*AT, *QUATERNION), pose, strict=True))
+    return {SENSOR_FILE: toml_text({"recording": about}), CAMERA_FILE: toml_text(sections)}
+
+
+def _cameras(reader: TomlReader, settings: Settings, common: SpatialSensor) -> Rig:
+    reader.expect(("camera", "tags"), reader.document, section=None)
+    cameras = reader.document.get("camera", {})
+    if not isinstance(cameras, dict) or not cameras or not all(isinstance(c, dict) for c in cameras.values()):
+        raise reader.error(None, "camera", "there is no camera", hint="[camera.NAME] with model and intrinsics")
+    sensors, baselines = [], []
+    for name, content in cameras.items():
+        section = f"camera.{name}"
+        reader.checked(section, content, _CAMERA)
+        values: dict[str, Any] = {
+            key: reader.number(section, key, content[key], *limits)
+            for key, limits in _OF_CAMERA.items()
+            if key in content
+        }
+        if "mount" in content:
+            inner = f"{section}.mount"
+            values["mount_robot_sensor"] = _mount(reader, inner, reader.checked(inner, content["mount"], _MOUNT))
+        values |= _lens(reader, section, content)
+        sensor = replace(common, name=name, **values)
+        _check_range(reader, section, sensor)
+        sensors.append(sensor)
+        baseline = content.get("baseline_m")
+        baselines.append(
+            float("nan") if baseline is None else reader.number(section, "baseline_m", baseline, 1e-4, 1e3)
+        )
+    size_m, sizes = _tags(reader)
+    return Rig(settings, tuple(sensors), tuple(baselines), size_m, sizes)
+
+
+def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str, Any]:
+    """How a camera projects; nothing for a sensor that is no camera."""
+    if "intrinsics" not in content:
+        for key in ("model", "distortion", "baseline_m"):
+            if key in content:
+                raise reader.error(
+                    section, key, "needs intrinsics, too", hint="intrinsics = [fx, fy, cx, cy] in pixels"
+                )
+        return {}
+    intrinsics = reader.numbers(section, "intrinsics", content["intrinsics"], (4,))
+    if min(intrinsics[:2]) <= 0.0:
+        raise reader.error(section, "intrinsics", "focal lengths must be positive", hint="[fx, fy, cx, cy] in pixels")
+    model = content.get("model", "pinhole")
+    if model not in COEFFICIENTS:
+        raise reader.error(section, "model", f"no camera model '{model}'", hint="one of " + ", ".join(COEFFICIENTS))
+    distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *COEFFICIENTS[model]))
+    found: dict[str, Any] = {"intrinsics": intrinsics, "distortion": distortion, "distortion_model": model}
+    if "resolution_px" in content:
+        width, height = reader.numbers(section, "resolution_px", content["resolution_px"], (2,))
+        found["resolution_px"] = (int(width), int(height))
+    return found
+
+
+def _mount(reader: TomlReader, section: str, content: dict[str, Any]) -> tuple[float, ...]:
+    """A pose from x, y, z and a quaternion, or roll, pitch and yaw (about x, then y, then z, of the robot)."""
+    at = [reader.number(section, key, content.get(key, 0.0), -1e3, 1e3) for key in AT]
+    if any(key in content for key in QUATERNION):
+        for key in QUATERNION:
+            if key not in content or any(angle in content for angle in _ANGLES):
+                raise reader.error(section, key, "an orientation is all of qx, qy, qz, qw, or roll, pitch and yaw")
+        quaternion = np.array([reader.number(section, key, content[key], -2.0, 2.0) for key in QUATERNION])
+        if abs(np.linalg.norm(quaternion) - 1.0) > 1e-2:
+            raise reader.error(section, "qw", "qx, qy, qz, qw are not a unit quaternion", hint="scalar last")
+        return tuple(se3.normalised(np.concatenate([at, quaternion])).tolist())
+    turns = [reader.number(section, key, content.get(key, 0.0), -2 * pi, 2 * pi) for key in _ANGLES]
+    pose = np.array([*at, 0.0, 0.0, 0.0, 1.0])
+    for axis in (2, 1, 0):
+        pose = se3.compose(pose, se3.exp(np.eye(6)[3 + axis] * turns[axis]))
+    return tuple(pose.tolist())
+
+
+def _tags(reader: TomlReader) -> tuple[float, dict[int, float]]:
+    content = reader.section("tags", ("size_m", "sizes"))
+    size_m = float("nan")
+    if "size_m" in content:
+        size_m = reader.number("tags", "size_m", content["size_m"], 1e-4, 1e3)
+    sizes = content.get("sizes", {})
+    if not isinstance(sizes, dict):
+        raise reader.error("tags", "sizes", "must be a section", hint="[tags.sizes] with lines such as 17 = 0.2")
+    return size_m, {
+        int(name) if name.isdecimal() else landmark_id_of(name): reader.number("tags.sizes", name, size, 1e-4, 1e3)
+        for name, size in sizes.items()
+    }
+
+
+def _check_range(reader: TomlReader, section: str, sensor: SpatialSensor) -> None:
+    if sensor.range_min_m >= sensor.range_max_m:
+        raise reader.error(section, "range_max_m", "must be greater than range_min_m")

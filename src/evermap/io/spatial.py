@@ -1,0 +1,146 @@
+"""What readers of recordings in space share: columns of poses and covariances, detections, tags' poses from corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.geometry.square import square_poses
+from evermap.io.table import Table
+from evermap.io.text import counted
+from evermap.types import UNKNOWN, FloatArray, IntArray, SpatialDetections, SpatialSensor, rows_of
+from evermap.valid import QUATERNION as QUANTITIES
+from evermap.valid import X_M, Y_M, Z_M, Quantity, is_covariance
+
+AT = ("x_m", "y_m", "z_m")
+QUATERNION = tuple(quantity.name for quantity in QUANTITIES)
+BOX = ("length_m", "width_m", "height_m")
+COVARIANCE = tuple(f"cov_{pair}_m2" for pair in ("xx", "xy", "xz", "yy", "yz", "zz"))
+"""The upper triangle of a position's covariance, row by row."""
+TURN_COVARIANCE = tuple(f"cov_{pair}_rad2" for pair in ("rxrx", "rxry", "rxrz", "ryry", "ryrz", "rzrz"))
+
+
+def positions(table: Table, *, optional: bool = False) -> FloatArray:
+    """Return the columns `x_m, y_m, z_m`. Shape (R, 3)."""
+    return np.stack([table.numbers(replace(axis, optional=optional)) for axis in (X_M, Y_M, Z_M)], axis=1)
+
+
+def quaternions(table: Table, *, optional: bool = False) -> FloatArray:
+    """Return the columns `qx, qy, qz, qw` as unit quaternions of the sign of `se3`. Shape (R, 4); nan where empty.
+
+    Raises:
+        InputError: a column is missing, or numbers are not a unit quaternion within a hundredth.
+    """
+    table.expect(QUATERNION, tuple(table.columns))
+    given = np.stack([table.numbers(replace(one, optional=optional)) for one in QUANTITIES], axis=1)
+    length = np.linalg.norm(given, axis=1)
+    absent = np.isnan(given).all(axis=1)
+    wrong = np.flatnonzero(~(np.abs(length - 1.0) <= 1e-2) & ~absent)
+    if len(wrong):
+        row, hint = int(wrong[0]), "scalar last; all four or none"
+        problem = (
+            "is incomplete" if np.isnan(length[row]) else f"is not a unit quaternion, its length is {length[row]:g}"
+        )
+        raise table.error(problem, row=row, field="qx, qy, qz, qw", hint=hint)
+    return unit(given)
+
+
+def unit(quaternion: FloatArray) -> FloatArray:
+    """Return quaternions (..., 4) at unit length and of the sign of `se3`; those that have it keep every bit."""
+    pose = np.concatenate([np.zeros((*quaternion.shape[:-1], 3)), quaternion], axis=-1)
+    there = np.abs(np.linalg.norm(quaternion, axis=-1, keepdims=True) - 1.0) < 1e-12
+    with np.errstate(invalid="ignore"):
+        normal = se3.normalised(pose)[..., 3:]
+    same = np.where(np.sum(normal * quaternion, axis=-1, keepdims=True) < 0.0, -quaternion, quaternion)
+    return np.where(there, same, normal)
+
+
+def poses(table: Table) -> FloatArray:
+    """Return the columns `x_m, y_m, z_m, qx, qy, qz, qw`. Shape (R, 7)."""
+    return np.concatenate([positions(table), quaternions(table)], axis=1)
+
+
+def covariances(table: Table, names: tuple[str, ...], *, optional: bool = False) -> FloatArray | None:
+    """Return matrices (R, K, K) from the columns of their upper triangle; None where there is no such column.
+
+    Raises:
+        InputError: a column is missing, or a matrix is not positive semidefinite.
+    """
+    if not table.has_any(names):
+        return None
+    table.expect(names, tuple(table.columns))
+    size = {3: 2, 6: 3}[len(names)]
+    cells = np.stack([table.numbers(Quantity(name, -1e12, 1e12, optional=optional)) for name in names], axis=1)
+    covariance = np.empty((len(table), size, size))
+    upper, right = np.triu_indices(size)
+    covariance[:, upper, right] = covariance[:, right, upper] = cells
+    # estimates of well-known landmarks may miss being positive by rounding
+    wrong = np.flatnonzero(~is_covariance(covariance) & ~np.isnan(cells).all(axis=1))
+    if len(wrong):
+        raise table.error("is not a covariance: not positive semidefinite", row=int(wrong[0]), field=names[0])
+    return covariance
+
+
+def upper_triangle(matrix: FloatArray, names: tuple[str, ...]) -> dict[str, FloatArray]:
+    """Return the columns from which `covariances` makes matrices (R, K, K)."""
+    upper, right = np.triu_indices(matrix.shape[-1])
+    return dict(zip(names, np.ascontiguousarray(matrix[:, upper, right].T), strict=True))
+
+
+def boxes(table: Table) -> FloatArray:
+    """Return the columns `length_m, width_m, height_m`. Shape (R, 3), nan where empty."""
+    table.expect(BOX, tuple(table.columns))
+    sides = (Quantity(name, 0.0, 1e4, optional=True, hint="metres") for name in BOX)
+    return np.stack([table.numbers(side) for side in sides], axis=1)
+
+
+def spatial_detections(frame: IntArray, **given: FloatArray | IntArray) -> SpatialDetections:
+    """Return detections of which only some columns are known: ids are `UNKNOWN` and numbers nan in all others.
+
+    Args:
+        frame: (M,) row of `Frames`.
+        **given: columns of `SpatialDetections`, by name.
+    """
+    count = len(frame)
+    shapes: dict[str, tuple[int, ...]] = {
+        "position_sensor_m": (3,), "rotation": (4,), "covariance_sensor_m2": (3, 3), "sigma_rad": (),
+        "corner_px": (4, 2), "tag_size_m": (), "size_m": (3,), "score": (),
+    }  # fmt: skip
+    columns: dict[str, FloatArray | IntArray] = {
+        "sensor": np.zeros(count, dtype=np.int64),
+        "landmark_id": np.full(count, UNKNOWN),
+        "class_id": np.full(count, UNKNOWN),
+        "source_line": np.zeros(count, dtype=np.int64),
+        **{name: np.full((count, *shape), np.nan) for name, shape in shapes.items()},
+    }
+    return SpatialDetections(frame=frame, **{**columns, **given})  # type: ignore[arg-type]
+
+
+def with_tag_poses(
+    detections: SpatialDetections, sensors: Sequence[SpatialSensor], warnings: list[str]
+) -> SpatialDetections:
+    """Return the detections with the better pose of every tag of which only corners were given.
+
+    Tags whose corners cannot be those of a square ahead of the camera, or whose size is not known, are left out;
+    `warnings` gets their number.
+    """
+    position, rotation = detections.position_sensor_m.copy(), detections.rotation.copy()
+    wanted = np.isnan(position).any(axis=1) & np.isfinite(detections.corner_px).all(axis=(1, 2))
+    for number, sensor in enumerate(sensors):
+        rows = np.flatnonzero(wanted & (detections.sensor == number))
+        if len(rows) and sensor.intrinsics is not None:
+            found = square_poses(detections.corner_px[rows], detections.tag_size_m[rows], sensor).pose[0]
+            position[rows], rotation[rows] = found[:, :3], found[:, 3:]
+    sizeless = wanted & np.isnan(detections.tag_size_m)
+    broken = wanted & ~sizeless & np.isnan(position).any(axis=1)
+    if sizeless.any():
+        ids = np.unique(detections.landmark_id[sizeless])
+        shown = ", ".join(map(str, ids[:5].tolist())) + (", ..." if len(ids) > 5 else "")
+        warnings.append(f"{counted(int(sizeless.sum()), 'tag')} of unknown size left out (ids {shown})")
+    if broken.any():
+        warnings.append(f"{counted(int(broken.sum()), 'tag')} left out: their corners are not those of a square")
+    filled = replace(detections, position_sensor_m=position, rotation=rotation)
+    return rows_of(filled, ~sizeless & ~broken) if (sizeless | broken).any() else filled

@@ -1,0 +1,348 @@
+"""Recordings of TagSLAM (Pfrommer, Daniilidis, arXiv 1910.00679, 2019): square tags seen by calibrated cameras.
+
+A folder holds `cameras.yaml`, `camera_poses.yaml` and `tagslam.yaml` as TagSLAM reads them, and what was seen: tables
+(`detections`, `frames`, optionally `odometry`, `reference`, `survey`), or the ROS 1 bag itself. The robot's frame is
+the rig, in which `camera_poses.yaml` gives the cameras. What the authors mended by hand, `tag_id_remap` and
+`ignore_tags`, is not applied: which identities are wrong is for the estimate to find.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import DataError, InputError
+from evermap.geometry import se3
+from evermap.geometry.camera import COEFFICIENTS
+from evermap.io.assemble import SAME_STAMP_S, finish_spatial, forward_stamps, last_of_equal
+from evermap.io.files import FileSet, Reader, find_file_set
+from evermap.io.rosbag import TagSightings, read_tag_bag
+from evermap.io.spatial import poses, positions, spatial_detections, with_tag_poses
+from evermap.io.table import Table, parse_csv, parse_parquet
+from evermap.io.text import counted
+from evermap.io.yaml import parse_yaml
+from evermap.types import (
+    Clock,
+    FloatArray,
+    Frames,
+    IntArray,
+    Landmarks,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
+    Trajectory,
+)
+from evermap.valid import Quantity
+
+MOST_HAMMING = 2
+"""Tags of which the detector had to correct more bits are left out: most of them are no tags."""
+
+CAMERAS, CAMERA_POSES, SETTINGS = "cameras.yaml", "camera_poses.yaml", "tagslam.yaml"
+BAG_ENDINGS = (".bag", ".bag.bz2")
+_ENDINGS = (".csv", ".csv.gz", ".parquet")
+_CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "uv")
+_VARIANCES = ("cxx", "cyy", "czz", "crr", "cpp", "cww")
+_MODELS = {"equidistant": "equidistant", "radtan": "radtan", "plumb_bob": "radtan", "pinhole": "pinhole"}
+
+
+@dataclass(frozen=True, slots=True)
+class TagRig:
+    """The calibration files.
+
+    Attributes:
+        sensors: the cameras.
+        tag_topics: on which each camera's tags come in a bag.
+        odometry_topic: of the odometry in a bag; '' where there is none.
+        mount_rig_odometry: (7,) pose of the odometry's body in the rig's frame.
+        tag_size_m: edges of tags that are listed, by id.
+        default_size_m: edge of all others; nan where it is not known.
+    """
+
+    sensors: tuple[SpatialSensor, ...]
+    tag_topics: tuple[str, ...]
+    odometry_topic: str
+    mount_rig_odometry: FloatArray
+    tag_size_m: Mapping[int, float]
+    default_size_m: float
+
+
+def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording:
+    """Return a recording of TagSLAM from a folder of tables, or from a ROS 1 bag beside the calibration files.
+
+    Args:
+        path: folder with `cameras.yaml`, `camera_poses.yaml`, `tagslam.yaml` and tables; or a `.bag` or `.bag.bz2` in
+            such a folder, whose tags and odometry are then taken instead of the tables'.
+        robot: must be None.
+
+    Raises:
+        InputError: a file is missing or malformed, with its line.
+        DataError: no tag was seen.
+        MissingExtraError: a bag is asked for, and the package that reads bags is not installed.
+    """
+    path = Path(path)
+    if robot is not None:
+        raise InputError(f"there is no robot {robot}: the recording is of one rig", path=path, hint="leave it out")
+    bag = path if path.is_file() and path.name.endswith(BAG_ENDINGS) else None
+    files = find_file_set(path if bag is None else path.parent, is_tagslam if bag is None else _is_calibrated)
+    if files is None:
+        raise InputError("no TagSLAM recording here", path=path, hint=TAGSLAM.looks_for)
+    warnings: list[str] = []
+    setup = _setup(files)
+    if bag is None:
+        seen, odometry = _sightings(files, setup, warnings), None
+    else:
+        seen, odometry = read_tag_bag(bag, setup.tag_topics, setup.odometry_topic)
+    odometry = odometry or _odometry(files, warnings)
+    if odometry is not None:
+        odometry = _of_rig(odometry, setup.mount_rig_odometry)
+    return _recording(files, path, setup, seen, odometry, warnings)
+
+
+def is_tagslam(files: FileSet) -> bool:
+    """Return whether files look like a TagSLAM recording in tables."""
+    return _is_calibrated(files) and any(f"detections{ending}" in files for ending in _ENDINGS)
+
+
+def _is_calibrated(files: FileSet) -> bool:
+    return CAMERAS in files and CAMERA_POSES in files
+
+
+TAGSLAM = Reader(
+    "tagslam",
+    "folder with cameras.yaml, camera_poses.yaml, tagslam.yaml and detections.csv, or a .bag beside them",
+    is_tagslam,
+    read_tagslam,
+    endings=BAG_ENDINGS,
+)
+
+
+def _recording(
+    files: FileSet,
+    path: Path,
+    setup: TagRig,
+    seen: TagSightings,
+    odometry: SpatialOdometry | None,
+    warnings: list[str],
+) -> SpatialRecording:
+    doubtful = seen.hamming > MOST_HAMMING
+    if doubtful.any():
+        warnings.append(f"{counted(int(doubtful.sum()), 'tag')} with more than {MOST_HAMMING} wrong bits left out")
+    order = np.flatnonzero(~doubtful)
+    order = order[np.argsort(seen.stamp_s[order], kind="stable")]
+    looked = np.unique(np.concatenate([seen.looked_s, seen.stamp_s]))
+    looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
+    frame = np.clip(np.searchsorted(looked, seen.stamp_s[order] + SAME_STAMP_S) - 1, 0, None)
+    tag_id = seen.tag_id[order]
+    sizes = [setup.tag_size_m.get(tag, setup.default_size_m) for tag in tag_id.tolist()]
+    detections = spatial_detections(
+        np.asarray(frame, dtype=np.int64),
+        sensor=seen.camera[order],
+        landmark_id=tag_id,
+        corner_px=seen.corner_px[order],
+        tag_size_m=np.array(sizes, dtype=np.float64),
+        source_line=seen.line[order],
+    )
+    recording = SpatialRecording(
+        name=f"TagSLAM {files.title}",
+        odometry=odometry,
+        frames=Frames(looked, complete=True, clock=Clock.UNIX),
+        detections=with_tag_poses(detections, setup.sensors, warnings),
+        sensors=setup.sensors,
+        truth=_reference(files, warnings),
+        true_landmarks=_survey(files, warnings),
+        source=str(path),
+        clock=Clock.UNIX,
+    )
+    return finish_spatial(recording, warnings=warnings)
+
+
+def _setup(files: FileSet) -> TagRig:
+    cameras = _yaml(files, CAMERAS)
+    mounts = _yaml(files, CAMERA_POSES)
+    content = _yaml(files, SETTINGS) if SETTINGS in files else {}
+    sensors, topics = [], []
+    for name, camera in cameras.items():
+        model = _MODELS.get(_get(files, CAMERAS, camera, "distortion_model", name))
+        if model is None:
+            hint = "one of " + ", ".join(_MODELS)
+            field = f"{name}.distortion_model"
+            raise InputError("unknown camera model", path=files.path_of(CAMERAS), field=field, hint=hint)
+        distortion = _numbers(files, CAMERAS, camera, "distortion_coeffs", name, (0, *COEFFICIENTS[model]))
+        width, height = _numbers(files, CAMERAS, camera, "resolution", name, (2,))
+        fx, fy, cx, cy = _numbers(files, CAMERAS, camera, "intrinsics", name, (4,))
+        pose = _get(files, CAMERA_POSES, mounts, name, "")
+        sensor = SpatialSensor(
+            name=name,
+            mount_robot_sensor=tuple(
+                _pose(files, CAMERA_POSES, _get(files, CAMERA_POSES, pose, "pose", name)).tolist()
+            ),
+            intrinsics=(fx, fy, cx, cy),
+            distortion=distortion,
+            distortion_model=model,
+            resolution_px=(int(width), int(height)),
+        )
+        sensors.append(sensor)
+        topics.append(str(camera.get("tagtopic", "")))
+    if not sensors:
+        raise InputError("lists no camera", path=files.path_of(CAMERAS))
+    bodies = _bodies(files, content)
+    mounted = next((body for body in bodies.values() if "T_body_odom" in body), {})
+    odometry = _pose(files, SETTINGS, mounted["T_body_odom"]) if mounted else se3.identity()
+    sizes, default = _sizes(bodies, content.get("default_body"))
+    topic = next((str(body["odom_topic"]) for body in bodies.values() if "odom_topic" in body), "")
+    return TagRig(tuple(sensors), tuple(topics), topic, odometry, sizes, default)
+
+
+def _bodies(files: FileSet, content: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    listed = content.get("bodies") or []
+    if not isinstance(listed, list) or not all(isinstance(body, dict) for body in listed):
+        raise InputError("must be a list of bodies", path=files.path_of(SETTINGS), field="bodies")
+    return {name: body or {} for entry in listed for name, body in entry.items()}
+
+
+def _sizes(bodies: Mapping[str, dict[str, Any]], default_body: Any) -> tuple[dict[int, float], float]:
+    """Edges of tags by id, and that of all others: the default body's, or that of all bodies if they agree."""
+    sizes: dict[int, float] = {}
+    for body in bodies.values():
+        if board := body.get("board"):
+            first, count = int(board["tag_start_id"]), int(board["tag_rows"]) * int(board["tag_columns"])
+            sizes |= dict.fromkeys(range(first, first + count), float(board["tag_size"]))
+        default = body.get("default_tag_size")
+        for tag in body.get("tags") or []:
+            if (size := tag.get("size", default)) is not None:
+                sizes[int(tag["id"])] = float(size)
+    defaults = {name: float(body["default_tag_size"]) for name, body in bodies.items() if "default_tag_size" in body}
+    if default_body in defaults:
+        return sizes, defaults[default_body]
+    common = set(defaults.values())
+    return sizes, common.pop() if len(common) == 1 else float("nan")
+
+
+def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightings:
+    table = _table(files, "detections", warnings)
+    assert table is not None
+    table.expect(("stamp_s", "camera", "tag_id", *_CORNERS), tuple(table.columns))
+    corner = np.stack([table.numbers(Quantity(name, -1e6, 1e6, hint="pixels")) for name in _CORNERS], axis=1)
+    stamp_s = forward_stamps(table)
+    frames = _table(files, "frames", warnings)
+    count = len(table)
+    return TagSightings(
+        looked_s=stamp_s if frames is None else forward_stamps(frames),
+        stamp_s=stamp_s,
+        camera=_camera_rows(table, setup),
+        tag_id=table.ids("tag_id", optional=False),
+        hamming=table.ids("hamming", optional=False) if "hamming" in table else np.zeros(count, dtype=np.int64),
+        corner_px=corner.reshape(-1, 4, 2),
+        line=np.asarray(table.line, dtype=np.int64),
+    )
+
+
+def _camera_rows(table: Table, setup: TagRig) -> IntArray:
+    known = {sensor.name: row for row, sensor in enumerate(setup.sensors)}
+    labels = table.labels("camera")
+    row = next((row for row, label in enumerate(labels) if label not in known), None)
+    if row is not None:
+        hint = "one of " + ", ".join(known)
+        raise table.error(f"no camera '{labels[row]}' in {CAMERAS}", row=row, field="camera", hint=hint)
+    return np.array([known[label] for label in labels], dtype=np.int64)
+
+
+def _odometry(files: FileSet, warnings: list[str]) -> SpatialOdometry | None:
+    table = _table(files, "odometry", warnings)
+    if table is None:
+        return None
+    if len(table) == 0:
+        raise DataError("holds no odometry", path=table.path)
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    unknown = np.full(len(table), np.nan)
+    variance = [
+        table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in _VARIANCES
+    ]
+    return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=Clock.UNIX)
+
+
+def _of_rig(odometry: SpatialOdometry, mount: FloatArray) -> SpatialOdometry:
+    """Poses of the rig from those of the odometry's body, and variances along the rig's axes from those along the
+    axes of the odometry's frame, as ROS states them.
+    """
+    pose = se3.compose(odometry.pose_world_robot, se3.inverse(mount))
+    share = se3.rotation_of(pose) ** 2
+    variance = [np.einsum("nij,ni->nj", share, half) for half in (odometry.variance[:, :3], odometry.variance[:, 3:])]
+    return replace(odometry, pose_world_robot=pose, variance=np.concatenate(variance, axis=1))
+
+
+def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:
+    table = _table(files, "reference", warnings)
+    if table is None or len(table) == 0:
+        return None
+    stamp_s = forward_stamps(table)
+    keep = last_of_equal(stamp_s, path=table.path, warnings=warnings)
+    pose = poses(table)[keep]
+    return Trajectory(stamp_s[keep], pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=Clock.UNIX)
+
+
+def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
+    """The surveyed tags, their orientations given as rotation vectors."""
+    table = _table(files, "survey", warnings)
+    if table is None or len(table) == 0:
+        return None
+    ids = table.ids("tag_id", optional=False)
+    turn = np.stack([table.numbers(Quantity(f"r{axis}_rad", -10.0, 10.0, hint="radians")) for axis in "xyz"], axis=1)
+    size = table.numbers(Quantity("size_m", 0.0, 1e3, positive=True, hint="metres"))
+    rotation = se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=1))[:, 3:]
+    return Landmarks.in_space(
+        ids, positions(table), rotation=rotation, size_m=size[:, None] * [1.0, 1.0, 0.0], clock=Clock.UNIX
+    )
+
+
+def _table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
+    file = next((f"{name}{ending}" for ending in _ENDINGS if f"{name}{ending}" in files), None)
+    if file is None:
+        return None
+    data, path = files.read(file), files.path_of(file)
+    return parse_parquet(data, path) if file.endswith(".parquet") else parse_csv(data, path, warnings)
+
+
+def _yaml(files: FileSet, name: str) -> dict[str, Any]:
+    content = parse_yaml(files.read(name), files.path_of(name))
+    if not isinstance(content, dict):
+        raise InputError("must be a map of names", path=files.path_of(name))
+    return content
+
+
+def _get(files: FileSet, name: str, content: Any, key: str, inside: str) -> Any:
+    if not isinstance(content, dict) or key not in content:
+        field = f"{inside}.{key}" if inside else key
+        raise InputError("is missing", path=files.path_of(name), field=field)
+    return content[key]
+
+
+def _numbers(
+    files: FileSet, name: str, content: Any, key: str, inside: str, counts: tuple[int, ...]
+) -> tuple[float, ...]:
+    values = _get(files, name, content, key, inside) or []
+    if not isinstance(values, list) or len(values) not in counts or not all(_is_number(value) for value in values):
+        wanted = " or ".join(map(str, counts))
+        field = f"{inside}.{key}"
+        raise InputError(f"must be a list of {wanted} numbers", path=files.path_of(name), field=field)
+    return tuple(map(float, values))
+
+
+def _pose(files: FileSet, name: str, content: Any) -> FloatArray:
+    """A pose (7,) from a position and a rotation vector."""
+    parts = [
+        [_get(files, name, content, part, "pose").get(axis) for axis in "xyz"] for part in ("position", "rotation")
+    ]
+    if not all(_is_number(value) for part in parts for value in part):
+        raise InputError("x, y and z must be numbers", path=files.path_of(name), field="pose")
+    turn = se3.exp(np.array([0.0, 0.0, 0.0, *parts[1]]))
+    return np.concatenate([np.array(parts[0], dtype=np.float64), turn[3:]])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
