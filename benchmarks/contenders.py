@@ -12,9 +12,9 @@ import numpy as np
 
 from benchmarks.world import World
 from evermap.geometry import se2
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Estimate
 from evermap.slam.smoother import Smoother
-from evermap.slam.solver import Motion
 from evermap.types import FloatArray
 from evermap_studies.peers.isam import RELINEARIZE_SKIP, RELINEARIZE_THRESHOLD, IncrementalSmoother
 

@@ -19,8 +19,8 @@ from evermap.geometry import se2
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.solver import Motion
 from evermap.types import FloatArray, Sensor
 
 SIZES = (100, 1_000, 10_000)

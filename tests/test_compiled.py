@@ -186,7 +186,7 @@ import warnings
 warnings.simplefilter("always")
 warnings.showwarning = lambda message, category, *_: print(category.__name__, message)
 from module import twice
-import evermap.slam.frame_factor
+import evermap.slam.filter_kernels
 print(twice(2), *(sum(twice.stats[k].values()) for k in (1, 2)))
 """
     first, second = run(code), run(code)

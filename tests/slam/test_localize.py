@@ -26,8 +26,8 @@ from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces, Neighbourhood
 from evermap.slam.localize import Localizer
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive
-from evermap.slam.solver import Motion
 
 COUNT, SIDE_M = 40, 14.0
 

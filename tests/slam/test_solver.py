@@ -1,9 +1,10 @@
-"""The incremental solvers by one protocol: a step from an optimum leads to the next optimum."""
+"""The filter of a stream, beside iSAM2: a step from an optimum leads to the next optimum."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,17 +14,43 @@ from test_smoother import elsewhere, tied
 
 from evermap.config import SlamConfig
 from evermap.geometry import se2
-from evermap.slam import local_filter
+from evermap.slam import streaming
+from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import beliefs, prepare
-from evermap.slam.local_filter import LocalFilter
+from evermap.slam.local_filter import LocalFilter, columns
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Estimate
+from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import Smoother
-from evermap.slam.solver import IncrementalSolver, Motion
 from evermap.slam.streaming import StreamingSlam, sighted_at
 from evermap_studies.peers.isam import IncrementalSmoother
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 
-SOLVERS: dict[str, Callable[..., IncrementalSolver]] = {"arrow": LocalFilter, "gtsam": IncrementalSmoother}
+KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
+
+
+class OneStep(SessionFilter):
+    """The filter with the methods of its peer."""
+
+    def add(self, row: int, motion: Motion, landmark: np.ndarray) -> None:
+        self.drive(motion)
+        super().add(row, landmark)
+
+    def last_pose(self) -> np.ndarray:
+        return self.pose
+
+    def last_covariance(self) -> np.ndarray:
+        return self.covariance[:3, :3]
+
+    def landmark(self, row: int) -> np.ndarray:
+        return self.position[row]
+
+    def around(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        slots = self.bring(places)
+        return self.covariance, self.position[self._row], slots
+
+
+SOLVERS: dict[str, Callable[..., Any]] = {"filter": OneStep, "gtsam": IncrementalSmoother}
 
 
 @pytest.fixture(params=SOLVERS)
@@ -70,7 +97,7 @@ def optimum_of(world: World, n_poses: int) -> Estimate:
     return Smoother(problem, world.noise, robust=False).optimum(start, tolerance=1e-9)
 
 
-def covariance_around(solver: IncrementalSolver, places: np.ndarray) -> np.ndarray:
+def covariance_around(solver: Any, places: np.ndarray) -> np.ndarray:
     """Of newest pose, calibration states and these places, in order."""
     joint, place, column = solver.around(places)
     for j, at in zip(places, column, strict=True):
@@ -181,13 +208,12 @@ def test_far_places_wait_and_come_back_where_their_neighbours_are(monkeypatch):
     prepared = prepare(recording)
     online, spread, most = {}, {}, {}
     for room in (96, 24):
-        monkeypatch.setattr(local_filter, "MOST_ACTIVE", room)
-        monkeypatch.setattr(local_filter, "LEAVING", 6)
+        monkeypatch.setattr(streaming, "SessionFilter", partial(SessionFilter, most=room))
         slam = StreamingSlam(prepared.problem, noise, prior)
         most[room] = 0
         for _ in prepared.problem.stamp_s:
             slam.step()
-            most[room] = max(most[room], len(slam._solver._active))
+            most[room] = max(most[room], len(slam._filter.active))
         online[room], spread[room] = slam.online_pose, slam.online_covariance
     assert most[24] <= 24
     assert most[96] > 50
@@ -195,3 +221,74 @@ def test_far_places_wait_and_come_back_where_their_neighbours_are(monkeypatch):
     apart = np.abs(se2.local(online[96], online[24])) / sigma
     assert np.quantile(apart, 0.99) < 0.5
     assert np.sqrt(np.einsum("nii->ni", spread[24])) / sigma == pytest.approx(1.0, abs=0.2)
+
+
+def test_the_filter_is_the_smoother_where_all_is_nearly_linear():
+    """From the first frame on, places met by their detections alone."""
+    made = make_world(0, n_poses=6, n_landmarks=3, noisy=0.02, prior=KNOWN_SENSORS, p_seen=1.0)
+    problem = made.problem
+    local = LocalFilter(problem.mount, problem.prior)
+    start = local.covariance.copy()
+    start[:3, :3] = np.eye(3) / problem.start_information
+    local.hold(problem.start_pose, problem.prior.mean, start, np.arange(0), np.zeros((0, 2)))
+    for row in range(len(problem.stamp_s)):
+        if row > 0:
+            local.drive(Motion.between(problem, made.noise, row, local.states))
+        for m in np.flatnonzero(problem.pose_row == row):
+            j, sigma = problem.landmark_row[m : m + 1], made.noise.of_detections(problem.sigma_given[m : m + 1])
+            local.know_of(3)
+            if np.isnan(local.position[j[0], 0]):
+                local.meet(int(j[0]), sighted_at(local.pose, problem.reading[m], local.states, problem.mount))
+            local.update(j, problem.reading[m : m + 1], sigma)
+    smoother = Smoother(problem, made.noise, robust=False)
+    estimate = smoother.optimum(Estimate(made.truth.pose, made.truth.landmark, problem.prior.mean))
+    batch = LocalFilter(problem.mount, problem.prior)
+    batch.begin(estimate, smoother.marginals(estimate), len(problem.stamp_s) - 1, np.arange(3))
+    np.testing.assert_allclose(local.position, batch.position, atol=2e-4)
+    np.testing.assert_allclose(local.pose, batch.pose, atol=2e-4)
+    slots = local.bring(np.arange(3))
+    own, other = np.append(np.arange(3), columns(slots)), np.append(np.arange(3), columns(np.arange(3)))
+    np.testing.assert_allclose(
+        local.covariance[np.ix_(own, own)], batch.covariance[np.ix_(other, other)], rtol=0.05, atol=2e-5
+    )
+
+
+def test_places_that_are_only_considered_stay_and_the_rest_gets_the_best_gain():
+    """Schmidt's update written down densely, where weights are 1 and the frame is nearly linear."""
+    rng = np.random.default_rng(3)
+    mount, n = np.array([0.2, -0.1, 0.3]), 4
+    prior = CalibrationPrior.from_settings(calibrated=True, fix={})
+    place = rng.uniform(2.0, 5.0, (n, 2))
+    spread = rng.normal(size=(12 + 2 * n, 12 + 2 * n))
+    spread = 1e-6 * (spread @ spread.T + np.eye(12 + 2 * n))
+    sigma = np.full((n, 2), 2e-3)
+    states, pose = prior.mean, np.array([0.3, 0.1, 0.5])
+    held = {}
+    for considered in (True, False):
+        local = LocalFilter(mount, prior, considered=considered)
+        local.hold(pose, states, spread, np.arange(n), place.copy())
+        true_pose = se2.compose(pose, np.array([1e-3, -1e-3, 5e-4]))
+        away = se2.transform(se2.inverse(se2.compose(true_pose, mount)), place)
+        reading = np.column_stack([np.hypot(*away.T), np.arctan2(away[:, 1], away[:, 0])])
+        nis, _, residual, by = local.compare(np.arange(n), reading, sigma)
+        h = np.zeros((2 * n, 12 + 2 * n))
+        for m in range(n):
+            h[2 * m : 2 * m + 2, :8], h[2 * m : 2 * m + 2, 12 + 2 * m : 14 + 2 * m] = by[m, :, :8], by[m, :, 8:]
+        s = h @ spread @ h.T + np.diag(sigma.ravel() ** 2)
+        for m in range(n):
+            mine = slice(2 * m, 2 * m + 2)
+            assert nis[m] == pytest.approx(residual[m] @ np.linalg.solve(s[mine, mine], residual[m]))
+        gain = np.linalg.solve(s, h @ spread).T
+        if considered:
+            gain[12:] = 0.0
+        expected = spread - gain @ h @ spread - (gain @ h @ spread).T + gain @ s @ gain.T
+        moved = -gain @ residual.ravel()
+        local.update(np.arange(n), reading, sigma)
+        size = np.sqrt(np.diag(expected))
+        scale = np.outer(size, size)
+        assert np.abs((local.covariance[: len(scale), : len(scale)] - expected) / scale).max() < 5e-3
+        np.testing.assert_allclose(se2.log(se2.between(pose, local.pose)), moved[:3], atol=2e-5)
+        np.testing.assert_allclose(local.position - place, moved[12:].reshape(-1, 2), atol=2e-5)
+        held[considered] = local.position
+    np.testing.assert_array_equal(held[True], place)
+    assert np.abs(held[False] - place).max() > 1e-5

@@ -139,10 +139,6 @@ class SlamConfig(Section):
     unknown_ids: bool = Field(
         default=False, description="ignore the identities that detections carry; associate by geometry"
     )
-    solver: Literal["arrow", "gtsam"] = Field(
-        default="arrow",
-        description="of the steps between two batch solutions: 'arrow' is our own, 'gtsam' its iSAM2, to compare with",
-    )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
     outlier_log_odds: float = Field(
         default=7.0,

@@ -90,7 +90,6 @@ def solve(
         prior_map=prepared.prior_map,
         robust=settings.robust,
         estimate_noise=settings.estimate_noise,
-        solver=settings.solver,
         method=_method(prepared, prior, recording.sensor, settings),
     )
     step_s, interrupted = fed(

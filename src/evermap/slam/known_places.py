@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
@@ -67,7 +68,8 @@ class KnownPlaces:
 
     def joint_of(self, rows: IntArray) -> FloatArray:
         """Return (2 K, 2 K) covariance of some places together."""
-        assert self.joint_m2 is not None
+        if self.joint_m2 is None:
+            return self.covariance_m2[rows[0]] if len(rows) == 1 else np.asarray(block_diag(*self.covariance_m2[rows]))
         return of_places(self.joint_m2, self.joint_row[rows]) + LEAST_VARIANCE * np.eye(2 * len(rows))
 
     @classmethod

@@ -4,49 +4,43 @@ Given the newest pose the older ones say nothing more about the next detection. 
 its odometry, marginalises the one before, and updates with the detections of the frame: an iterated extended Kalman
 filter (Bell and Cathey 1993) whose measurement noise is re-weighted like the smoother's.
 
-Only the places that were used last, at most `MOST_ACTIVE`, stand in the covariance, so that a step costs the same
-whatever the size of the world (compare the compressed filter of Guivant and Nebot 2001, whose far places wait, too). A
-place that leaves is kept with what ties it to its nearest neighbours; where it comes back it is where these take it.
-Those that were met before the last relinearisation are tied as the batch smoother says, exactly.
+Only the places that were used last stand in the covariance, so that a step costs the same whatever the size of the
+world (compare the compressed filter of Guivant and Nebot 2001, whose far places wait, too). A place that leaves is kept
+with what ties it to its nearest neighbours; where it comes back it is where these take it. Those that a batch solution
+or a map knows are tied as that says, exactly.
+
+The stream (`session_filter`), the association of detections without identities and the localisation in a fixed map all
+drive this filter. In a fixed map places are only considered (Schmidt 1966): they are wrong, by what their covariance
+says, and wrong in the same way in every frame. A filter that takes that for fresh noise of each detection believes
+after a hundred frames in its pose to a tenth of the map's error.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from evermap.compiled import kept
-from evermap.slam.frame_factor import linearise_frame, spread_of_frame, turn_pose
-from evermap.slam.kernels import (
-    AT_PLACES,
-    adjoint,
-    composed,
-    inlier_weight,
-    inverted,
-    kernel,
-    wrapped,
-)
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem
-from evermap.slam.smoother import Smoother
-from evermap.slam.solver import Motion
-from evermap.types import FloatArray, IntArray
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.filter_kernels import BELIEVED, drive_on, innovations, update
+from evermap.slam.kernels import AT_PLACES
+from evermap.slam.motion import Motion
+from evermap.slam.problem import Estimate, Marginals
+from evermap.types import UNKNOWN, FloatArray, IntArray
 
 UNKNOWN_VARIANCE = 1e4
 """Of a place before its first sighting, m^2: where nothing is known, but not so wide that digits are lost."""
+ANYWHERE = UNKNOWN_VARIANCE * np.eye(2)
 LEAST_VARIANCE = 1e-12
 """Of neighbours, m^2: two that are known exactly, or as one, say no more than one of them."""
-ITERATIONS = 10
-SMALL_STEP = 1e-4
-"""Iterations of an update at most, and the step (m, rad or 1) that ends them."""
 MOST_ACTIVE = 64
 """Places in the covariance: those of several views around the robot."""
-LEAVING = 16
-"""Places that leave at once when there are more."""
+FEWEST_SLOTS = 16
+"""Places that there is room for at first."""
 NEIGHBOURS = 8
 """Places, the nearest, to which a place is tied while it is not in the covariance."""
+NO_PLACES, NO_GAIN, NO_ODDS, NOWHERE = np.arange(0), np.zeros((2, 0)), np.zeros(0), np.zeros((0, 2, 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,323 +60,241 @@ class Ties:
 
 
 class LocalFilter:
-    """The incremental solver for worlds of any size; see `solver.IncrementalSolver` for its methods.
+    """The newest pose, the calibration states and the places around; nothing is known of the pose before `hold`.
 
     Args:
-        problem: the measurements.
-        noise: standard deviations.
-        robust: down-weight outliers (Cauchy, decided when the detection comes).
+        mount: (3,) pose of the sensor on the robot.
+        prior: of the calibration states.
+        most: places in the covariance, unless a single frame sees more.
+        considered: no detection moves a place.
     """
 
-    def __init__(self, problem: Problem, noise: Noise, *, robust: bool = True) -> None:
-        self.problem = problem
-        self._robust = robust
-        self._noise = noise
-        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
-        self._pose = problem.start_pose.copy()
-        self._states = problem.prior.mean.copy()
-        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
-        self._covariance[:3, :3] = np.eye(3) / problem.start_information
-        self._covariance[3:, 3:] = np.diag(problem.prior.sigma**2)
-        self._position = np.full((len(problem.landmark_mean), 2), np.nan)
-        self._slot = np.full(len(problem.landmark_mean), -1)
-        self._active: IntArray = np.zeros(0, dtype=np.int64)
+    def __init__(
+        self, mount: FloatArray, prior: CalibrationPrior, *, most: int = MOST_ACTIVE, considered: bool = False
+    ) -> None:
+        self._mount, self._free, self._most, self._considered = mount, prior.free, most, considered
+        self.pose = np.full(3, np.nan)
+        """(3,) the newest pose."""
+        self.states = prior.mean.copy()
+        """(9,) calibration states."""
+        self.covariance = np.zeros((AT_PLACES, AT_PLACES))
+        """(12 + 2 K, 12 + 2 K) of pose, in its own frame, states, and places in K slots, zero in free ones."""
+        self.covariance[3:, 3:] = np.diag((prior.sigma * prior.free) ** 2)
+        self.position = np.zeros((0, 2))
+        """(L, 2) all places, those that wait as they were when they left; nan where one was never met."""
+        self._row: IntArray = np.zeros(0, dtype=np.int64)
         self._used_at: IntArray = np.zeros(0, dtype=np.int64)
+        self._slot: IntArray = np.zeros(0, dtype=np.int64)
+        self._now = 0
         self._left: dict[int, Ties] = {}
-        self._batch: Marginals | None = None
-        self._batch_position = np.zeros((0, 2))
-        self._old_pose = np.zeros((0, 3))
-        self._new_pose: list[FloatArray] = []
+        self._given_position, self._neighbours = np.zeros((0, 2)), NEIGHBOURS
+        self._given_joint: Callable[[IntArray], FloatArray] | None = None
 
-    def restart(self, estimate: Estimate, noise: Noise, problem: Problem, marginals: Marginals | None = None) -> None:
-        """Restart at an optimum of all poses so far."""
-        self.problem, self._noise = problem, noise
-        n = len(estimate.pose)
-        if marginals is None:
-            marginals = Smoother(problem.until(n), noise, heavy=True, robust=self._robust).marginals(estimate)
-        self._batch, self._batch_position = marginals, estimate.landmark.copy()
-        self._position = estimate.landmark.copy()
-        recent = problem.landmark_row[: self._first_detection[n]][::-1]
-        seen, first = np.unique(recent[: 50 * MOST_ACTIVE], return_index=True)
-        active = seen[np.argsort(first, kind="stable")][: MOST_ACTIVE - LEAVING]
-        if np.count_nonzero(estimate.known) <= MOST_ACTIVE - LEAVING:
-            active = np.flatnonzero(estimate.known)
-        active = active[estimate.known[active]]
-        joint = self._batch.joint(active, poses=np.array([n - 1]), states=True)
-        end = 3 + 2 * len(active)
+    @property
+    def active(self) -> IntArray:
+        """Rows of the places in the covariance."""
+        active: IntArray = self._row[self._row != UNKNOWN]
+        return active
+
+    def lean_on(self, position: FloatArray, joint: Callable[[IntArray], FloatArray], *, tied: bool = True) -> None:
+        """Take places (L, 2) from a solution or a map; `joint` returns the covariance (2 k, 2 k) of some rows of it.
+
+        Args:
+            position: where they are; nan where they are not known.
+            joint: of their covariance; called as `joint(rows)`.
+            tied: False where all are independent.
+        """
+        self._given_position, self._given_joint = position, joint
+        self._neighbours = NEIGHBOURS if tied else 0
+
+    def hold(
+        self, pose: FloatArray, states: FloatArray, covariance: FloatArray, rows: IntArray, position: FloatArray
+    ) -> None:
+        """Begin anew at a joint Gaussian of pose, states and different places `rows` of all places (L, 2)."""
+        self.pose, self.states, self.position = np.array(pose, dtype=np.float64), states.copy(), position
+        if len(self._slot) == len(position):
+            self._slot[self.active] = -1
+        else:
+            self._slot = np.full(len(position), -1)
+        room = max(FEWEST_SLOTS, len(rows))
+        self._row, self._used_at = np.full(room, UNKNOWN), np.full(room, self._now)
+        self._row[: len(rows)] = rows
+        self._slot[rows] = np.arange(len(rows))
+        self.covariance = np.zeros((AT_PLACES + 2 * room, AT_PLACES + 2 * room))
+        self.covariance[: len(covariance), : len(covariance)] = covariance
+        self._left.clear()
+
+    def begin(self, estimate: Estimate, marginals: Marginals, pose_row: int, rows: IntArray) -> None:
+        """Begin anew at a pose of a batch solution, with some of its places; the others are taken from there."""
+        joint = marginals.joint(rows, poses=np.array([pose_row]), states=True)
+        end = 3 + 2 * len(rows)
         order = np.concatenate([np.arange(3), end + np.arange(9), np.arange(3, end)])
-        self._covariance = np.ascontiguousarray(joint[np.ix_(order, order)])
-        self._slot = np.full(len(estimate.landmark), -1)
-        self._slot[active] = np.arange(len(active))
-        self._active, self._used_at, self._left = active, np.full(len(active), n - 1), {}
-        self._pose, self._states = estimate.pose[-1].copy(), estimate.states.copy()
-        self._old_pose, self._new_pose = estimate.pose[:-1], [self._pose.copy()]
+        covariance = joint[np.ix_(order, order)]
+        self.hold(estimate.pose[pose_row], estimate.states, covariance, rows, estimate.landmark.copy())
+        self.lean_on(estimate.landmark, marginals.joint)
 
-    def add(self, row: int, motion: Motion | None, landmark: FloatArray) -> None:
-        """Add pose `row` with its odometry and its detections."""
-        problem = self.problem
-        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-        rows = problem.landmark_row[detections]
-        self._activate(rows, landmark)
-        if motion is not None:
-            drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
-        _update(
-            self._pose, self._states, self._position, self._covariance, self._active, rows, self._slot[rows],
-            problem.reading[detections], self._noise.of_detections(problem.sigma_given[detections]), problem.mount,
-            problem.prior.free, self._robust,
-        )  # fmt: skip
-        self._new_pose.append(self._pose.copy())
+    def drive(self, motion: Motion) -> None:
+        """Advance the newest pose."""
+        self._now += 1
+        drive_on(self.pose, self.covariance, motion.increment, motion.by_states, motion.covariance)
 
-    def last_pose(self) -> FloatArray:
-        """Return (3,) the newest pose."""
-        return self._pose.copy()
-
-    def last_covariance(self) -> FloatArray:
-        """Return (3, 3) its covariance, in its own frame."""
-        return self._covariance[:3, :3].copy()
-
-    def states(self) -> FloatArray:
-        """Return (9,) calibration states."""
-        return self._states.copy()
-
-    def landmark(self, row: int) -> FloatArray:
-        """Return (2,) one place; nan where it is not known yet."""
-        return self._position[row].copy() if row < len(self._position) else np.full(2, np.nan)
-
-    def estimate(self) -> Estimate:
-        """Return values of everything so far; poses since the last restart as they were when they were added."""
-        landmark = np.full((len(self.problem.landmark_mean), 2), np.nan)
-        landmark[: len(self._position)] = self._position
-        return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self._states.copy())
-
-    def around(self, places: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        """Return the covariance with these places in it, all its places, and which of them these are."""
-        self._activate(places, self._position)
-        return self._covariance, self._position[self._active], self._slot[places]
-
-    def _activate(self, rows: IntArray, landmark: FloatArray) -> None:
-        """Have places in the covariance; those without a position yet are at their prior, or where `landmark` says."""
-        new = len(self.problem.landmark_mean) - len(self._position)
-        if new > 0:
-            self._position = np.pad(self._position, ((0, new), (0, 0)), constant_values=np.nan)
-            self._slot = np.pad(self._slot, (0, new), constant_values=-1)
-        now, slots = len(self._old_pose) + len(self._new_pose), self._slot[rows]
+    def bring(self, rows: IntArray) -> IntArray:
+        """Have known places (k,) in the covariance, in place of those used longest ago; returns their slots."""
+        slots = self._slot[rows]
         here = slots >= 0
         if np.count_nonzero(here) == len(here):
-            self._used_at[slots] = now
-            return
-        self._used_at[slots[here]] = now
+            self._used_at[slots] = self._now
+            return slots
+        self._used_at[slots[here]] = self._now
         waiting = list(dict.fromkeys(rows[~here].tolist()))
-        if len(self._active) + len(waiting) > MOST_ACTIVE:
-            self._leave(len(self._active) + len(waiting) - MOST_ACTIVE + LEAVING, now)
-        for j in waiting:
-            self._enter(j, landmark, now)
+        self._make_room(len(waiting))
+        for row in waiting:
+            self._return(row, self._left.pop(row) if row in self._left else self._given(row))
+        return self._slot[rows]
 
-    def _leave(self, count: int, now: int) -> None:
-        """Take the places out that were not used for longest."""
-        order = np.argsort(self._used_at, kind="stable")[:count]
-        leaving = order[self._used_at[order] < now]
-        stays = np.ones(len(self._active), dtype=bool)
+    def meet(
+        self,
+        row: int,
+        place: FloatArray,
+        spread: FloatArray = ANYWHERE,
+        given: IntArray = NO_PLACES,
+        gain: FloatArray = NO_GAIN,
+    ) -> None:
+        """Put a new place at `place` (2,).
+
+        Args:
+            row: of all places.
+            place: where it is.
+            spread: (2, 2) its covariance, given others.
+            given: (k,) these, in the covariance.
+            gain: (2, 2 k) how it follows them.
+        """
+        self.know_of(row + 1)
+        self._make_room(1)
+        self._enter(row, given, gain, spread)
+        self.position[row] = place
+
+    def compare(
+        self, rows: IntArray, reading: FloatArray, sigma: FloatArray, own: FloatArray = NOWHERE
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Compare detections with a place each, as `filter_kernels.innovations`.
+
+        Args:
+            rows: (k,) the places.
+            reading: (k, 2) range and bearing.
+            sigma: (k, 2) their noise.
+            own: (k, 2, 2) covariance of the places, where some are not in that of the filter.
+        """
+        return innovations(
+            self.pose, self.states, self.covariance, self.position[rows], self._slot[rows], own, reading, sigma,
+            self._mount, self._free,
+        )  # fmt: skip
+
+    def update(
+        self,
+        rows: IntArray,
+        reading: FloatArray,
+        sigma: FloatArray,
+        *,
+        weighing: int = BELIEVED,
+        log_odds: FloatArray | None = None,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Update by detections of places in the covariance, as `filter_kernels.update`."""
+        odds = NO_ODDS if log_odds is None else log_odds
+        return update(
+            self.pose, self.states, self.covariance, self.position, self._row, self._slot[rows], reading, sigma, odds,
+            self._mount, self._free, self._considered, weighing,
+        )  # fmt: skip
+
+    def know_of(self, count: int) -> None:
+        """Have so many places in all; nothing is known of new ones."""
+        more = count - len(self.position)
+        if more > 0:
+            self.position = np.pad(self.position, ((0, more), (0, 0)), constant_values=np.nan)
+            self._slot = np.pad(self._slot, (0, more), constant_values=-1)
+
+    def _make_room(self, count: int) -> None:
+        """Have so many free slots: new ones as long as there are few, else those that were not used for longest."""
+        free, have = int(np.count_nonzero(self._row == UNKNOWN)), len(self._row)
+        room = max(FEWEST_SLOTS, have)
+        while room < min(self._most, have - free + count):
+            room *= 2
+        room = min(room, max(self._most, have))
+        excess = have - free + count - room
+        if excess > 0:
+            order = np.argsort(np.where(self._row == UNKNOWN, self._now, self._used_at), kind="stable")[:excess]
+            leaving = order[self._used_at[order] < self._now]
+            self._leave(leaving[self._row[leaving] != UNKNOWN])
+            room += excess - len(leaving)  # a frame of more places than there is room for
+        if room > have:
+            self._row = np.append(self._row, np.full(room - have, UNKNOWN))
+            self._used_at = np.append(self._used_at, np.full(room - have, self._now))
+            self.covariance = np.pad(self.covariance, (0, 2 * (room - have)))
+
+    def _leave(self, leaving: IntArray) -> None:
+        """Free slots; what ties their places to others is kept, if it is not known anyway."""
+        stays = self._row != UNKNOWN
         stays[leaving] = False
         kept = np.flatnonzero(stays)
-        position = self._position[self._active]
-        for slot in leaving.tolist():
-            away = ((position[kept] - position[slot]) ** 2).sum(axis=1)
-            near = kept[np.argsort(away, kind="stable")[:NEIGHBOURS]]
-            at = _columns(np.append(slot, near))
-            self._left[int(self._active[slot])] = Ties(
-                self._active[near], position[slot], position[near], self._covariance[np.ix_(at, at)]
+        position = self.position[self._row[kept]]
+        for slot in leaving.tolist() if not self._considered else ():
+            row = int(self._row[slot])
+            near = kept[_nearest(position, self.position[row], NEIGHBOURS)]
+            at = columns(np.append(slot, near))
+            rows = self._row[near]
+            self._left[row] = Ties(
+                rows, self.position[row].copy(), self.position[rows], self.covariance[np.ix_(at, at)]
             )
-        self._slot[self._active[leaving]] = -1
-        self._active, self._used_at = self._active[kept], self._used_at[kept]
-        self._slot[self._active] = np.arange(len(kept))
-        rows = np.concatenate([np.arange(AT_PLACES), _columns(kept)])
-        self._covariance = np.ascontiguousarray(self._covariance[np.ix_(rows, rows)])
+        self._slot[self._row[leaving]], self._row[leaving] = -1, UNKNOWN
+        at = columns(leaving)
+        self.covariance[at], self.covariance[:, at] = 0.0, 0.0
 
-    def _enter(self, row: int, landmark: FloatArray, now: int) -> None:
-        """Put a place back, or a new one: given those that are in the covariance, at its ties or its prior."""
-        size, problem = len(self._covariance), self.problem
-        if np.isfinite(self._position[row, 0]):
-            ties = self._ties(row)
-            there = np.flatnonzero(self._slot[ties.rows] >= 0)
+    def _given(self, row: int) -> Ties:
+        """What ties a place to others, as the solution or the map says."""
+        assert self._given_joint is not None
+        of = self.active if self._neighbours else self._row[:0]
+        of = of[of < len(self._given_position)]
+        of = of[np.isfinite(self._given_position[of, 0])]
+        near = of[_nearest(self._given_position[of], self._given_position[row], self._neighbours)]
+        joint = self._given_joint(np.append(row, near))
+        return Ties(near, self._given_position[row], self._given_position[near], joint)
+
+    def _return(self, row: int, ties: Ties) -> None:
+        """Put a known place back where those of its neighbours that are in the covariance take it."""
+        there = np.flatnonzero(self._slot[ties.rows] >= 0) if len(ties.rows) else NO_PLACES
+        given, own = ties.rows[there], ties.joint[:2, :2]
+        if len(there):
             at = 2 + (2 * there[:, None] + [0, 1]).ravel()
-            given = ties.rows[there]
             known = ties.joint[np.ix_(at, at)] + LEAST_VARIANCE * np.eye(len(at))
-            gain = np.asarray(np.linalg.solve(known, ties.joint[at, :2]).T, dtype=np.float64)
-            spread: FloatArray = ties.joint[:2, :2] - gain @ ties.joint[at, :2]
-            place: FloatArray = ties.place + gain @ (self._position[given] - ties.neighbours[there]).ravel()
+            gain: FloatArray = np.linalg.solve(known, ties.joint[at, :2]).T
+            moved = (self.position[given] - ties.neighbours[there]).ravel()
+            self._enter(row, given, gain, own - gain @ ties.joint[at, :2])
         else:
-            active = np.zeros(len(problem.landmark_mean), dtype=bool)
-            active[self._active] = True
-            prior = problem.conditional_prior(row, active)
-            given, gain = prior.given, prior.gain
-            if prior.information.any():
-                spread = np.asarray(np.linalg.inv(prior.information))
-                place = prior.place(self._position, problem.landmark_mean)
-            else:
-                spread, place = UNKNOWN_VARIANCE * np.eye(2), landmark[row]
-        across: FloatArray = gain @ self._covariance[_columns(self._slot[given])]
-        grown = np.empty((size + 2, size + 2))
-        grown[:size, :size] = self._covariance
-        grown[size:, :size] = across
-        grown[:size, size:] = across.T
-        grown[size:, size:] = across[:, _columns(self._slot[given])] @ gain.T + 0.5 * (spread + spread.T)
-        self._covariance = grown
-        self._slot[row] = len(self._active)
-        self._active, self._used_at = np.append(self._active, row), np.append(self._used_at, now)
-        self._position[row] = place
+            gain, moved = NO_GAIN, NO_ODDS
+            self._enter(row, given, gain, own)
+        if self._considered:  # whatever its neighbours are held to be
+            slot = AT_PLACES + 2 * int(self._slot[row])
+            self.covariance[slot : slot + 2, slot : slot + 2] = own
+        else:
+            self.position[row] = ties.place + gain @ moved
 
-    def _ties(self, row: int) -> Ties:
-        """What ties a place that is known, but in no covariance: as it was when it left, or as the smoother says."""
-        if row in self._left:
-            return self._left.pop(row)
-        assert self._batch is not None
-        of_batch = self._active[self._active < len(self._batch_position)]
-        of_batch = of_batch[np.isfinite(self._batch_position[of_batch, 0])]
-        away = ((self._batch_position[of_batch] - self._batch_position[row]) ** 2).sum(axis=1)
-        near = of_batch[np.argsort(away, kind="stable")[:NEIGHBOURS]]
-        every = np.append(row, near)
-        return Ties(near, self._batch_position[row], self._batch_position[near], self._batch.joint(every))
+    def _enter(self, row: int, given: IntArray, gain: FloatArray, spread: FloatArray) -> None:
+        """Put a place in a free slot."""
+        slot = int(np.argmax(self._row == UNKNOWN))
+        others, own = columns(self._slot[given]), slice(AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 2)
+        across = gain @ self.covariance[others]
+        self.covariance[own], self.covariance[:, own] = across, across.T
+        self.covariance[own, own] = across[:, others] @ gain.T + 0.5 * (spread + spread.T)
+        self._row[slot], self._slot[row], self._used_at[slot] = row, slot, self._now
 
 
-def _columns(slots: IntArray) -> IntArray:
-    """Columns of x and y of places in the covariance."""
+def columns(slots: IntArray) -> IntArray:
+    """Return the columns of x and y of places in the covariance."""
     return np.asarray(AT_PLACES + (2 * slots[:, None] + [0, 1]).ravel(), dtype=np.int64)
 
 
-@kernel
-def drive_on(
-    pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
-) -> None:
-    """Advance the newest pose and the joint covariance to the next pose, in place."""
-    pose[:] = composed(pose, increment)
-    pose[2] = wrapped(pose[2])
-    size = len(covariance)
-    carry = adjoint(inverted(increment))
-    for k in range(3, size):
-        x, y, turn = covariance[0, k], covariance[1, k], covariance[2, k]
-        covariance[0, k] = carry[0, 0] * x + carry[0, 1] * y + carry[0, 2] * turn
-        covariance[1, k] = carry[1, 0] * x + carry[1, 1] * y + carry[1, 2] * turn
-    block = covariance[:3, :3].copy()
-    cross = covariance[:3, 8:12].copy() @ by_states.T
-    covariance[:3, :3] = carry @ block @ carry.T + cross + cross.T + noise
-    covariance[:3, :3] += by_states @ covariance[8:12, 8:12].copy() @ by_states.T
-    for a in range(3):
-        for k in range(3, size):
-            for b in range(4):
-                covariance[a, k] += by_states[a, b] * covariance[8 + b, k]
-            covariance[k, a] = covariance[a, k]
-
-
-@kernel
-def _update(
-    pose: FloatArray, states: FloatArray, position: FloatArray, covariance: FloatArray, active: Any, seen: Any,
-    slot: Any, reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any, robust: bool,
-) -> None:  # fmt: skip
-    """All detections of a frame at once, relinearised and re-weighted until nothing moves; all in place.
-
-    Only pose, calibration and the places that are `seen` take part in that; the other `active` places follow at last.
-    """
-    count, size = len(reading), AT_PLACES + 2 * len(reading)
-    if count == 0:
-        return
-    place, where, own = position[seen], np.arange(size), np.arange(count)
-    where[AT_PLACES::2], where[AT_PLACES + 1 :: 2] = AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 1
-    part = np.ascontiguousarray(covariance[where][:, where])
-    start, start_states, start_place = pose.copy(), states.copy(), place.copy()
-    before, step, weight, innovation, pull = (
-        np.zeros(size),
-        np.zeros(size),
-        np.ones(count),
-        np.zeros(2 * count),
-        np.zeros(2 * count),
-    )
-    jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
-    root, gain = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size))
-    for iteration in range(ITERATIONS):
-        linearise_frame(pose, states, place, own, reading, mount, free, step[2], innovation, jacobian, column)
-        spread_of_frame(part, jacobian, column, gain, root)
-        for m in range(count if robust else 0):
-            x, y = innovation[2 * m], innovation[2 * m + 1]
-            # before anything is known of this frame: as surprising as its innovation is
-            unknown = 1.0 if iteration == 0 else 0.0
-            a = unknown * root[2 * m, 2 * m] + sigma[m, 0] ** 2
-            b = unknown * root[2 * m, 2 * m + 1]
-            d = unknown * root[2 * m + 1, 2 * m + 1] + sigma[m, 1] ** 2
-            weight[m] = inlier_weight((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b), 0.0, True)
-        for row in range(2 * count):
-            root[row, row] += sigma[row // 2, row % 2] ** 2 / weight[row // 2]
-            # innovation at the step so far, told at the start
-            for a in range(10):
-                innovation[row] -= jacobian[row, a] * step[column[row // 2, a]]
-        _solve(root, innovation, pull)
-        before[:], step[:] = step, 0.0
-        for row in range(2 * count):
-            for k in range(size):
-                step[k] -= pull[row] * gain[row, k]
-        c, s = math.cos(start[2]), math.sin(start[2])
-        pose[0] = start[0] + c * step[0] - s * step[1]
-        pose[1] = start[1] + s * step[0] + c * step[1]
-        pose[2] = wrapped(start[2] + step[2])
-        moved = 0.0
-        for k in range(size):
-            moved = max(moved, abs(step[k] - before[k]))
-            if k >= AT_PLACES:
-                place[(k - AT_PLACES) // 2, k % 2] = start_place[(k - AT_PLACES) // 2, k % 2] + step[k]
-            elif k >= 3:
-                states[k - 3] = start_states[k - 3] + step[k]
-        if moved < SMALL_STEP:
-            break
-    column[:, 8], column[:, 9] = where[AT_PLACES::2], where[AT_PLACES + 1 :: 2]
-    white = np.zeros((2 * count, len(covariance) + 1))
-    white[:, -1] = innovation
-    _condition(covariance, jacobian, column, root, white)
-    for k in range(len(active)):
-        for row in range(2 * count):
-            for a in range(2):
-                position[active[k], a] -= white[row, AT_PLACES + 2 * k + a] * white[row, -1]
-    turn_pose(covariance, step[2])
-
-
-@kernel
-def _solve(matrix: FloatArray, right: FloatArray, x: FloatArray) -> None:
-    """Solve by Cholesky's factor, which takes the place of the lower triangle of the matrix."""
-    for i in range(len(matrix)):
-        for k in range(i + 1):
-            total = matrix[i, k]
-            for a in range(k):
-                total -= matrix[i, a] * matrix[k, a]
-            matrix[i, k] = math.sqrt(total) if k == i else total / matrix[k, k]
-        x[i] = right[i]
-        for a in range(i):
-            x[i] -= matrix[i, a] * x[a]
-        x[i] /= matrix[i, i]
-    for i in range(len(matrix) - 1, -1, -1):
-        x[i] /= matrix[i, i]
-        for a in range(i):
-            x[a] -= matrix[i, a] * x[i]
-
-
-@kept(effort=3, error_model="numpy", fastmath={"contract"})
-def _condition(covariance: FloatArray, jacobian: FloatArray, column: Any, root: FloatArray, white: FloatArray) -> None:
-    """Condition on detections, with the lower root of `H P H' + R`.
-
-    `white`, zeros and the innovations in its last column, becomes `root^-1 (H P, innovations)`.
-    """
-    for row in range(len(white)):
-        for a in range(10):
-            by, at = jacobian[row, a], column[row // 2, a]
-            for k in range(len(covariance) if by != 0.0 else 0):
-                white[row, k] += by * covariance[at, k]
-        for other in range(row):
-            for k in range(white.shape[1]):
-                white[row, k] -= root[row, other] * white[other, k]
-        for k in range(white.shape[1]):
-            white[row, k] /= root[row, row]
-    for i in range(len(covariance)):
-        mine = covariance[i]
-        for row in range(0, len(white), 2):
-            one, two = white[row], white[row + 1]
-            a, b = one[i], two[i]
-            for k in range(len(covariance)):
-                mine[k] -= a * one[k] + b * two[k]
+def _nearest(position: FloatArray, to: FloatArray, count: int) -> IntArray:
+    """Rows of the nearest points, the nearest first."""
+    away = ((position - to) ** 2).sum(axis=1)
+    near: IntArray = np.argsort(away, kind="stable")[:count]
+    return near

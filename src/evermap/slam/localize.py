@@ -1,8 +1,9 @@
 """Where the robot is in a map that is not changed by it: pose and calibration, frame after frame, at a fixed cost.
 
 An error-state extended Kalman filter of the newest pose and the calibration states. What a frame costs depends on what
-is in view, not on the size of the map: of its places only those used last are considered (see `schmidt`), and only the
-neighbourhood is expected. Where the robot starts is not known; the same search finds it again when it was carried away.
+is in view, not on the size of the map: of its places only those used last are considered (see `local_filter`), and only
+the neighbourhood is expected. Where the robot starts is not known; the same search finds it again when it was carried
+away.
 """
 
 from __future__ import annotations
@@ -16,18 +17,16 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES
 from evermap.slam.known_places import LEAST_BELIEF, KnownPlaces, LocalTrack, Neighbourhood, Placed
-from evermap.slam.local_filter import drive_on
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive, Noise
-from evermap.slam.schmidt import choose_places, update_considering
-from evermap.slam.solver import Motion
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
 MOST_CONSIDERED = 256
 """Places whose errors are kept correlated with the pose's: those used last. Of a frame no more are used."""
-NEIGHBOURS = 8
-"""Places, the nearest, through which a new one is correlated with all else where errors of the map are joint."""
 EXPECTING_SIGMA_M = 0.5
 """No landmark is expected while the robot's position is less certain than this, along either axis."""
 HARDLY_EXPECTED = 0.01
@@ -110,34 +109,26 @@ class Localizer:
         self._believed_there[places.most_probable()] = True
         self._believed_there &= places.p_here >= BELIEVED
         self._stamp_s: float | None = None
-        self._pose = np.full(3, np.nan)
-        self._states = prior.mean.copy()
-        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
-        self._covariance[3:, 3:] = np.diag((prior.sigma * prior.free) ** 2)
-        self._considered: IntArray = np.zeros(0, dtype=np.int64)
-        self._used_at: IntArray = np.zeros(0, dtype=np.int64)
-        self._slot = np.full(len(places), -1, dtype=np.int64)
-        self._frame = 0
+        self._filter = LocalFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
         self._agreed: dict[int, tuple[float, bool]] = {}
         self._track: LocalTrack | None = LocalTrack(self._mount)
         if start is not None:
-            self._place_at(Placed(*start, np.zeros(0, dtype=np.int64), np.zeros((3, 0))))
+            self._place_at(Placed(*start, NO_PLACES, np.zeros((3, 0))))
 
     @property
     def states(self) -> FloatArray:
         """(9,) calibration states."""
-        return self._states.copy()
+        return self._filter.states.copy()
 
     @property
     def states_covariance(self) -> FloatArray:
         """(9, 9) of them."""
-        return self._covariance[3:AT_PLACES, 3:AT_PLACES].copy()
+        return self._filter.covariance[3:AT_PLACES, 3:AT_PLACES].copy()
 
     @property
     def considered(self) -> IntArray:
         """Rows of the places whose errors are kept correlated with the pose's."""
-        considered: IntArray = self._considered[self._considered != UNKNOWN]
-        return considered
+        return self._filter.active
 
     def step(self, stamp_s: float, drive: Drive, seen: FrameSightings) -> Located:
         """Process a frame: predict, place if need be, compare, update, expect.
@@ -148,23 +139,23 @@ class Localizer:
                 is looked at.
             seen: its detections; those of unknown identity, or of landmarks that the map lacks, are not used.
         """
-        self._frame += 1
+        states = self._filter.states
         if self._stamp_s is not None:
-            self._drive(Motion.over(drive, self._stamp_s, stamp_s, self._states, self._prior.free, self.noise))
+            self._drive(Motion.over(drive, self._stamp_s, stamp_s, states, self._prior.free, self.noise))
         self._stamp_s = stamp_s
         first, last = self.places.rows_of(seen.landmark_id)
         usable = (last > first) & np.all(np.isfinite(seen.reading), axis=1) & (seen.landmark_id != UNKNOWN)
         used = np.flatnonzero(usable)[:MOST_CONSIDERED]
         if self._track is not None:
-            self._track.see(stamp_s, seen.landmark_id[used], seen.reading[used], self._states)
+            self._track.see(stamp_s, seen.landmark_id[used], seen.reading[used], states)
             self._search(stamp_s)
         place = np.full(len(usable), UNKNOWN, dtype=np.int64)
         nis, p_inlier = np.full((2, len(usable)), np.nan)
         if self._is_placed and len(used):
             place[used], nis[used], p_inlier[used] = self._update(stamp_s, first[used], last[used], seen, used)
         return Located(
-            self._pose.copy(),
-            self._covariance[:3, :3].copy(),
+            self._filter.pose.copy(),
+            self._filter.covariance[:3, :3].copy(),
             place,
             nis,
             p_inlier,
@@ -174,13 +165,13 @@ class Localizer:
 
     @property
     def _is_placed(self) -> bool:
-        return bool(np.isfinite(self._pose[0]))
+        return bool(np.isfinite(self._filter.pose[0]))
 
     def _drive(self, motion: Motion) -> None:
         if self._track is not None:
             self._track.drive(motion.increment)
         if self._is_placed:
-            drive_on(self._pose, self._covariance, motion.increment, motion.by_states, motion.covariance)
+            self._filter.drive(motion)
 
     def _search(self, stamp_s: float) -> None:
         """Lay the drive since the robot got lost over the map, and go there if that explains much more than staying."""
@@ -188,8 +179,9 @@ class Localizer:
         placed = self._track.placed(stamp_s, self.places)
         if placed is None:
             return
+        here, there = self._filter.pose, placed.pose
         if self._is_placed and (
-            self._track.agreement(placed.pose, self.places) < BETTER_BY * self._track.agreement(self._pose, self.places)
+            self._track.agreement(there, self.places) < BETTER_BY * self._track.agreement(here, self.places)
         ):
             self._track = None  # it is the world that differs from the map
             self._agreed.clear()
@@ -198,18 +190,16 @@ class Localizer:
 
     def _place_at(self, placed: Placed) -> None:
         """Begin anew at a pose; what is known of the calibration stays."""
-        states = self.states_covariance
-        self._slot[:] = -1
-        self._considered = self._used_at = np.zeros(0, dtype=np.int64)
-        self._covariance = np.zeros((AT_PLACES, AT_PLACES))
-        self._consider(placed.rows)
-        by_places = np.zeros((3, 2 * len(self._considered)))
-        by_places[:, _columns(self._slot[placed.rows])] = placed.by_places
-        follows = by_places @ self._covariance[AT_PLACES:, AT_PLACES:]
-        self._covariance[:3, AT_PLACES:], self._covariance[AT_PLACES:, :3] = follows, follows.T
-        self._covariance[:3, :3] = placed.covariance + follows @ by_places.T
-        self._covariance[3:AT_PLACES, 3:AT_PLACES] = states
-        self._pose = np.array(placed.pose, dtype=np.float64)
+        local, places = self._filter, self.places
+        alone = np.zeros((AT_PLACES, AT_PLACES))
+        alone[3:, 3:] = self.states_covariance
+        local.hold(placed.pose, self.states, alone, NO_PLACES, places.position_m)
+        local.lean_on(places.position_m, places.joint_of, tied=places.joint_m2 is not None)
+        at = columns(local.bring(placed.rows))
+        covariance = local.covariance
+        follows = placed.by_places @ covariance[at]
+        covariance[:3, AT_PLACES:], covariance[AT_PLACES:, :3] = follows[:, AT_PLACES:], follows[:, AT_PLACES:].T
+        covariance[:3, :3] = placed.covariance + follows[:, at] @ placed.by_places.T
         self._believed[:] = self._log_p
         self._track = None
         self._agreed.clear()
@@ -218,60 +208,31 @@ class Localizer:
         self, stamp_s: float, first: IntArray, last: IntArray, seen: FrameSightings, used: IntArray
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """Place, innovation and weight of the detections `used`."""
-        places, reading = self.places, np.ascontiguousarray(seen.reading[used])
+        reading = np.ascontiguousarray(seen.reading[used])
         sigma = self.noise.of_detections(seen.sigma_given[used])
-        row = np.empty(len(used), dtype=np.int64)
-        choose_places(
-            self._pose, self._states, self._covariance, places.position_m, places.covariance_m2,
-            self._believed, self._slot, first, last, reading, sigma, self._mount, self._prior.free, row,
-        )  # fmt: skip
-        self._consider(np.unique(row))
-        nis, weight = np.empty((2, len(used)))
+        row = self._chosen(first, last, reading, sigma)
+        self._filter.bring(row)
         log_odds = self.noise.outlier_log_odds + self._believed[row]
-        update_considering(
-            self._pose, self._states, self._covariance, places.position_m[self._considered], self._slot[row], reading,
-            sigma, log_odds, self._mount, self._prior.free, nis, weight,
-        )  # fmt: skip
+        nis, weight = self._filter.update(row, reading, sigma, weighing=BY_OTHERS, log_odds=log_odds)
         doubt = self._log_p[row] - self._believed[row]
         agrees = weight * (1.0 + np.exp(doubt)) > 1.0  # would be more likely there than not, if it were not doubted
         self._believed[row] = self._log_p[row] - np.clip(doubt + np.where(agrees, -DOUBT, DOUBT), 0.0, MOST_DOUBT)
         self._judge(stamp_s, seen.landmark_id[used], agrees)
         return row, nis, weight
 
-    def _consider(self, rows: IntArray) -> None:
-        """Have different places (k,) in the covariance, instead of those that were used longest ago."""
-        new = rows[self._slot[rows] < 0]
-        self._used_at[self._slot[rows[self._slot[rows] >= 0]]] = self._frame
-        free = np.flatnonzero(self._considered == UNKNOWN)
-        room = len(self._considered)
-        if len(new) > len(free) and room < MOST_CONSIDERED:
-            more = min(max(room, len(new)), MOST_CONSIDERED - room)
-            self._considered = np.append(self._considered, np.full(more, UNKNOWN))
-            self._used_at = np.append(self._used_at, np.full(more, -1))
-            self._covariance = np.pad(self._covariance, (0, 2 * more))
-        longest_ago = np.argsort(self._used_at, kind="stable")[: len(new)]  # those that are free first
-        for slot in longest_ago[self._considered[longest_ago] != UNKNOWN].tolist():
-            self._slot[self._considered[slot]] = -1
-            self._considered[slot] = UNKNOWN
-        for row, slot in zip(new.tolist(), np.sort(longest_ago).tolist(), strict=True):
-            self._put(row, slot)
-
-    def _put(self, row: int, slot: int) -> None:
-        """One more place. Its error is known to be like its neighbours', as far as the map says that."""
-        at = slice(AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 2)
-        covariance, places = self._covariance, self.places
-        covariance[:, at] = 0.0
-        taken = np.flatnonzero(self._considered != UNKNOWN)
-        if places.joint_m2 is not None and len(taken):
-            others = self._considered[taken]
-            away = ((places.position_m[others] - places.position_m[row]) ** 2).sum(axis=1)
-            near = np.argsort(away, kind="stable")[:NEIGHBOURS]
-            joint = places.joint_of(np.append(others[near], row))
-            by = np.linalg.solve(joint[:-2, :-2], joint[:-2, -2:])
-            covariance[:, at] = covariance[:, AT_PLACES + _columns(taken[near])] @ by
-        covariance[at] = covariance[:, at].T
-        covariance[at, at] = places.covariance_m2[row]
-        self._slot[row], self._considered[slot], self._used_at[slot] = slot, row, self._frame
+    def _chosen(self, first: IntArray, last: IntArray, reading: FloatArray, sigma: FloatArray) -> IntArray:
+        """(M,) known place at which each landmark was seen: the most probable one (max-mixture, MATH.md section 5)."""
+        count = last - first
+        if np.count_nonzero(count > 1) == 0:
+            return first
+        begin = np.cumsum(count) - count
+        row = np.repeat(first - begin, count) + np.arange(int(count.sum()))
+        of = np.repeat(np.arange(len(first)), count)
+        nis, log_det, *_ = self._filter.compare(row, reading[of], sigma[of], self.places.covariance_m2[row])
+        score = self._believed[row] - 0.5 * nis - 0.5 * log_det
+        best = np.maximum.reduceat(score, begin)[of] == score
+        chosen: IntArray = row[best][np.unique(of[best], return_index=True)[1]]
+        return chosen
 
     def _judge(self, stamp_s: float, landmark_id: IntArray, agrees: BoolArray) -> None:
         """Lost where most of the landmarks compared last were not where they should have been."""
@@ -289,17 +250,12 @@ class Localizer:
 
     def _expect(self, seen_id: IntArray) -> tuple[IntArray, FloatArray, BoolArray]:
         """Rows of places in view, P(detect) of each, and which are missed."""
-        sigma = math.sqrt(max(self._covariance[0, 0], self._covariance[1, 1]))
+        spread, pose = self._filter.covariance, self._filter.pose
+        sigma = math.sqrt(max(spread[0, 0], spread[1, 1]))
         if not self._is_placed or self._track is not None or sigma > EXPECTING_SIGMA_M:
             return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.bool_)
-        rows = self._near(se2.compose(self._pose, self._mount)[:2])
-        p = self._field.p_detect(self._pose[None], self.places.position_m[rows])[0]
+        rows = self._near(se2.compose(pose, self._mount)[:2])
+        p = self._field.p_detect(pose[None], self.places.position_m[rows])[0]
         rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
         well = self._believed_there[rows] & self._field.worth_a_look(p)
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
-
-
-def _columns(rows: IntArray) -> IntArray:
-    """Columns of x and y of places."""
-    columns: IntArray = se2.xy_rows(rows)
-    return columns

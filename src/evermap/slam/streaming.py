@@ -1,6 +1,6 @@
 """Landmark SLAM of one recording, frame after frame.
 
-Every frame is predicted from odometry, compared with the map (innovations), and added to the incremental solver.
+Every frame is predicted from odometry, compared with the map (innovations), and added to the filter.
 Whenever the number of poses has doubled, the batch smoother relinearises: it finds the optimum of all so far,
 re-estimates the noise levels and hands both back, so the whole costs a constant factor more than the increments. A
 method decides which places detections belong to: of a frame before it is used, and of all at relinearisations.
@@ -9,20 +9,17 @@ method decides which places detections belong to: of a frame before it is used, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
-from evermap import plugins
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.local_filter import LocalFilter
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
+from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import Smoother
-from evermap.slam.solver import IncrementalSolver, Motion, compare
 from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -108,7 +105,6 @@ class StreamingSlam:
         prior_map: where to localise; None maps from scratch.
         robust: explain outliers instead of believing every identity.
         estimate_noise: learn noise levels from the recording, else keep `noise`.
-        solver: of the steps between two relinearisations.
         method: how landmarks that moved are explained; None takes the world to be static.
     """
 
@@ -121,7 +117,6 @@ class StreamingSlam:
         prior_map: PriorMap | None = None,
         robust: bool = True,
         estimate_noise: bool = True,
-        solver: Literal["arrow", "gtsam"] = "arrow",
         method: Method | None = None,
     ) -> None:
         self._prior = prior
@@ -131,8 +126,7 @@ class StreamingSlam:
         self._robust = robust
         self._estimate_noise = estimate_noise
         self._method = Static(len(problem.landmark_mean)) if method is None else method
-        self._solver_name: Literal["arrow", "gtsam"] = solver
-        self._solver = _solver(solver, self._problem, noise, robust=robust)
+        self._filter = SessionFilter(self._problem, noise, robust=robust)
         self._job: Slices[None] | None = None
         self._disputed = False
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
@@ -156,25 +150,23 @@ class StreamingSlam:
         """Process the next pose: predict, compare, add, and relinearise when it is time."""
         row = self._n_poses
         detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-        motion = self._motion(self._solver, row)
-        self._assign(row, motion, detections)
-        if motion is not None:
-            self._compare(motion, detections)
-        self._meet_new_landmarks(self._solver, self._landmark, motion, detections)
-        self._solver.add(row, motion, self._landmark)
+        if row > 0:
+            self._filter.drive(self._filter.motion(row))
+        self._assign(row, detections)
+        if row > 0:
+            self._compare(detections)
+        self._meet_new_landmarks(self._filter, self._landmark, detections)
+        self._filter.add(row, self._landmark)
         self._n_poses += 1
         self._plan(detections)
         self._work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
-        pose, covariance = self._solver.last_pose(), self._solver.last_covariance()
+        pose, covariance = self._filter.pose.copy(), self._filter.covariance[:3, :3].copy()
         pose[:2] *= self._scale
         covariance[:2] *= self._scale
         covariance[:, :2] *= self._scale
         self.online_pose[row], self.online_covariance[row] = pose, covariance
-
-    def _motion(self, solver: IncrementalSolver, row: int) -> Motion | None:
-        return Motion.between(self._problem, self._noise, row, solver.states()) if row > 0 else None
 
     def _plan(self, detections: IntArray) -> None:
         """Begin to relinearise if it is time."""
@@ -203,7 +195,7 @@ class StreamingSlam:
         if self._prior_map is not None and not self._aligned and self._can_align(final=True):
             self._enter_map()
         self._job = None
-        problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._solver.estimate())
+        problem, estimate = self._method.unprejudiced(self._problem.until(self._n_poses), self._filter.estimate())
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
             estimate = exhausted(_voted(Smoother(problem, self._noise, heavy=True), estimate))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
@@ -243,14 +235,14 @@ class StreamingSlam:
         assert fit is not None
         return smoother, estimate, replace(fit, noise=noise)
 
-    def _assign(self, row: int, motion: Motion | None, detections: IntArray) -> None:
+    def _assign(self, row: int, detections: IntArray) -> None:
         """Ask the method for the places of the coming pose's detections."""
 
         def distances(of: IntArray, places: IntArray) -> tuple[FloatArray, FloatArray]:
             squared, log_volume = np.full((2, len(of)), np.nan)
             known = np.isfinite(self._landmark[places, 0])
-            if motion is not None and known.any():
-                squared[known], log_volume[known] = compare(self._solver, self._noise, motion, of[known], places[known])
+            if row > 0 and known.any():
+                squared[known], log_volume[known] = self._filter.distances(of[known], places[known])
             return squared, log_volume
 
         before = self._problem.landmark_row[detections]
@@ -265,7 +257,7 @@ class StreamingSlam:
             replace(self._problem, landmark_row=landmark_row).with_places(count),
             np.pad(self._landmark, new, constant_values=np.nan),
         )
-        self._solver.problem = self._problem
+        self._filter.problem = self._problem
 
     def _adopt(self, problem: Problem, landmark: FloatArray) -> None:
         """Other places from here on, perhaps more of them or fewer; the first are the landmarks as before."""
@@ -274,14 +266,14 @@ class StreamingSlam:
         self._n_compared = np.pad(self._n_compared, (0, max(missing, 0)))[: len(landmark)]
         self._n_surprising = np.pad(self._n_surprising, (0, max(missing, 0)))[: len(landmark)]
 
-    def _compare(self, motion: Motion, detections: IntArray) -> None:
+    def _compare(self, detections: IntArray) -> None:
         landmark = self._problem.landmark_row[detections]
         known = np.isfinite(self._landmark[landmark, 0])
         if np.count_nonzero(known) < len(known):
             detections, landmark = detections[known], landmark[known]
         if not len(detections):
             return
-        nis, _ = compare(self._solver, self._noise, motion, detections, landmark)
+        nis, _ = self._filter.distances(detections, landmark)
         self.nis[detections] = nis
         np.add.at(self._n_compared, landmark, 1)
         surprising = nis > SURPRISING_NIS
@@ -297,9 +289,7 @@ class StreamingSlam:
         mapped = self._problem.mapped  # the map is believed: no vote moves its landmarks
         return any(not mapped[j] and self._n_compared[j] in DISPUTED_AT for j in doubted)
 
-    def _meet_new_landmarks(
-        self, solver: IncrementalSolver, landmark: FloatArray, motion: Motion | None, detections: IntArray
-    ) -> None:
+    def _meet_new_landmarks(self, running: SessionFilter, landmark: FloatArray, detections: IntArray) -> None:
         """Where a landmark that is seen for the first time must be: in the map, or by this one sighting."""
         new = np.isnan(landmark[self._problem.landmark_row[detections], 0])
         for m in detections[new] if np.count_nonzero(new) else ():
@@ -310,10 +300,8 @@ class StreamingSlam:
                 prior = self._problem.conditional_prior(j, np.isfinite(landmark[:, 0]))
                 landmark[j] = prior.place(landmark, self._problem.landmark_mean)
             else:
-                pose = solver.last_pose()
-                if motion is not None:
-                    pose = se2.compose(pose, motion.increment)
-                landmark[j] = sighted_at(pose, self._problem.reading[m], solver.states(), self._problem.mount)
+                reading, mount = self._problem.reading[m], self._problem.mount
+                landmark[j] = sighted_at(running.pose, reading, running.states, mount)
 
     def _relinearised(self, *, learn: bool) -> Slices[None]:
         """Relinearise all poses so far beside the stream, catch up with it, and take over.
@@ -321,7 +309,7 @@ class StreamingSlam:
         With `learn`, also vote on places, ask the method, and learn the noise.
         """
         self._relinearised_at = n = self._n_poses
-        problem, estimate = self._problem.until(n), self._solver.estimate()
+        problem, estimate = self._problem.until(n), self._filter.estimate()
         smoother = Smoother(problem, self._noise, heavy=True, robust=self._robust)
         if learn and self._robust:
             voted = yield from _voted(smoother, estimate)
@@ -354,26 +342,26 @@ class StreamingSlam:
             marginals = yield from smoother.under(self._noise, heavy=True).marginals_in_slices(estimate)
         if learn:
             self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
-        solver = _solver(self._solver_name, self._problem, self._noise, robust=self._robust)
-        solver.restart(estimate, self._noise, self._problem, marginals)
+        following = SessionFilter(self._problem, self._noise, robust=self._robust)
+        following.restart(estimate, self._noise, self._problem, marginals)
         landmark = estimate.landmark.copy()
         for row in range(n, len(self.online_pose)):
             if row == self._n_poses:
                 break
-            solver.problem = self._problem
+            following.problem = self._problem
             landmark = np.pad(
                 landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
             )
-            motion = self._motion(solver, row)
+            following.drive(following.motion(row))
             detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
-            self._meet_new_landmarks(solver, landmark, motion, detections)
-            solver.add(row, motion, landmark)
+            self._meet_new_landmarks(following, landmark, detections)
+            following.add(row, landmark)
             yield CAUGHT_UP_MS
-        self._solver, self._landmark = solver, landmark
+        self._filter, self._landmark = following, landmark
 
     def _restart(self, estimate: Estimate) -> None:
         self._landmark = estimate.landmark.copy()
-        self._solver.restart(estimate, self._noise, self._problem)
+        self._filter.restart(estimate, self._noise, self._problem)
 
     def _can_align(self, *, final: bool = False) -> bool:
         """Most of the prior map's landmarks seen so far stand to each other as in the map; two must do at the end."""
@@ -386,7 +374,7 @@ class StreamingSlam:
             return False
         self._align_tried = count
         at = self._prior_map.mean[both]
-        _, agree = consensus(self._solver.estimate().landmark[: len(both)][both], at)
+        _, agree = consensus(self._filter.estimate().landmark[: len(both)][both], at)
         if final:
             return bool(agree.sum() >= 2)
         enough = agree.sum() >= MIN_ALIGN_LANDMARKS and 2 * agree.sum() > count
@@ -396,7 +384,7 @@ class StreamingSlam:
         """From the first pose's frame into the prior map's: move all that is known, then hold it by the map."""
         prior_map = self._prior_map
         assert prior_map is not None
-        estimate = self._solver.estimate()
+        estimate = self._filter.estimate()
         new = len(estimate.landmark) - len(prior_map.given)  # places that landmarks have besides their own
         mean, given = np.pad(prior_map.mean, ((0, new), (0, 0))), np.pad(prior_map.given, (0, new))
         both = given & estimate.known
@@ -446,13 +434,6 @@ class StreamingSlam:
             aligned=self._aligned,
             revision=revision,
         )
-
-
-def _solver(name: Literal["arrow", "gtsam"], problem: Problem, noise: Noise, *, robust: bool) -> IncrementalSolver:
-    if name == "arrow":
-        return LocalFilter(problem, noise, robust=robust)
-    solver: IncrementalSolver = plugins.load("evermap.solvers", name)(problem, noise, robust=robust)
-    return solver
 
 
 def _settled(before: Noise, after: Noise, within: float) -> bool:

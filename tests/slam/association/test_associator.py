@@ -12,12 +12,10 @@ from recordings import building
 
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise
-from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
 from evermap.slam.association.identify import identified
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
-from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, Landmarks
 
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
@@ -52,30 +50,6 @@ def test_a_detection_of_nothing_is_nobodys() -> None:
     row = associated(replace(made, problem=replace(made.problem, reading=reading))).landmark_row
     assert row[50] == NOBODY
     assert identity_scores(np.delete(row, 50), np.delete(made.problem.landmark_row, 50)).purity == 1.0
-
-
-def test_the_filter_is_the_smoother_where_all_is_nearly_linear() -> None:
-    made = make_world(0, n_poses=6, n_landmarks=3, noisy=0.02, prior=KNOWN_SENSORS, p_seen=1.0)
-    problem, sigma = made.problem, made.noise.of_detections(made.problem.sigma_given)
-    belief = PoseBelief.first(problem)
-    for row in range(len(problem.stamp_s)):
-        belief = predicted(belief, problem, made.noise, row)
-        detections = np.flatnonzero(problem.pose_row == row)
-        pairings, by = pairings_of_frame(belief, problem, sigma, detections, confidence=1.0 - 1e-12, density=0.1)
-        right = pairings.target == problem.landmark_row[detections[pairings.source]]
-        if right.any():
-            belief = updated(belief, pairings, by, np.flatnonzero(right))
-        for m in detections[problem.landmark_row[detections] >= len(belief.landmark)]:
-            belief = with_landmark(belief, problem, sigma, int(m))
-    smoother = Smoother(problem, made.noise, robust=False)
-    estimate = smoother.optimum(Estimate(made.truth.pose, made.truth.landmark, problem.prior.mean))
-    batch = PoseBelief.at(estimate, smoother.marginals(estimate), len(problem.stamp_s) - 1)
-    np.testing.assert_allclose(belief.landmark, batch.landmark, atol=2e-4)
-    np.testing.assert_allclose(belief.pose, batch.pose, atol=2e-4)
-    free = np.r_[0:3, 12 : len(batch.covariance)]
-    np.testing.assert_allclose(
-        belief.covariance[np.ix_(free, free)], batch.covariance[np.ix_(free, free)], rtol=0.05, atol=2e-5
-    )
 
 
 def test_merging_and_forgetting_keep_the_detections_together() -> None:

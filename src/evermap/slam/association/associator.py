@@ -12,13 +12,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.constellation import RISE_NATS, propose_constellation, propose_merges
-from evermap.slam.association.filter import PoseBelief, pairings_of_frame, predicted, updated, with_landmark
-from evermap.slam.association.jcbb import Pairings, pairing_probability
+from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.linearise import detection_residuals
+from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
+from evermap.slam.motion import Motion
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
+from evermap.slam.streaming import sighted_at
 from evermap.types import BoolArray, FloatArray, IntArray
 
 CAUTION = 2.0
@@ -50,6 +53,8 @@ NOISE_FLOOR = 0.5
 """Share of the start's noise of sightings that imaginary ones vouch for."""
 INFLATION = 1.3
 """Of the noise of sightings: what was associated is what agreed."""
+MOST_COMPARED = 256
+"""Landmarks, the nearest, that a frame is compared with."""
 MERGE_ROUNDS = 20
 """Merges that are tried whenever stock is taken, at most."""
 LAST_ROUNDS = 5
@@ -60,9 +65,7 @@ LAST_ROUNDS = 5
 class _Frame:
     """A frame compared with the map: rows of `pairings` that are certain, and p (n,) of each to be new."""
 
-    belief: PoseBelief
     pairings: Pairings
-    derivative: FloatArray
     taken: IntArray
     p_new: FloatArray
     sigma: FloatArray
@@ -86,25 +89,51 @@ class Associator:
         self._pose = np.zeros((len(problem.stamp_s), 3))
         self._row: IntArray = np.full(len(problem.pose_row), NOBODY, dtype=np.int64)
         self._sighting_noise = SightingNoise.constant(noise.detection)
-        self._belief = PoseBelief.first(problem)
+        self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done = 0
         self._next_stock = FIRST_STOCK
 
     def step(self) -> None:
         """Associate the next frame."""
-        row = self._done
+        row, local = self._done, self._filter
         detections = np.arange(self._first[row], self._first[row + 1])
-        before = self._belief
-        frame = self._match(predicted(before, self._problem, self.noise, row), detections)
-        if row > 0 and len(frame.taken) == 0:  # the wheels slipped, or stamps jittered in a turn?
-            slipped = self._match(predicted(before, self._problem, self._slipping, row), detections)
-            frame = slipped if len(slipped.taken) else frame
+        if row == 0:
+            covariance = local.covariance.copy()
+            covariance[:3, :3] = np.eye(3) / self._problem.start_information
+            local.hold(self._problem.start_pose, local.states, covariance, NO_PLACES, local.position)
+            frame = self._match(detections)
+        else:
+            frame = self._after_driving(row, detections)
         self._use(frame, detections)
-        self._pose[row] = self._belief.pose
+        self._pose[row] = local.pose
         self._done += 1
         if self._done == self._next_stock:
             self._take_stock()
             self._next_stock = self._done + max(FIRST_STOCK, self._done // 10)
+
+    def _after_driving(self, row: int, detections: IntArray) -> _Frame:
+        """The next frame compared with the map; if nothing is where it should be, as after wheels that slipped."""
+        local, problem = self._filter, self._problem
+        motion = Motion.between(problem, self.noise, row, local.states)
+        self._have_near(se2.compose(local.pose, motion.increment))
+        before = local.pose.copy(), local.covariance.copy()
+        local.drive(motion)
+        frame = self._match(detections)
+        if len(frame.taken):
+            return frame
+        after = local.pose, local.covariance  # the wheels slipped, or stamps jittered in a turn?
+        local.pose, local.covariance = before
+        local.drive(Motion.between(problem, self._slipping, row, local.states))
+        slipped = self._match(detections)
+        if len(slipped.taken):
+            return slipped
+        local.pose, local.covariance = after
+        return frame
+
+    def _have_near(self, pose: FloatArray) -> None:
+        """Have the landmarks around a pose in the filter: all, if they are few."""
+        away = np.hypot(*(self._filter.position - pose[:2]).T)
+        self._filter.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
 
     def finish(self) -> Assignment:
         """Settle everything processed so far."""
@@ -119,23 +148,19 @@ class Associator:
     @property
     def _density(self) -> float:
         """Landmarks a square metre that one may still meet."""
-        return density_of_unmet(self._belief.landmark)
+        return density_of_unmet(self._filter.position)
 
-    def _match(self, belief: PoseBelief, detections: IntArray) -> _Frame:
+    def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
-        pairings, derivative = pairings_of_frame(
-            belief, self._problem, sigma, detections, confidence=GATE, density=self._density
-        )
+        pairings = pairings_of_frame(self._filter, self._problem, sigma, detections, density=self._density)
         probability, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
-        taken = np.flatnonzero((probability >= P_MATCH) | self._harmless(belief, pairings, probability, known))
-        return _Frame(belief, pairings, derivative, taken, 1.0 - known, sigma)
+        taken = np.flatnonzero((probability >= P_MATCH) | self._harmless(pairings, probability, known))
+        return _Frame(pairings, taken, 1.0 - known, sigma)
 
-    def _harmless(
-        self, belief: PoseBelief, pairings: Pairings, probability: FloatArray, known: FloatArray
-    ) -> BoolArray:
+    def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray) -> BoolArray:
         """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
 
         That is where the gate is small, or where its rivals may well be the same landmark.
@@ -148,34 +173,45 @@ class Associator:
             own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
             area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density
             tight = area_m2 < TIGHT_M2
-            best[first] = tight or all(
-                belief.may_be_one(pairings.target[first], pairings.target[k], GATE) for k in rivals
-            )
+            best[first] = tight or all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
         return best
+
+    def _may_be_one(self, a: int, b: int) -> bool:
+        """True where the difference of two landmarks is insignificant."""
+        local = self._filter
+        at = columns(local.bring(np.array([a, b])))
+        by = np.hstack([np.eye(2), -np.eye(2)])
+        spread = by @ local.covariance[np.ix_(at, at)] @ by.T + 1e-12 * np.eye(2)
+        gap = local.position[a] - local.position[b]
+        return bool(gap @ np.linalg.solve(spread, gap) < gates(1, GATE)[1])
 
     def _use(self, frame: _Frame, detections: IntArray) -> None:
         """Update with the certain pairings, and start landmarks where none is near enough."""
-        belief, pairings, taken = frame.belief, frame.pairings, frame.taken
-        self._row[detections[pairings.source[taken]]] = pairings.target[taken]
-        if len(taken):
-            belief = updated(belief, pairings, frame.derivative, taken)
-        for m in detections[frame.p_new >= P_NEW]:
-            self._row[m] = len(belief.landmark)
-            belief = with_landmark(belief, self._problem, frame.sigma, m)
-        self._belief = belief
+        problem, local, pairings = self._problem, self._filter, frame.pairings
+        known, target = detections[pairings.source[frame.taken]], pairings.target[frame.taken]
+        self._row[known] = target
+        local.update(target, problem.reading[known], frame.sigma[known])
+        new = detections[frame.p_new >= P_NEW]
+        self._row[new] = len(local.position) + np.arange(len(new))
+        at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
+        for row, place in zip(self._row[new].tolist(), at, strict=True):
+            local.meet(row, place)
+        local.update(self._row[new], problem.reading[new], frame.sigma[new])
 
     def _take_stock(self) -> None:
         """Solve everything so far, merge what is one, and go on from there."""
         assignment, marginals = self._settled(self._without_chance(self._assignment()))
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
-        self._belief = PoseBelief.at(assignment.estimate, marginals, self._done - 1)
+        place = assignment.estimate.landmark
+        near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
+        self._filter.begin(assignment.estimate, marginals, self._done - 1, near)
 
     def _assignment(self) -> Assignment:
         measured = self._problem.until(self._done)
         sigma = INFLATION * self._sighting_noise.of_detections(measured)
         measured = replace(measured, sigma_given=sigma)
-        estimate = Estimate(self._pose[: self._done].copy(), self._belief.landmark, self._belief.states)
+        estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
         return Assignment(measured, self._row[: len(measured.pose_row)].copy(), estimate)
 
     def _without_chance(self, assignment: Assignment) -> Assignment:
@@ -243,16 +279,52 @@ class Associator:
         """Every detection compared with the whole map once more, and given to whom it most probably belongs."""
         problem = assignment.measured
         sigma = problem.sigma_given
-        row, across = np.full_like(assignment.landmark_row, NOBODY), marginals.pose_shared
+        row, everything = np.full_like(assignment.landmark_row, NOBODY), np.arange(assignment.n_landmarks)
+        smoothed, local = assignment.estimate, LocalFilter(problem.mount, problem.prior)
+        n = 2 * len(everything)
+        order = np.append(n + np.arange(9), np.arange(n))
+        covariance = np.zeros((3 + len(order), 3 + len(order)))
+        covariance[3:, 3:] = marginals.shared[np.ix_(order, order)]
         for i in range(self._done):
             detections = np.arange(self._first[i], self._first[i + 1])
-            belief = PoseBelief.at(assignment.estimate, marginals, i, across[i])
-            pairings, _ = pairings_of_frame(belief, problem, sigma, detections, confidence=GATE, density=self._density)
+            covariance[:3, :3], covariance[:3, 3:] = marginals.pose[i], marginals.pose_shared[i][:, order]
+            covariance[3:, :3] = covariance[:3, 3:].T
+            local.hold(smoothed.pose[i], smoothed.states, covariance, everything, smoothed.landmark)
+            pairings = pairings_of_frame(local, problem, sigma, detections, density=self._density)
             probability, _ = pairing_probability(pairings, confidence=GATE)
             taken = np.flatnonzero(probability > 0.5)
             row[detections[pairings.source[taken]]] = pairings.target[taken]
         again = Assignment(problem, row, assignment.estimate)
         return again.without(again.sightings == 0)
+
+
+def pairings_of_frame(
+    local: LocalFilter, problem: Problem, sigma: FloatArray, detections: IntArray, *, density: float
+) -> Pairings:
+    """Return detections of a frame with the landmarks whose gates they pass.
+
+    Args:
+        local: the pose that made the detections, with the landmarks that are compared.
+        problem: the readings.
+        sigma: (M, 2) standard deviations of all detections.
+        detections: (n,) rows of those of the frame.
+        density: landmarks a square metre that one expects where none was met before.
+    """
+    target = np.sort(local.active)
+    source, target = np.repeat(np.arange(len(detections)), len(target)), np.tile(target, len(detections))
+    seen = detections[source]
+    nis, _, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
+    inside = np.flatnonzero(nis <= gates(1, GATE)[1])
+    source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
+    rows = np.zeros((count, 2, len(local.covariance)))
+    rows[:, :, :8] = by[inside, :, :8]
+    at = columns(local.bring(target)).reshape(-1, 1, 2)
+    np.put_along_axis(rows, np.repeat(at, 2, axis=1), by[inside, :, 8:], axis=2)
+    h = rows.reshape(2 * count, rows.shape[2])
+    joint = h @ local.covariance @ h.T + np.diag((sigma[seen] ** 2).ravel())
+    # a square metre has r dr db
+    new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
+    return Pairings(source, target, innovation[inside], joint, new, len(detections))
 
 
 def density_of_unmet(place: FloatArray) -> float:

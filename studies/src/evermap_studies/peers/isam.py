@@ -15,9 +15,9 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 
 from evermap.geometry import se2
+from evermap.slam.motion import Motion
 from evermap.slam.problem import ConditionalPrior, Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.solver import Motion
 from evermap.types import FloatArray, IntArray
 from evermap_studies.peers.whitened import whitened_detections, whitened_odometry
 
@@ -38,7 +38,7 @@ def _landmark_key(row: int) -> int:
 
 
 class IncrementalSmoother:
-    """The incremental solver to compare others with; see `solver.IncrementalSolver` for its methods.
+    """The incremental solver to compare `session_filter.SessionFilter` with.
 
     The tree holds the last poses only. What the older ones say about them, about the landmarks and the states is one
     linear factor, so that a step costs what the map costs, whatever the age of the recording.

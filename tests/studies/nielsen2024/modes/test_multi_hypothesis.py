@@ -25,7 +25,7 @@ def stream(moving: MovingWorld, method: object, *, told: bool = False) -> Outcom
         method=method,  # type: ignore[arg-type]
     )
     slam._problem = replace(problem, prior=default_prior())  # the map is given, as after entering one
-    slam._solver.problem = slam._problem
+    slam._filter.problem = slam._problem
     slam._aligned = True
     for _ in range(len(problem.stamp_s)):
         slam.step()

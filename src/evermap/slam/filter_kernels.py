@@ -1,0 +1,418 @@
+"""The steps of the local filter, compiled: drive on, compare a frame with places, update by all of it at once.
+
+A state is the newest pose, the calibration states and the places in slots: covariance (12 + 2 K, 12 + 2 K) in this
+order, rows of slots that are free zero. Everything is in place.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from evermap.compiled import kept
+from evermap.slam.kernels import (
+    AT_PLACES,
+    adjoint,
+    composed,
+    detection_residual,
+    inlier_weight,
+    inverted,
+    kernel,
+    sandwich,
+    wrapped,
+)
+from evermap.types import FloatArray, IntArray
+
+ITERATIONS = 10
+SMALL_STEP = 1e-4
+"""Iterations of an update at most, and the step (m, rad or 1) that ends them."""
+CONSIDERED_STEP = 1e-2
+"""The same where places are only considered, and none can be led astray: less bends no measurement equation."""
+SETTLED_WEIGHT = 0.02
+"""Change of a weight below which the iterations end."""
+UNSURE = 4.0
+"""Times by which a detection's innovation is wider (in area) than its own noise where the pose is so uncertain that
+whether the detection is an outlier is better asked of the others of the frame."""
+LEAST_WEIGHT = 1e-6
+LARGE = 32
+"""Rows from which a matrix is factorised by LAPACK."""
+BELIEVED, HEAVY, BY_OTHERS = 0, 1, 2
+"""How detections are weighed: not at all; by the Cauchy's tails, as in the smoother's first rounds; as inliers or
+outliers, where the pose is uncertain by what the others of the frame say."""
+
+
+@kernel
+def linearise_frame(
+    pose: FloatArray, states: FloatArray, place: FloatArray, slot: IntArray, reading: FloatArray, mount: FloatArray,
+    free: Any, turned: float, residual: FloatArray, jacobian: FloatArray, column: IntArray,
+) -> None:  # fmt: skip
+    """Compute residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
+
+    The step of the pose is told in the frame of where it started, from which it has `turned` by now.
+    """
+    e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    c, s = math.cos(turned), math.sin(turned)
+    for m in range(len(reading)):
+        detection_residual(pose, place[slot[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
+        for k in range(2):
+            row = 2 * m + k
+            residual[row] = e[k]
+            jacobian[row, 0] = c * jx[k, 0] - s * jx[k, 1]
+            jacobian[row, 1] = s * jx[k, 0] + c * jx[k, 1]
+            jacobian[row, 2] = jx[k, 2]
+            for a in range(5):
+                jacobian[row, 3 + a] = jc[k, a] if free[a] else 0.0
+            jacobian[row, 8], jacobian[row, 9] = jl[k, 0], jl[k, 1]
+        for a in range(8):
+            column[m, a] = a
+        column[m, 8], column[m, 9] = AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
+
+
+@kernel
+def spread_of_frame(
+    covariance: FloatArray, jacobian: FloatArray, column: IntArray, gain: FloatArray, spread: FloatArray
+) -> None:
+    """Compute `H P` (2 M, size) and `H P H'` (2 M, 2 M)."""
+    gain[:] = 0.0
+    for row in range(len(jacobian)):
+        for a in range(10):
+            by, at = jacobian[row, a], column[row // 2, a]
+            if by != 0.0:
+                for k in range(len(covariance)):
+                    gain[row, k] += by * covariance[at, k]
+    spread[:] = np.ascontiguousarray(gain[:, :8]) @ np.ascontiguousarray(jacobian[:, :8].T)
+    for row in range(len(jacobian)):
+        for other in range(row + 1):
+            x, y = column[other // 2, 8], column[other // 2, 9]
+            total = spread[row, other] + gain[row, x] * jacobian[other, 8] + gain[row, y] * jacobian[other, 9]
+            spread[row, other] = spread[other, row] = total
+
+
+@kernel
+def turn_pose(covariance: FloatArray, turned: float) -> None:
+    """Rotate the covariance of the pose into its own frame, which has turned."""
+    c, s = math.cos(turned), math.sin(turned)
+    for k in range(len(covariance)):
+        x, y = covariance[0, k], covariance[1, k]
+        covariance[0, k], covariance[1, k] = c * x + s * y, -s * x + c * y
+    for k in range(len(covariance)):
+        x, y = covariance[k, 0], covariance[k, 1]
+        covariance[k, 0], covariance[k, 1] = c * x + s * y, -s * x + c * y
+
+
+@kernel
+def drive_on(
+    pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
+) -> None:
+    """Advance the newest pose and the joint covariance to the next pose, in place."""
+    pose[:] = composed(pose, increment)
+    pose[2] = wrapped(pose[2])
+    size = len(covariance)
+    carry = adjoint(inverted(increment))
+    for k in range(3, size):
+        x, y, turn = covariance[0, k], covariance[1, k], covariance[2, k]
+        covariance[0, k] = carry[0, 0] * x + carry[0, 1] * y + carry[0, 2] * turn
+        covariance[1, k] = carry[1, 0] * x + carry[1, 1] * y + carry[1, 2] * turn
+    block = covariance[:3, :3].copy()
+    cross = covariance[:3, 8:12].copy() @ by_states.T
+    covariance[:3, :3] = carry @ block @ carry.T + cross + cross.T + noise
+    covariance[:3, :3] += by_states @ covariance[8:12, 8:12].copy() @ by_states.T
+    for a in range(3):
+        for k in range(3, size):
+            for b in range(4):
+                covariance[a, k] += by_states[a, b] * covariance[8 + b, k]
+            covariance[k, a] = covariance[a, k]
+
+
+@kernel
+def innovations(
+    pose: FloatArray, states: FloatArray, covariance: FloatArray, place: FloatArray, slot: Any, own: FloatArray,
+    reading: FloatArray, sigma: FloatArray, mount: FloatArray, free: Any,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:  # fmt: skip
+    """Compare K detections with a place each, each pair by itself: `S = H P H' + R`.
+
+    Args:
+        pose: (3,) of the state.
+        states: (9,) of it.
+        covariance: of it.
+        place: (K, 2).
+        slot: (K,) where the place stands in the covariance, -1 where it does not.
+        own: (K, 2, 2) covariance of places without a slot.
+        reading: (K, 2) range and bearing.
+        sigma: (K, 2) their noise.
+        mount: (3,) pose of the sensor on the robot.
+        free: (9,) which calibration states are estimated.
+
+    Returns:
+        (K,) squared Mahalanobis distance, (K,) `log |S|`, (K, 2) residual and (K, 2, 10) its derivatives by pose,
+        sensor states and place.
+    """
+    count = len(reading)
+    nis, log_det, residual, by = np.empty(count), np.empty(count), np.empty((count, 2)), np.zeros((count, 2, 10))
+    jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
+    part, h_part, s = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2))
+    for m in range(count):
+        e, h, at = residual[m], by[m], AT_PLACES + 2 * slot[m]
+        detection_residual(pose, place[m], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
+        for a in range(2):
+            h[a, :3], h[a, 8:] = jx[a], jl[a]
+            for b in range(5):
+                h[a, 3 + b] = jc[a, b] if free[b] else 0.0
+        part[:8, :8] = covariance[:8, :8]
+        if slot[m] >= 0:
+            part[:8, 8:], part[8:, :8] = covariance[:8, at : at + 2], covariance[at : at + 2, :8]
+            part[8:, 8:] = covariance[at : at + 2, at : at + 2]
+        else:
+            part[:8, 8:], part[8:, :8] = 0.0, 0.0
+            part[8:, 8:] = own[m]
+        sandwich(h, part, h_part, s)
+        a, b, d = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
+        nis[m] = _squared(a, b, d, e[0], e[1])
+        log_det[m] = math.log(a * d - b * b)
+    return nis, log_det, residual, by
+
+
+@kernel
+def update(
+    pose: FloatArray, states: FloatArray, covariance: FloatArray, position: FloatArray, row: Any, slot: Any,
+    reading: FloatArray, sigma: FloatArray, log_odds: FloatArray, mount: FloatArray, free: Any, considered: bool,
+    weighing: int,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Update by all detections of a frame at once, relinearised and re-weighted until nothing moves.
+
+    Only pose, calibration and the places that are seen take part in that; the other places follow at last. Places that
+    are only considered (Schmidt 1966) stand in the covariance with the correlations that detections make, but stay
+    where they are: pose and calibration get the gain that is best for them, the places none.
+
+    Args:
+        pose: (3,) in and out.
+        states: (9,) in and out.
+        covariance: in and out.
+        position: (L, 2) in and out, of all places.
+        row: (K,) which of them is in each slot, negative in a free one.
+        slot: (M,) of the place of each detection.
+        reading: (M, 2) range and bearing.
+        sigma: (M, 2) their noise.
+        log_odds: (M,) for 'no outlier' where a detection is exactly where it is expected, for `BY_OTHERS`.
+        mount: (3,) pose of the sensor on the robot.
+        free: (9,) which calibration states are estimated.
+        considered: whether places stay where they are.
+        weighing: how detections are weighed.
+
+    Returns:
+        (M,) squared distance of each innovation by itself, before the frame was used, and (M,) weights.
+    """
+    count, small = len(slot), CONSIDERED_STEP if considered else SMALL_STEP
+    size, own = AT_PLACES + 2 * count, np.arange(count)
+    nis, weight, credible = np.zeros(count), np.ones(count), np.ones(count)
+    if count == 0:
+        return nis, weight
+    place, where = position[row[slot]], np.arange(size)
+    where[AT_PLACES::2], where[AT_PLACES + 1 :: 2] = AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 1
+    part = np.empty((size, size))
+    for k in range(size):
+        for other in range(size):
+            part[k, other] = covariance[where[k], where[other]]
+    start, start_states, start_place = pose.copy(), states.copy(), place.copy()
+    moving, before, step = AT_PLACES if considered else size, np.zeros(size), np.zeros(size)
+    innovation, pull = np.zeros(2 * count), np.zeros(2 * count)
+    jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
+    root, gain, spread = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size)), np.zeros((0, 0))
+    unsure = False
+    for iteration in range(ITERATIONS):
+        linearise_frame(pose, states, place, own, reading, mount, free, step[2], innovation, jacobian, column)
+        spread_of_frame(part, jacobian, column, gain, root)
+        if weighing == BY_OTHERS and iteration == 0:
+            unsure = _surprises(part, jacobian, root, innovation, sigma, nis)
+            for m in range(count):
+                weight[m] = credible[m] = max(inlier_weight(nis[m], log_odds[m], False), LEAST_WEIGHT)
+        for m in range(count if weighing == HEAVY else 0):
+            # before anything is known of this frame: as surprising as its innovation is
+            unknown = 1.0 if iteration == 0 else 0.0
+            a, d = unknown * root[2 * m, 2 * m], unknown * root[2 * m + 1, 2 * m + 1]
+            squared = _squared(
+                a + sigma[m, 0] ** 2, unknown * root[2 * m, 2 * m + 1], d + sigma[m, 1] ** 2,
+                innovation[2 * m], innovation[2 * m + 1],
+            )  # fmt: skip
+            weight[m] = inlier_weight(squared, 0.0, True)
+        for each in range(2 * count):
+            root[each, each] += sigma[each // 2, each % 2] ** 2 / weight[each // 2]
+            # innovation at the step so far, told at the start
+            for a in range(10):
+                innovation[each] -= jacobian[each, a] * step[column[each // 2, a]]
+        if unsure:
+            spread = root.copy()
+        _solve(root, innovation, pull)
+        before[:], step[:] = step, 0.0
+        moved = 0.0
+        for k in range(moving):
+            for each in range(2 * count):
+                step[k] -= pull[each] * gain[each, k]
+            moved = max(moved, abs(step[k] - before[k]))
+        c, s = math.cos(start[2]), math.sin(start[2])
+        pose[0] = start[0] + c * step[0] - s * step[1]
+        pose[1] = start[1] + s * step[0] + c * step[1]
+        pose[2] = wrapped(start[2] + step[2])
+        for k in range(3, size):
+            if k >= AT_PLACES:
+                place[(k - AT_PLACES) // 2, k % 2] = start_place[(k - AT_PLACES) // 2, k % 2] + step[k]
+            else:
+                states[k - 3] = start_states[k - 3] + step[k]
+        changed = 0.0
+        if unsure:
+            changed = _weigh_by_the_others(spread, pull, sigma, log_odds, iteration == 0, credible, weight)
+        if moved < small and changed < SETTLED_WEIGHT:
+            break
+    column[:, 8], column[:, 9] = where[AT_PLACES::2], where[AT_PLACES + 1 :: 2]
+    white = np.zeros((2 * count, len(covariance) + 1))
+    white[:, -1] = innovation
+    _across(covariance, jacobian, column, white)
+    if considered:
+        _consider(covariance, root, white)
+    else:
+        _condition(covariance, root, white)
+        for k in range(len(row)):
+            for each in range(2 * count if row[k] >= 0 else 0):
+                for a in range(2):
+                    position[row[k], a] -= white[each, AT_PLACES + 2 * k + a] * white[each, -1]
+    turn_pose(covariance, step[2])
+    return nis, weight
+
+
+@kernel
+def _surprises(
+    part: FloatArray, jacobian: FloatArray, spread: FloatArray, residual: FloatArray, sigma: FloatArray, nis: FloatArray
+) -> bool:
+    """Squared distance of every detection by itself; True where the pose is so uncertain that this tells little."""
+    unsure = False
+    for m in range(len(nis)):
+        r, q, x = sigma[m, 0] ** 2, sigma[m, 1] ** 2, AT_PLACES + 2 * m
+        a, b, d = spread[2 * m, 2 * m] + r, spread[2 * m, 2 * m + 1], spread[2 * m + 1, 2 * m + 1] + q
+        nis[m] = _squared(a, b, d, residual[2 * m], residual[2 * m + 1])
+        # what it would be if only the reading and the place were uncertain
+        xx, xy, yy = part[x, x], part[x, x + 1], part[x + 1, x + 1]
+        i, j = jacobian[2 * m, 8], jacobian[2 * m, 9]
+        k, n = jacobian[2 * m + 1, 8], jacobian[2 * m + 1, 9]
+        own_a = i * i * xx + 2.0 * i * j * xy + j * j * yy + r
+        own_b = i * k * xx + (i * n + j * k) * xy + j * n * yy
+        own_d = k * k * xx + 2.0 * k * n * xy + n * n * yy + q
+        unsure |= a * d - b * b > UNSURE * (own_a * own_d - own_b * own_b)
+    return unsure
+
+
+@kernel
+def _weigh_by_the_others(
+    spread: FloatArray,
+    pull: FloatArray,
+    sigma: FloatArray,
+    log_odds: FloatArray,
+    heavy: bool,
+    credible: FloatArray,
+    weight: FloatArray,
+) -> float:
+    """New weights, at most `credible`, by each detection's innovation given all others; returns the largest change.
+
+    With `V` the inverse of the innovations' covariance and `p = V r`, what is left of detection m when the others have
+    been used is `V_mm^-1 p_m`, with covariance `V_mm^-1` (leave one out).
+    """
+    inverse: Any = np.linalg.inv(spread)
+    changed = 0.0
+    for m in range(len(weight)):
+        a, b, d = inverse[2 * m, 2 * m], inverse[2 * m, 2 * m + 1], inverse[2 * m + 1, 2 * m + 1]
+        det = a * d - b * b
+        aa, bb, dd = d / det, -b / det, a / det
+        x, y = aa * pull[2 * m] + bb * pull[2 * m + 1], bb * pull[2 * m] + dd * pull[2 * m + 1]
+        more = 1.0 / weight[m] - 1.0  # noise by which it was held to be an outlier
+        squared = _squared(aa - more * sigma[m, 0] ** 2, bb, dd - more * sigma[m, 1] ** 2, x, y)
+        now = min(max(inlier_weight(max(squared, 0.0), log_odds[m], heavy), LEAST_WEIGHT), credible[m])
+        changed = max(changed, abs(now - weight[m]))
+        weight[m] = now
+    return changed
+
+
+@kernel
+def _squared(a: float, b: float, d: float, x: float, y: float) -> float:
+    """Squared Mahalanobis distance of (x, y) with covariance [[a, b], [b, d]]."""
+    return (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+
+
+@kernel
+def _solve(matrix: FloatArray, right: FloatArray, x: FloatArray) -> None:
+    """Solve by Cholesky's factor, which takes the place of the lower triangle of the matrix."""
+    large = len(matrix) > LARGE
+    if large:
+        factor: Any = np.linalg.cholesky(matrix)
+        matrix[:] = factor
+    for i in range(len(matrix)):
+        for k in range(0 if large else i + 1):
+            total = matrix[i, k]
+            for a in range(k):
+                total -= matrix[i, a] * matrix[k, a]
+            matrix[i, k] = math.sqrt(total) if k == i else total / matrix[k, k]
+        x[i] = right[i]
+        for a in range(i):
+            x[i] -= matrix[i, a] * x[a]
+        x[i] /= matrix[i, i]
+    for i in range(len(matrix) - 1, -1, -1):
+        x[i] /= matrix[i, i]
+        for a in range(i):
+            x[a] -= matrix[i, a] * x[i]
+
+
+vectorised = kept(effort=3, error_model="numpy", fastmath={"contract"})
+
+
+@vectorised
+def _across(covariance: FloatArray, jacobian: FloatArray, column: Any, out: FloatArray) -> None:
+    """Add `H P`, (2 M, size), to the first columns of `out`."""
+    for row in range(len(out)):
+        for a in range(10):
+            by, at = jacobian[row, a], column[row // 2, a]
+            for k in range(len(covariance) if by != 0.0 else 0):
+                out[row, k] += by * covariance[at, k]
+
+
+@vectorised
+def _condition(covariance: FloatArray, root: FloatArray, white: FloatArray) -> None:
+    """Condition on detections, with the lower root of `S = H P H' + R`; `white`, `H P` and innovations, becomes
+    `root^-1 (H P, innovations)`.
+    """
+    for row in range(len(white)):
+        for other in range(row):
+            for k in range(white.shape[1]):
+                white[row, k] -= root[row, other] * white[other, k]
+        for k in range(white.shape[1]):
+            white[row, k] /= root[row, row]
+    for i in range(len(covariance)):
+        mine = covariance[i]
+        for row in range(0, len(white), 2):
+            one, two = white[row], white[row + 1]
+            a, b = one[i], two[i]
+            for k in range(len(covariance)):
+                mine[k] -= a * one[k] + b * two[k]
+
+
+@vectorised
+def _consider(covariance: FloatArray, root: FloatArray, across: FloatArray) -> None:
+    """Update pose and states as Schmidt with `across`, the `H P` of all; the places keep what is unknown of them."""
+    n, size = len(root), len(covariance)
+    told = across[:, :AT_PLACES].copy()  # becomes S^-1 H P, of pose and states alone
+    for i in range(n):
+        for k in range(i):
+            for b in range(AT_PLACES):
+                told[i, b] -= root[i, k] * told[k, b]
+        for b in range(AT_PLACES):
+            told[i, b] /= root[i, i]
+    for i in range(n - 1, -1, -1):
+        for b in range(AT_PLACES):
+            told[i, b] /= root[i, i]
+        for k in range(i):
+            for b in range(AT_PLACES):
+                told[k, b] -= root[i, k] * told[i, b]
+    less = np.ascontiguousarray(told.T) @ across
+    for a in range(AT_PLACES):
+        for k in range(a, size):
+            covariance[a, k] -= less[a, k]
+            covariance[k, a] = covariance[a, k]
