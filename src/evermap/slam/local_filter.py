@@ -139,7 +139,7 @@ class LocalFilter:
         drive_on(self.pose, self.covariance, motion.increment, motion.by_states, motion.covariance)
 
     def bring(self, rows: IntArray) -> IntArray:
-        """Have known places (k,) in the covariance, in place of those used longest ago; returns their slots."""
+        """Bring known places (k,) into the covariance, in place of those used longest ago, and return their slots."""
         slots = self._slot[rows]
         here = slots >= 0
         if np.count_nonzero(here) == len(here):
@@ -207,7 +207,7 @@ class LocalFilter:
         )  # fmt: skip
 
     def know_of(self, count: int) -> None:
-        """Have so many places in all; nothing is known of new ones."""
+        """Make room for so many places in all; nothing is known of new ones."""
         more = count - len(self.position)
         if more > 0:
             self.position = np.pad(self.position, ((0, more), (0, 0)), constant_values=np.nan)
