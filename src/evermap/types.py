@@ -619,6 +619,11 @@ class SpatialRecording(Shown):
             "source": self.source,
         }
 
+    def plot(self) -> Figure:
+        """Draw detections over time and range, and the truth where there is one; returns a matplotlib figure."""
+        figure: Figure = draw("plot_recording", self)
+        return figure
+
 
 AnyRecording = Recording | SpatialRecording
 """A session in the plane or in space."""
@@ -693,8 +698,9 @@ class MapChange(Shown):
         landmark_ids: the group, sorted.
         kind: what happened to it.
         stamp_from_s, stamp_to_s: it happened between these two; nan and the first stamp for 'before the session'.
-        displacement_m: (x, y) of the group's centroid, in the map's frame; nan where it was not, or is not, there.
-        rotation_rad: about the centroid, counter-clockwise; 0 where it did not turn.
+        displacement_m: (x, y), in space (x, y, z), of the group's centroid, in the map's frame; nan where it was not,
+            or is not, there.
+        rotation_rad: about the centroid, counter-clockwise, in space about any axis; 0 where it did not turn.
         probability: of this very group at this time, over all hypotheses that were weighed.
         n_hits, n_misses: detections at the new place, and expected detections at the old one that did not come.
         names: what the landmarks are called, if any id has a text behind it; see `labels`.
@@ -704,7 +710,7 @@ class MapChange(Shown):
     kind: ChangeKind
     stamp_from_s: float
     stamp_to_s: float
-    displacement_m: tuple[float, float]
+    displacement_m: tuple[float, ...]
     rotation_rad: float
     probability: float
     n_hits: int = 0
@@ -784,7 +790,7 @@ class SlamResult(Shown):
             "interrupted": self.interrupted,
         }
 
-    def plot(self, recording: Recording | None = None) -> Figure:
+    def plot(self, recording: AnyRecording | None = None) -> Figure:
         """Draw path and map; with its recording also the truth and what was seen. Returns a matplotlib figure."""
         figure: Figure = draw("plot_result", self, recording)
         return figure

@@ -37,7 +37,10 @@ _ROWS = (
     ("metrics", "pose_rmse_m", "position error, RMSE", "{:.3f} m"),
     ("metrics", "heading_rmse_deg", "heading error, RMSE", "{:.2f} deg"),
     ("metrics", "heading_rmse_in_view_deg", "  while landmarks were in view", "{:.2f} deg"),
+    ("metrics", "orientation_rmse_deg", "orientation error, RMSE", "{:.2f} deg"),
     ("metrics", "landmark_rmse_m", "landmark error, RMSE", "{:.3f} m"),
+    ("metrics", "landmark_median_m", "landmark error, median", "{:.3f} m"),
+    ("metrics", "landmark_orientation_rmse_deg", "landmark orientation, RMSE", "{:.2f} deg"),
     ("metrics", "dead_reckoning_rmse_m", "odometry alone, RMSE", "{:.3f} m"),
     ("metrics", "nis_mean", "innovations (2 is consistent)", "{:.2f}"),
     ("timing", "real_time_factor", "speed", "{:.0f} x real time"),
@@ -237,10 +240,11 @@ def _write(
     if how["as_json"]:
         print_json(summary)
         return
+    twice = {"orientation_rmse_deg"} if summary["metrics"]["heading_rmse_deg"] is not None else set()  # in the plane
     rows = [
         (label, form.format(summary[section][key]))
         for section, key, label, form in _ROWS
-        if summary[section].get(key) is not None
+        if summary[section].get(key) is not None and key not in twice
     ]
     files = (out / name for name in ("report.html", "summary.json"))
     rows += [(file.stem, str(file)) for file in files if file.is_file()]

@@ -26,7 +26,7 @@ from evermap.errors import ConfigError
 from evermap.interrupts import held, kept, temporary
 from evermap.io.files import write_atomic
 from evermap.runs.summary import SUMMARY_SCHEMA_VERSION, RunInfo, change_dict, changes_text, summary_dict, timing_dict
-from evermap.types import Innovations, Recording, SlamResult
+from evermap.types import AnyRecording, Innovations, SlamResult
 
 if TYPE_CHECKING:
     from evermap.metrics.summary import Evaluation
@@ -383,7 +383,7 @@ class Asked(TypedDict, total=False):
 
 def write_run(
     out: str | Path,
-    recording: Recording,
+    recording: AnyRecording,
     result: SlamResult,
     config: Any = None,
     *,
@@ -474,12 +474,11 @@ def _write_innovations(innovations: Innovations, path: Path) -> None:
     """One row a detection that had a prediction; columns as the attributes of `Innovations`."""
     from evermap.io.table import parquet_bytes
 
-    columns = ("stamp_s", "detection", "landmark_id", "nis", "p_inlier")
-    path.write_bytes(parquet_bytes({name: getattr(innovations, name) for name in columns}))
+    path.write_bytes(parquet_bytes(innovations._columns()))
 
 
 def _draw(
-    recording: Recording, result: SlamResult, evaluation: Evaluation, timing: Mapping[str, Any]
+    recording: AnyRecording, result: SlamResult, evaluation: Evaluation, timing: Mapping[str, Any]
 ) -> tuple[NamedFigure, ...]:
     from evermap.viz.run_figures import draw_figures
 
@@ -496,7 +495,7 @@ def _write_figures(folder: RunFolder, figures: Sequence[NamedFigure]) -> None:
 
 
 def _write_scene(
-    folder: RunFolder, recording: Recording, result: SlamResult, evaluation: Evaluation, *, must: bool
+    folder: RunFolder, recording: AnyRecording, result: SlamResult, evaluation: Evaluation, *, must: bool
 ) -> list[str]:
     """Writes the scene; where it is only a default and cannot be written, a remark says so."""
     from evermap.errors import MissingExtraError

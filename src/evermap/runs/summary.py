@@ -17,16 +17,23 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import MapChange, ParameterEstimate, Recording, SlamResult, json_number
+from evermap.types import AnyRecording, MapChange, ParameterEstimate, SlamResult, json_number
 
 SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
 
 _FRAME_MEANING = {
-    "first_pose": "the robot's first pose: origin where it stood, x ahead of it, y to its left; metres",
+    "first_pose": "the robot's first pose: origin where it stood, {axes}; metres",
     "prior_map": "the frame of the map that was given; metres",
     "truth": "the frame of the recording's own reference; metres",
 }
+_AXES = {3: "x ahead of it, y to its left", 7: "axes as they were"}
+_ROBOT = {
+    3: "x forward, y left, angles counter-clockwise; pose covariances are in this frame",
+    7: "the frame of the odometry and of the sensors' mounts; pose covariances are in this frame: translation along "
+    "x, y, z, then rotation about them",
+}
+"""Texts in the plane and in space, by how many numbers a pose has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +99,7 @@ def summary_head(
 
 
 def summary_dict(
-    recording: Recording,
+    recording: AnyRecording,
     result: SlamResult,
     metrics: Mapping[str, Any],
     *,
@@ -112,15 +119,15 @@ def summary_dict(
         timing: `timing_dict(...)`.
         warnings: remarks beyond those of the recording and the result.
     """
-    frame = result.trajectory.frame
+    size = result.trajectory.pose_world_robot.shape[1]
     remarks = [*recording.warnings, *result.warnings, *warnings]
     return {
         **summary_head(info, config=config, source=recording.source, timing=timing, warnings=remarks),
         "recording": {"name": recording.name, "source": recording.source, "clock": recording.clock.value},
         "frames": {
-            "world": f"{frame}: {_FRAME_MEANING.get(frame, 'as named; metres')}",
-            "robot": "x forward, y left, angles counter-clockwise; pose covariances are in this frame",
-            "map": f"{result.landmarks.frame}: {_FRAME_MEANING.get(result.landmarks.frame, 'as named; metres')}",
+            "world": _frame_text(result.trajectory.frame, size),
+            "robot": _ROBOT[size],
+            "map": _frame_text(result.landmarks.frame, size),
             "clock": f"{recording.clock.value}; seconds",
         },
         "metrics": dict(metrics),
@@ -133,6 +140,10 @@ def summary_dict(
         "parameters": [_parameter(parameter) for parameter in result.parameters],
         "interrupted": bool(result.interrupted),
     }
+
+
+def _frame_text(frame: str, size: int) -> str:
+    return f"{frame}: {_FRAME_MEANING.get(frame, 'as named; metres').format(axes=_AXES[size])}"
 
 
 def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: float | None = None) -> dict[str, Any]:
@@ -164,7 +175,7 @@ def changes_text(changes: Iterable[Mapping[str, Any]]) -> str:
     return "".join(json.dumps(change, allow_nan=False, ensure_ascii=False) + "\n" for change in changes)
 
 
-def timing_dict(recording: Recording, result: SlamResult, info: RunInfo) -> dict[str, Any]:
+def timing_dict(recording: AnyRecording, result: SlamResult, info: RunInfo) -> dict[str, Any]:
     """Return what the run cost: real-time factor, step latencies [ms], total [s] and peak memory [MB]. Not
     reproducible.
     """
@@ -215,17 +226,17 @@ def peak_memory_mb() -> float | None:
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def _processed_s(recording: Recording, result: SlamResult) -> float:
+def _processed_s(recording: AnyRecording, result: SlamResult) -> float:
     """Duration of the part that was processed."""
     stamps = result.online.stamp_s if result.interrupted else recording.frames.stamp_s
     return float(stamps[-1] - stamps[0]) if len(stamps) > 1 else 0.0
 
 
-def _counts(recording: Recording, result: SlamResult) -> dict[str, Any]:
+def _counts(recording: AnyRecording, result: SlamResult) -> dict[str, Any]:
     sightings = recording.robot_sightings
     return {
         "duration_s": _processed_s(recording, result),
-        "odometry_rows": len(recording.odometry),
+        "odometry_rows": 0 if recording.odometry is None else len(recording.odometry),
         "frames": len(recording.frames),
         "frames_processed": len(result.step_s),
         "detections": len(recording.detections),

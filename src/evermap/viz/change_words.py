@@ -57,9 +57,11 @@ def what(change: MapChange) -> str:
     if change.kind is ChangeKind.RETURNED:
         far = math.hypot(*change.displacement_m)
         return f"{_group(change)} returned" + (f", {far:.2f} m from where it was" if far > 0.0 else "")
-    moved = f"moved by ({_signed(change.displacement_m[0])}, {_signed(change.displacement_m[1])}) m"
+    moved = f"moved by ({', '.join(map(_signed, change.displacement_m))}) m"
     if change.kind is ChangeKind.ROTATED:
-        return f"{_group(change)} turned by {_signed(math.degrees(change.rotation_rad), 1)}° and {moved}"
+        turn = math.degrees(change.rotation_rad)
+        sign = _signed(turn, 1) if len(change.displacement_m) == 2 else f"{turn:.1f}"  # in space about some axis
+        return f"{_group(change)} turned by {sign}° and {moved}"
     return f"{_group(change)} {moved}"
 
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from evermap.errors import InputError, printable
 from evermap.types import BoolArray, Clock, FloatArray, IntArray, Landmarks, rows_of
-from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone
+from evermap.viz.map_figure import GONE, LABELS_UP_TO, class_names_of, draw_ellipses, draw_gone, magnification
+from evermap.viz.panels import View, draw_shapes, height_over_width, lay_out, seen
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -50,7 +51,7 @@ class MapView:
     Attributes:
         landmarks: L landmarks at their most probable places, also those that are believed gone.
         pinned: (L,) marked by a ring.
-        other_m: (K, 2) other places at which landmarks are known to have stood.
+        other_m: (K, 2), in space (K, 3), other places at which landmarks are known to have stood.
         other_of: (K,) row of the landmark of each.
         seen_from_m: (V, 2) middles of the floor's cells from which the robot looked.
         cell_m: side of a cell.
@@ -75,53 +76,60 @@ def plot_living_map(view: MapView, *, title: str) -> Figure:
     landmarks = view.landmarks
     if not len(landmarks):
         raise InputError("nothing to draw: the map has no landmark")
-    everything = np.concatenate([landmarks.position_m, view.other_m, view.seen_from_m, *view.walls_m])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    places = np.concatenate([landmarks.position_m, *([view.other_m] if len(view.other_m) else [])])
+    low, high = places.min(axis=0), places.max(axis=0)
+    for part in (view.seen_from_m, *view.walls_m):
+        if len(part):
+            low[:2], high[:2] = np.minimum(low[:2], part.min(axis=0)), np.maximum(high[:2], part.max(axis=0))
     size = np.maximum(high - low, 1.0)
     margin = 0.05 * float(size.max())
-    with drawing(7.2, float(np.clip(6.4 * size[1] / size[0], 2.4, 7.5)) + 1.3) as figure:
-        axes = figure.add_subplot()
-        axes.set(
-            xlim=(low[0] - margin, high[0] + margin),
-            ylim=(low[1] - margin, high[1] + margin),
-            aspect="equal",
-            xlabel="x [m]",
-            ylabel="y [m]",
-            title=printable(title),
-        )
-        handles = [*_draw_floor(axes, view), *_draw_landmarks(axes, view, size)]
-        if len(landmarks) <= LABELS_UP_TO:
-            names = [landmarks.names.get(name, str(name)) for name in landmarks.landmark_id.tolist()]
-            label_points(axes, landmarks.position_m, names)
+    with drawing(7.2, float(np.clip(6.4 * height_over_width(size), 2.4, 7.5)) + 1.3) as figure:
+        panels = lay_out(figure, low - margin, high + margin)
+        (handles, *_) = [_draw_panel(axes, columns, view, float(size.max())) for axes, columns in panels]
+        first = panels[0][0]
+        first.set_title(", ".join(text for text in (printable(title), first.get_title(loc="left")) if text))
         _legend(figure, handles)
     return figure
 
 
-def _draw_floor(axes: Axes, view: MapView) -> list[Any]:
-    """Walls, from where the robot looked, and other known places; returns what to put into a legend."""
+def _draw_panel(axes: Axes, columns: View, view: MapView, reach_m: float) -> list[Any]:
+    """Draw floor and landmarks into a panel; returns what to put into a legend."""
+    landmarks = view.landmarks
+    handles = [*_draw_floor(axes, columns, view), *_draw_landmarks(axes, columns, view, reach_m)]
+    if len(landmarks) <= LABELS_UP_TO:
+        names = [landmarks.names.get(name, str(name)) for name in landmarks.landmark_id.tolist()]
+        label_points(axes, landmarks.position_m[:, columns], names)
+    return handles
+
+
+def _draw_floor(axes: Axes, columns: View, view: MapView) -> list[Any]:
+    """Walls and from where the robot looked, as seen from above, and other known places; returns what to put into a
+    legend.
+    """
     from matplotlib.collections import PolyCollection
 
     handles: list[Any] = []
-    if len(view.seen_from_m):
+    above = columns == [0, 1]
+    if above and len(view.seen_from_m):
         corners = 0.5 * view.cell_m * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         squares = view.seen_from_m[:, None, :] + corners
         axes.add_collection(PolyCollection(list(squares), facecolors=SHADE, edgecolors=SHADE, lw=0.4, zorder=0.5))
         handles.append(_mark("s", "looked from here", color=SHADE, ms=7, mec="none"))
-    for wall in view.walls_m:
+    for wall in view.walls_m if above else ():
         axes.plot(*wall.T, color=INK, lw=1.6, solid_capstyle="round", zorder=1)
     if view.walls_m:
         handles.append(_mark("", "wall", color=INK, ls="-", lw=1.6))
     if len(view.other_m):
         for place, now in zip(view.other_m, view.landmarks.position_m[view.other_of], strict=True):
-            axes.plot(*np.stack([place, now]).T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
-        axes.plot(*view.other_m.T, ".", color=MUTED, ms=4, zorder=2)
+            axes.plot(*np.stack([place, now])[:, columns].T, color=MUTED, lw=0.5, alpha=0.5, zorder=1.5)
+        axes.plot(*view.other_m[:, columns].T, ".", color=MUTED, ms=4, zorder=2)
         handles.append(_mark(".", "other known place", color=MUTED, ms=4))
     return handles
 
 
-def _draw_landmarks(axes: Axes, view: MapView, size: FloatArray) -> list[Any]:
+def _draw_landmarks(axes: Axes, columns: View, view: MapView, reach_m: float) -> list[Any]:
     """Landmarks by class with their uncertainty; returns what to put into a legend."""
-    landmarks = view.landmarks
+    landmarks = seen(view.landmarks, columns)
     there = landmarks.p_exists >= _EXISTS
     names = class_names_of(landmarks)
     looks = class_looks(landmarks.class_names)
@@ -142,7 +150,9 @@ def _draw_landmarks(axes: Axes, view: MapView, size: FloatArray) -> list[Any]:
     if not there.all():
         hollow = _mark("o", "", mfc="none", mec=MUTED, alpha=0.6, ms=7, mew=1.1)
         handles.append((hollow, _mark("x", GONE, color=ALERT, ms=6, mew=1.1, alpha=0.8)))
-    label = draw_ellipses(axes, landmarks.position_m[there], landmarks.covariance_m2[there], colours, size)
+    draw_shapes(axes, rows_of(view.landmarks, there), columns, colours, reach_m)
+    factor = magnification(view.landmarks.covariance_m2[there], reach_m)
+    label = draw_ellipses(axes, landmarks.position_m[there], landmarks.covariance_m2[there], colours, factor)
     handles.append(_mark("o", label, mfc="none", mec=MUTED, ms=7))
     if view.pinned.any():
         axes.plot(*landmarks.position_m[view.pinned].T, "o", mfc="none", mec=INK, ms=11, mew=1.0, zorder=5)

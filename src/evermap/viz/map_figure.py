@@ -1,4 +1,4 @@
-"""Plan view of a run: path and landmarks with their uncertainty against truth and odometry, and what changed."""
+"""The map of a run: path and landmarks with their uncertainty against truth and odometry, and what changed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from evermap.geometry import se2
+from evermap.geometry.group import PLANE, Group, group_of
 from evermap.metrics.summary import Evaluation
-from evermap.metrics.trajectory import rotate_covariance
-from evermap.types import ChangeKind, FloatArray, Landmarks, MapChange, Recording, SlamResult
+from evermap.types import AnyRecording, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
+from evermap.viz.panels import View, corners_of, draw_shapes, height_over_width, lay_out, moved_map, seen
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -40,80 +41,110 @@ LABELS_UP_TO = 60
 _MAGNIFICATIONS = (1, 2, 5, 10, 20, 50, 100)
 
 
-def draw_map(recording: Recording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
-    """Plan view in the frame of the truth where there is one, else in the map's own; what changed, with arrows."""
-    pose_truth_map = _alignment(evaluation)
-    poses = se2.compose(pose_truth_map, result.trajectory.pose_world_robot)
-    landmarks, gone = (
-        replace(
-            known,
-            position_m=se2.transform(pose_truth_map, known.position_m),
-            covariance_m2=rotate_covariance(known.covariance_m2, se2.rotation_of(pose_truth_map)),
-        )
-        for known in (result.landmarks, result.gone)
-    )
-    truth = None if recording.truth is None else recording.truth.pose_world_robot
-    survey = None if recording.true_landmarks is None else recording.true_landmarks.position_m
-    if evaluation.poses is None and evaluation.landmarks_own is None:
-        truth = survey = None  # nothing ties the frames together
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """What a map shows, in the frame of the picture; all with two or all with three coordinates.
 
-    changed = moves(result, pose_truth_map)
-    places = [
-        poses[:, :2],
-        landmarks.position_m,
-        gone.position_m,
-        *(part for move in changed for part in (move.before_m, move.after_m)),
-    ]
-    low, high = _frame([*places, *(part[:, :2] for part in (truth, survey) if part is not None)])
-    size = high - low
-    lines = 1 + (len(changed) if len(changed) <= _MOST_LINES else 1) + (len(set(class_names_of(landmarks))) + 6) // 4
-    height_in = float(np.clip(6.6 * size[1] / size[0], 2.6, 7.2)) + 0.65 + 0.18 * lines
+    Attributes:
+        path_m: (N, D) positions of the robot; odometry_m: as odometry alone has them.
+        truth_m, survey_m: true positions of robot and landmarks; None where there are none, or nothing ties the frames.
+        landmarks, gone: the map.
+        changed: what changed.
+    """
+
+    path_m: FloatArray
+    odometry_m: FloatArray
+    truth_m: FloatArray | None
+    survey_m: FloatArray | None
+    landmarks: Landmarks
+    gone: Landmarks
+    changed: Sequence[Move]
+
+    def corners(self) -> tuple[FloatArray, FloatArray]:
+        """Return the corners of what must be in the picture, with a margin; odometry may leave it."""
+        moved = [part for move in self.changed for part in (move.before_m, move.after_m)]
+        true = [part for part in (self.truth_m, self.survey_m) if part is not None]
+        return corners_of([self.path_m, self.landmarks.position_m, self.gone.position_m, *moved, *true])
+
+
+def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
+    """Draw path and map from above, in space from the side too: in the frame of the truth where there is one, else in
+    the map's own; what changed, with arrows.
+    """
+    scene = _scene(recording, result, evaluation)
+    low, high = scene.corners()
+    changed, names = scene.changed, class_names_of(scene.landmarks)
+    lines = 1 + (len(changed) if len(changed) <= _MOST_LINES else 1) + (len(set(names)) + 6) // 4
+    highest = 7.2 if len(low) == 2 else 8.2
+    height_in = float(np.clip(6.6 * height_over_width(high - low), 2.6, highest)) + 0.65 + 0.18 * lines
     figure = new_figure(7.2, height_in)
-    axes = figure.add_subplot()
-
-    faint = 0.5 if changed else 1.0  # paths step back behind what changed
-    odometry = evaluation.dead_reckoning
-    pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
-    drifted = _thin(se2.compose(pose_truth_odometry, result.dead_reckoning.pose_world_robot)[:, :2])
-    leaves = bool(np.any((drifted < low) | (drifted > high)))
-    label = "odometry alone" + (" (leaves the picture)" if leaves else "")
-    axes.plot(*drifted.T, color=ODOMETRY, lw=0.8, alpha=0.65 * faint, label=label, zorder=1)
-    if truth is not None:
-        axes.plot(*_thin(truth[:, :2]).T, color=INK, lw=1.6, alpha=0.35 * faint, label="true path", zorder=2)
-    axes.plot(*_thin(poses[:, :2]).T, color=ESTIMATE, lw=0.9, alpha=faint, label="estimated path", zorder=3)
-    if survey is not None:
-        axes.plot(*survey.T, "s", mfc="none", mec=INK, ms=8.0, mew=0.7, label="surveyed landmark", zorder=4)
-    _draw_landmarks(axes, landmarks, size)
-    draw_gone(axes, gone)
-    if len(poses):
-        axes.plot(*poses[0, :2], "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6, label="start", zorder=7)
-    moved = draw_moves(axes, changed)
-
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    axes.spines[["top", "right"]].set_visible(True)
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    panels = lay_out(figure, low, high)
+    (moved, *_) = [_draw_panel(axes, view, scene, low, high) for axes, view in panels]
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     if moved:
         figure.legend(
             handles=moved, loc="outside lower left", ncols=1 if len(changed) <= _MOST_LINES else 3, handlelength=3.2
         )
-    return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, bool(changed)))
+    return NamedFigure("map", figure, "Trajectory and map", _caption(recording, evaluation, scene))
 
 
-def _alignment(evaluation: Evaluation) -> FloatArray:
+def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> _Scene:
+    group = group_of(result.trajectory.pose_world_robot)
+    size = group.point_dim
+    pose_truth_map = _alignment(evaluation, group)
+    truth = None if recording.truth is None else recording.truth.pose_world_robot[:, :size]
+    survey = None if recording.true_landmarks is None else recording.true_landmarks.position_m
+    if evaluation.poses is None and evaluation.landmarks_own is None:
+        truth = survey = None  # nothing ties the frames together
+    odometry = evaluation.dead_reckoning
+    pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
+    drifted = result.dead_reckoning.pose_world_robot
+    if len(drifted):  # a run without odometry need not say how many coordinates it has
+        drifted = group.compose(pose_truth_odometry, drifted)
+    return _Scene(
+        path_m=group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size],
+        odometry_m=drifted[:, :size],
+        truth_m=truth,
+        survey_m=survey,
+        landmarks=moved_map(result.landmarks, pose_truth_map),
+        gone=moved_map(result.gone, pose_truth_map),
+        changed=moves(result, pose_truth_map),
+    )
+
+
+def _draw_panel(axes: Axes, view: View, scene: _Scene, low: FloatArray, high: FloatArray) -> list[Artist]:
+    """Draw a scene into one panel; returns what a legend may say of the changes."""
+    faint = 0.5 if scene.changed else 1.0  # paths step back behind what changed
+    if len(scene.odometry_m):
+        drifted = _thin(scene.odometry_m)
+        leaves = bool(np.any((drifted < low) | (drifted > high)))
+        label = "odometry alone" + (" (leaves the picture)" if leaves else "")
+        axes.plot(*drifted[:, view].T, color=ODOMETRY, lw=0.8, alpha=0.65 * faint, label=label, zorder=1)
+    if scene.truth_m is not None:
+        dashes = "-" if len(low) == 2 else (0, (4, 1.5))
+        axes.plot(*_thin(scene.truth_m)[:, view].T, color=INK, lw=1.6, ls=dashes, alpha=0.35 * faint,
+                  label="true path", zorder=2)  # fmt: skip
+    axes.plot(*_thin(scene.path_m)[:, view].T, color=ESTIMATE, lw=0.9, alpha=faint, label="estimated path", zorder=3)
+    if scene.survey_m is not None:
+        axes.plot(*scene.survey_m[:, view].T, "s", mfc="none", mec=INK, ms=8.0, mew=0.7, label="surveyed landmark",
+                  zorder=4)  # fmt: skip
+    reach_m = float(np.max(high - low))
+    _draw_landmarks(axes, view, scene, reach_m)
+    draw_gone(axes, seen(scene.gone, view))
+    if len(scene.path_m):
+        axes.plot(*scene.path_m[0, view], "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6, label="start", zorder=7)
+    axes.spines[["top", "right"]].set_visible(True)
+    return draw_moves(axes, [
+        replace(move, before_m=move.before_m[:, view], after_m=move.after_m[:, view]) for move in scene.changed
+    ])  # fmt: skip
+
+
+def _alignment(evaluation: Evaluation, group: Group) -> FloatArray:
     if evaluation.poses is not None:
         return evaluation.poses.pose_truth_estimate
     if evaluation.landmarks_own is not None:
         return evaluation.landmarks_own.pose_truth_estimate
-    return np.zeros(3)
-
-
-def _frame(parts: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Corners of what must be in the picture, with a margin; odometry may leave it."""
-    finite = [part[np.all(np.isfinite(part), axis=1)] for part in parts if len(part)]
-    everything = np.concatenate([part for part in finite if len(part)] or [np.zeros((1, 2))])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    margin = max(0.06 * float(np.max(high - low)), 0.5)
-    return low - margin, high + margin
+    return group.identity()
 
 
 def _thin(points: FloatArray) -> FloatArray:
@@ -127,10 +158,11 @@ def class_names_of(landmarks: Landmarks) -> list[str]:
     return [names[k] if 0 <= k < len(names) else "" for k in landmarks.class_id.tolist()]
 
 
-def _draw_landmarks(axes: Axes, landmarks: Landmarks, size: FloatArray) -> None:
-    """Landmarks by class with their names and 2-sigma ellipses."""
+def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> None:
+    """Landmarks by class with their names, shapes and 2-sigma ellipses."""
     from matplotlib.lines import Line2D
 
+    landmarks = seen(scene.landmarks, view)
     names, looks = class_names_of(landmarks), class_looks(landmarks.class_names)
     for name in sorted(set(names)):
         look, mine = looks[name], [k for k, other in enumerate(names) if other == name]
@@ -140,7 +172,9 @@ def _draw_landmarks(axes: Axes, landmarks: Landmarks, size: FloatArray) -> None:
     if len(landmarks) == 0:
         return
     colours = np.array([looks[name].colour for name in names])
-    label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, size)
+    factor = magnification(scene.landmarks.covariance_m2, reach_m)
+    draw_shapes(axes, scene.landmarks, view, colours, reach_m, scene.path_m)
+    label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, factor)
     axes.add_line(Line2D([], [], ls="", marker="o", mfc="none", mec=MUTED, ms=7, label=label))
     if len(landmarks) <= LABELS_UP_TO:
         ids = landmarks.landmark_id.tolist()
@@ -162,23 +196,28 @@ def draw_gone(axes: Axes, gone: Landmarks) -> None:
         axes.add_line(Line2D([], [], marker="x", color=ALERT, ls="", ms=6, mew=1.1, alpha=0.8, label=GONE))
 
 
-def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colours: Any, size: FloatArray) -> str:
-    """Draw 2-sigma ellipses about points (K, 2) and return their label; those too small to see are magnified.
+def magnification(covariance: FloatArray, reach_m: float) -> int:
+    """Return how many times larger 2-sigma ellipses of covariances (K, D, D) are drawn in a picture, to be seen."""
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance), 0.0))
+    visible = 0.012 * reach_m
+    typical = 2.0 * float(np.median(sigma[:, -1])) if len(sigma) else 0.0
+    return next((m for m in _MAGNIFICATIONS if m * typical >= visible), _MAGNIFICATIONS[-1]) if typical > 0 else 1
+
+
+def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colours: Any, factor: int) -> str:
+    """Draw 2-sigma ellipses about points (K, 2) and return their label.
 
     Args:
-        axes: a plan view.
+        axes: a panel.
         points: (K, 2).
         covariance: (K, 2, 2) [m²].
         colours: (K,).
-        size: (2,) extent of the picture [m].
+        factor: how many times larger.
     """
     from matplotlib.collections import EllipseCollection
 
     variance, axis = np.linalg.eigh(covariance)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    visible = 0.012 * float(np.max(size))
-    typical = 2.0 * float(np.median(sigma[:, 1])) if len(points) else 0.0
-    factor = next((m for m in _MAGNIFICATIONS if m * typical >= visible), _MAGNIFICATIONS[-1]) if typical > 0 else 1
     angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
     full = 2.0 * 2.0 * factor * sigma
     ellipses = EllipseCollection(
@@ -189,23 +228,27 @@ def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colour
     return "2σ of its position" + (f", drawn {factor} × larger" if factor > 1 else "")
 
 
-def _caption(recording: Recording, evaluation: Evaluation, changed: bool) -> str:
-    if changed:
-        arrows = (
+def _caption(recording: AnyRecording, evaluation: Evaluation, scene: _Scene) -> str:
+    text = _frame_caption(recording, evaluation, scene.path_m.shape[1])
+    if scene.landmarks.rotation is not None:
+        text += " Short lines show where tags face; boxes have their edges."
+    if scene.changed:
+        text += (
             " Arrows lead from where a landmark was (diamond) to where it is now; a plus is what appeared, a cross what"
             " vanished; dashed: another explanation. The displacements are in the map's own frame."
         )
-        return _frame_caption(recording, evaluation) + arrows
-    return _frame_caption(recording, evaluation)
+    return text
 
 
-def _frame_caption(recording: Recording, evaluation: Evaluation) -> str:
+def _frame_caption(recording: AnyRecording, evaluation: Evaluation, size: int) -> str:
     poses, odometry = evaluation.poses, evaluation.dead_reckoning
     if poses is None and evaluation.landmarks_own is None:
-        return "Frame of the first pose: the map's origin is where the robot stood at the start, x ahead of it."
+        ahead = ", x ahead of it" if size == 2 else ""
+        return f"Frame of the first pose: the map's origin is where the robot stood at the start{ahead}."
+    moved = f"Turned and shifted (SE({size}), no scale)"
     if poses is None:
-        return "Turned and shifted (SE(2), no scale) onto the surveyed landmarks; there is no true path to compare."
-    text = "Turned and shifted (SE(2), no scale) so that the estimated path fits the true one best, for display only."
+        return f"{moved} onto the surveyed landmarks; there is no true path to compare."
+    text = f"{moved} so that the estimated path fits the true one best, for display only."
     if odometry is not None:
         text += (
             f" Odometry alone, with an alignment of its own, is {odometry.rmse_m:.2f} m off;"
@@ -215,7 +258,7 @@ def _frame_caption(recording: Recording, evaluation: Evaluation) -> str:
     return text + (f" Truth covers {covered:.0%} of the recording." if covered < 0.98 else "")
 
 
-def _duration(recording: Recording) -> float:
+def _duration(recording: AnyRecording) -> float:
     stamps = recording.frames.stamp_s
     return float(stamps[-1] - stamps[0]) if len(stamps) else 0.0
 
@@ -235,7 +278,7 @@ class Move:
 
     Attributes:
         change: what it is.
-        before_m, after_m: (K, 2) places of its landmarks that are in the map. Two that exchanged their identities have
+        before_m, after_m: (K, D) places of its landmarks that are in the map. Two that exchanged their identities have
             not moved: `before_m` is where the other one is.
         label: for the legend.
         colour: of its group.
@@ -260,7 +303,7 @@ def moves(result: SlamResult, pose_truth_map: FloatArray) -> list[Move]:
 
     Args:
         result: what came out.
-        pose_truth_map: (3,) from the map's frame to that of the picture.
+        pose_truth_map: (3,) or (7,) from the map's frame to that of the picture.
     """
     found = []
     for number, (change, before, after) in enumerate(
@@ -330,6 +373,7 @@ def _places(
     known: Sequence[Landmarks], changes: Sequence[MapChange], pose_truth_map: FloatArray
 ) -> list[tuple[MapChange, FloatArray, FloatArray]]:
     """(change, before, after) by time: undone one after the other from the last, for some landmarks move twice."""
+    group = group_of(pose_truth_map)
     place = {name: at for some in known for name, at in zip(some.landmark_id.tolist(), some.position_m, strict=True)}
     found = []
     by_time = sorted(changes, key=lambda change: change.stamp_to_s)
@@ -343,7 +387,9 @@ def _places(
         elif not np.all(np.isfinite(change.displacement_m)):  # it was nowhere before
             before = after
         else:
-            before = se2.move_together(after, -np.array(change.displacement_m), -change.rotation_rad)
+            turn = change.rotation_rad if group is PLANE else None  # in space nobody knows about which axis
+            step = np.array(change.displacement_m)
+            before = after - step if turn is None else se2.move_together(after, -step, -turn)
             place |= zip(ids, before, strict=True)
-        found.append((change, se2.transform(pose_truth_map, before), se2.transform(pose_truth_map, after)))
+        found.append((change, group.transform(pose_truth_map, before), group.transform(pose_truth_map, after)))
     return found[::-1]

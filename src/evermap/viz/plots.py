@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from evermap.geometry import se3
+from evermap.geometry.group import group_of
 from evermap.metrics.summary import compare_with_truth
 from evermap.survival.base import LifetimePrior
 from evermap.types import (
     UNKNOWN,
+    AnyRecording,
     Detections,
     FloatArray,
     Frames,
@@ -22,6 +25,7 @@ from evermap.types import (
 from evermap.viz.lifetime_figures import plot_lifetimes, plot_survival
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import draw_map
+from evermap.viz.panels import corners_of, height_over_width, lay_out
 from evermap.viz.style import (
     ESTIMATE,
     INK,
@@ -30,6 +34,7 @@ from evermap.viz.style import (
     PAPER,
     drawing,
     house_style,
+    settle,
 )
 from evermap.viz.time_axis import guess_clock
 from evermap.viz.track_figures import plot_objects
@@ -42,11 +47,13 @@ _PLAN: Any = {"aspect": "equal", "xlabel": "x [m]", "ylabel": "y [m]"}
 """Axes of a plan view."""
 
 
-def plot_result(result: SlamResult, recording: Recording | None = None) -> Figure:
+def plot_result(result: SlamResult, recording: AnyRecording | None = None) -> Figure:
     """Draw path, odometry and map of a run, in the frame of the recording's truth where there is one."""
     whole = recording or _nothing_but_frames(result)
     with house_style():
-        return draw_map(whole, result, compare_with_truth(whole, result)).figure
+        figure = draw_map(whole, result, compare_with_truth(whole, result)).figure
+        settle(figure)
+    return figure
 
 
 def plot_map(living: Any, *, title: str = "") -> Figure:
@@ -128,40 +135,76 @@ def _paths(result: Any) -> list[tuple[int, FloatArray]]:
 
 
 def plot_trajectory(trajectory: Trajectory) -> Figure:
-    """Draw a path and its first pose."""
-    with drawing(6.0, 5.0) as figure:
-        axes = figure.add_subplot(**_PLAN)
-        axes.plot(*trajectory.pose_world_robot[:, :2].T, color=ESTIMATE, lw=1.0)
-        axes.plot(*trajectory.pose_world_robot[:1, :2].T, "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6)
+    """Draw a path and its first pose, in space from above and from the side."""
+    place = _places(trajectory)
+    low, high = corners_of([place])
+    with drawing(6.0, float(np.clip(5.6 * height_over_width(high - low), 3.0, 7.5))) as figure:
+        for axes, view in lay_out(figure, low, high):
+            axes.plot(*place[:, view].T, color=ESTIMATE, lw=1.0)
+            axes.plot(*place[:1, view].T, "o", color=PAPER, mec=ESTIMATE, mew=1.4, ms=6)
     return figure
 
 
-def plot_recording(recording: Recording) -> Figure:
-    """Draw range and landmark of every detection over time, odometry, and the true path where there is one."""
+def plot_recording(recording: AnyRecording) -> Figure:
+    """Draw what was seen and driven over time, and the true path where there is one."""
+    truth = recording.truth
+    rows = _seen_rows(recording) | _driven_rows(recording)
     start_s = recording.frames.stamp_s[0] if len(recording.frames) else 0.0
-    seen_s = recording.frames.stamp_s[recording.detections.frame] - start_s
-    odometry = recording.odometry
-    panels = {
-        "range [m]": (seen_s, recording.detections.range_m),
-        "landmark": (seen_s, _rows_of_landmarks(recording.detections)),
-        "forward [m/s]": (odometry.stamp_s - start_s, odometry.forward_mps),
-        "turn [rad/s]": (odometry.stamp_s - start_s, odometry.angular_radps),
-    }
-    with drawing(10.0 if recording.truth is not None else 7.2, 5.4) as figure:
-        grid = figure.add_gridspec(len(panels), 2 if recording.truth is not None else 1)
+    with drawing(10.0 if truth is not None else 7.2, 5.4) as figure:
+        grid = figure.add_gridspec(len(rows), 2 if truth is not None else 1)
         top: Axes | None = None
-        for k, (label, (time_s, values)) in enumerate(panels.items()):
+        for k, (label, (stamp_s, values)) in enumerate(rows.items()):
             axes = figure.add_subplot(grid[k, 0], sharex=top)
             top = top or axes
-            axes.plot(time_s, values, "." if k < 2 else "-", color=LANDMARK if k < 2 else INK, ms=1.5, lw=0.6)
+            style, colour = (".", LANDMARK) if k < 2 else ("-", INK)
+            axes.plot(stamp_s - start_s, values, style, color=colour, ms=1.5, lw=0.6)
             axes.set_ylabel(label)
         axes.set_xlabel("time since the first frame [s]")
-        if recording.truth is not None:
-            plan = figure.add_subplot(grid[:, 1], **_PLAN)
-            plan.plot(*recording.truth.pose_world_robot[:, :2].T, color=INK, lw=0.8)
-            if recording.true_landmarks is not None:
-                plan.plot(*recording.true_landmarks.position_m.T, "s", mfc="none", mec=INK, ms=5, mew=0.8)
+        if truth is not None:
+            path, survey = _places(truth), recording.true_landmarks
+            places = path[:0] if survey is None else survey.position_m
+            for plan, view in lay_out(figure, *corners_of([path, places]), grid[:, 1]):
+                plan.plot(*path[:, view].T, color=INK, lw=0.8)
+                plan.plot(*places[:, view].T, "s", mfc="none", mec=INK, ms=5, mew=0.8)
     return figure
+
+
+def _places(trajectory: Trajectory) -> FloatArray:
+    """Positions (N, 2) or (N, 3)."""
+    poses = trajectory.pose_world_robot
+    return poses[:, : group_of(poses).point_dim]
+
+
+_Rows = dict[str, tuple[FloatArray, FloatArray]]
+"""Stamps and values by the label of their axis."""
+
+
+def _seen_rows(recording: AnyRecording) -> _Rows:
+    """How far every detection was, or where in the image, and of which landmark."""
+    detections = recording.detections
+    seen_s = recording.frames.stamp_s[detections.frame]
+    _, rank = np.unique(detections.landmark_id, return_inverse=True)
+    which = np.where(detections.landmark_id == UNKNOWN, np.nan, rank)
+    if isinstance(detections, Detections):
+        return {"range [m]": (seen_s, detections.range_m), "landmark": (seen_s, which)}
+    distance = np.linalg.norm(detections.position_sensor_m, axis=1)
+    if np.isfinite(distance).any():
+        return {"distance [m]": (seen_s, distance), "landmark": (seen_s, which)}
+    return {"column [px]": (seen_s, detections.corner_px[:, :, 0].mean(axis=1)), "landmark": (seen_s, which)}
+
+
+def _driven_rows(recording: AnyRecording) -> _Rows:
+    """Speed and turn rate by odometry; nothing without any."""
+    odometry = recording.odometry
+    if odometry is None:
+        return {}
+    if isinstance(odometry, Odometry):
+        forward, turn = odometry.forward_mps, odometry.angular_radps
+        return {"forward [m/s]": (odometry.stamp_s, forward), "turn [rad/s]": (odometry.stamp_s, turn)}
+    poses, stamps = odometry.pose_world_robot, odometry.stamp_s
+    rate = se3.local(poses[:-1], poses[1:]) / np.diff(stamps)[:, None]
+    speed, turned = np.linalg.norm(rate[:, :3], axis=1), np.linalg.norm(rate[:, 3:], axis=1)
+    return {"speed [m/s]": (stamps[1:], speed), "turn [rad/s]": (stamps[1:], turned)}
 
 
 def plot_lifetime(prior: LifetimePrior, **options: Any) -> Figure:
@@ -172,12 +215,6 @@ def plot_lifetime(prior: LifetimePrior, **options: Any) -> Figure:
 def plot_estimate(estimate: Any, **options: Any) -> Figure:
     """Draw the survival function of an estimate; options as of `plot_survival`."""
     return plot_survival({type(estimate).__name__: estimate}, **options)
-
-
-def _rows_of_landmarks(detections: Detections) -> np.ndarray:
-    """Return the rank (M,) of each detection's landmark among the ids; nan where it is unknown."""
-    _, rank = np.unique(detections.landmark_id, return_inverse=True)
-    return np.where(detections.landmark_id == UNKNOWN, np.nan, rank)
 
 
 def _nothing_but_frames(result: SlamResult) -> Recording:

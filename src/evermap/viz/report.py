@@ -15,7 +15,7 @@ import numpy as np
 
 from evermap.metrics.summary import Evaluation
 from evermap.stamps import stamp_text
-from evermap.types import UNKNOWN, Clock, ParameterEstimate, Recording, SlamResult
+from evermap.types import UNKNOWN, AnyRecording, Clock, ParameterEstimate, SlamResult
 from evermap.viz.change_words import explanations, grew, near_alternatives
 from evermap.viz.page import PAGE, STYLE, card, cards_html, figure_html, table, warnings_note
 from evermap.viz.run_figures import has_prior, quantity
@@ -41,7 +41,7 @@ class ReportSection:
 
 
 def render_report(
-    recording: Recording,
+    recording: AnyRecording,
     result: SlamResult,
     evaluation: Evaluation,
     summary: Mapping[str, Any],
@@ -152,8 +152,11 @@ def _frames(summary: Mapping[str, Any]) -> str:
     alignment = summary["metrics"]["alignment"]
     pose = alignment["pose_truth_estimate"]
     if pose is not None:
+        turn = "rad" if "theta_rad" in pose else "quaternion x, y, z, w"
+        angle = ", ".join(f"{value:.4f}" for name, value in pose.items() if not name.endswith("_m"))
+        shift = ", ".join(f"{value:.3f}" for name, value in pose.items() if name.endswith("_m"))
         how = (
-            f"truth = R({pose['theta_rad']:.4f} rad) · estimate + ({pose['x_m']:.3f}, {pose['y_m']:.3f}) m, by"
+            f"truth = R({angle} {turn}) · estimate + ({shift}) m, by"
             f" {escape(alignment['method'])} on {alignment['scored_stamps']} positions at {alignment['rate_hz']:g} Hz,"
             f" {alignment['scored_from_s']:.1f} s to {alignment['scored_to_s']:.1f} s; {escape(alignment['purpose'])}."
             " Odometry alone and the online poses each have an alignment of their own."
@@ -174,6 +177,7 @@ def _calibration(result: SlamResult) -> str:
 
 def _consistency(summary: Mapping[str, Any]) -> str:
     metrics = summary["metrics"]
+    dof = metrics["nees_dof"] or 2
     rows = [
         ("NIS, mean of the inliers", _cell(metrics["nis_mean"]), "2"),
         ("NIS, mean of all", _cell(metrics["nis_mean_all"]), "2 without outliers"),
@@ -181,13 +185,14 @@ def _consistency(summary: Mapping[str, Any]) -> str:
         ("NIS, share below the 95% bound", _cell(metrics["nis_in_band_share"], "{:.1%}"), "95%"),
         ("NIS, correlation between a landmark's successive values", _cell(metrics["nis_lag1_autocorrelation"]), "0"),
         ("detections judged outliers", _cell(metrics["outlier_share"], "{:.2%}"), ""),
-        ("NEES of positions, aligned", _cell(metrics["pose_nees_mean"]), "below 2: alignment removes error"),
+        ("NEES of positions, aligned", _cell(metrics["pose_nees_mean"]), f"below {dof}: alignment removes error"),
         (
             "NEES of positions, first pose held",
             _cell(metrics["pose_nees_anchored_mean"]),
-            "2, one draw: scatters widely",
+            f"{dof}, one draw: scatters widely",
         ),
-        ("NEES of landmarks, aligned", _cell(metrics["landmark_nees_mean"]), "below 2: alignment removes error"),
+        ("NEES of whole poses, aligned", _cell(metrics["whole_pose_nees_mean"]), f"below {3 * dof - 3}"),
+        ("NEES of landmarks, aligned", _cell(metrics["landmark_nees_mean"]), f"below {dof}: alignment removes error"),
     ]
     return table(("quantity", "here", "if consistent"), [row for row in rows if row[1]], numbers=(1,))
 
@@ -230,10 +235,11 @@ def _cards(summary: Mapping[str, Any]) -> list[str | None]:
     """Cards for the numbers this run has, each with a sentence that says what it means."""
     metrics, timing = summary["metrics"], summary["timing"]
     odometry, pose = metrics["dead_reckoning_rmse_m"], metrics["pose_rmse_m"]
-    heading, odometry_heading = metrics["heading_rmse_deg"], metrics["dead_reckoning_heading_rmse_deg"]
+    turn, odometry_turn = metrics["orientation_rmse_deg"], metrics["dead_reckoning_orientation_rmse_deg"]
+    turned = "Orientation error" if metrics["heading_rmse_deg"] is None else "Heading error"
     return [
         card("Position error", pose, "{:.3f}", "m RMSE", _gain(pose, odometry, "{:.2f} m")),
-        card("Heading error", heading, "{:.2f}", "° RMSE", _gain(heading, odometry_heading, "{:.1f}°")),
+        card(turned, turn, "{:.2f}", "° RMSE", _gain(turn, odometry_turn, "{:.1f}°")),
         _landmark_card(metrics),
         card("Speed", timing["real_time_factor"], "{:.0f}", "× real time", _latency(timing)),
         card("Innovations", metrics["nis_mean"], "{:.2f}", "mean NIS", _nis(metrics)),
@@ -329,7 +335,9 @@ def change_table(result: SlamResult) -> str:
     ]
     zone = {Clock.RECORDING: "since the start", Clock.UNIX: "UTC"}.get(clock, "local clock")
     head = ("landmarks", "kind", f"not before ({zone})", f"not after ({zone})")
-    return table((*head, "Δx [m]", "Δy [m]", "turn [°]", "probability"), rows, numbers=(2, 3, 4, 5, 6, 7))
+    steps = [f"Δ{axis} [m]" for axis in "xyz"[: len(result.changes[0].displacement_m)]]
+    columns = (*head, *steps, "turn [°]", "probability")
+    return table(columns, rows, numbers=range(2, len(columns)))
 
 
 def _number(value: float, digits: int) -> str:
@@ -341,27 +349,29 @@ def landmark_table(result: SlamResult, evaluation: Evaluation) -> str:
     landmarks, errors = result.landmarks, evaluation.landmarks or evaluation.landmarks_own
     if len(landmarks) == 0:
         return ""
-    error_of = {} if errors is None else dict(zip(errors.landmark_id.tolist(), errors.error_m.tolist(), strict=True))
-    nees_of = {} if errors is None else dict(zip(errors.landmark_id.tolist(), errors.nees.tolist(), strict=True))
-    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance_m2)[:, 1], 0.0))
+    known = () if errors is None else (1e3 * errors.error_m, errors.nees, np.degrees(errors.orientation_error_rad))
+    of = {} if errors is None else dict(zip(errors.landmark_id.tolist(), np.column_stack(known), strict=True))
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance_m2)[:, -1], 0.0))
+    oriented = errors is not None and bool(np.isfinite(errors.orientation_error_rad).any())
     rows = []
     for i, name in enumerate(landmarks.landmark_id[:_MAX_LANDMARK_ROWS].tolist()):
         kind = int(landmarks.class_id[i])
-        nees = nees_of.get(name, math.nan)
+        error_mm, nees, turn_deg = of.get(name, np.full(3, np.nan))
         rows.append(
             (
                 escape(landmarks.names.get(name, str(name))),
                 escape(landmarks.class_names[kind]) if UNKNOWN < kind < len(landmarks.class_names) else "–",
                 f"{landmarks.n_hits[i]:,}",
                 f"{landmarks.n_misses[i]:,}",
-                f"{landmarks.position_m[i, 0]:.3f}",
-                f"{landmarks.position_m[i, 1]:.3f}",
+                *(f"{metres:.3f}" for metres in landmarks.position_m[i]),
                 f"{2e3 * sigma[i]:.0f}",
-                f"{1e3 * error_of[name]:.0f}" if name in error_of else "–",
-                f"{nees:.1f}" if math.isfinite(nees) else "–",
+                _number(error_mm, 0),
+                _number(nees, 1),
+                *([_number(turn_deg, 1)] if oriented else []),
             )
         )
-    head = ("id", "class", "seen", "missed", "x [m]", "y [m]", "2σ [mm]", "error [mm]", "NEES")
-    html = table(head, rows, numbers=(2, 3, 4, 5, 6, 7, 8))
+    places = [f"{axis} [m]" for axis in "xyz"[: landmarks.position_m.shape[1]]]
+    head = ("id", "class", "seen", "missed", *places, "2σ [mm]", "error [mm]", "NEES", *["turned [°]"] * oriented)
+    html = table(head, rows, numbers=range(2, len(head)))
     more = len(landmarks) - len(rows)
     return html + (f"<p>{more} more are in <code>map.parquet</code>.</p>" if more > 0 else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import MissingExtraError
-from evermap.geometry import se2
-from evermap.metrics.consistency import chi2_interval
+from evermap.geometry.group import group_of
+from evermap.metrics.consistency import chi2_interval, comparable_nis
 from evermap.metrics.summary import Evaluation, compare_with_truth
-from evermap.types import BoolArray, Clock, FloatArray, IntArray, Recording, SlamResult, Trajectory
+from evermap.types import (
+    AnyRecording,
+    BoolArray,
+    Clock,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    SlamResult,
+    SpatialRecording,
+    Trajectory,
+    rows_of,
+)
 from evermap.viz.map_figure import class_names_of, moves
-from evermap.viz.style import ALERT, ESTIMATE, INK, MUTED, ODOMETRY, class_looks
+from evermap.viz.panels import box_sizes, landmark_poses, moved_map
+from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, class_looks
 from evermap.viz.track_figures import DYNAMIC, STATIC
 
 
@@ -42,12 +55,14 @@ TIMELINE = "stamp_s"
 _MAX_STEPS = 3000
 _MAX_LANDMARK_ENTITIES = 250
 _ELLIPSE_CORNERS = 33
+_PLATE_M = (0.16, 0.16, 0.004)
+"""What stands for a tag, whose size a map does not say."""
 
 Float32Array = NDArray[np.float32]
 
 
 def write_scene(
-    recording: Recording, result: SlamResult, path: str | Path, *, evaluation: Evaluation | None = None
+    recording: AnyRecording, result: SlamResult, path: str | Path, *, evaluation: Evaluation | None = None
 ) -> Path:
     """Write `path` (.rrd): robot, path so far, landmarks as they appear, what changed, rays of detections, truth, NIS.
 
@@ -62,7 +77,9 @@ def write_scene(
 
     path = Path(path)
     evaluation = evaluation or compare_with_truth(recording, result)
-    pose_truth_map = np.zeros(3) if evaluation.poses is None else evaluation.poses.pose_truth_estimate
+    pose_truth_map = group_of(result.trajectory.pose_world_robot).identity()
+    if evaluation.poses is not None:
+        pose_truth_map = evaluation.poses.pose_truth_estimate
     stream = rr.RecordingStream("evermap", recording_id=recording.name or "run", send_properties=False)
     stream.save(path, default_blueprint=_blueprint(recording, result, pose_truth_map))
     stream.send_recording_name(recording.name)
@@ -70,20 +87,22 @@ def write_scene(
     _send_truth(stream, recording, evaluation)
     _send_odometry(stream, result, evaluation)
     _send_robot(stream, result.trajectory, pose_truth_map, recording.clock)
-    _send_landmarks(stream, result, pose_truth_map, recording.clock)
+    landmarks = moved_map(result.landmarks, pose_truth_map)
+    start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
+    _send_landmarks(stream, landmarks, start_s, recording.clock)
     _send_changes(stream, result, pose_truth_map, recording.clock)
-    _send_rays(stream, recording, result, pose_truth_map)
+    _send_rays(stream, recording, result, pose_truth_map, landmarks)
     _send_numbers(stream, recording, result, evaluation)
     stream.flush()
     stream.disconnect()
     return path
 
 
-def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatArray) -> Any:
+def _blueprint(recording: AnyRecording, result: SlamResult, pose_truth_map: FloatArray) -> Any:
     import rerun.blueprint as rrb
 
-    positions = se2.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :2]
-    centre = positions.mean(axis=0) if len(positions) else np.zeros(2)
+    positions = _flat(_places(pose_truth_map, result.trajectory.pose_world_robot))
+    centre = positions.mean(axis=0) if len(positions) else np.zeros(3)
     reach = float(np.max(np.ptp(positions, axis=0))) if len(positions) else 10.0
     so_far = rrb.VisibleTimeRange(
         TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
@@ -93,8 +112,8 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
         origin="world",
         overrides={"world/path": rrb.VisibleTimeRanges(so_far)},
         eye_controls=rrb.EyeControls3D(
-            position=[centre[0], centre[1] - 0.6 * reach, 1.1 * reach + 1.0],
-            look_target=[*centre, 0.0],
+            position=[centre[0], centre[1] - 0.6 * reach, centre[2] + 1.1 * reach + 1.0],
+            look_target=centre,
             eye_up=[0.0, 0.0, 1.0],
         ),
         line_grid=rrb.LineGrid3D(spacing=1.0),
@@ -103,9 +122,9 @@ def _blueprint(recording: Recording, result: SlamResult, pose_truth_map: FloatAr
     if len(recording.frames):
         ends = [rrb.TimeRangeBoundary.absolute(seconds=float(recording.frames.stamp_s[k])) for k in (0, -1)]
         whole = rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
-    shown = {"nis": "NIS, log10 (95% band)", "error": "error against truth [m]", "latency": "step [ms]"}
-    if recording.truth is None:
-        del shown["error"]
+    shown = {"nis": "NIS, log10 (95% band)", "latency": "step [ms]"}
+    if recording.truth is not None:
+        shown = {"error": "error against truth [m]", "turn": "orientation error [deg]", **shown}
     plots = [rrb.TimeSeriesView(name=title, origin=origin, axis_x=whole) for origin, title in shown.items()]
     return rrb.Blueprint(
         rrb.Horizontal(scene, rrb.Vertical(*plots), column_shares=[5, 3]),
@@ -134,20 +153,29 @@ def _thin(count: int, limit: int = _MAX_STEPS) -> IntArray:
 
 
 def _flat(points: FloatArray, height_m: float = 0.0) -> Float32Array:
-    """Points (N, 2) on a horizontal plane."""
-    return np.column_stack([points, np.full(len(points), height_m)]).astype(np.float32)
+    """Points (..., 2) on a horizontal plane, at a height that keeps them apart; points (..., 3) as they are."""
+    if points.shape[-1] == 3:
+        return points.astype(np.float32)
+    return np.concatenate([points, np.full((*points.shape[:-1], 1), height_m)], axis=-1).astype(np.float32)
 
 
-def _send_truth(stream: Any, recording: Recording, evaluation: Evaluation) -> None:
+def _places(pose_truth_map: FloatArray, poses: FloatArray) -> FloatArray:
+    """Positions (N, D) of poses in the frame of the picture."""
+    group = group_of(pose_truth_map)
+    return group.compose(pose_truth_map, poses)[:, : group.point_dim]
+
+
+def _send_truth(stream: Any, recording: AnyRecording, evaluation: Evaluation) -> None:
     import rerun as rr
 
     if recording.truth is not None and evaluation.poses is not None:
         rows = _thin(len(recording.truth))
-        line = _flat(recording.truth.pose_world_robot[rows, :2], -0.01)
+        poses = recording.truth.pose_world_robot[rows]
+        line = _flat(_places(group_of(poses).identity(), poses), -0.01)
         stream.log("world/truth/path", rr.LineStrips3D([line], colors=rgb(MUTED), radii=0.012), static=True)
     if recording.true_landmarks is not None and evaluation.poses is not None:
         points = _flat(recording.true_landmarks.position_m)
-        size = np.full((len(points), 3), [0.07, 0.07, 0.002])
+        size = np.full((len(points), 3), [0.07, 0.07, 0.002 if evaluation.poses.dof == 2 else 0.07])
         boxes = rr.Boxes3D(centers=points, half_sizes=size, colors=rgb(MUTED))
         stream.log("world/truth/landmarks", boxes, static=True)
 
@@ -157,10 +185,9 @@ def _send_odometry(stream: Any, result: SlamResult, evaluation: Evaluation) -> N
 
     if len(result.dead_reckoning) == 0:
         return
-    aligned = evaluation.dead_reckoning
-    pose = np.zeros(3) if aligned is None else aligned.pose_truth_estimate
-    rows = _thin(len(result.dead_reckoning))
-    line = se2.compose(pose, result.dead_reckoning.pose_world_robot[rows])[:, :2]
+    aligned, poses = evaluation.dead_reckoning, result.dead_reckoning.pose_world_robot
+    pose = group_of(poses).identity() if aligned is None else aligned.pose_truth_estimate
+    line = _places(pose, poses[_thin(len(poses))])
     strip = rr.LineStrips3D([_flat(line, -0.02)], colors=rgb(ODOMETRY), radii=0.006)
     stream.log("world/odometry_alone", strip, static=True)
 
@@ -172,34 +199,39 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
     if len(trajectory) == 0:
         return
     rows = _thin(len(trajectory))
-    poses = se2.compose(pose_truth_map, trajectory.pose_world_robot[rows])
-    stamps, half = trajectory.stamp_s[rows], 0.5 * poses[:, 2]
-    quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
-    places = rr.Transform3D.columns(translation=_flat(poses[:, :2]), quaternion=quaternion)
+    group = group_of(pose_truth_map)
+    poses = group.compose(pose_truth_map, trajectory.pose_world_robot[rows])
+    stamps, at = trajectory.stamp_s[rows], poses[:, : group.point_dim]
+    quaternion = poses[:, 3:]
+    if group.point_dim == 2:
+        half = 0.5 * poses[:, 2]
+        quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
+    places = rr.Transform3D.columns(translation=_flat(at), quaternion=quaternion)
     stream.send_columns("world/robot", [_time(stamps, clock)], places)
     body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=rgb(ESTIMATE), fill_mode="solid")
     heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=rgb(ESTIMATE), radii=0.02)
+    if group.point_dim == 3:  # a camera that is carried may look along any of its axes
+        colours = [rgb(colour) for colour in (ALERT, LANDMARK, ESTIMATE)]
+        heading = rr.Arrows3D(vectors=0.4 * np.eye(3), origins=np.zeros((3, 3)), colors=colours, radii=0.015)
     stream.log("world/robot/body", body, static=True)
     stream.log("world/robot/heading", heading, static=True)
     if len(rows) > 1:
-        points = _flat(poses[:, :2], 0.01)
+        points = _flat(at, 0.01)
         pieces = np.stack([points[:-1], points[1:]], axis=1)
         columns = rr.LineStrips3D.columns(strips=pieces)
         stream.send_columns("world/path", [_time(stamps[1:], clock)], columns)
         stream.log("world/path", rr.LineStrips3D.from_fields(colors=rgb(ESTIMATE), radii=0.012), static=True)
 
 
-def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray, clock: Clock) -> None:
+def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Clock) -> None:
     """Send final positions with 2-sigma ellipses by class, each from its first sighting on; large maps in groups."""
     import rerun as rr
 
-    landmarks = result.landmarks
     if len(landmarks) == 0:
         return
-    start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
     first_s = np.where(np.isfinite(landmarks.first_seen_s), landmarks.first_seen_s, start_s)
-    points = _flat(se2.transform(pose_truth_map, landmarks.position_m))
-    ellipses = _ellipses(points, landmarks.covariance_m2, float(pose_truth_map[2]))
+    points = _flat(landmarks.position_m)
+    ellipses = _ellipses(points, landmarks.covariance_m2)
     looks, classes = class_looks(landmarks.class_names), class_names_of(landmarks)
     colours = np.array([rgb(looks[name].colour) for name in classes], dtype=np.uint8)
     called = np.array(
@@ -221,8 +253,26 @@ def _send_landmarks(stream: Any, result: SlamResult, pose_truth_map: FloatArray,
             show_labels=len(order) <= 60,
         )
         stream.log(entity, marks)
-        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(ellipses[group], colors=colours[group], radii=0.008))
+        lines, repeated = np.concatenate(ellipses[group]), np.repeat(colours[group], ellipses.shape[1], axis=0)
+        stream.log(f"{entity}/two_sigma", rr.LineStrips3D(lines, colors=repeated, radii=0.008))
+        _send_bodies(stream, entity, rows_of(landmarks, group), colours[group])
     stream.reset_time()
+
+
+def _send_bodies(stream: Any, entity: str, landmarks: Landmarks, colours: NDArray[np.uint8]) -> None:
+    """Boxes as large as they are, and plates where tags are, turned as the map says."""
+    import rerun as rr
+
+    poses = landmark_poses(landmarks) if landmarks.rotation is not None else np.zeros((len(landmarks), 0))
+    rows = np.flatnonzero(np.isfinite(poses).all(axis=1) & bool(poses.shape[1]))
+    if not len(rows):
+        return
+    size = box_sizes(landmarks)[rows]
+    size = np.where(np.isfinite(size).all(axis=1, keepdims=True), size, _PLATE_M)
+    bodies = rr.Boxes3D(
+        half_sizes=0.5 * size, centers=poses[rows, :3], quaternions=poses[rows, 3:], colors=colours[rows]
+    )
+    stream.log(f"{entity}/body", bodies)
 
 
 def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray, clock: Clock) -> None:
@@ -243,18 +293,30 @@ def _send_changes(stream: Any, result: SlamResult, pose_truth_map: FloatArray, c
     stream.reset_time()
 
 
-def _ellipses(points: Float32Array, covariance: FloatArray, turn_rad: float) -> Float32Array:
-    """2-sigma outlines (L, corners, 3) on the floor."""
+def _ellipses(points: Float32Array, covariance: FloatArray) -> Float32Array:
+    """2-sigma outlines (L, 1, corners, 3) on the floor; in space (L, 3, corners, 3), one through every two axes."""
     variance, axis = np.linalg.eigh(covariance)
     root = axis * np.sqrt(np.maximum(variance, 0.0))[:, None, :]
     angle = np.linspace(0, 2 * np.pi, _ELLIPSE_CORNERS)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    outline = np.swapaxes(2.0 * se2.rotation(turn_rad) @ root @ circle, 1, 2)
-    flat = np.concatenate([outline, np.zeros((*outline.shape[:2], 1))], axis=2)
-    return np.asarray(points[:, None, :] + flat, dtype=np.float32)
+    across = [list(pair) for pair in combinations(range(root.shape[1]), 2)]
+    outlines = [_flat(np.swapaxes(2.0 * root[..., pair] @ circle, 1, 2)) for pair in across]
+    return np.asarray(points[:, None, None, :] + np.stack(outlines, axis=1), dtype=np.float32)
 
 
-def _send_rays(stream: Any, recording: Recording, result: SlamResult, pose_truth_map: FloatArray) -> None:
+def _readings(recording: AnyRecording) -> tuple[FloatArray, FloatArray]:
+    """Pose of the sensor on the robot and place in the sensor's frame of each detection, nan where it has no depth."""
+    if isinstance(recording, SpatialRecording):
+        mounts = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
+        return mounts[recording.detections.sensor], recording.detections.position_sensor_m
+    bearing, range_m = recording.detections.bearing_rad, recording.detections.range_m
+    place = range_m[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+    return np.tile(recording.sensor.mount_robot_sensor, (len(range_m), 1)), place
+
+
+def _send_rays(
+    stream: Any, recording: AnyRecording, result: SlamResult, pose_truth_map: FloatArray, landmarks: Landmarks
+) -> None:
     """Each frame's detections as rays from the sensor to where they put their landmark; raw readings."""
     import rerun as rr
 
@@ -267,39 +329,43 @@ def _send_rays(stream: Any, recording: Recording, result: SlamResult, pose_truth
     )
     kept = kept[within]
     nearest = np.clip(np.searchsorted(result.trajectory.stamp_s, frames.stamp_s[kept]), 0, len(result.trajectory) - 1)
-    sensor = se2.compose(
-        se2.compose(pose_truth_map, result.trajectory.pose_world_robot[nearest]),
-        np.asarray(recording.sensor.mount_robot_sensor),
-    )
+    group = group_of(pose_truth_map)
+    robot = group.compose(pose_truth_map, result.trajectory.pose_world_robot[nearest])
     row_of = np.full(len(frames), -1)
     row_of[kept] = np.arange(len(kept))
-    used = np.flatnonzero((row_of[detections.frame] >= 0) & np.isfinite(detections.range_m))
+    mount, ends = _readings(recording)
+    used = np.flatnonzero(row_of[detections.frame] >= 0)
     row = row_of[detections.frame[used]]
-    bearing = detections.bearing_rad[used]
-    ends = detections.range_m[used, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-    rays = np.stack([_flat(sensor[row, :2], 0.1), _flat(se2.transform(sensor[row], ends), 0.05)], axis=1)
+    sensor = group.compose(robot[row], mount[used])
+    ends = group.transform(sensor, ends[used])
+    place = dict(zip(landmarks.landmark_id.tolist(), landmarks.position_m, strict=True))
+    for k in np.flatnonzero(~np.isfinite(ends[:, 0])):  # an image has no depth
+        ends[k] = place.get(int(detections.landmark_id[used[k]]), ends[k])
+    shown = np.isfinite(ends).all(axis=1)
+    row, sensor, ends = row[shown], sensor[shown], ends[shown]
+    rays = np.stack([_flat(sensor[:, : group.point_dim], 0.1), _flat(ends, 0.05)], axis=1)
     counts = np.bincount(row, minlength=len(kept))
     columns = rr.LineStrips3D.columns(strips=rays).partition(lengths=counts)
     stream.send_columns("world/detections", [_time(frames.stamp_s[kept], recording.clock)], columns)
     stream.log("world/detections", rr.LineStrips3D.from_fields(colors=rgb(ALERT), radii=0.006), static=True)
 
 
-def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluation: Evaluation) -> None:
+def _send_numbers(stream: Any, recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> None:
     """NIS with its band, latency and, with truth, the position error with its 2-sigma band."""
     import rerun as rr
 
     def at(stamp_s: FloatArray) -> Any:
         return _time(stamp_s, recording.clock)
 
-    innovations = result.innovations
-    finite = np.flatnonzero(np.isfinite(innovations.nis) & (innovations.nis > 0))
+    innovations, nis = result.innovations, comparable_nis(result.innovations)
+    finite = np.flatnonzero(np.isfinite(nis) & (nis > 0))
     if len(finite):
         rows = finite[_thin(len(finite))]
         _plot(
             stream,
             "nis/detection",
             at(innovations.stamp_s[rows]),
-            np.log10(innovations.nis[rows]),
+            np.log10(nis[rows]),
             ESTIMATE,
             points=True,
         )
@@ -312,8 +378,16 @@ def _send_numbers(stream: Any, recording: Recording, result: SlamResult, evaluat
     poses = evaluation.poses
     if poses is not None:
         rows = _thin(len(poses.stamp_s))
-        band = 2.0 * np.sqrt(np.trace(poses.covariance[rows, :2, :2], axis1=1, axis2=2))
+        band = 2.0 * np.sqrt(np.trace(poses.covariance[rows, : poses.dof, : poses.dof], axis1=1, axis2=2))
         _plot(stream, "error/position_m", at(poses.stamp_s[rows]), poses.position_error_m[rows], ESTIMATE)
+        if poses.dof == 3:
+            _plot(
+                stream,
+                "turn/orientation_deg",
+                at(poses.stamp_s[rows]),
+                np.degrees(poses.orientation_error_rad[rows]),
+                ESTIMATE,
+            )
         _plot(stream, "error/two_sigma_m", at(poses.stamp_s[rows]), band, MUTED)
     stream.log("about", rr.TextDocument(f"{recording.name}\n\nsource: {recording.source}"), static=True)
 

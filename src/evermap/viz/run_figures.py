@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evermap.metrics.consistency import chi2_interval, chi2_quantile, running_mean
+from evermap.geometry.group import PLANE, group_of
+from evermap.metrics.consistency import chi2_interval, chi2_quantile, comparable_nis, running_mean
 from evermap.metrics.summary import Evaluation
+from evermap.metrics.trajectory import PoseErrors
 from evermap.stamps import stamp_text
-from evermap.types import Clock, FloatArray, ParameterEstimate, Recording, SlamResult
+from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult
 from evermap.viz.map_figure import draw_map
 from evermap.viz.style import (
     ALERT,
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def draw_figures(
-    recording: Recording, result: SlamResult, evaluation: Evaluation, *, real_time_factor: float | None = None
+    recording: AnyRecording, result: SlamResult, evaluation: Evaluation, *, real_time_factor: float | None = None
 ) -> tuple[NamedFigure, ...]:
     """Return all figures that this run has something to show in, in the order of the report.
 
@@ -70,8 +72,8 @@ def blind_stretches(stamp_s: FloatArray, longer_than_s: float = BLIND_S) -> Floa
     return np.stack([stamp_s[gaps], stamp_s[gaps + 1]], axis=1) if len(gaps) else np.zeros((0, 2))
 
 
-def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
-    """Draw the position and heading error with the 2-sigma band; the band alone where there is no truth."""
+def draw_errors(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) -> NamedFigure:
+    """Draw errors of position and heading, in space orientation, with 2-sigma bands; bands alone without truth."""
     figure = new_figure(7.2, 4.2)
     above, below = figure.subplots(2, 1, sharex=True)
     start_s = _start(recording)
@@ -81,16 +83,19 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
     else:
         stamps, covariance = poses.stamp_s, poses.covariance
     time = stamps - start_s
-    position_band = 2.0 * np.sqrt(np.trace(covariance[:, :2, :2], axis1=1, axis2=2))
-    heading_band = 2.0 * np.degrees(np.sqrt(covariance[:, 2, 2]))
+    group = group_of(result.trajectory.pose_world_robot)
+    size, turn = group.point_dim, "heading" if group is PLANE else "orientation"
+    position_band = 2.0 * np.sqrt(np.trace(covariance[:, :size, :size], axis1=1, axis2=2))
+    turn_band = 2.0 * np.degrees(np.sqrt(np.trace(covariance[:, size:, size:], axis1=1, axis2=2)))
 
     blind = blind_stretches(recording.frames.stamp_s) - start_s
     for axes in (above, below):
         for k, (begin, end) in enumerate(blind):
             axes.axvspan(begin, end, color=SHADE, lw=0, zorder=0, label=f"blind > {BLIND_S:g} s" if k == 0 else None)
+    lowest = -1.0 if group is PLANE else 0.0  # headings have a sign, angles in space have none
     above.fill_between(time, 0, position_band, color=ESTIMATE_BAND, lw=0, zorder=1, label="2σ expected")
-    below.fill_between(time, -heading_band, heading_band, color=ESTIMATE_BAND, lw=0, zorder=1)
-    top, side = _limit(position_band), _limit(heading_band)
+    below.fill_between(time, lowest * turn_band, turn_band, color=ESTIMATE_BAND, lw=0, zorder=1)
+    top, side = _limit(position_band), _limit(turn_band)
     if poses is not None:
         online = evaluation.online
         if online is not None:
@@ -98,16 +103,18 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
             above.plot(
                 causal[0] - start_s, causal[1], color=ONLINE, lw=0.8, label=f"online (RMSE {online.rmse_m:.3f} m)"
             )
-            causal = _with_breaks(online.stamp_s, np.degrees(online.heading_error_rad))
+            causal = _with_breaks(online.stamp_s, _turn_deg(online))
             below.plot(causal[0] - start_s, causal[1], color=ONLINE, lw=0.8)
-        heading = np.degrees(poses.heading_error_rad)
+        turned = _turn_deg(poses)
         above.plot(time, poses.position_error_m, color=ESTIMATE, lw=1.1, label=f"smoothed (RMSE {poses.rmse_m:.3f} m)")
-        below.plot(time, heading, color=ESTIMATE, lw=1.1)
+        below.plot(time, turned, color=ESTIMATE, lw=1.1)
         below.axhline(0, color=MUTED, lw=0.7)
         top = max(1.12 * poses.max_m, min(top, 3.0 * poses.max_m))
-        side = max(1.12 * float(np.max(np.abs(heading))), min(side, 3.0 * float(np.max(np.abs(heading)))))
+        side = max(1.12 * float(np.max(np.abs(turned))), min(side, 3.0 * float(np.max(np.abs(turned)))))
     above.set(ylim=(0, top or None), ylabel="position error [m]" if poses else "2σ of position [m]")
-    below.set(ylim=(-side, side) if side else None, ylabel="heading error [°]" if poses else "2σ of heading [°]")
+    below.set(
+        ylim=(lowest * side, side) if side else None, ylabel=f"{turn} error [°]" if poses else f"2σ of {turn} [°]"
+    )
     below.set(xlabel=_since_start(recording))
     _span(below, recording)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4)
@@ -115,12 +122,19 @@ def draw_errors(recording: Recording, result: SlamResult, evaluation: Evaluation
     return NamedFigure("errors", figure, title, _error_caption(evaluation, len(blind)))
 
 
+def _turn_deg(errors: PoseErrors) -> FloatArray:
+    """Errors of headings, signed; in space of orientations."""
+    plane = group_of(errors.estimate) is PLANE
+    return np.asarray(np.degrees(errors.heading_error_rad if plane else errors.orientation_error_rad))
+
+
 def draw_consistency(result: SlamResult) -> NamedFigure | None:
     """Draw the NIS over time with its 95% band and running mean, and its histogram against the chi-square density."""
-    finite = np.isfinite(result.innovations.nis)
+    values, stamps = comparable_nis(result.innovations), result.innovations.stamp_s
+    finite = np.isfinite(values)
     if not np.any(finite):
         return None
-    nis, stamps = result.innovations.nis[finite], result.innovations.stamp_s[finite]
+    nis, stamps = values[finite], stamps[finite]
     inlier = result.innovations.p_inlier[finite] >= 0.5
     figure = new_figure(7.2, 3.3)
     left, right = figure.subplots(1, 2, width_ratios=(2.1, 1))
@@ -160,13 +174,15 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
         "Squared distance of every detection from its prediction, in standard deviations, before it was used."
         " If the noise levels are honest the mean is 2 and 95% stay below 5.99."
     )
+    if result.innovations.dof is not None:
+        caption += " Detections that measure more than two numbers are shown by their tail probability, on one scale."
     if len(kept):
         caption += f" Here: mean {kept.mean():.2f}, {np.mean(kept <= usual):.1%} below"
         caption += f", {np.mean(~inlier):.1%} judged outliers" + (f", {beyond:.1%} beyond the axis." if beyond else ".")
     return NamedFigure("consistency", figure, "Innovation consistency", caption)
 
 
-def draw_latency(recording: Recording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
+def draw_latency(recording: AnyRecording, result: SlamResult, real_time_factor: float | None) -> NamedFigure | None:
     """Draw the processing time of every step, with the median, the 99th percentile and the time there was."""
     count = len(result.step_s)
     if count == 0:
@@ -201,11 +217,11 @@ def draw_latency(recording: Recording, result: SlamResult, real_time_factor: flo
     return NamedFigure("latency", figure, "Step latency", caption)
 
 
-def _start(recording: Recording) -> float:
+def _start(recording: AnyRecording) -> float:
     return float(recording.frames.stamp_s[0]) if len(recording.frames) else 0.0
 
 
-def _since_start(recording: Recording) -> str:
+def _since_start(recording: AnyRecording) -> str:
     """Label of an axis of seconds, with the date of the first frame where it is known."""
     if recording.clock is Clock.RECORDING or not len(recording.frames):
         return "time since the first frame [s]"
@@ -213,7 +229,7 @@ def _since_start(recording: Recording) -> str:
     return f"time since the first frame, {stamp_text(_start(recording), recording.clock)} {zone} [s]"
 
 
-def _span(axes: Axes, recording: Recording) -> None:
+def _span(axes: Axes, recording: AnyRecording) -> None:
     stamps = recording.frames.stamp_s
     if len(stamps) > 1:
         axes.set_xlim(0, float(stamps[-1] - stamps[0]))
@@ -234,7 +250,7 @@ def _error_caption(evaluation: Evaluation, blind: int) -> str:
     if poses is None:
         return "Uncertainty relative to the first pose; the recording has no pose truth to compare with."
     text = (
-        f"After SE(2) alignment: {poses.rmse_m:.3f} m and {poses.heading_rmse_deg:.2f}° RMSE,"
+        f"After SE({poses.dof}) alignment: {poses.rmse_m:.3f} m and {poses.orientation_rmse_deg:.2f}° RMSE,"
         f" {poses.max_m:.2f} m at worst. The band is twice the standard deviation that the estimator reports, relative"
         " to its first pose; alignment makes errors a little smaller than that."
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -133,7 +134,7 @@ def _draw_change(axes: Axes, change: MapChange, study: Study, pose_truth_map: Fl
     if change.kind == ChangeKind.VANISHED:
         axes.plot(*here.T, "x", ms=6.5, color=ALERT, mew=1.9, zorder=8)
         return "vanished"
-    if not np.hypot(*change.displacement_m) >= NEAR_M:  # it was not there before, or is back where it was
+    if not math.hypot(*change.displacement_m) >= NEAR_M:  # it was not there before, or is back where it was
         axes.plot(*here.T, "+", ms=9, color=ALERT, mew=1.6, zorder=6)
         return "came"
     end = here.mean(axis=0)

@@ -1,0 +1,150 @@
+"""Panels of a map: from above, and in space from the side as well, at one scale; how landmarks look in them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.geometry.group import group_of
+from evermap.metrics.trajectory import rotate_covariance
+from evermap.types import BoolArray, FloatArray, Landmarks
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.gridspec import SubplotSpec
+
+View = list[int]
+"""Which two coordinates a panel shows: to the right, and upwards."""
+_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_EDGES = np.array([[i, i | bit] for bit in (1, 2, 4) for i in range(8) if not i & bit])
+_NORMAL = 0.04
+"""Length of the line that shows where a tag faces, as a share of the picture."""
+
+
+def height_over_width(size: FloatArray) -> float:
+    """Return the height of all panels, one below the other, over their width, for a picture of `size` (2,) or (3,)."""
+    views = _views(size)
+    return float(sum(size[up] for _, up in views) / max(size[right] for right, _ in views))
+
+
+def lay_out(
+    figure: Figure, low: FloatArray, high: FloatArray, within: SubplotSpec | None = None
+) -> list[tuple[Axes, View]]:
+    """Add the panels for what lies between the corners `low` and `high`: (2,), in space (3,).
+
+    From the side one looks along the shorter of x and y, so that the longer one is seen. `within` is the place for all
+    of them, where they are not the only ones of the figure.
+    """
+    size = high - low
+    views = _views(size)
+    width = max(size[right] for right, _ in views)
+    heights: Any = {"nrows": len(views), "ncols": 1, "height_ratios": [size[up] for _, up in views]}
+    grid = figure.add_gridspec(**heights) if within is None else within.subgridspec(**heights)
+    rows = [figure.add_subplot(grid[k, 0]) for k in range(len(views))]
+    for axes, (right, up) in zip(rows, views, strict=True):
+        spare = 0.5 * (width - size[right])
+        axes.set(
+            xlim=(low[right] - spare, high[right] + spare), ylim=(low[up], high[up]), aspect="equal",
+            xlabel=f"{'xyz'[right]} [m]", ylabel=f"{'xyz'[up]} [m]",
+        )  # fmt: skip
+    if len(views) > 1:
+        for axes, title in zip(rows, ("from above", "from the side"), strict=True):
+            axes.set_title(title)
+    return list(zip(rows, views, strict=True))
+
+
+def corners_of(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of all finite points (N, D), with a margin; about the origin where there is none."""
+    finite = [part[np.all(np.isfinite(part), axis=1)] for part in parts if len(part)]
+    everything = np.concatenate([part for part in finite if len(part)] or [np.zeros((1, parts[0].shape[1]))])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    margin = max(0.06 * float(np.max(high - low)), 0.5)
+    return low - margin, high + margin
+
+
+def _views(size: FloatArray) -> Sequence[View]:
+    return [[0, 1]] if len(size) == 2 else [[0, 1], [int(np.argmax(size[:2])), 2]]
+
+
+def moved_map(landmarks: Landmarks, pose: FloatArray) -> Landmarks:
+    """Return a map in the frame in which `pose` (3,) or (7,) is that of its own frame."""
+    if not len(landmarks):
+        return landmarks
+    group = group_of(pose)
+    rotation = landmarks.rotation
+    if rotation is not None:
+        oriented = np.isfinite(rotation).all(axis=1)
+        rotation = rotation.copy()
+        rotation[oriented] = se3.compose(pose, landmark_poses(landmarks)[oriented])[:, 3:]
+    return replace(
+        landmarks,
+        position_m=group.transform(pose, landmarks.position_m),
+        covariance_m2=rotate_covariance(landmarks.covariance_m2, group.rotation_of(pose)),
+        rotation=rotation,
+    )
+
+
+def seen(landmarks: Landmarks, view: View) -> Landmarks:
+    """Return a map as a panel shows it: two coordinates of places and covariances."""
+    if not len(landmarks):
+        return replace(landmarks, position_m=np.zeros((0, 2)), covariance_m2=np.zeros((0, 2, 2)))
+    covariance = landmarks.covariance_m2[:, view][:, :, view]
+    return replace(landmarks, position_m=landmarks.position_m[:, view], covariance_m2=covariance)
+
+
+def draw_shapes(
+    axes: Axes,
+    landmarks: Landmarks,
+    view: View,
+    colours: Any,
+    reach_m: float,
+    path_m: FloatArray | None = None,
+) -> None:
+    """Draw boxes by their edges, and where the other landmarks that have an orientation face: along their z.
+
+    Args:
+        axes: a panel.
+        landmarks: in space; those without an orientation have no shape.
+        view: of the panel.
+        colours: (L,).
+        reach_m: size of the picture.
+        path_m: (N, 3) from where they were seen; then all face towards it, whichever way their z points.
+    """
+    from matplotlib.collections import LineCollection
+
+    if landmarks.rotation is None:
+        return
+    oriented = np.isfinite(landmarks.rotation).all(axis=1)
+    sized = np.asarray(np.isfinite(np.column_stack([landmarks.rotation, box_sizes(landmarks)])).all(axis=1))
+    lines = [*box_edges(landmarks, sized)[..., view].reshape(-1, 2, 2)]
+    looks = [colour for colour, box in zip(colours, sized, strict=True) if box for _ in _EDGES]
+    for row in np.flatnonzero(oriented & ~sized):
+        start, normal = landmarks.position_m[row], se3.rotation_of(landmark_poses(landmarks)[row])[:, 2]
+        if path_m is not None and len(path_m):
+            nearest = path_m[np.argmin(np.sum((path_m - start) ** 2, axis=1))]
+            normal = normal * (-1.0 if (nearest - start) @ normal < 0.0 else 1.0)
+        lines.append(np.stack([start, start + _NORMAL * reach_m * normal])[:, view])
+        looks.append(colours[row])
+    axes.add_collection(LineCollection(lines, colors=looks, linewidths=1.1, zorder=5.5))
+
+
+def box_sizes(landmarks: Landmarks) -> FloatArray:
+    """Return the sizes (L, 3) of boxes, nan of all else."""
+    return np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
+
+
+def box_edges(landmarks: Landmarks, rows: BoolArray) -> FloatArray:
+    """Return the ends (K, 12, 2, 3) of the edges of the boxes in some rows."""
+    corners = se3.transform(landmark_poses(landmarks)[rows][:, None], _CORNERS * box_sizes(landmarks)[rows][:, None])
+    return corners[:, _EDGES]
+
+
+def landmark_poses(landmarks: Landmarks) -> FloatArray:
+    """Return poses (L, 7) of landmarks in space, nan where there is no orientation."""
+    rotation = np.full((len(landmarks), 4), np.nan) if landmarks.rotation is None else landmarks.rotation
+    return np.column_stack([landmarks.position_m, rotation])
