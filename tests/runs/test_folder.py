@@ -99,6 +99,28 @@ def test_files_hold_the_estimate(written, run):
     assert json.loads((out / "map.geojson").read_text())["type"] == "FeatureCollection"
 
 
+def test_a_run_in_space_has_the_same_folder(written, tmp_path):
+    from synthetic_run import make_spatial_run, with_spatial_changes
+
+    recording, result = make_spatial_run()
+    result = with_spatial_changes(result)
+    out = tmp_path / "stair"
+    summary = write_run(out, recording, result, load_config(), info=INFO)
+    assert summary["outputs"] == written[1]["outputs"]
+    assert summary["metrics"].keys() == written[1]["metrics"].keys()
+    assert summary["counts"].keys() == written[1]["counts"].keys()
+    rows = np.loadtxt(out / "trajectory.tum")
+    np.testing.assert_allclose(rows[:, 1:], result.trajectory.pose_world_robot, atol=1e-9)
+    innovations = pq.read_table(out / "innovations.parquet")
+    np.testing.assert_array_equal(innovations["dof"].to_numpy(), result.innovations.dof)
+    known = read_prior_map(out / "map.parquet", sigma_m=1.0)
+    np.testing.assert_allclose(known.position_m, result.landmarks.position_m)
+    np.testing.assert_allclose(known.covariance_m2, result.landmarks.covariance_m2)
+    np.testing.assert_allclose(known.rotation, result.landmarks.rotation)
+    told = [json.loads(text) for text in (out / "changes.jsonl").read_text().splitlines()]
+    assert told == summary["changes"]
+
+
 def test_the_same_run_gives_the_same_bytes_but_for_time(written, run, tmp_path):
     out, _ = written
     slower = RunInfo(command=INFO.command, seeds=INFO.seeds, processing_s=9.0)

@@ -74,6 +74,18 @@ def test_a_narrow_tall_site_is_seen_along_its_shorter_side(spatial):
     assert np.ptp(above.get_xlim()) == pytest.approx(np.ptp(side.get_xlim()))
 
 
+def test_a_survey_of_much_more_than_was_mapped_may_leave_the_picture(drawn, spatial):
+    recording, result = spatial
+    survey = recording.true_landmarks
+    far = Landmarks.in_space(
+        [*survey.landmark_id, 999], np.vstack([survey.position_m, [500.0, 0.0, 0.0]]),
+        rotation=np.vstack([survey.rotation, [0.0, 0.0, 0.0, 1.0]]),
+    )  # fmt: skip
+    larger = dataclasses.replace(recording, true_landmarks=far)
+    figure = draw_figures(larger, result, compare_with_truth(larger, result))[0].figure
+    assert figure.axes[0].get_xlim() == drawn["map"].figure.axes[0].get_xlim()
+
+
 def test_ellipses_are_two_sigma_of_what_a_panel_shows(drawn, spatial):
     pose, _ = aligned(*spatial)
     turn = se3.rotation_of(pose)

@@ -12,7 +12,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.geometry.group import PLANE, Group, group_of
 from evermap.metrics.summary import Evaluation
-from evermap.types import AnyRecording, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
+from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
 from evermap.viz.panels import View, corners_of, draw_shapes, height_over_width, lay_out, moved_map, seen
 from evermap.viz.style import (
@@ -48,6 +48,7 @@ class _Scene:
     Attributes:
         path_m: (N, D) positions of the robot; odometry_m: as odometry alone has them.
         truth_m, survey_m: true positions of robot and landmarks; None where there are none, or nothing ties the frames.
+        mapped: (S,) which of the surveyed landmarks the map has.
         landmarks, gone: the map.
         changed: what changed.
     """
@@ -56,14 +57,16 @@ class _Scene:
     odometry_m: FloatArray
     truth_m: FloatArray | None
     survey_m: FloatArray | None
+    mapped: BoolArray
     landmarks: Landmarks
     gone: Landmarks
     changed: Sequence[Move]
 
     def corners(self) -> tuple[FloatArray, FloatArray]:
-        """Return the corners of what must be in the picture, with a margin; odometry may leave it."""
+        """Return the corners of what must be in the picture; odometry and a larger survey may leave it."""
         moved = [part for move in self.changed for part in (move.before_m, move.after_m)]
-        true = [part for part in (self.truth_m, self.survey_m) if part is not None]
+        survey = None if self.survey_m is None else self.survey_m[self.mapped]
+        true = [part for part in (self.truth_m, survey) if part is not None]
         return corners_of([self.path_m, self.landmarks.position_m, self.gone.position_m, *moved, *true])
 
 
@@ -93,7 +96,8 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
     size = group.point_dim
     pose_truth_map = _alignment(evaluation, group)
     truth = None if recording.truth is None else recording.truth.pose_world_robot[:, :size]
-    survey = None if recording.true_landmarks is None else recording.true_landmarks.position_m
+    known = Landmarks.at([], np.zeros((0, 2))) if recording.true_landmarks is None else recording.true_landmarks
+    survey = None if recording.true_landmarks is None else known.position_m
     if evaluation.poses is None and evaluation.landmarks_own is None:
         truth = survey = None  # nothing ties the frames together
     odometry = evaluation.dead_reckoning
@@ -106,6 +110,7 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
         odometry_m=drifted[:, :size],
         truth_m=truth,
         survey_m=survey,
+        mapped=np.isin(known.landmark_id, result.landmarks.landmark_id),
         landmarks=moved_map(result.landmarks, pose_truth_map),
         gone=moved_map(result.gone, pose_truth_map),
         changed=moves(result, pose_truth_map),

@@ -153,7 +153,7 @@ def _frames(summary: Mapping[str, Any]) -> str:
     pose = alignment["pose_truth_estimate"]
     if pose is not None:
         turn = "rad" if "theta_rad" in pose else "quaternion x, y, z, w"
-        angle = ", ".join(f"{value:.4f}" for name, value in pose.items() if not name.endswith("_m"))
+        angle = ", ".join(f"{pose[name]:.4f}" for name in ("theta_rad", "qx", "qy", "qz", "qw") if name in pose)
         shift = ", ".join(f"{value:.3f}" for name, value in pose.items() if name.endswith("_m"))
         how = (
             f"truth = R({angle} {turn}) · estimate + ({shift}) m, by"
