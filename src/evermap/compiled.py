@@ -35,7 +35,8 @@ def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]
     """Return a decorator that compiles a function at its first call and keeps the machine code for all processes.
 
     It is kept beside the source, or where that is read-only in the user's cache folder, or in a temporary one. It is
-    compiled again when the function, what it calls, or a constant that either of them reads has changed.
+    compiled again when the function, what it calls, or a constant that either of them reads has changed. A call lets go
+    of the interpreter's lock: kernels run side by side in threads.
 
     Args:
         effort: LLVM's level of optimisation, from 1. Level 1 compiles in two thirds of the time; level 3 pays where
@@ -49,7 +50,7 @@ def kept(*, effort: int = 3, **options: Any) -> Callable[[_Function], _Function]
     def decorate(function: _Function) -> _Function:
         from numba import njit
 
-        dispatcher = njit(**options)(function)
+        dispatcher = njit(nogil=True, **options)(function)  # of other options what numba brings is compiled anew
         dispatcher._cache = _keeper()(function)
         dispatcher._cache.of = dispatcher
         dispatcher.effort = effort

@@ -192,12 +192,12 @@ def run_and_write(
     **how: Unpack[_How],
 ) -> None:
     """Run, write the folder, show what came out. A run that Ctrl-C cut short is written as far as it came."""
+    from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
-    from evermap.slam.warmup import warm_up as compile_kernels
 
-    in_map = prior is not None
-    warm_up(lambda: compile_kernels(search=may_search(len(recording.frames.stamp_s), in_map=in_map)))
+    search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
+    warm_up(lambda: compile_kernels(search=search, unknown_ids=config.slam.unknown_ids))
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)
@@ -311,6 +311,7 @@ class MapOptions(NamedTuple):
 
 def run_in_map(recording: Recording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
+    from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
@@ -322,7 +323,7 @@ def run_in_map(recording: Recording, config: Config, options: MapOptions, out: P
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
     said = priors_of(*priors_by_class(priors))
-    warm_up()
+    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} stays as it was")

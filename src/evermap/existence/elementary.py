@@ -14,9 +14,8 @@ from numba.extending import intrinsic
 
 from evermap.compiled import kept
 
-kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
-"""Products and sums may fuse, nothing else is relaxed. A call lets go of the interpreter's lock: kernels run side by
-side in threads."""
+kernel = kept(error_model="numpy", fastmath={"contract"})
+"""Products and sums may fuse, nothing else is relaxed."""
 inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 """Into the kernels that call it, which is what lets their loops be vectorised."""
 reordered = kept(error_model="numpy", fastmath={"contract", "reassoc", "nsz"}, forceinline=True)

@@ -296,7 +296,9 @@ def forward(
                     total = _log_add(total, now[age, s])
             log_odds[f] = seen - sites if sites > -np.inf else 0.0
             log_evidence[c] += total
-            now[:, :n] -= total
+            for age in range(2):
+                for s in range(n):
+                    now[age, s] -= total
 
 
 @kernel
@@ -316,7 +318,9 @@ def backward(chain: SiteChain, log_ratio: FloatArray, filtered: FloatArray, smoo
                 for age in range(2):
                     smoothed[f, age, s] = filtered[f, age, s] + ahead[age, s]
                     total = _log_add(total, smoothed[f, age, s])
-            smoothed[f, :, :n] -= total
+            for age in range(2):
+                for s in range(n):
+                    smoothed[f, age, s] -= total
             if f > first_frame[c]:
                 for s in range(n):
                     gone = -np.inf

@@ -23,8 +23,8 @@ FAR_OUT = 5.0
 EXPONENT = 600.0
 """Cut of log likelihood ratios: far from what a double holds, and certain either way."""
 
-kernel = kept(nogil=True, error_model="numpy", fastmath={"contract"})
-exact = kept(nogil=True, error_model="numpy")
+kernel = kept(error_model="numpy", fastmath={"contract"})
+exact = kept(error_model="numpy")
 """Without contractions: the same probability whichever kernel asks."""
 inlined = kept(error_model="numpy", fastmath={"contract"}, forceinline=True)
 
@@ -436,6 +436,15 @@ def _below(z: float) -> float:
 
 
 @exact
+def _longer(rows: Any, more: int) -> Any:
+    """Return the rows, and room for more."""
+    longer = np.empty(len(rows) + more, rows.dtype)
+    for k in range(len(rows)):
+        longer[k] = rows[k]
+    return longer
+
+
+@exact
 def looks(
     eye: FloatArray, position: FloatArray, limits: tuple[float, ...], reach: tuple[float, float, int],
     first_seen: Any, seen: Any,
@@ -469,8 +478,7 @@ def looks(
             marked[seen[k]] = i
         if count + n_around > len(pose):
             more = count + n_around
-            pose, landmark = np.append(pose, np.empty(more, np.int64)), np.append(landmark, np.empty(more, np.int64))
-            p, hit = np.append(p, np.empty(more)), np.append(hit, np.empty(more, np.bool_))
+            pose, landmark, p, hit = _longer(pose, more), _longer(landmark, more), _longer(p, more), _longer(hit, more)
         for k in range(n_around):
             j = around[k]
             p[count] = in_view(position[j, 0] - eye[i, 0], position[j, 1] - eye[i, 1], eye[i, 2], limits)

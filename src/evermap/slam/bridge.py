@@ -141,15 +141,19 @@ def _bridge(
             odometry_covariance(noise, floor, variance, collected[side])
         if i < 0:  # dead reckoning backwards from the first pose
             out[k] = composed(pose[0], inverted(increment[1]))
-            joint[:3, :3] = covariance[0] + collected[1]
-            sandwich(adjoint(increment[1]), joint[:3, :3], part, spread[k])
+            for a in range(3):
+                for b in range(3):
+                    share[a, b] = covariance[0, a, b] + collected[1, a, b]
+            sandwich(adjoint(increment[1]), share, part, spread[k])
             continue
         forward = composed(pose[i], increment[0])
         from_start = adjoint(inverted(increment[0]))
         if i >= n - 1:
             out[k] = forward
             sandwich(from_start, covariance[i], part, spread[k])
-            spread[k] += collected[0]
+            for a in range(3):
+                for b in range(3):
+                    spread[k, a, b] += collected[0, a, b]
             continue
         closing = composed(inverted(composed(forward, increment[1])), pose[i + 1])
         closing[2] = wrapped(closing[2])

@@ -12,6 +12,7 @@ import numpy as np
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.chunked import JointCovariance
+from evermap.sensing.visibility import NominalField
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.estimate import fed
@@ -71,7 +72,7 @@ def localize(
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
     landmarks, places = _existing(landmarks, joint_m2)
-    _compile()
+    warm_up()
     localizer = Localizer(places, recording.sensor, prior, noise)
     frame = np.flatnonzero((stamps >= start_s) & (stamps <= odometry.stamp_s[-1]))
     run = _feed(localizer, recording, frame, drive, realtime=realtime, progress=progress)
@@ -210,8 +211,8 @@ def _result(
 
 
 @functools.cache
-def _compile() -> None:
-    """Two frames of landmarks, one of which has two places: through all kernels, so that no frame has to wait."""
+def warm_up() -> None:
+    """Compile all kernels, or load them, so that no frame has to wait: two frames of landmarks, one with two places."""
     at = np.array([[2.0, 0.0], [0.0, 2.0], [2.0, 2.0], [3.0, 3.0]])
     places = KnownPlaces.of(np.array([0, 1, 2, 2]), at, np.tile(np.eye(2), (4, 1, 1)), np.full(4, 0.5))
     sensor, prior = Sensor(range_max_m=5.0), CalibrationPrior.from_settings(calibrated=True, fix={})
@@ -220,6 +221,7 @@ def _compile() -> None:
     seen = FrameSightings(np.arange(3), reading, np.full((3, 2), np.nan))
     for stamp_s in (0.0, 0.1):
         localizer.step(stamp_s, Drive.from_rows(np.array([0.0, 0.1]), np.zeros((2, 3))), seen)
+    NominalField(sensor).p_detect(np.zeros((1, 3)), at)  # asked for places that are believed to be there
 
 
 def _with_counts(

@@ -20,7 +20,7 @@ from scipy.integrate import quad
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence, compare
 from evermap.slam.changes.explain import GivenMap, MovedGroup, explained
-from evermap.slam.changes.gain import ChangePrior, hypothesis_gain
+from evermap.slam.changes.gain import ChangePrior, Tables, hypothesis_gain
 from evermap.slam.changes.search import item_columns
 from evermap.slam.problem import Estimate
 
@@ -43,12 +43,7 @@ def gain_of(
         np.array(label),
         np.array([0, *onset]),
         np.array([False, *turns]),
-        quadratic,
-        linear,
-        position,
-        prior.spread,
-        prior.log_prior(count, count),
-        prior.log_onset(n_windows),
+        Tables(quadratic, linear, position, prior.spread, prior.log_prior(count, count), prior.log_onset(n_windows)),
     )
 
 

@@ -16,7 +16,7 @@ window on'. `quadratic` and `linear` hold `T'AT` and `T'b` for the four columns 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import gammaln
@@ -28,24 +28,10 @@ _TURN_STEPS = 6
 """Gauss-Newton steps towards the angles; without a turning group one is exact."""
 
 
-@kernel
-def hypothesis_gain(
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
-    quadratic: FloatArray,
-    linear: FloatArray,
-    position: FloatArray,
-    spread: FloatArray,
-    log_prior: FloatArray,
-    log_onset: FloatArray,
-) -> tuple[float, FloatArray]:
-    """Return the gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
+class Tables(NamedTuple):
+    """What gains are computed from.
 
-    Args:
-        label: (L,) group of every landmark, 0 = static, groups are 1..G.
-        onset: (G + 1,) window from which on a group has moved; row 0 is not used.
-        turns: (G + 1,) whether a group also turns.
+    Attributes:
         quadratic: (4 K, 4 K) `T'AT`.
         linear: (4 K,) `T'b`.
         position: (L, 2) mapped positions.
@@ -54,10 +40,27 @@ def hypothesis_gain(
             'nothing moved'.
         log_onset: (W,) log prior of the window from which on a group has moved.
     """
-    groups = len(onset) - 1
-    width, first, matrix, right, gain = _products(
-        label, onset, turns, quadratic, linear, position, log_prior, log_onset
-    )
+
+    quadratic: FloatArray
+    linear: FloatArray
+    position: FloatArray
+    spread: FloatArray
+    log_prior: FloatArray
+    log_onset: FloatArray
+
+
+@kernel
+def hypothesis_gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> tuple[float, FloatArray]:
+    """Return the gain [nats] and the most probable motion (G, 3) of every group: x [m], y [m], angle [rad].
+
+    Args:
+        label: (L,) group of every landmark, 0 = static, groups are 1..G.
+        onset: (G + 1,) window from which on a group has moved; row 0 is not used.
+        turns: (G + 1,) whether a group also turns.
+        tables: what it is computed from.
+    """
+    groups, spread = len(onset) - 1, tables.spread
+    width, first, matrix, right, gain = _products(label, onset, turns, tables)
     motion = np.zeros((groups, 3))
     total = first[groups + 1]
     if total == 0:
@@ -74,22 +77,34 @@ def hypothesis_gain(
         for a in range(start[g + 1] - start[g]):
             scale[start[g] + a] = spread[a]
     value = np.zeros(size)  # in units of its prior
-    column, tangent = np.zeros(total), np.zeros((total, size))
+    column, tangent, weighted = np.zeros(total), np.zeros((total, size)), np.zeros(total)
     inner, step = np.zeros((size, size)), np.zeros(size)
     for _ in range(_TURN_STEPS if any_turns else 1):
         _columns_of(value, scale, width, first, start, column, tangent)
-        weighted = matrix @ tangent
-        inner[:] = tangent.T @ weighted
-        step[:] = tangent.T @ (right - matrix @ column) - value
         for a in range(size):
-            inner[a, a] += 1.0
+            for k in range(total):
+                weighted[k] = 0.0
+                for m in range(total):
+                    weighted[k] += matrix[k, m] * tangent[m, a]
+            step[a] = -value[a]
+            for k in range(total):
+                step[a] += tangent[k, a] * right[k] - weighted[k] * column[k]
+            for c in range(size):
+                inner[c, a] = 1.0 if c == a else 0.0
+                for k in range(total):
+                    inner[c, a] += tangent[k, c] * weighted[k]
         _factor(inner)
         _solve(inner, step)
-        value += step
+        for a in range(size):
+            value[a] += step[a]
     _columns_of(value, scale, width, first, start, column, tangent)
-    gain += np.dot(right, column) - 0.5 * np.dot(column, matrix @ column) - 0.5 * np.dot(value, value)
+    for k in range(total):
+        pull = right[k]
+        for m in range(total):
+            pull -= 0.5 * matrix[k, m] * column[m]
+        gain += column[k] * pull
     for a in range(size):
-        gain -= np.log(inner[a, a])
+        gain -= 0.5 * value[a] * value[a] + np.log(inner[a, a])
     for g in range(1, groups + 1):
         for a in range(start[g + 1] - start[g]):
             motion[g - 1, a] = value[start[g] + a] * scale[start[g] + a]
@@ -98,16 +113,10 @@ def hypothesis_gain(
 
 @kernel
 def _products(
-    label: IntArray,
-    onset: IntArray,
-    turns: Any,
-    quadratic: FloatArray,
-    linear: FloatArray,
-    position: FloatArray,
-    log_prior: FloatArray,
-    log_onset: FloatArray,
+    label: IntArray, onset: IntArray, turns: Any, tables: Tables
 ) -> tuple[IntArray, IntArray, FloatArray, FloatArray, float]:
     """Columns of every group (0, 2 or 4), the first of each, their `C'AC` and `C'b` about the centroids; log prior."""
+    quadratic, linear, position, _, log_prior, log_onset = tables
     count, groups = len(label), len(onset) - 1
     width, size = np.zeros(groups + 1, dtype=np.int64), np.zeros(groups + 1, dtype=np.int64)
     first = np.zeros(groups + 2, dtype=np.int64)
@@ -117,11 +126,13 @@ def _products(
         g = label[i]
         members[g, size[g]] = i
         size[g] += 1
-        centre[g] += position[i]
+        centre[g, 0] += position[i, 0]
+        centre[g, 1] += position[i, 1]
     prior = 0.0
     for g in range(1, groups + 1):
         if size[g] > 0:
-            centre[g] /= size[g]
+            centre[g, 0] /= size[g]
+            centre[g, 1] /= size[g]
             width[g] = 4 if turns[g] else 2
             prior += log_prior[size[g], 1 if turns[g] else 0] + log_onset[onset[g]]
         first[g + 1] = first[g] + width[g]

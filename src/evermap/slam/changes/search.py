@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.changes.evidence import Comparison, WindowEvidence
-from evermap.slam.changes.gain import ChangePrior, hypothesis_gain
+from evermap.slam.changes.gain import ChangePrior, Tables, hypothesis_gain
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -79,15 +79,15 @@ def find_changes(
         prior.log_onset(n_windows),
     )
     may_turn, weighed = prior.p_rotated > 0.0, Weighed.nothing(count, MOST_GROUPS)
-    climb_from_many_starts(may_turn, tables, label, onset, turns, weighed)
+    _climb_from_many_starts((label, onset, turns), tables, weighed, may_turn=may_turn)
     near = weighed.ranked
     for k in near[weighed.gain[near] > weighed.best[0] - NEAR][:MOST_WIDENED]:
-        weigh_neighbours(weighed.label[k], weighed.onset[k], weighed.turns[k], may_turn, tables, weighed)
+        _climb(weighed.label[k], weighed.onset[k], weighed.turns[k], may_turn, tables, weighed, False)
     ranked = weighed.ranked
     labels = np.zeros((len(ranked), len(position)), np.int64)
     labels[:, candidates] = weighed.label[ranked]
     motion = np.array(
-        [hypothesis_gain(weighed.label[k], weighed.onset[k], weighed.turns[k], *tables)[1] for k in ranked]
+        [hypothesis_gain(weighed.label[k], weighed.onset[k], weighed.turns[k], tables)[1] for k in ranked]
     )
     return Hypotheses(labels, weighed.onset[ranked], weighed.turns[ranked], motion, weighed.gain[ranked])
 
@@ -146,17 +146,6 @@ WORTH_KEEPING = 25.0
 """Hypotheses that are further below the best [nats] weigh nothing."""
 MOST_KEPT = 20_000
 SLOTS = 1 << 17
-
-
-class Tables(NamedTuple):
-    """What the gain is computed from: the arguments of `hypothesis_gain` behind the hypothesis."""
-
-    quadratic: FloatArray
-    linear: FloatArray
-    position: FloatArray
-    spread: FloatArray
-    log_prior: FloatArray
-    log_onset: FloatArray
 
 
 class Weighed(NamedTuple):
@@ -225,22 +214,6 @@ def _compact(label: IntArray, onset: IntArray, turns: Any) -> None:
 
 
 @kernel
-def _gain(label: IntArray, onset: IntArray, turns: Any, tables: Tables) -> float:
-    gain, _ = hypothesis_gain(
-        label,
-        onset,
-        turns,
-        tables.quadratic,
-        tables.linear,
-        tables.position,
-        tables.spread,
-        tables.log_prior,
-        tables.log_onset,
-    )
-    return gain
-
-
-@kernel
 def _hash(label: IntArray, onset: IntArray, turns: Any) -> int:
     """FNV-1a over the numbers that make a hypothesis; never 0."""
     key = 1469598103934665603
@@ -261,7 +234,7 @@ def _weigh(label: IntArray, onset: IntArray, turns: Any, tables: Tables, weighed
         if weighed.key[slot] == key:
             return float(weighed.value[slot])
         slot = (slot + 1) & (SLOTS - 1)
-    gain = _gain(label, onset, turns, tables)
+    gain, _ = hypothesis_gain(label, onset, turns, tables)
     if 2 * weighed.used[1] < SLOTS:
         weighed.key[slot] = key
         weighed.value[slot] = gain
@@ -269,35 +242,40 @@ def _weigh(label: IntArray, onset: IntArray, turns: Any, tables: Tables, weighed
     weighed.best[0] = max(weighed.best[0], gain)
     row = weighed.used[0]
     if gain > weighed.best[0] - WORTH_KEEPING and row < len(weighed.gain):
-        weighed.label[row] = label
-        weighed.onset[row] = onset
-        weighed.turns[row] = turns
+        _copy(label, onset, turns, weighed.label[row], weighed.onset[row], weighed.turns[row])
         weighed.gain[row] = gain
         weighed.used[0] += 1
     return gain
 
 
 @kernel
-def _climb(label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed) -> float:
-    """From one start uphill to a local optimum, in place; its gain."""
+def _copy(label: IntArray, onset: IntArray, turns: Any, to_label: IntArray, to_onset: IntArray, to_turns: Any) -> None:
+    """Copy a hypothesis; assigning whole arrays compiles for longer, for the message of shapes that do not fit."""
+    for i in range(len(label)):
+        to_label[i] = label[i]
+    for g in range(len(onset)):
+        to_onset[g], to_turns[g] = onset[g], turns[g]
+
+
+@kernel
+def _climb(
+    label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed, uphill: bool
+) -> float:
+    """From one start uphill to a local optimum, in place; its gain. Else weigh all that one move makes of the start."""
     n_windows = len(tables.log_onset)
     trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
-    best = _weigh(label, onset, turns, tables, weighed)
+    best = _weigh(label, onset, turns, tables, weighed) if uphill else np.inf
     improved = True
     while improved:
         improved = False
         for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):
-            trial[:] = label
-            trial_onset[:] = onset
-            trial_turns[:] = turns
+            _copy(label, onset, turns, trial, trial_onset, trial_turns)
             if not _apply(trial, trial_onset, trial_turns, move, n_windows, may_turn):
                 continue
             gain = _weigh(trial, trial_onset, trial_turns, tables, weighed)
             if gain > best + 1e-9:
                 best = gain
-                label[:] = trial
-                onset[:] = trial_onset
-                turns[:] = trial_turns
+                _copy(trial, trial_onset, trial_turns, label, onset, turns)
                 improved = True
     return best
 
@@ -306,6 +284,15 @@ def _climb(label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables:
 def _count_moves(count: int, groups: int, n_windows: int) -> int:
     relabels, merges = count * (groups + 1), 2 * groups * groups
     return relabels + merges + groups + groups + groups * n_windows + groups
+
+
+@kernel
+def _size(label: IntArray, group: int) -> int:
+    size = 0
+    for i in range(len(label)):
+        if label[i] == group:
+            size += 1
+    return size
 
 
 @kernel
@@ -323,21 +310,25 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
         # two that turned together are no one group that only moved, so merging and turning is one step
         turn, pair = move // (groups * groups), move % (groups * groups)
         g, h = 1 + pair // groups, 1 + pair % groups
-        if g == h or not np.any(label == g) or not np.any(label == h) or (turn and (turns[g] or not may_turn)):
+        if g == h or _size(label, g) == 0 or _size(label, h) == 0 or (turn and (turns[g] or not may_turn)):
             return False
-        label[label == h] = g
+        for i in range(count):
+            if label[i] == h:
+                label[i] = g
         turns[g] = turns[g] or turn
         return True
     move -= 2 * groups * groups
     if move < groups:
-        if not np.any(label == move + 1):
+        if _size(label, move + 1) == 0:
             return False
-        label[label == move + 1] = 0
+        for i in range(count):
+            if label[i] == move + 1:
+                label[i] = 0
         return True
     move -= groups
     if move < groups:
         g = move + 1
-        if not np.any(label == g):
+        if _size(label, g) == 0:
             return False
         for i in range(count):
             if label[i] == g:
@@ -348,12 +339,12 @@ def _apply(label: IntArray, onset: IntArray, turns: Any, move: int, n_windows: i
     move -= groups
     if move < groups * n_windows:
         g, window = 1 + move // n_windows, move % n_windows
-        if onset[g] == window or not np.any(label == g):
+        if onset[g] == window or _size(label, g) == 0:
             return False
         onset[g] = window
         return True
     g = move - groups * n_windows + 1
-    if not may_turn or np.sum(label == g) < 2:
+    if not may_turn or _size(label, g) < 2:
         return False
     turns[g] = not turns[g]
     return True
@@ -377,7 +368,7 @@ def _add_best_pair(
                 continue
             label[landmark] = group
             label[other] = group
-            gain = _gain(label, onset, turns, tables)
+            gain, _ = hypothesis_gain(label, onset, turns, tables)
             label[landmark] = 0
             label[other] = 0
             if gain > best:
@@ -388,54 +379,30 @@ def _add_best_pair(
     turns[group] = turning
 
 
-@kernel
-def climb_from_many_starts(
-    may_turn: bool, tables: Tables, label: IntArray, onset: IntArray, turns: Any, weighed: Weighed
+def _climb_from_many_starts(
+    start: tuple[IntArray, IntArray, BoolArray], tables: Tables, weighed: Weighed, *, may_turn: bool
 ) -> None:
-    """Climb from `label`, from the best pair of every landmark, and from the best so far with each landmark changed.
+    """Climb from a start, from the best pair of every landmark, and from the best so far with each landmark changed.
 
-    A static landmark changes by moving on its own, and by moving with the one that goes with it best.
+    A static landmark changes by moving on its own, and by moving with the one that goes with it best. Not
+    compiled: the machine code of a climb would be made again within it.
     """
+    label, onset, turns = start
     count, groups = len(label), len(onset) - 1
-    best_gain = _climb(label, onset, turns, may_turn, tables, weighed)
-    best, best_onset, best_turns = label.copy(), onset.copy(), turns.copy()
-    for start in range(3 * count):
-        landmark = start % count
-        if start < count:
-            label[:] = 0
-            onset[:] = 0
-            turns[:] = False
-        else:
-            label[:] = best
-            onset[:] = best_onset
-            turns[:] = best_turns
-        free = int(np.max(label)) + 1
-        if start >= 2 * count and label[landmark] > 0:
+    best_gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
+    best = label.copy(), onset.copy(), turns.copy()
+    for attempt in range(3 * count):
+        landmark = attempt % count
+        label[:], onset[:], turns[:] = (0, 0, False) if attempt < count else best
+        free = int(label.max()) + 1
+        if attempt >= 2 * count and label[landmark] > 0:
             label[landmark] = 0
         elif label[landmark] > 0 or free > groups:
             continue
-        elif start >= 2 * count:
+        elif attempt >= 2 * count:
             label[landmark] = free
         else:
             _add_best_pair(landmark, free, may_turn, tables, label, onset, turns)
-        gain = _climb(label, onset, turns, may_turn, tables, weighed)
+        gain = _climb(label, onset, turns, may_turn, tables, weighed, True)
         if gain > best_gain:
-            best[:] = label
-            best_onset[:] = onset
-            best_turns[:] = turns
-            best_gain = gain
-
-
-@kernel
-def weigh_neighbours(
-    label: IntArray, onset: IntArray, turns: Any, may_turn: bool, tables: Tables, weighed: Weighed
-) -> None:
-    """Weigh all that one move makes of a hypothesis."""
-    n_windows = len(tables.log_onset)
-    trial, trial_onset, trial_turns = label.copy(), onset.copy(), turns.copy()
-    for move in range(_count_moves(len(label), len(onset) - 1, n_windows)):
-        trial[:] = label
-        trial_onset[:] = onset
-        trial_turns[:] = turns
-        if _apply(trial, trial_onset, trial_turns, move, n_windows, may_turn):
-            _weigh(trial, trial_onset, trial_turns, tables, weighed)
+            best, best_gain = (label.copy(), onset.copy(), turns.copy()), gain

@@ -185,6 +185,27 @@ def _leaves(
 
 
 @kernel
+def _order(key: FloatArray) -> IntArray:
+    """Rows in the order of their keys, equal ones as they come; the sorts of numba take a second to compile."""
+    n, width = len(key), 1
+    order, merged = np.arange(n), np.empty(n, np.int64)
+    while width < n:
+        for low in range(0, n, 2 * width):
+            middle, high = min(low + width, n), min(low + 2 * width, n)
+            a, b = low, middle
+            for k in range(low, high):
+                if a < middle and (b >= high or key[order[a]] <= key[order[b]]):
+                    merged[k] = order[a]
+                    a += 1
+                else:
+                    merged[k] = order[b]
+                    b += 1
+        order, merged = merged, order
+        width *= 2
+    return order
+
+
+@kernel
 def _dissect(
     leaf_first: Any, leaf_variable: Any, coordinate: FloatArray, dim: Any, owner: Any, parent: Any, node_of_leaf: Any,
     leaf_of_node: Any, order: Any, span: Any, todo: Any, progress: Any,
@@ -215,7 +236,10 @@ def _dissect(
             key = np.empty(m)
             for r in range(m):
                 key[r] = coordinate[leaves[r], axis]
-            leaves = leaves[np.argsort(key, kind="mergesort")]
+            by_key = _order(key)
+            for r in range(m):
+                by_key[r] = leaves[by_key[r]]
+            leaves = by_key
             change = np.zeros(m + 1, np.int64)
             mark = node * axes + axis
             for r in range(m):
@@ -239,9 +263,9 @@ def _dissect(
                 cost = shared + 1e-3 * abs(2 * cut - m) / m
                 if cut >= least and cost < best - 1e-9:
                     best, best_cut, best_order = cost, cut, leaves
-        order[low:high] = best_order
-        for r in range(low, high):
-            work += leaf_first[order[r] + 1] - leaf_first[order[r]]
+        for r in range(m):
+            order[low + r] = best_order[r]
+            work += leaf_first[best_order[r] + 1] - leaf_first[best_order[r]]
         mark = (node + 1) * axes * -1 - 2
         for r in range(m):
             leaf = order[low + r]
@@ -279,7 +303,6 @@ def _fronts(
         rank[border[k]] = (count + 2) * n_variables + k
     stamp, used = np.full(n_variables, -1), 0
     for node in range(count - 1, -1, -1):
-        mine = np.empty(0, np.int64)
         total = len(border)
         for c in child[node]:
             if c >= 0:
@@ -307,21 +330,23 @@ def _fronts(
                     stamp[v] = node
                     mine[m] = v
                     m += 1
-        key = np.empty(m, np.int64)
+        key = np.empty(m)
         for k in range(m):
             key[k] = rank[mine[k]]
-        mine = mine[np.argsort(key)]
+        by_rank = _order(key)
         if used + m > len(found):
             grown = np.empty(2 * (used + m), np.int64)
-            grown[:used] = found[:used]
+            for k in range(used):
+                grown[k] = found[k]
             found = grown
         begin[node], end[node] = used, used + m
         for k in range(m):
-            found[used + k] = mine[k]
-            size[node] += dim[mine[k]]
-            if owner[mine[k]] == node:
+            v = mine[by_rank[k]]
+            found[used + k] = v
+            size[node] += dim[v]
+            if owner[v] == node:
                 n_own[node] += 1
-                own[node] += dim[mine[k]]
+                own[node] += dim[v]
         used += m
     # in the order of the nodes, with positions
     first = np.zeros(count + 1, np.int64)
