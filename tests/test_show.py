@@ -208,11 +208,17 @@ def test_columns_of_a_map_and_of_a_path() -> None:
     np.testing.assert_array_equal(table["cov_xy_m2"], LANDMARKS.covariance_m2[:, 0, 1])
     assert table["name"][1] == "the red door"
     assert set(table["class"]) == {"door"}
+    tags = Landmarks.in_space(IDS, POSES[:, :3], rotation=POSES[:, 3:], size_m=POSES[:, :3])
+    assert {"z_m", "cov_xz_m2", "qw", "rotation_cov_xx", "rotation_cov_zz", "size_z_m"} <= set(tags.to_pandas())
+    assert "z_m=(3.0, 3.0)" in repr(tags)
     path = RESULT.trajectory.to_pandas()
     np.testing.assert_array_equal(path[["x_m", "y_m", "theta_rad"]], RESULT.trajectory.pose_world_robot)
     np.testing.assert_array_equal(path["cov_tt"], RESULT.trajectory.covariance[:, 2, 2])
     errors = OBJECTS["PoseErrors"].to_pandas()
     np.testing.assert_array_equal(errors["truth_y_m"], OBJECTS["PoseErrors"].truth[:, 1])
+    places = evaluate_landmarks(dataclasses.replace(tags, n_hits=IDS), tags, np.array([0, 0, 0, 0, 0, 0, 1.0]))
+    assert places is not None
+    assert {"truth_z_m", "error_m", "orientation_error_rad"} <= set(places.to_pandas())
 
 
 def test_without_pandas_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

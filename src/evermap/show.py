@@ -31,8 +31,6 @@ _PARTS: Mapping[tuple[int, ...], tuple[tuple[str, tuple[int, ...]], ...]] = {
 }
 """Columns of a data frame that positions, poses and their covariances become, by their shape after the first axis."""
 _PLAIN = ("position", "pose", "covariance", "rotation", "corner")
-_POINTS = ("position_m", "position_sensor_m", "size_m")
-"""Three numbers of these are a point's; of others a pose in the plane."""
 
 
 class Shown:
@@ -88,12 +86,14 @@ class ShownTable(Shown):
                 found[name] = values
                 continue
             unit = next((end for end in ("_m2", "_m", "_px") if name.endswith(end)), "")
-            prefix = "" if name.startswith(_PLAIN) else name.removesuffix(unit) + "_"
+            plain = name.startswith(_PLAIN) and not name.endswith("_covariance")
+            prefix = "" if plain else name.removesuffix(unit).removesuffix("_covariance") + "_"
             parts = _PARTS[values.shape[1:]]
-            if values.shape[1:] == (3,) and name not in _POINTS:
+            if values.shape[1:] == (3,) and not name.endswith("_m"):  # no point, but a pose in the plane
                 parts = (("x_m", (0,)), ("y_m", (1,)), ("theta_rad", (2,)))
+            third = "t" if plain and not unit else "z"
             for part, place in parts:
-                found[prefix + part.format(unit=unit, t="z" if unit else "t")] = values[(slice(None), *place)]
+                found[prefix + part.format(unit=unit, t=third)] = values[(slice(None), *place)]
         return found
 
 

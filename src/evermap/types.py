@@ -335,8 +335,7 @@ class Landmarks(_Columns):
     def _facts(self) -> dict[str, Any]:
         return {
             "rows": len(self),
-            "x_m": extent(self.position_m[:, 0]),
-            "y_m": extent(self.position_m[:, 1]),
+            **{f"{axis}_m": extent(place) for axis, place in zip("xyz", self.position_m.T, strict=False)},
             "p_exists": extent(self.p_exists),
             "classes": self.class_names,
             "frame": self.frame,

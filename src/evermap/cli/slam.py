@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from evermap.maps.store import MapStore
     from evermap.runs.sessions import Entered
     from evermap.runs.summary import RunInfo
-    from evermap.types import Landmarks, Recording, SlamResult
+    from evermap.types import AnyRecording, Landmarks, Recording, SlamResult
 
 # (section, key, label, format); a number that the run does not have is left out
 _ROWS = (
@@ -228,7 +228,7 @@ def _info(config: Config, elapsed_s: float, *, realtime: bool, grown: int | None
 
 
 def _write(
-    out: Path, recording: Recording, result: SlamResult, config: Config, info: RunInfo, **how: Unpack[_How]
+    out: Path, recording: AnyRecording, result: SlamResult, config: Config, info: RunInfo, **how: Unpack[_How]
 ) -> None:
     """Write the folder; print its summary as JSON, or the main numbers, the files to look at and what was found."""
     from evermap.runs.folder import write_run

@@ -63,7 +63,8 @@ def corners_of(parts: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     finite = [part[np.all(np.isfinite(part), axis=1)] for part in parts if len(part)]
     everything = np.concatenate([part for part in finite if len(part)] or [np.zeros((1, parts[0].shape[1]))])
     low, high = everything.min(axis=0), everything.max(axis=0)
-    margin = max(0.06 * float(np.max(high - low)), 0.5)
+    reach = float(np.max(high - low))
+    margin = max(0.06 * reach, min(0.5, 0.25 * reach) or 0.5)  # half a metre, less about what stands on a table
     return low - margin, high + margin
 
 

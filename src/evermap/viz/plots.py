@@ -180,17 +180,19 @@ _Rows = dict[str, tuple[FloatArray, FloatArray]]
 
 
 def _seen_rows(recording: AnyRecording) -> _Rows:
-    """How far every detection was, or where in the image, and of which landmark."""
+    """How far every detection was, or where in the image, and of which landmark, or of which class."""
     detections = recording.detections
     seen_s = recording.frames.stamp_s[detections.frame]
-    _, rank = np.unique(detections.landmark_id, return_inverse=True)
-    which = np.where(detections.landmark_id == UNKNOWN, np.nan, rank)
+    known = detections.landmark_id != UNKNOWN
+    what, ids = ("landmark", detections.landmark_id) if known.any() else ("class", detections.class_id)
+    _, rank = np.unique(ids, return_inverse=True)
+    which = {what: (seen_s, np.where(ids == UNKNOWN, np.nan, rank))}
     if isinstance(detections, Detections):
-        return {"range [m]": (seen_s, detections.range_m), "landmark": (seen_s, which)}
+        return {"range [m]": (seen_s, detections.range_m), **which}
     distance = np.linalg.norm(detections.position_sensor_m, axis=1)
     if np.isfinite(distance).any():
-        return {"distance [m]": (seen_s, distance), "landmark": (seen_s, which)}
-    return {"column [px]": (seen_s, detections.corner_px[:, :, 0].mean(axis=1)), "landmark": (seen_s, which)}
+        return {"distance [m]": (seen_s, distance), **which}
+    return {"column [px]": (seen_s, detections.corner_px[:, :, 0].mean(axis=1)), **which}
 
 
 def _driven_rows(recording: AnyRecording) -> _Rows:
