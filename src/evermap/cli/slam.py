@@ -112,12 +112,15 @@ Template = Annotated[
     typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
 ]
 
+InSpace = Annotated[bool, typer.Option("--3d", help="With --init: a recording in space, of a camera that sees tags.")]
+
 HELP = """\
 Estimate where the robot was and where the landmarks are.
 
 \b
 Examples:
   evermap slam --init my-recording
+  evermap slam --init my-flight --3d
   evermap slam my-recording --out out/mine
   evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
   evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
@@ -146,12 +149,15 @@ def slam(
     as_json: AsJson = False,
     force: Force = False,
     init: Template = None,
+    in_space: InSpace = False,
     show_config: ShowConfig = False,
 ) -> None:
     """Estimate trajectory and landmarks of a recording and write the folder of the run."""
     if init is not None:
-        _write_template(init)
+        _write_template(init, in_space=in_space)
         return
+    if in_space:
+        raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": unknown_ids or None}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     if input is None:
@@ -266,10 +272,10 @@ def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str 
         )
 
 
-def _write_template(folder: Path) -> None:
+def _write_template(folder: Path, *, in_space: bool) -> None:
     from evermap.io import write_template
 
-    write_template(folder)
+    write_template(folder, in_space=in_space)
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
 
 

@@ -303,7 +303,7 @@ def _pose_columns(table: Table) -> dict[str, FloatArray]:
         turn[np.isnan(found["rotation"]).any(axis=1)] = np.nan
         found["rotation_covariance"] = turn
     if table.has_any(BOX):
-        found["size_m"] = boxes(table)
+        found["size_m"] = boxes(table, flat=True)
     elif "tag_size_m" in table:
         edge = table.numbers(Quantity("tag_size_m", 0.0, 1e3, positive=True, optional=True, hint="metres"))
         found["size_m"] = edge[:, None] * [1.0, 1.0, 0.0]

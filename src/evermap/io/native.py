@@ -69,9 +69,11 @@ def read_native(path: str | Path, robot: int | None = None) -> Recording | Spati
     if in_space(tables, files):
         rig = read_rig(files, warnings)
         settings = replace(rig.settings, clock=_clock(rig.settings, tables, files))
-        return spatial_recording(
-            tables, replace(rig, settings=settings), title=files.title, source=str(path), warnings=warnings
-        )
+        driven, table = None, tables["odometry"]
+        if table is not None and table.has_any((*_VELOCITIES, *_INCREMENTS)):
+            driven, tables = _odometry(table, settings.clock, warnings), {**tables, "odometry": None}
+        rig = replace(rig, settings=settings)
+        return spatial_recording(tables, rig, driven, title=files.title, source=str(path), warnings=warnings)
     settings = _read_settings(files, warnings)
     settings = replace(settings, clock=_clock(settings, tables, files))
     tables = {**tables, "odometry": _needed("odometry", tables, files), "detections": detection_table}

@@ -36,6 +36,7 @@ from evermap.types import (
     Clock,
     FloatArray,
     IntArray,
+    Odometry,
     SpatialDetections,
     SpatialOdometry,
     SpatialRecording,
@@ -75,13 +76,20 @@ def in_space(tables: Mapping[str, Table | None], files: FileSet) -> bool:
 
 
 def spatial_recording(
-    tables: Mapping[str, Table | None], rig: Rig, *, title: str, source: str, warnings: list[str]
+    tables: Mapping[str, Table | None],
+    rig: Rig,
+    driven: Odometry | None,
+    *,
+    title: str,
+    source: str,
+    warnings: list[str],
 ) -> SpatialRecording:
     """Return the recording that native tables hold.
 
     Args:
         tables: by name; `detections` is there.
         rig: the sensors.
+        driven: odometry of a robot that drives in the plane, where that is what there is.
         title: name of the recording where its settings give none.
         source: where it was read from.
         warnings: gets remarks.
@@ -117,7 +125,7 @@ def spatial_recording(
         )
     recording = SpatialRecording(
         name=settings.name or title,
-        odometry=_odometry(tables["odometry"], settings.clock, warnings),
+        odometry=_odometry(tables["odometry"], settings.clock, warnings) if driven is None else _in_space(driven),
         frames=frames,
         detections=detections,
         sensors=rig.sensors,
@@ -146,8 +154,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
     if given is TWIST:
         zero = np.zeros(len(table))
         twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
-        pose = _integrated(stamp_s[keep], twist[keep])
-        return SpatialOdometry(stamp_s[keep], pose, np.full((len(pose), 6), np.nan), clock=clock)
+        return _integrated(stamp_s[keep], twist[keep], clock)
     unknown = np.full(len(table), np.nan)
     variance = [
         table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in VARIANCES
@@ -155,13 +162,20 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
     return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=clock)
 
 
-def _integrated(stamp_s: FloatArray, twist: FloatArray) -> FloatArray:
-    """Poses (N, 7) from the origin, each velocity (N, 6) held until the next stamp."""
+def _in_space(odometry: Odometry) -> SpatialOdometry:
+    """The odometry of a robot on a floor, as poses in space."""
+    twist = np.zeros((len(odometry), 6))
+    twist[:, 0], twist[:, 1], twist[:, 5] = odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps
+    return _integrated(odometry.stamp_s, twist, odometry.clock)
+
+
+def _integrated(stamp_s: FloatArray, twist: FloatArray, clock: Clock) -> SpatialOdometry:
+    """Poses from the origin, each velocity (N, 6) held until the next stamp."""
     pose = se3.identity(len(stamp_s))
     step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
     for row in range(len(step)):
         pose[row + 1] = se3.compose(pose[row], step[row])
-    return pose
+    return SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan), clock=clock)
 
 
 def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:

@@ -90,10 +90,12 @@ def upper_triangle(matrix: FloatArray, names: tuple[str, ...]) -> dict[str, Floa
     return dict(zip(names, np.ascontiguousarray(matrix[:, upper, right].T), strict=True))
 
 
-def boxes(table: Table) -> FloatArray:
-    """Return the columns `length_m, width_m, height_m`. Shape (R, 3), nan where empty."""
+def boxes(table: Table, *, flat: bool = False) -> FloatArray:
+    """Return the columns `length_m, width_m, height_m`, of which none is zero unless `flat`. Shape (R, 3), nan where
+    empty.
+    """
     table.expect(BOX, tuple(table.columns))
-    sides = (Quantity(name, 0.0, 1e4, optional=True, hint="metres") for name in BOX)
+    sides = (Quantity(name, 0.0, 1e4, positive=not flat, optional=True, hint="metres") for name in BOX)
     return np.stack([table.numbers(side) for side in sides], axis=1)
 
 

@@ -41,6 +41,9 @@ from evermap.valid import Quantity
 MOST_HAMMING = 2
 """Tags of which the detector had to correct more bits are left out: most of them are no tags."""
 
+_MOST_TAGS = 100_000
+"""On a board: no tag family has more."""
+
 CAMERAS, CAMERA_POSES, SETTINGS = "cameras.yaml", "camera_poses.yaml", "tagslam.yaml"
 BAG_ENDINGS = (".bag", ".bag.bz2")
 _ENDINGS = (".csv", ".csv.gz", ".parquet")
@@ -192,7 +195,7 @@ def _setup(files: FileSet) -> TagRig:
     bodies = _bodies(files, content)
     mounted = next((body for body in bodies.values() if "T_body_odom" in body), {})
     odometry = _pose(files, SETTINGS, mounted["T_body_odom"]) if mounted else se3.identity()
-    sizes, default = _sizes(bodies, content.get("default_body"))
+    sizes, default = _sizes(files, bodies, content.get("default_body"))
     topic = next((str(body["odom_topic"]) for body in bodies.values() if "odom_topic" in body), "")
     return TagRig(tuple(sensors), tuple(topics), topic, odometry, sizes, default)
 
@@ -204,18 +207,24 @@ def _bodies(files: FileSet, content: dict[str, Any]) -> dict[str, dict[str, Any]
     return {name: body or {} for entry in listed for name, body in entry.items()}
 
 
-def _sizes(bodies: Mapping[str, dict[str, Any]], default_body: Any) -> tuple[dict[int, float], float]:
+def _sizes(files: FileSet, bodies: Mapping[str, dict[str, Any]], default_body: Any) -> tuple[dict[int, float], float]:
     """Edges of tags by id, and that of all others: the default body's, or that of all bodies if they agree."""
     sizes: dict[int, float] = {}
-    for body in bodies.values():
-        if board := body.get("board"):
-            first, count = int(board["tag_start_id"]), int(board["tag_rows"]) * int(board["tag_columns"])
-            sizes |= dict.fromkeys(range(first, first + count), float(board["tag_size"]))
-        default = body.get("default_tag_size")
-        for tag in body.get("tags") or []:
-            if (size := tag.get("size", default)) is not None:
-                sizes[int(tag["id"])] = float(size)
-    defaults = {name: float(body["default_tag_size"]) for name, body in bodies.items() if "default_tag_size" in body}
+    defaults: dict[str, float] = {}
+    for name, body in bodies.items():
+        try:
+            if board := body.get("board"):
+                first, count = int(board["tag_start_id"]), int(board["tag_rows"]) * int(board["tag_columns"])
+                sizes |= dict.fromkeys(range(first, first + min(count, _MOST_TAGS)), float(board["tag_size"]))
+            if "default_tag_size" in body:
+                defaults[name] = float(body["default_tag_size"])
+            for tag in body.get("tags") or []:
+                if (size := tag.get("size", defaults.get(name))) is not None:
+                    sizes[int(tag["id"])] = float(size)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            problem = "its tags or board are not described"
+            hint = "tags with id and size, or a board with tag_start_id, tag_rows, tag_columns, tag_size"
+            raise InputError(problem, path=files.path_of(SETTINGS), field=name, hint=hint) from None
     if default_body in defaults:
         return sizes, defaults[default_body]
     common = set(defaults.values())

@@ -1,4 +1,4 @@
-"""A small, complete example of the native format for `evermap slam --init`: a robot circles past three landmarks."""
+"""Small, complete examples of the native format for `evermap slam --init`: a robot circles past three landmarks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from evermap.geometry import se2
 from evermap.io.files import staged_folder
 from evermap.io.table import csv_text
+from evermap.io.template_space import SPATIAL_COMMENTS, SPATIAL_FILES, spatial_template
 from evermap.types import FloatArray
 
 _SPEED_MPS = 0.5
@@ -72,17 +73,22 @@ Optional: the landmarks' true positions, for errors or with '--prior-map truth'.
 }
 
 
-def write_template(folder: str | Path) -> Path:
+def write_template(folder: str | Path, *, in_space: bool = False) -> Path:
     """Write a commented, complete recording of 20 s that can be localised as it is; the same bytes every time.
+
+    Args:
+        folder: to make.
+        in_space: whether a camera moves in space and sees tags, instead of a robot that drives in the plane.
 
     Raises:
         InputError: the folder exists and is not empty, or cannot be written.
     """
+    texts = dict(SPATIAL_FILES) if in_space else {"sensor.toml": _SENSOR_TOML}
+    tables, comments = (spatial_template(), SPATIAL_COMMENTS) if in_space else (_tables(), _COMMENTS)
     with staged_folder(folder) as staging:
-        (staging / "sensor.toml").write_text(_SENSOR_TOML, encoding="utf-8", newline="\n")
-        for name, columns in _tables().items():
-            text = csv_text(columns, comment=_COMMENTS[name])
-            (staging / f"{name}.csv").write_text(text, encoding="utf-8", newline="\n")
+        texts |= {f"{name}.csv": csv_text(columns, comment=comments[name]) for name, columns in tables.items()}
+        for name, text in texts.items():
+            (staging / name).write_text(text, encoding="utf-8", newline="\n")
     return Path(folder)
 
 
