@@ -13,8 +13,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from evermap.errors import EvermapError
-from evermap.io import read_landmarks, read_recording, read_tum, write_map_geojson, write_map_parquet, write_native
+from evermap.io import (
+    read_landmarks,
+    read_recording,
+    read_tum,
+    write_map_geojson,
+    write_map_parquet,
+    write_native,
+    write_template,
+)
 from evermap.types import Landmarks
+from evermap.valid import validate_spatial
 
 Files = dict[str, bytes]
 damage_settings = settings(
@@ -92,6 +101,24 @@ def test_damaged_native(
     files[name] = data.draw(damaged(files[name]))
     path = lay_out(files)
     sound_or_one_line(lambda: read_recording(path), check_recording)
+
+
+@pytest.mark.parametrize("made", ["space", "template", "tagslam", "ycbv"])
+@damage_settings
+@given(data=st.data())
+def test_damaged_in_space(
+    data: st.DataObject, made: str, request: pytest.FixtureRequest, lay_out: Callable, tmp_path: Path
+) -> None:
+    if made == "template":
+        template = tmp_path / "template"
+        shutil.rmtree(template, ignore_errors=True)
+        files = {path.name: path.read_bytes() for path in write_template(template, in_space=True).iterdir()}
+    else:
+        files = {name: text.encode() for name, text in request.getfixturevalue(made).items()}
+    name = data.draw(st.sampled_from(sorted(files)))
+    files[name] = data.draw(damaged(files[name]))
+    path = lay_out(files)
+    sound_or_one_line(lambda: read_recording(path), validate_spatial)
 
 
 @damage_settings

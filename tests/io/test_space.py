@@ -52,29 +52,6 @@ door = 0.3
 """
 
 
-@pytest.fixture
-def space() -> Files:
-    """Poses as odometry, a point, a tag with an orientation and a box, truth and landmarks."""
-    turn = np.sqrt(0.5)
-    return {
-        "odometry.csv": POSES.replace("\n", ",var_x_m2,var_rz_rad2\n")
-        + "".join(
-            f"{0.5 * i},{0.2 * i},0,{0.01 * i},0,0,{-turn},{-turn},0.01,{'' if i else '1e-4'}\n" for i in range(5)
-        ),
-        "detections.csv": "stamp_s,landmark_id,x_m,y_m,z_m,qx,qy,qz,qw,sigma_m,sigma_rad,class_id,score,"
-        "length_m,width_m,height_m\n"
-        "0.5,7,1,2,3,,,,,0.1,,pole,,,,\n0.5,door,0,0,4,0,0,0,2.001e0,,0.02,tag,0.9,,,\n".replace("2.001e0", "1.001")
-        + "1.0,,5,1,0.5,0,0,1,0,,,car,-1.5,4.5,1.8,1.5\n",
-        "frames.csv": "stamp_s\n0\n0.5\n1\n1.5\n",
-        "truth.csv": POSES + "0,0,0,0,0,0,0,1\n1,0.4,0,0,0,0,0,-1\n",
-        "landmarks.csv": "landmark_id,x_m,y_m,z_m,qx,qy,qz,qw,sigma_m,sigma_rad,tag_size_m,class_id\n"
-        f"door,1,2,3,0,{turn},0,{turn},0.1,0.2,0.3,tag\n7,4,5,6,,,,,,,,pole\n",
-        "sensor.toml": '[recording]\nname = "hall"\nclock = "unix"\n[limits]\nrange_max_m = 20\n'
-        "[noise]\nsigma_m = 0.05\n[mount]\nz_m = 0.5\nqx = 0.0\nqy = 0.0\nqz = 1.0\nqw = 0.0\n"
-        "[detection]\np_detect = 0.8\n",
-    }
-
-
 def read(lay_out: Callable, files: Files, **changed: str | None) -> SpatialRecording:
     """The recording of files, some of them changed (`name__csv=text`) or left out (None)."""
     given = {name: text for name, text in files.items() if changed.get(name.replace(".", "__"), text) is not None}

@@ -51,6 +51,7 @@ def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str
 
 def forward_stamps(table: Table) -> FloatArray:
     """Return the column `stamp_s`, checked not to run backwards. Shape (R,)."""
+    table.expect((STAMP_S.name,), tuple(table.columns))
     stamp_s = table.numbers(STAMP_S)
     check_forward(stamp_s, path=table.path, line=table.line)
     return stamp_s

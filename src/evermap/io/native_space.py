@@ -35,6 +35,7 @@ from evermap.types import (
     BoolArray,
     Clock,
     FloatArray,
+    Frames,
     IntArray,
     Odometry,
     SpatialDetections,
@@ -105,17 +106,7 @@ def spatial_recording(
     if class_names is None:
         class_names = distinct_labels(table, landmarks)
     table = _by_sensor(table)
-    frame_table = tables["frames"]
-    if frame_table is not None:
-        frame_table.expect(("stamp_s",), _WHERE)
-    frames, frame = frames_of(
-        table,
-        frame_table,
-        complete=settings.frames_complete,
-        clock=settings.clock,
-        warnings=warnings,
-        several=len(rig.sensors) > 1,
-    )
+    frames, frame = _frames(table, tables["frames"], rig, warnings)
     detections = _detections(table, frame, rig, class_names, names, warnings)
     surveyed = None
     if landmarks is not None and len(landmarks):
@@ -137,6 +128,15 @@ def spatial_recording(
         landmark_names=names,
     )
     return finish_spatial(recording, warnings=warnings)
+
+
+def _frames(table: Table, frame_table: Table | None, rig: Rig, warnings: list[str]) -> tuple[Frames, IntArray]:
+    if frame_table is not None:
+        frame_table.expect(("stamp_s",), _WHERE)
+    complete, several = rig.settings.frames_complete, len(rig.sensors) > 1
+    return frames_of(
+        table, frame_table, complete=complete, clock=rig.settings.clock, warnings=warnings, several=several
+    )
 
 
 def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> SpatialOdometry | None:

@@ -25,6 +25,7 @@ TURN_COVARIANCE = tuple(f"cov_{pair}_rad2" for pair in ("rxrx", "rxry", "rxrz", 
 
 def positions(table: Table, *, optional: bool = False) -> FloatArray:
     """Return the columns `x_m, y_m, z_m`. Shape (R, 3)."""
+    table.expect(AT, tuple(table.columns))
     return np.stack([table.numbers(replace(axis, optional=optional)) for axis in (X_M, Y_M, Z_M)], axis=1)
 
 

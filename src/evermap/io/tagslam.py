@@ -8,6 +8,7 @@ the rig, in which `camera_poses.yaml` gives the cameras. What the authors mended
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from evermap.geometry.camera import COEFFICIENTS
 from evermap.io.assemble import SAME_STAMP_S, finish_spatial, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rosbag import TagSightings, read_tag_bag
-from evermap.io.spatial import poses, positions, spatial_detections, with_tag_poses
+from evermap.io.spatial import AT, poses, positions, spatial_detections, with_tag_poses
 from evermap.io.table import Table, parse_csv, parse_parquet
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
@@ -169,7 +170,7 @@ def _setup(files: FileSet) -> TagRig:
     content = _yaml(files, SETTINGS) if SETTINGS in files else {}
     sensors, topics = [], []
     for name, camera in cameras.items():
-        model = _MODELS.get(_get(files, CAMERAS, camera, "distortion_model", name))
+        model = _MODELS.get(str(_get(files, CAMERAS, camera, "distortion_model", name)))
         if model is None:
             hint = "one of " + ", ".join(_MODELS)
             field = f"{name}.distortion_model"
@@ -204,7 +205,11 @@ def _bodies(files: FileSet, content: dict[str, Any]) -> dict[str, dict[str, Any]
     listed = content.get("bodies") or []
     if not isinstance(listed, list) or not all(isinstance(body, dict) for body in listed):
         raise InputError("must be a list of bodies", path=files.path_of(SETTINGS), field="bodies")
-    return {name: body or {} for entry in listed for name, body in entry.items()}
+    bodies = {name: {} if body is None else body for entry in listed for name, body in entry.items()}
+    odd = next((name for name, body in bodies.items() if not isinstance(body, dict)), None)
+    if odd is not None:
+        raise InputError("is not described", path=files.path_of(SETTINGS), field=odd)
+    return bodies
 
 
 def _sizes(files: FileSet, bodies: Mapping[str, dict[str, Any]], default_body: Any) -> tuple[dict[int, float], float]:
@@ -225,8 +230,12 @@ def _sizes(files: FileSet, bodies: Mapping[str, dict[str, Any]], default_body: A
             problem = "its tags or board are not described"
             hint = "tags with id and size, or a board with tag_start_id, tag_rows, tag_columns, tag_size"
             raise InputError(problem, path=files.path_of(SETTINGS), field=name, hint=hint) from None
-    if default_body in defaults:
-        return sizes, defaults[default_body]
+    wrong = next((size for size in (*sizes.values(), *defaults.values()) if not 0.0 < size < 1e3), None)
+    if wrong is not None:
+        problem = f"{wrong:g} is not the edge of a tag"
+        raise InputError(problem, path=files.path_of(SETTINGS), field="size", hint="metres")
+    if str(default_body) in defaults:
+        return sizes, defaults[str(default_body)]
     common = set(defaults.values())
     return sizes, common.pop() if len(common) == 1 else float("nan")
 
@@ -300,8 +309,10 @@ def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
     table = _table(files, "survey", warnings)
     if table is None or len(table) == 0:
         return None
+    turns = ("rx_rad", "ry_rad", "rz_rad")
+    table.expect(("tag_id", "size_m", *AT, *turns), tuple(table.columns))
     ids = table.ids("tag_id", optional=False)
-    turn = np.stack([table.numbers(Quantity(f"r{axis}_rad", -10.0, 10.0, hint="radians")) for axis in "xyz"], axis=1)
+    turn = np.stack([table.numbers(Quantity(name, -10.0, 10.0, hint="radians")) for name in turns], axis=1)
     size = table.numbers(Quantity("size_m", 0.0, 1e3, positive=True, hint="metres"))
     rotation = se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=1))[:, 3:]
     return Landmarks.in_space(
@@ -345,7 +356,8 @@ def _numbers(
 def _pose(files: FileSet, name: str, content: Any) -> FloatArray:
     """A pose (7,) from a position and a rotation vector."""
     parts = [
-        [_get(files, name, content, part, "pose").get(axis) for axis in "xyz"] for part in ("position", "rotation")
+        [_get(files, name, _get(files, name, content, part, "pose"), axis, f"pose.{part}") for axis in "xyz"]
+        for part in ("position", "rotation")
     ]
     if not all(_is_number(value) for part in parts for value in part):
         raise InputError("x, y and z must be numbers", path=files.path_of(name), field="pose")
@@ -354,4 +366,4 @@ def _pose(files: FileSet, name: str, content: Any) -> FloatArray:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
