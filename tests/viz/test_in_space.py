@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.patches import FancyArrowPatch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -17,6 +17,7 @@ from evermap.metrics.summary import compare_with_truth, metrics_dict
 from evermap.runs.summary import RunInfo, summary_dict, timing_dict
 from evermap.types import Landmarks
 from evermap.viz.change_words import explanations
+from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import moves
 from evermap.viz.report import render_report
 from evermap.viz.rerun_scene import write_scene
@@ -245,6 +246,22 @@ def test_objects_plot_themselves_in_space(spatial):
         ),
     )  # fmt: skip
     assert [axes.get_ylabel() for axes in by_hand.plot().axes] == ["column [px]", "landmark"]
+
+
+def test_a_map_in_space_shows_other_places_in_both_panels_and_the_floor_from_above(spatial):
+    landmarks = dataclasses.replace(spatial[1].landmarks, p_exists=np.linspace(0.3, 1.0, len(spatial[1].landmarks)))
+    view = MapView(
+        landmarks, np.zeros(len(landmarks), dtype=bool), other_m=landmarks.position_m[:2] + [3.0, 0.0, 1.0],
+        other_of=np.array([0, 1]), seen_from_m=np.array([[0.0, 0.0], [30.0, 0.0]]),
+    )  # fmt: skip
+    above, side = plot_living_map(view, title="stair").axes
+    assert above.get_xlim()[1] > 30.0
+    assert (above.get_title(loc="left"), side.get_title(loc="left")) == ("stair, from above", "from the side")
+    for axes, columns in ((above, [0, 1]), (side, [0, 2])):
+        others = next(one for one in axes.lines if one.get_marker() == "." and len(one.get_xdata()) == 2)
+        np.testing.assert_allclose(others.get_xydata(), view.other_m[:, columns])
+    floor = [any(isinstance(item, PolyCollection) for item in axes.collections) for axes in (above, side)]
+    assert floor == [True, False]
 
 
 def test_runs_without_odometry_truth_or_landmarks_are_drawn(spatial, tmp_path):

@@ -178,7 +178,7 @@ def _draw_landmarks(axes: Axes, view: View, scene: _Scene, reach_m: float) -> No
         return
     colours = np.array([looks[name].colour for name in names])
     factor = magnification(scene.landmarks.covariance_m2, reach_m)
-    draw_shapes(axes, scene.landmarks, view, colours, reach_m, scene.path_m)
+    draw_shapes(axes, scene.landmarks, view, colours, reach_m, _thin(scene.path_m))
     label = draw_ellipses(axes, landmarks.position_m, landmarks.covariance_m2, colours, factor)
     axes.add_line(Line2D([], [], ls="", marker="o", mfc="none", mec=MUTED, ms=7, label=label))
     if len(landmarks) <= LABELS_UP_TO:

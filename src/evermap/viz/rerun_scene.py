@@ -27,7 +27,7 @@ from evermap.types import (
     rows_of,
 )
 from evermap.viz.map_figure import class_names_of, moves
-from evermap.viz.panels import box_sizes, landmark_poses, moved_map
+from evermap.viz.panels import box_sizes, corners_of, landmark_poses, moved_map
 from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, class_looks
 from evermap.viz.track_figures import DYNAMIC, STATIC
 
@@ -55,6 +55,8 @@ TIMELINE = "stamp_s"
 _MAX_STEPS = 3000
 _MAX_LANDMARK_ENTITIES = 250
 _ELLIPSE_CORNERS = 33
+_ROOM_M = 4.0
+"""About a smaller scene, such as a table, robot and landmarks are drawn smaller."""
 _PLATE_M = (0.16, 0.16, 0.004)
 """What stands for a tag, whose size a map does not say."""
 
@@ -86,10 +88,12 @@ def write_scene(
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     _send_truth(stream, recording, evaluation)
     _send_odometry(stream, result, evaluation)
-    _send_robot(stream, result.trajectory, pose_truth_map, recording.clock)
     landmarks = moved_map(result.landmarks, pose_truth_map)
+    low, high = corners_of([_places(pose_truth_map, result.trajectory.pose_world_robot), landmarks.position_m])
+    scale = float(np.clip(np.max(high - low) / _ROOM_M, 0.1, 1.0))
+    _send_robot(stream, result.trajectory, pose_truth_map, recording.clock, scale)
     start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
-    _send_landmarks(stream, landmarks, start_s, recording.clock)
+    _send_landmarks(stream, landmarks, start_s, recording.clock, scale)
     _send_changes(stream, result, pose_truth_map, recording.clock)
     _send_rays(stream, recording, result, pose_truth_map, landmarks)
     _send_numbers(stream, recording, result, evaluation)
@@ -192,7 +196,7 @@ def _send_odometry(stream: Any, result: SlamResult, evaluation: Evaluation) -> N
     stream.log("world/odometry_alone", strip, static=True)
 
 
-def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray, clock: Clock) -> None:
+def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray, clock: Clock, scale: float) -> None:
     """The robot's pose, and the path as one short piece a step that stays visible afterwards."""
     import rerun as rr
 
@@ -208,11 +212,13 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
         quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
     places = rr.Transform3D.columns(translation=_flat(at), quaternion=quaternion)
     stream.send_columns("world/robot", [_time(stamps, clock)], places)
-    body = rr.Boxes3D(half_sizes=[[0.17, 0.12, 0.06]], centers=[[0, 0, 0.06]], colors=rgb(ESTIMATE), fill_mode="solid")
-    heading = rr.Arrows3D(vectors=[[0.4, 0, 0]], origins=[[0, 0, 0.1]], colors=rgb(ESTIMATE), radii=0.02)
+    half, ahead = scale * np.array([0.17, 0.12, 0.06]), scale * np.array([0.4, 0.0, 0.0])
+    body = rr.Boxes3D(half_sizes=[half], centers=[[0, 0, half[2]]], colors=rgb(ESTIMATE), fill_mode="solid")
+    heading = rr.Arrows3D(vectors=[ahead], origins=[[0, 0, 0.1 * scale]], colors=rgb(ESTIMATE), radii=0.02 * scale)
     if group.point_dim == 3:  # a camera that is carried may look along any of its axes
         colours = [rgb(colour) for colour in (ALERT, LANDMARK, ESTIMATE)]
-        heading = rr.Arrows3D(vectors=0.4 * np.eye(3), origins=np.zeros((3, 3)), colors=colours, radii=0.015)
+        axes = 0.4 * scale * np.eye(3)
+        heading = rr.Arrows3D(vectors=axes, origins=np.zeros((3, 3)), colors=colours, radii=0.015 * scale)
     stream.log("world/robot/body", body, static=True)
     stream.log("world/robot/heading", heading, static=True)
     if len(rows) > 1:
@@ -223,7 +229,7 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
         stream.log("world/path", rr.LineStrips3D.from_fields(colors=rgb(ESTIMATE), radii=0.012), static=True)
 
 
-def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Clock) -> None:
+def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Clock, scale: float) -> None:
     """Send final positions with 2-sigma ellipses by class, each from its first sighting on; large maps in groups."""
     import rerun as rr
 
@@ -248,7 +254,7 @@ def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Cl
         marks = rr.Points3D(
             points[group],
             colors=colours[group],
-            radii=0.05,
+            radii=0.05 * scale,
             labels=called[group].tolist(),
             show_labels=len(order) <= 60,
         )
