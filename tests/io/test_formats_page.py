@@ -23,6 +23,7 @@ from evermap.types import (
     Odometry,
     Recording,
     SlamResult,
+    SpatialRecording,
     Trajectory,
 )
 
@@ -58,11 +59,33 @@ def test_the_defaults_of_the_sensor_file_are_those_of_the_program(repository: Pa
 
 
 def test_all_map_columns_are_listed(repository: Path, tmp_path: Path) -> None:
-    section = page(repository).split("## Maps")[1].split("\n## ")[0]
+    plane, _, space = page(repository).split("\n## Maps")[1].split("\n## ")[0].partition("\n### Maps in space")
+    flat = Landmarks.at([1], [[0, 0]])
+    written = pq.read_table(write_map_parquet(flat, tmp_path / "map.parquet")).column_names
+    assert column_names(plane) == written
+    tag = Landmarks.in_space([1], [[0, 0, 0]], rotation=[[0, 0, 0, 1]], size_m=[[1, 1, 0]])
+    written_too = pq.read_table(write_map_parquet(tag, tmp_path / "map.parquet")).column_names
+    added = [name for name in written_too if name not in written or name.startswith("cov_")]
+    assert column_names(space) == added
+
+
+def column_names(section: str) -> list[str]:
+    """Names in the first column of a table."""
     rows = [line.split("|")[1] for line in section.splitlines() if line.startswith("| `")]
-    listed = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
-    written = pq.read_table(write_map_parquet(Landmarks.at([1], [[0, 0]]), tmp_path / "map.parquet")).column_names
-    assert listed == written
+    return [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+
+
+def test_the_example_of_cameras_is_read(repository: Path, tmp_path: Path) -> None:
+    text = re.search(r"```toml\n(\[camera.*?)```", page(repository), re.DOTALL)
+    assert text is not None
+    (tmp_path / "camera.toml").write_text(text[1])
+    (tmp_path / "detections.csv").write_text(
+        "stamp_s,landmark_id,sensor,x_m,y_m,z_m\n0,17,lidar,1,2,3\n1,17,front,1,0,3\n"
+    )
+    recording = read_recording(tmp_path)
+    assert isinstance(recording, SpatialRecording)
+    front, lidar = recording.sensors
+    assert (front.distortion_model, front.resolution_px, lidar.range_max_m) == ("equidistant", (1280, 1024), 50.0)
 
 
 def test_all_keys_of_summaries_and_changes_are_listed(repository: Path) -> None:
@@ -76,7 +99,8 @@ def test_all_keys_of_summaries_and_changes_are_listed(repository: Path) -> None:
     summary = summary_dict(recording, result, {}, config={}, info=RunInfo(), timing={})
     summary["outputs"] = []  # of `RunFolder.finish`
     section = page(repository).split("## Summary and changes")[1].split("\n## ")[0]
-    listed = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in section.splitlines() if line[:3] == "| `"))
+    keys = section.partition("Errors in `metrics`")[0]
+    listed = re.findall(r"`(\w+)`", "".join(line.split("|")[1] for line in keys.splitlines() if line[:3] == "| `"))
     assert sorted([*listed, "schema_version"]) == sorted(summary)
 
     change = change_dict(MapChange((1,), ChangeKind.MOVED, 0.0, 1.0, (0.0, 0.0), 0.0, 1.0))

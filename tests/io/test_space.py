@@ -417,6 +417,17 @@ def test_written_and_read_again(
     assert_equal(first, again)
 
 
+def test_sensors_with_odd_names_and_mounts(lay_out: Callable, space: Files, tmp_path: Path) -> None:
+    """Roll, pitch and yaw are turned about the axes of the robot, one after the other, as scipy's 'xyz'."""
+    camera = '[camera."on the left"]\nintrinsics = [1, 1, 0, 0]\n[camera."on the left".mount]\nroll_rad = 0.1\n'
+    camera += "pitch_rad = 0.2\nyaw_rad = 0.3\n"
+    first = read(lay_out, space, camera__toml=camera)
+    expected = Rotation.from_euler("xyz", [0.1, 0.2, 0.3]).as_quat(canonical=True)
+    np.testing.assert_allclose(first.sensors[0].mount_robot_sensor[3:], expected, atol=1e-15)
+    again = read_recording(write_native(first, tmp_path / "again"))
+    assert_equal(first, again)
+
+
 def in_space() -> Landmarks:
     random = np.random.default_rng(8)
     root = random.normal(size=(2, 3, 3, 3))

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from evermap.errors import InputError
 from evermap.io import read_recording, write_template
-from evermap.types import Recording
+from evermap.types import Recording, SpatialRecording
 
 
 def test_the_template_reads_without_remarks(tmp_path: Path, check_recording: Callable) -> None:
@@ -91,3 +92,43 @@ def test_the_template_localises(tmp_path: Path) -> None:
     assert error < 0.05
     assert error < odometry_error
     assert map_error < 0.1
+
+
+def test_the_template_in_space_is_commented_and_reads_without_remarks(tmp_path: Path) -> None:
+    one, other = (write_template(tmp_path / name, in_space=True) for name in ("one", "other"))
+    names = sorted(path.name for path in one.iterdir())
+    tables = ["detections.csv", "frames.csv", "landmarks.csv", "odometry.csv", "truth.csv"]
+    assert names == sorted([*tables, "camera.toml", "sensor.toml"])
+    for name in names:
+        assert (one / name).read_bytes() == (other / name).read_bytes()
+        assert (one / name).read_text().startswith("# ")
+    recording = read_recording(one)
+    assert isinstance(recording, SpatialRecording)
+    assert recording.warnings == ()
+    assert recording.odometry is not None
+    assert recording.frames.stamp_s[-1] == 20.0
+    assert len(np.unique(recording.detections.landmark_id)) == 12
+
+
+def test_tags_of_the_template_in_space_are_where_the_truth_says(tmp_path: Path) -> None:
+    """Rotations by scipy: the first pose is the origin, tags are seen within centimetres, odometry drifts."""
+    recording = read_recording(write_template(tmp_path / "mine", in_space=True))
+    assert isinstance(recording, SpatialRecording)
+    seen, truth, known = recording.detections, recording.truth, recording.true_landmarks
+    assert truth is not None
+    assert known is not None
+    assert known.rotation is not None
+    assert recording.odometry is not None
+    np.testing.assert_array_equal(truth.pose_world_robot[0], [0, 0, 0, 0, 0, 0, 1])
+    stamp_s = recording.frames.stamp_s[seen.frame]
+    both = np.isin(stamp_s, truth.stamp_s)
+    robot = truth.pose_world_robot[np.searchsorted(truth.stamp_s, stamp_s[both])]
+    turn, mount = Rotation.from_quat(robot[:, 3:]), recording.sensors[0].mount_robot_sensor
+    camera = turn * Rotation.from_quat(mount[3:])
+    at = robot[:, :3] + turn.apply(mount[:3]) + camera.apply(seen.position_sensor_m[both])
+    tag = seen.landmark_id[both]
+    assert np.median(np.linalg.norm(at - known.position_m[tag], axis=1)) < 0.03
+    facing = camera * Rotation.from_quat(seen.rotation[both])
+    assert np.median((Rotation.from_quat(known.rotation[tag]).inv() * facing).magnitude()) < 0.08
+    end = recording.odometry.pose_world_robot[-1] - truth.pose_world_robot[-1]
+    assert 0.05 < np.linalg.norm(end[:3]) < 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf, pi
@@ -12,7 +13,7 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.geometry.camera import COEFFICIENTS
 from evermap.io.files import FileSet
-from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_text
+from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
 from evermap.types import FloatArray, IntArray, Sensor, SpatialSensor, landmark_id_of
 
@@ -27,6 +28,8 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
 """Of `sensor.toml`; the keys of all sections are those of a camera, too."""
 _OF_CAMERA = {key: limits for section in _LIMITS.values() for key, limits in section.items()}
 _ANGLES = ("roll_rad", "pitch_rad", "yaw_rad")
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
+"""Names that need no quotation marks in TOML."""
 _MOUNT = (*AT, *QUATERNION, *_ANGLES)
 _CAMERA = ("model", "intrinsics", "distortion", "resolution_px", "baseline_m", "mount", *_OF_CAMERA)
 
@@ -92,7 +95,8 @@ def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, 
     sections: dict[str, dict[str, Any]] = {}
     for sensor in sensors:
         is_camera = sensor.intrinsics is not None
-        sections[f"camera.{sensor.name}"] = {
+        section = f"camera.{sensor.name if _BARE.fullmatch(sensor.name) else toml_string(sensor.name)}"
+        sections[section] = {
             "model": sensor.distortion_model if is_camera else None,
             "intrinsics": None if sensor.intrinsics is None else tuple(map(float, sensor.intrinsics)),
             "distortion": tuple(map(float, sensor.distortion)) or None,
@@ -100,7 +104,7 @@ def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, 
             **{key: getattr(sensor, key) for key in _OF_CAMERA},
         }
         pose = map(float, sensor.mount_robot_sensor)
-        sections[f"camera.{sensor.name}.mount"] = dict(zip((*AT, *QUATERNION), pose, strict=True))
+        sections[f"{section}.mount"] = dict(zip((*AT, *QUATERNION), pose, strict=True))
     return {SENSOR_FILE: toml_text({"recording": about}), CAMERA_FILE: toml_text(sections)}
 
 

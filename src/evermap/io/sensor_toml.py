@@ -188,13 +188,14 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
-        return _quoted(value)
+        return toml_string(value)
     if isinstance(value, tuple):
         return f"[{', '.join(_toml_value(item) for item in value)}]"
     return repr(float(value)) if isinstance(value, float) else repr(int(value))
 
 
-def _quoted(value: str) -> str:
+def toml_string(value: str) -> str:
+    """Return a text as TOML has it, in quotation marks."""
     escaped = value.replace("\\", "\\\\").replace('"', '\\"')
     printable = "".join(c if c.isprintable() else f"\\u{ord(c):04x}" if ord(c) < 0x10000 else "?" for c in escaped)
     return f'"{printable}"'
