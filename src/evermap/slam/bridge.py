@@ -85,6 +85,11 @@ def dead_reckoned(stamp_s: FloatArray, drive: Drive, states: FloatArray, noise: 
 
 
 @kernel
+def _write(pose: FloatArray, out: FloatArray) -> None:
+    out[0], out[1], out[2] = pose[0], pose[1], pose[2]
+
+
+@kernel
 def _reckon(
     stamp: FloatArray,
     odometry_stamp: FloatArray,
@@ -100,11 +105,14 @@ def _reckon(
         integrate_odometry(
             odometry_stamp, velocity, unknown, stamp[i - 1], stamp[i], states, increment, motion, noise, floor
         )
-        out[i] = composed(out[i - 1], increment)
+        _write(composed(out[i - 1], increment), out[i])
         out[i, 2] = wrapped(out[i, 2])
         carry = adjoint(inverted(increment))
         odometry_covariance(noise, floor, variance, spread[i])
-        spread[i] += carry @ spread[i - 1] @ carry.T
+        carried = carry @ spread[i - 1] @ carry.T
+        for a in range(3):
+            for b in range(3):
+                spread[i, a, b] += carried[a, b]
 
 
 @kernel
@@ -140,7 +148,7 @@ def _bridge(
             )
             odometry_covariance(noise, floor, variance, collected[side])
         if i < 0:  # dead reckoning backwards from the first pose
-            out[k] = composed(pose[0], inverted(increment[1]))
+            _write(composed(pose[0], inverted(increment[1])), out[k])
             for a in range(3):
                 for b in range(3):
                     share[a, b] = covariance[0, a, b] + collected[1, a, b]
@@ -149,7 +157,7 @@ def _bridge(
         forward = composed(pose[i], increment[0])
         from_start = adjoint(inverted(increment[0]))
         if i >= n - 1:
-            out[k] = forward
+            _write(forward, out[k])
             sandwich(from_start, covariance[i], part, spread[k])
             for a in range(3):
                 for b in range(3):
@@ -175,7 +183,7 @@ def _bridge(
                 ends[a, b], ends[a, 3 + b] = from_start[a, b] - part[a, b], gain[a, b]
                 joint[a, b], joint[3 + a, 3 + b] = covariance[i, a, b], covariance[i + 1, a, b]
                 joint[a, 3 + b] = joint[3 + b, a] = consecutive[i, a, b]
-        out[k] = composed(forward, step)
+        _write(composed(forward, step), out[k])
         sandwich(ends, joint, ends_part, spread[k])
         multiply(collected[0], to_end.T, share)
         multiply(gain, share.T, part)

@@ -82,7 +82,7 @@ def spread_of_frame(
             if by != 0.0:
                 for k in range(len(covariance)):
                     gain[row, k] += by * covariance[at, k]
-    spread[:] = np.ascontiguousarray(gain[:, :8]) @ np.ascontiguousarray(jacobian[:, :8].T)
+    np.dot(np.ascontiguousarray(gain[:, :8]), np.ascontiguousarray(jacobian[:, :8].T), spread)
     for row in range(len(jacobian)):
         for other in range(row + 1):
             x, y = column[other // 2, 8], column[other // 2, 9]
@@ -107,9 +107,8 @@ def drive_on(
     pose: FloatArray, covariance: FloatArray, increment: FloatArray, by_states: FloatArray, noise: FloatArray
 ) -> None:
     """Advance the newest pose and the joint covariance to the next pose, in place."""
-    pose[:] = composed(pose, increment)
-    pose[2] = wrapped(pose[2])
-    size = len(covariance)
+    moved, size = composed(pose, increment), len(covariance)
+    pose[0], pose[1], pose[2] = moved[0], moved[1], wrapped(moved[2])
     carry = adjoint(inverted(increment))
     for k in range(3, size):
         x, y, turn = covariance[0, k], covariance[1, k], covariance[2, k]
@@ -117,9 +116,10 @@ def drive_on(
         covariance[1, k] = carry[1, 0] * x + carry[1, 1] * y + carry[1, 2] * turn
     block = covariance[:3, :3].copy()
     cross = covariance[:3, 8:12].copy() @ by_states.T
-    covariance[:3, :3] = carry @ block @ carry.T + cross + cross.T + noise
-    covariance[:3, :3] += by_states @ covariance[8:12, 8:12].copy() @ by_states.T
+    own, more = carry @ block @ carry.T, by_states @ covariance[8:12, 8:12].copy() @ by_states.T
     for a in range(3):
+        for k in range(3):
+            covariance[a, k] = own[a, k] + cross[a, k] + cross[k, a] + noise[a, k] + more[a, k]
         for k in range(3, size):
             for b in range(4):
                 covariance[a, k] += by_states[a, b] * covariance[8 + b, k]
@@ -152,21 +152,19 @@ def innovations(
     count = len(reading)
     nis, log_det, residual, by = np.empty(count), np.empty(count), np.empty((count, 2)), np.zeros((count, 2, 10))
     jx, jl, jc = np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    part, h_part, s = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2))
+    part, h_part, s, at = np.zeros((10, 10)), np.zeros((2, 10)), np.zeros((2, 2)), np.arange(10)
     for m in range(count):
-        e, h, at = residual[m], by[m], AT_PLACES + 2 * slot[m]
+        e, h, at[8], at[9] = residual[m], by[m], AT_PLACES + 2 * slot[m], AT_PLACES + 2 * slot[m] + 1
         detection_residual(pose, place[m], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         for a in range(2):
-            h[a, :3], h[a, 8:] = jx[a], jl[a]
-            for b in range(5):
-                h[a, 3 + b] = jc[a, b] if free[b] else 0.0
-        part[:8, :8] = covariance[:8, :8]
-        if slot[m] >= 0:
-            part[:8, 8:], part[8:, :8] = covariance[:8, at : at + 2], covariance[at : at + 2, :8]
-            part[8:, 8:] = covariance[at : at + 2, at : at + 2]
-        else:
-            part[:8, 8:], part[8:, :8] = 0.0, 0.0
-            part[8:, 8:] = own[m]
+            for b in range(10):
+                h[a, b] = jx[a, b] if b < 3 else jl[a, b - 8] if b >= 8 else jc[a, b - 3] if free[b - 3] else 0.0
+        for a in range(10):
+            for b in range(10):
+                if slot[m] >= 0 or max(a, b) < 8:
+                    part[a, b] = covariance[at[a], at[b]]
+                else:
+                    part[a, b] = own[m, a - 8, b - 8] if min(a, b) >= 8 else 0.0
         sandwich(h, part, h_part, s)
         a, b, d = s[0, 0] + sigma[m, 0] ** 2, s[0, 1], s[1, 1] + sigma[m, 1] ** 2
         nis[m] = _squared(a, b, d, e[0], e[1])
@@ -209,9 +207,12 @@ def update(
     nis, weight, credible = np.zeros(count), np.ones(count), np.ones(count)
     if count == 0:
         return nis, weight
-    place, where = position[row[slot]], np.arange(size)
-    where[AT_PLACES::2], where[AT_PLACES + 1 :: 2] = AT_PLACES + 2 * slot, AT_PLACES + 2 * slot + 1
-    part = np.empty((size, size))
+    place, where, part = np.empty((count, 2)), np.arange(size), np.empty((size, size))
+    for k in range(2 * count):
+        place[k // 2, k % 2], where[AT_PLACES + k] = (
+            position[row[slot[k // 2]], k % 2],
+            AT_PLACES + 2 * slot[k // 2] + k % 2,
+        )
     for k in range(size):
         for other in range(size):
             part[k, other] = covariance[where[k], where[other]]
@@ -245,9 +246,9 @@ def update(
         if unsure:
             spread = root.copy()
         _solve(root, innovation, pull)
-        before[:], step[:] = step, 0.0
         moved = 0.0
         for k in range(moving):
+            before[k], step[k] = step[k], 0.0
             for each in range(2 * count):
                 step[k] -= pull[each] * gain[each, k]
             moved = max(moved, abs(step[k] - before[k]))
@@ -265,9 +266,9 @@ def update(
             changed = _weigh_by_the_others(spread, pull, sigma, log_odds, iteration == 0, credible, weight)
         if moved < small and changed < SETTLED_WEIGHT:
             break
-    column[:, 8], column[:, 9] = where[AT_PLACES::2], where[AT_PLACES + 1 :: 2]
     white = np.zeros((2 * count, len(covariance) + 1))
-    white[:, -1] = innovation
+    for k in range(2 * count):
+        column[k // 2, 8 + k % 2], white[k, -1] = where[AT_PLACES + k], innovation[k]
     _across(covariance, jacobian, column, white)
     if considered:
         _consider(covariance, root, white)
@@ -344,7 +345,9 @@ def _solve(matrix: FloatArray, right: FloatArray, x: FloatArray) -> None:
     large = len(matrix) > LARGE
     if large:
         factor: Any = np.linalg.cholesky(matrix)
-        matrix[:] = factor
+        for i in range(len(matrix)):
+            for k in range(i + 1):
+                matrix[i, k] = factor[i, k]
     for i in range(len(matrix)):
         for k in range(0 if large else i + 1):
             total = matrix[i, k]

@@ -108,5 +108,7 @@ def linearise_interval(
     odometry_covariance(intervals.noise[i], intervals.floor[i], variance, information)
     invert_3x3(information, information)
     odometry_residual(pose[i], pose[i + 1], intervals.increment[i], residual, jacobian[:, :3], jacobian[:, 3:6])
-    jacobian[:, 6:] = intervals.by_states[i]
+    for a in range(3):
+        for k in range(4):
+            jacobian[a, 6 + k] = intervals.by_states[i, a, k]
     residual_by_states(jacobian[:, 6:], residual, free)
