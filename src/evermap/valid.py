@@ -103,6 +103,8 @@ SIGMA_RANGE_M = Quantity("sigma_range_m", 0.0, 1e6, positive=True, optional=True
 SIGMA_BEARING_RAD = Quantity(
     "sigma_bearing_rad", 0.0, 1e6, positive=True, optional=True, hint="leave empty where unknown"
 )
+CAMERA_MODELS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
+"""How many numbers of distortion each model of a camera has."""
 P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
@@ -204,6 +206,18 @@ def _check_spatial_sensor(sensor: SpatialSensor) -> None:
     ):
         raise InputError(f"{where}: {sensor.intrinsics} are not focal lengths and a principal point",
                          field="sensors.intrinsics", hint="fx, fy, cx, cy in pixels")  # fmt: skip
+    counts = CAMERA_MODELS.get(sensor.distortion_model)
+    if counts is None:
+        problem = f"{where}: no camera model '{sensor.distortion_model}'"
+        raise InputError(problem, field="sensors.distortion_model", hint="one of " + ", ".join(CAMERA_MODELS))
+    if len(sensor.distortion) not in (0, *counts):
+        wanted = " or ".join(map(str, counts))
+        problem = f"{where}: {sensor.distortion_model} needs {wanted} coefficients, not {len(sensor.distortion)}"
+        raise InputError(problem, field="sensors.distortion")
+    for name in ("p_detect", "p_false"):
+        if not 0.0 <= getattr(sensor, name) <= 1.0:
+            problem = f"{where}: {getattr(sensor, name)} is not a probability"
+            raise InputError(problem, field=f"sensors.{name}", hint="0 to 1")
     if not sensor.range_min_m < sensor.range_max_m:
         problem = f"{where}: {sensor.range_min_m} is not below range_max_m = {sensor.range_max_m}"
         raise InputError(problem, field="sensors.range_min_m")

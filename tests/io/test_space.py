@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from evermap.io import (
 )
 from evermap.io.landmarks import write_map_csv
 from evermap.types import UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
+from evermap.valid import validate_spatial
 
 Files = dict[str, str]
 
@@ -469,6 +470,68 @@ def test_maps_in_space_may_say_less(tmp_path: Path) -> None:
     path.write_text("landmark_id,x_m,y_m,qx,qy,qz,qw\n7,1,2,0,0,0,1\n")
     with pytest.raises(InputError, match=r"map\.csv:1: field 'qx': unknown column"):
         read_prior_map(path)
+
+
+def test_maps_may_be_gzipped(lay_out: Callable, space: Files, tmp_path: Path) -> None:
+    folder = lay_out(space)
+    table = folder / "landmarks.csv"
+    plain = read_landmarks(table)
+    (folder / "landmarks.csv.gz").write_bytes(gzip.compress(table.read_bytes()))
+    table.unlink()
+    assert_equal(plain, read_landmarks(folder))
+
+
+NOWHERE = np.full((3, 3), np.nan)
+WRONG: dict[str, tuple[str, dict[str, Any], str]] = {
+    "position": ("detections", {"position_sensor_m": NOWHERE}, "detections.position_sensor_m.*is nowhere"),
+    "rotation": ("detections", {"rotation": np.ones((3, 4))}, "detections.rotation.*not a unit quaternion"),
+    "sensor": ("detections", {"sensor": np.array([0, 1, 0])}, "detections.sensor.*row 1: 1 is not one of 1 sensors"),
+    "frame": ("detections", {"frame": np.array([0, 1, 9])}, "detections.frame.*row 2: 9 is not a row of 4 frames"),
+    "id": ("detections", {"landmark_id": np.array([0, -2, 1])}, "detections.landmark_id.*row 1: -2"),
+    "covariance": ("detections", {"covariance_sensor_m2": -np.stack([np.eye(3)] * 3)}, "covariance_sensor_m2"),
+    "sigma": ("detections", {"sigma_rad": np.array([0.1, 0.0, np.nan])}, "detections.sigma_rad.*row 1"),
+    "tag": ("detections", {"tag_size_m": np.array([np.nan, -1.0, np.nan])}, "detections.tag_size_m.*row 1"),
+    "box": ("detections", {"size_m": np.zeros((3, 3))}, "detections.size_m.*is not positive"),
+    "odometry": ("odometry", {"pose_world_robot": np.zeros((5, 7))}, "odometry.pose_world_robot.*unit quaternion"),
+    "variance": ("odometry", {"variance": -np.ones((5, 6))}, "odometry.variance.*is negative"),
+    "stamps": ("frames", {"stamp_s": np.zeros(4)}, "frames.stamp_s.*row 1: repeats"),
+    "truth": ("truth", {"pose_world_robot": np.full((2, 7), np.inf)}, "truth.pose_world_robot.*inf"),
+    "landmarks": ("true_landmarks", {"covariance_m2": -np.stack([np.eye(3)] * 2)}, "true_landmarks.covariance_m2"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_arrays_are_named(name: str, lay_out: Callable, space: Files) -> None:
+    part, changed, message = WRONG[name]
+    recording = read(lay_out, space)
+    validate_spatial(recording)
+    wrong = replace(recording, **{part: replace(getattr(recording, part), **changed)})
+    with pytest.raises(InputError, match=message):
+        validate_spatial(wrong)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"mount_robot_sensor": (0.0, 0.0, 0.0)}, "is not a pose"),
+        ({"intrinsics": (-1.0, 1.0, 0.0, 0.0)}, "are not focal lengths"),
+        ({"distortion_model": "cubic"}, "no camera model 'cubic'"),
+        ({"distortion_model": "radtan", "distortion": (0.1,)}, "needs 4 or 5 coefficients, not 1"),
+        ({"range_min_m": 30.0}, "is not below range_max_m"),
+        ({"sigma_px": 0.0}, "is not a standard deviation"),
+        ({"p_detect": 1.5}, "is not a probability"),
+    ],
+)
+def test_wrong_sensors_are_named(changed: dict[str, Any], message: str, lay_out: Callable, space: Files) -> None:
+    recording = read(lay_out, space)
+    wrong = replace(recording, sensors=(replace(recording.sensors[0], **changed),))
+    with pytest.raises(InputError, match=message):
+        validate_spatial(wrong)
+
+
+def test_what_else_is_no_recording_in_space(lay_out: Callable, native: Files, space: Files) -> None:
+    with pytest.raises(InputError, match="a SpatialRecording is needed, not Recording"):
+        validate_spatial(read_recording(lay_out(native)))
 
 
 def test_trajectories_in_space(lay_out: Callable, space: Files, tmp_path: Path) -> None:

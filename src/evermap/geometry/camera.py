@@ -14,9 +14,6 @@ import numpy as np
 
 from evermap.types import FloatArray, IntArray, SpatialSensor
 
-COEFFICIENTS: dict[str, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
-"""How many numbers of distortion each model has."""
-
 _STEPS = 30
 """Newton steps by which distortion is removed, at most; three to six are usual."""
 

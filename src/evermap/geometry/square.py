@@ -127,25 +127,25 @@ def _refined(
     pose: FloatArray, corner_m: FloatArray, corner_px: FloatArray, sensor: SpatialSensor
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Poses (M, 7) at the nearest minimum of the reprojection error, these errors (M,) and information (M, 6, 6)."""
-    damping = np.full(len(pose), 1e-6)
+    pose = pose.copy()
     residual, normal, gradient = _linearised(pose, corner_m, corner_px, sensor)
+    damping = np.full(len(pose), 1e-6)
+    rows = np.flatnonzero(np.isfinite(residual))
     for _ in range(_STEPS):
-        diagonal = np.einsum("mii->mi", normal)
-        damped = normal + np.einsum("mi,ij->mij", damping[:, None] * diagonal + 1e-12, np.eye(6))
-        fine = np.isfinite(damped).all(axis=(1, 2))
-        step = np.zeros((len(pose), 6))
-        step[fine] = -np.linalg.solve(damped[fine], gradient[fine][..., None])[..., 0]
-        tried = se3.retract(pose, step)
-        after = _linearised(tried, corner_m, corner_px, sensor)
-        better = (after[0] < residual) & (tried[:, 2] > 0.0)
-        pose = np.where(better[:, None], tried, pose)
-        normal = np.where(better[:, None, None], after[1], normal)
-        gradient = np.where(better[:, None], after[2], gradient)
-        gained = np.where(better, residual - after[0], 0.0)
-        residual = np.where(better, after[0], residual)
-        damping = np.where(better, damping / 10.0, damping * 10.0)
-        if not np.any((gained > 1e-10 * residual) | (~better & (damping < 1e3))):
+        diagonal = np.einsum("mii->mi", normal[rows])
+        damped = normal[rows] + np.einsum("mi,ij->mij", damping[rows, None] * diagonal + 1e-12, np.eye(6))
+        step = -np.linalg.solve(damped, gradient[rows][..., None])[..., 0]
+        going = -np.sum(gradient[rows] * step, axis=1) > 1e-10 * residual[rows] + 1e-18  # what the step would gain
+        rows, step = rows[going], step[going]
+        if not len(rows):
             break
+        tried = se3.retract(pose[rows], step)
+        after = _linearised(tried, corner_m[rows], corner_px[rows], sensor)
+        better = (after[0] < residual[rows]) & (tried[:, 2] > 0.0)
+        gained = rows[better]
+        pose[gained], residual[gained] = tried[better], after[0][better]
+        normal[gained], gradient[gained] = after[1][better], after[2][better]
+        damping[rows] *= np.where(better, 0.1, 10.0)
     return pose, np.sqrt(residual / 8.0), normal
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.io.assemble import repeats
-from evermap.io.files import write_atomic
+from evermap.io.files import unpacked, write_atomic
 from evermap.io.spatial import (
     AT,
     BOX,
@@ -41,7 +41,7 @@ _OPTIONAL = (
     "sigma_m", *COVARIANCE_COLUMNS, "class_id", "p_exists", "n_hits", "n_misses", "first_seen_s", "last_seen_s",
     "name",
 )  # fmt: skip
-_MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "map.geojson")
+_MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "landmarks.csv.gz", "map.geojson")
 
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
 _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
@@ -73,10 +73,10 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0) -> Landmarks:
     """Return a map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
     path = _map_file(Path(path))
     try:
-        data = path.read_bytes()
+        data = unpacked(path.read_bytes(), path)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
-    ending = path.suffix.lower()
+    ending = Path(path.name.lower().removesuffix(".gz")).suffix
     warnings: list[str] = []
     about: dict[str, Any] = {}
     if ending == ".csv":

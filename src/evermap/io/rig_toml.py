@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.geometry.camera import COEFFICIENTS
 from evermap.io.files import FileSet
 from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
 from evermap.types import FloatArray, IntArray, Sensor, SpatialSensor, landmark_id_of
+from evermap.valid import CAMERA_MODELS
 
 SENSOR_FILE = "sensor.toml"
 CAMERA_FILE = "camera.toml"
@@ -150,9 +150,9 @@ def _lens(reader: TomlReader, section: str, content: dict[str, Any]) -> dict[str
     if min(intrinsics[:2]) <= 0.0:
         raise reader.error(section, "intrinsics", "focal lengths must be positive", hint="[fx, fy, cx, cy] in pixels")
     model = content.get("model", "pinhole")
-    if model not in COEFFICIENTS:
-        raise reader.error(section, "model", f"no camera model '{model}'", hint="one of " + ", ".join(COEFFICIENTS))
-    distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *COEFFICIENTS[model]))
+    if model not in CAMERA_MODELS:
+        raise reader.error(section, "model", f"no camera model '{model}'", hint="one of " + ", ".join(CAMERA_MODELS))
+    distortion = reader.numbers(section, "distortion", content.get("distortion", []), (0, *CAMERA_MODELS[model]))
     found: dict[str, Any] = {"intrinsics": intrinsics, "distortion": distortion, "distortion_model": model}
     if "resolution_px" in content:
         width, height = reader.numbers(section, "resolution_px", content["resolution_px"], (2,))

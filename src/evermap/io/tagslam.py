@@ -18,7 +18,6 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
-from evermap.geometry.camera import COEFFICIENTS
 from evermap.io.assemble import SAME_STAMP_S, finish_spatial, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rosbag import TagSightings, read_tag_bag
@@ -37,7 +36,7 @@ from evermap.types import (
     SpatialSensor,
     Trajectory,
 )
-from evermap.valid import Quantity
+from evermap.valid import CAMERA_MODELS, Quantity
 
 MOST_HAMMING = 2
 """Tags of which the detector had to correct more bits are left out: most of them are no tags."""
@@ -175,7 +174,7 @@ def _setup(files: FileSet) -> TagRig:
             hint = "one of " + ", ".join(_MODELS)
             field = f"{name}.distortion_model"
             raise InputError("unknown camera model", path=files.path_of(CAMERAS), field=field, hint=hint)
-        distortion = _numbers(files, CAMERAS, camera, "distortion_coeffs", name, (0, *COEFFICIENTS[model]))
+        distortion = _numbers(files, CAMERAS, camera, "distortion_coeffs", name, (0, *CAMERA_MODELS[model]))
         width, height = _numbers(files, CAMERAS, camera, "resolution", name, (2,))
         fx, fy, cx, cy = _numbers(files, CAMERAS, camera, "intrinsics", name, (4,))
         pose = _get(files, CAMERA_POSES, mounts, name, "")
