@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, localize, npmle, persistence, scale, scale_report, selectors, tracking
+from benchmarks import cliques, kitti, localize, npmle, persistence, scale, scale_report, selectors, tracking
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -35,12 +35,13 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **cliques.METRICS,
     **npmle.METRICS,
     **tracking.METRICS,
+    **kitti.METRICS,
     **localize.METRICS,
     **scale.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "localize", "scale")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "kitti", "localize", "scale")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -102,6 +103,9 @@ def run(
         measured |= ratios
     if only in (None, "tracking"):
         ratios, shown["tracking"] = tracking.run(n_frames, n_stored)
+        measured |= ratios
+    if only == "kitti" or (only is None and kitti.FOLDER.is_dir()):
+        ratios, shown["kitti"] = kitti.run()
         measured |= ratios
     if only in (None, "localize"):
         ratios, shown["localize"] = localize.run(n_steps)
@@ -192,6 +196,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", npmle.as_text(shown["npmle"])]
     if "tracking" in shown:
         lines += ["", tracking.as_markdown(shown["tracking"])]
+    if "kitti" in shown:
+        lines += ["", kitti.as_markdown(shown["kitti"])]
     if "localize" in shown:
         lines += ["", localize.as_markdown(shown["localize"])]
     if "scale" in shown:

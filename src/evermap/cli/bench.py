@@ -23,7 +23,7 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, localize or scale."
+            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize or scale."
         ),
     ] = None,
     sizes: Annotated[

@@ -164,14 +164,15 @@ def _run(
     """Read, run, write; return the summary."""
     from evermap.runs.folder import check_replaceable
     from evermap.runs.summary import RunInfo
-    from evermap.runs.track.detections import read_confusion, read_detections
+    from evermap.runs.track.detections import read_confusion
+    from evermap.runs.track.poses import read_input
     from evermap.runs.track.run import run_track
     from evermap.runs.track.run import warm_up as compile_kernels
     from evermap.runs.track.write import write_track
 
     check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
     start = time.perf_counter()
-    table = read_detections(path, min_score=config.min_score)
+    table = read_input(path, min_score=config.min_score)
     confusion = None if confusion_path is None else read_confusion(confusion_path, table.class_names)
     info = RunInfo(command=command_line(), read_s=time.perf_counter() - start)
     warm_up(compile_kernels)

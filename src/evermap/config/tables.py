@@ -94,6 +94,26 @@ class TrackerConfig(Section):
     p_real: Share = Field(
         default=0.5, description="probability that a detection of no known object is an object, not a false alarm"
     )
+    sigma_face_m: NotNegative = Field(default=0.05, description="noise of where a face of a detected box is [m] ...")
+    sigma_face_share: NotNegative = Field(default=0.035, description="... and as a share of the box's size")
+    speed_per_length_hz: NotNegative = Field(
+        default=3.0,
+        description="standard deviation of a new box's speed along its heading, in its lengths a second [Hz]",
+    )
+    score_midpoint: float = Field(
+        default=3.7, description="score at which a first detection is as likely real as false, unless all are in [0, 1]"
+    )
+    score_scale: Positive = Field(default=1.2, description="score by which the log odds of that grow by one")
+    score_memory: float = Field(
+        default=0.85, gt=0.0, le=1.0, description="weight of an object's older scores for each newer one"
+    )
+    seen_nats: NotNegative = Field(
+        default=0.4, description="log odds to be real, beside the scores, times the log of the number of detections"
+    )
+    missed_nats: NotNegative = Field(default=1.0, description="log odds to be real that every frame without one takes")
+    p_believed: Share = Field(
+        default=0.5, description="belief by its scores from which on a tracklet is ALIVE, where detections have scores"
+    )
     p_confirm: Share = Field(default=0.999, description="belief from which on a tracklet is ALIVE")
     p_dead: Share = Field(default=0.01, description="belief below which a tracklet is DEAD")
     warm_up: Count = Field(default=3, description="detections that a tracklet needs to be ALIVE")
@@ -181,7 +201,13 @@ class TrackConfig(TrackerConfig):
     range_m: Positive | None = Field(
         default=None, description="the sensor's reach [m]; unset: nothing is known of what should be seen"
     )
-    min_score: Probability = Field(default=0.0, description="detections of a lower score are left out")
+    fov_deg: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=360.0,
+        description="horizontal field of view, ahead of the sensor [deg], with `range_m` and poses; unset: all around",
+    )
+    min_score: float | None = Field(default=None, description="detections of a lower score are left out; unset: none")
     gap_s: Positive | None = Field(
         default=None, description="a longer time between two frames is one without any look [s]; unset: chosen"
     )

@@ -20,7 +20,8 @@ import numpy as np
 
 from evermap.tracking.frame import Frame
 from evermap.tracking.grid import bucket_of, cell_of, fill
-from evermap.tracking.kalman import distance_and_log_det, inlined, kernel, sum_of
+from evermap.tracking.kalman import Symmetric, distance_and_log_det, inlined, kernel, sum_of
+from evermap.tracking.shape import shape_log_ratio
 from evermap.types import FloatArray, IntArray
 
 
@@ -55,6 +56,7 @@ class Targets(NamedTuple):
         covariance: (N, D, D).
         class_p: (N, C) posterior over classes.
         appearance: (N, A) unit vectors, or zeros.
+        box: (N, 9) size and heading, or (N, 0).
         inverse_odds: (N,) `(1 - p) / p` of being there.
         p_detect: (N,) probability to detect each, if it is there.
     """
@@ -63,6 +65,7 @@ class Targets(NamedTuple):
     covariance: FloatArray
     class_p: FloatArray
     appearance: FloatArray
+    box: FloatArray
     inverse_odds: FloatArray
     p_detect: FloatArray
 
@@ -86,6 +89,28 @@ class Pairs(NamedTuple):
 NEVER_SURE = 1e-3
 """Least probability to detect an object: what a sensing model rules out is unlikely, but its geometry is not exact."""
 LOG_TWO_PI = math.log(2.0 * math.pi)
+MISPLACED = 16.0
+"""Times the variance of its noise, of a box that is found beside its place: of what is far or half hidden ..."""
+LOG_P_MISPLACED = math.log(0.02)
+"""... and how often."""
+
+
+@inlined
+def blurred(a: FloatArray, noise: FloatArray) -> Symmetric:
+    """Return the covariance of an innovation if a box is misplaced."""
+    return (
+        a[0, 0] + MISPLACED * noise[0, 0], a[0, 1] + MISPLACED * noise[0, 1], a[0, 2] + MISPLACED * noise[0, 2],
+        a[1, 1] + MISPLACED * noise[1, 1], a[1, 2] + MISPLACED * noise[1, 2], a[2, 2] + MISPLACED * noise[2, 2],
+    )  # fmt: skip
+
+
+@inlined
+def is_misplaced(mean: FloatArray, covariance: FloatArray, position: FloatArray, noise: FloatArray) -> bool:
+    """Return whether a box is rather misplaced than where its noise would have it."""
+    offset = position[0] - mean[0], position[1] - mean[1], position[2] - mean[2]
+    near, det = distance_and_log_det(offset, sum_of(covariance, noise))
+    far, wide_det = distance_and_log_det(offset, blurred(covariance, noise))
+    return -0.5 * (near + det) < LOG_P_MISPLACED - 0.5 * (far + wide_det)
 
 
 @inlined
@@ -123,7 +148,8 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
         frame: M detections.
         likelihood: numbers of the settings.
     """
-    mean, covariance, class_p, appearance, inverse_odds, p_detect = targets
+    mean, covariance, class_p, appearance, box, inverse_odds, p_detect = targets
+    boxes = box.shape[1] > 0
     position, noise = frame.position, frame.noise
     m = position.shape[0]
     start = np.zeros(n + 1, dtype=np.int64)
@@ -137,10 +163,11 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
         for a in range(3):
             widest[a] = max(widest[a], noise[j, a, a])
     reach = np.empty((n, 3))
+    wide = MISPLACED if boxes else 1.0
     total = 0.0
     for i in range(n):
         for a in range(3):
-            reach[i, a] = math.sqrt(likelihood.gate * max(covariance[i, a, a] + widest[a], 0.0))
+            reach[i, a] = math.sqrt(likelihood.gate * max(covariance[i, a, a] + widest[a] * wide, 0.0))
             reach[i, a] = max(reach[i, a], likelihood.moved_reach_m)
             total += reach[i, a]
     cell_m = max(2.0 * total / (3 * n), 1e-9)
@@ -179,6 +206,10 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                 dx, dy, dz = position[j, 0] - mean[i, 0], position[j, 1] - mean[i, 1], position[j, 2] - mean[i, 2]
                 squared, log_det = distance_and_log_det((dx, dy, dz), sum_of(covariance[i], noise[r]))
                 log_density = -0.5 * (squared + log_det + 3.0 * LOG_TWO_PI) if squared <= likelihood.gate else -math.inf
+                if boxes:
+                    far, wide_det = distance_and_log_det((dx, dy, dz), blurred(covariance[i], noise[r]))
+                    if far <= likelihood.gate:
+                        log_density = max(log_density, LOG_P_MISPLACED - 0.5 * (far + wide_det + 3.0 * LOG_TWO_PI))
                 if dx * dx + dy * dy + dz * dz <= likelihood.moved_reach_m * likelihood.moved_reach_m:
                     log_density = max(log_density, likelihood.log_moved)
                 if log_density == -math.inf:
@@ -188,6 +219,8 @@ def candidates(targets: Targets, n: int, frame: Frame, likelihood: Likelihood) -
                 ratio += appearance_log_ratio(
                     appearance[i], frame.appearance[j], likelihood.appearance_nats, likelihood.appearance_neutral
                 )
+                if boxes:
+                    ratio += shape_log_ratio(box[i], frame.box[j], frame.box_noise[j])
                 if missed_over_hit - ratio >= 0.0:
                     continue
                 if e == room:

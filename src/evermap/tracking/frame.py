@@ -19,6 +19,9 @@ class Frame(NamedTuple):
         noise: (M, 3, 3) covariances, or (1, 3, 3) for all.
         class_id: (M,) or `UNKNOWN`.
         appearance: (M, A) unit vectors, or zeros.
+        box: (M, 4) length, width, height, heading; (M, 0) where the tracker follows points.
+        box_noise: (M, 4) their variances.
+        level: (M, 1) log odds by the score that a detection is real, inf without one; (M, 0) where none has a score.
     """
 
     stamp_s: float
@@ -26,6 +29,25 @@ class Frame(NamedTuple):
     noise: FloatArray
     class_id: IntArray
     appearance: FloatArray
+    box: FloatArray
+    box_noise: FloatArray
+    level: FloatArray
+
+
+def p_real_of(score: FloatArray, midpoint: float, scale: float) -> FloatArray:
+    """Return (M,) probabilities that detections are real: scores themselves if all are in [0, 1], else logistic.
+
+    Args:
+        score: (M,) of one detector, nan for none.
+        midpoint: score of even odds, where scores are any numbers.
+        scale: score by which the log odds grow by one.
+    """
+    from scipy.special import expit
+
+    given = score[~np.isnan(score)]
+    if len(given) == 0 or (given.min() >= 0.0 and given.max() <= 1.0):
+        return score
+    return np.asarray(expit((score - midpoint) / scale))
 
 
 def positions(values: Any) -> FloatArray:
@@ -45,6 +67,39 @@ def positions(values: Any) -> FloatArray:
     if not np.isfinite(array).all():
         row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
         raise InputError(f"detection {row}: {array[row].tolist()} is not finite", field="position_m")
+    return array
+
+
+def boxes(values: Any, m: int) -> FloatArray:
+    """Return (M, 4) sizes and headings.
+
+    Raises:
+        InputError: another shape, a size that is not positive, or a heading that is not finite.
+    """
+    array = np.ascontiguousarray(values, dtype=np.float64) if m else np.empty((0, 4))
+    if array.shape != (m, 4):
+        raise InputError(f"shape {array.shape} instead of ({m}, 4)", field="box", hint="length, width, height, heading")
+    wrong = np.flatnonzero(~(np.isfinite(array).all(axis=1) & (array[:, :3] > 0.0).all(axis=1)))
+    if wrong.size:
+        what = f"detection {wrong[0]}: {array[wrong[0]].tolist()} is no box"
+        raise InputError(what, field="box", hint="positive sizes [m] and a heading [rad]")
+    return array
+
+
+def probabilities(values: Any, m: int) -> FloatArray:
+    """Return (M,) probabilities, nan where none is given.
+
+    Raises:
+        InputError: another shape, or a number that is not a probability.
+    """
+    if values is None:
+        return np.full(m, np.nan)
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != (m,):
+        raise InputError(f"shape {array.shape} instead of ({m},)", field="p_real")
+    wrong = np.flatnonzero((array < 0.0) | (array > 1.0))
+    if wrong.size:
+        raise InputError(f"detection {wrong[0]}: {array[wrong[0]]} is not a probability", field="p_real")
     return array
 
 

@@ -13,10 +13,31 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.existence.kernels import aged, observed
-from evermap.tracking.association import NEVER_SURE, NOBODY, Likelihood, Targets, assign, candidates
+from evermap.tracking.association import (
+    MISPLACED,
+    NEVER_SURE,
+    NOBODY,
+    Likelihood,
+    Targets,
+    assign,
+    candidates,
+    is_misplaced,
+)
 from evermap.tracking.frame import Frame
-from evermap.tracking.kalman import kernel, update
-from evermap.tracking.rows import DISPLACED, displacement, end_spell, noise_of, place_filter, settle, start_rest
+from evermap.tracking.kalman import inlined, kernel, update
+from evermap.tracking.rows import (
+    DISPLACED,
+    LEAST,
+    believed,
+    displacement,
+    end_spell,
+    noise_of,
+    reset_filter,
+    settle,
+    start_rest,
+)
+from evermap.tracking.scores import MISSED, update_level
+from evermap.tracking.shape import update_shape
 from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, Tracklets, TrackState
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -25,8 +46,8 @@ WORKING_SET, DEAD = int(TrackState.WORKING_SET), int(TrackState.DEAD)
 EVENT_BORN, EVENT_LOST, EVENT_FOUND = int(EventKind.BORN), int(EventKind.LOST), int(EventKind.FOUND)
 EVENT_STORED, EVENT_DIED = int(EventKind.STORED), int(EventKind.DIED)
 NOTHING = -1
-MOST, LEAST = 1e30, 1e-12
-"""Bounds of inverse odds: however long an object was watched, a dozen misses may undo it."""
+MOST = 1e30
+"""Bound of inverse odds."""
 
 
 class InSight(NamedTuple):
@@ -79,6 +100,18 @@ def recognise(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray,
         t.appearance[i] /= max(math.sqrt(length), 1e-12)
 
 
+@inlined
+def renew(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray, rules: Rules) -> None:
+    """Update all of tracklet `i` but its place by detection `j`: class, appearance, box, score, counts."""
+    recognise(t, i, frame, j, confusion, rules.appearance_memory)
+    if t.box.shape[1]:
+        update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
+    t.n_hits[i] += 1
+    t.n_missed[i] = 0
+    if t.level.shape[1]:
+        update_level(t, i, frame.level[j, 0], rules)
+
+
 @kernel
 def live(
     t: Tracklets, n: int, frame: Frame, in_sight: InSight, likelihood: Likelihood, rules: Rules, happened: Happened
@@ -99,7 +132,7 @@ def live(
     """
     p_detect, view_known, death_odds = in_sight
     track_of_detection, events, spells = happened
-    targets = Targets(t.mean, t.covariance, t.class_p, t.appearance, t.inverse_odds, p_detect)
+    targets = Targets(t.mean, t.covariance, t.class_p, t.appearance, t.box, t.inverse_odds, p_detect)
     pairs = candidates(targets, n, frame, likelihood)
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
     n_events, n_gone = 0, 0
@@ -112,16 +145,17 @@ def live(
             gone = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0))
             after, _ = observed(predicted, max(p_detect[i], NEVER_SURE), gone)
             t.inverse_odds[i] = max(after, LEAST)
-            update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
-            recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
-            t.n_hits[i] += 1
-            t.n_missed[i] = 0
+            if t.box.shape[1] and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j)):
+                update(t.mean[i], t.covariance[i], frame.position[j], MISPLACED * noise_of(frame, j))
+            else:
+                update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
+            renew(t, i, frame, j, likelihood.confusion, rules)
             n_spells = settle(t, i, frame, j, rules, spells, n_spells)
             if t.state[i] == LOST:
                 t.state[i] = ALIVE
                 events.kind[n_events], events.row[n_events] = EVENT_FOUND, i
                 n_events += 1
-            elif t.state[i] == BIRTH and t.n_hits[i] >= rules.warm_up and t.inverse_odds[i] <= rules.odds_confirm:
+            elif t.state[i] == BIRTH and believed(t, i, rules):
                 t.state[i] = ALIVE
                 events.kind[n_events], events.row[n_events] = EVENT_BORN, i
                 n_events += 1
@@ -130,6 +164,8 @@ def live(
             after, _ = observed(predicted, max(1.0 - p_detect[i], 1e-12), 1.0)
             t.inverse_odds[i] = min(after, MOST)
         t.n_missed[i] += 1
+        if t.level.shape[1]:
+            t.level[i, MISSED] += rules.missed_nats if p_detect[i] > 0.0 else 0.0
         what = NOTHING
         if t.inverse_odds[i] > rules.odds_dead:
             what = EVENT_DIED
@@ -213,10 +249,8 @@ def resume(
         else:
             update(t.rest_mean[i], t.rest_covariance[i], frame.position[j], noise_of(frame, j))
         t.state[i] = ALIVE
-        place_filter(t, i, frame.position[j], noise_of(frame, j), rules)
-        recognise(t, i, frame, j, confusion, rules.appearance_memory)
-        t.n_hits[i] += 1
-        t.n_missed[i] = 0
+        reset_filter(t, i, frame, j, rules)
+        renew(t, i, frame, j, confusion, rules)
         t.rest_seen_s[i] = frame.stamp_s
         t.slow[i] = 1
     return n_spells

@@ -18,6 +18,8 @@ from evermap.tracking.tracklets import EventKind, SpellTable, Tracklets, TrackSt
 from evermap.tracking.working_set import Stored, WorkingSet
 from evermap.types import BoolArray, FloatArray, IntArray
 
+BOX_COLUMNS = ("length_m", "width_m", "height_m", "yaw_rad")
+
 
 class InSpace(ShownTable):
     """Mixin of tables of objects: positions and velocities are three columns each, states are words."""
@@ -39,6 +41,9 @@ class InSpace(ShownTable):
                 found[name] = words[values]
             elif name == "class_p":
                 found["class_id"] = values.argmax(axis=1)
+            elif name.startswith("box"):
+                if name == "box" and values.shape[1]:
+                    found |= {column: values[:, k] for k, column in enumerate(BOX_COLUMNS)}
             elif values.ndim == 2:
                 prefix, unit = {"position_m": ("", "m"), "velocity_mps": ("v", "mps")}[name]
                 found |= {f"{prefix}{axis}_{unit}": values[:, k] for k, axis in enumerate("xyz")}
@@ -72,6 +77,8 @@ class _Objects(InSpace):
     velocity_covariance_m2ps2: FloatArray
     class_p: FloatArray
     p_exists: FloatArray
+    box: FloatArray
+    box_variance: FloatArray
     static: BoolArray
 
 
@@ -87,6 +94,7 @@ class Followed(_Objects):
         position_covariance_m2, velocity_covariance_m2ps2: (N, 3, 3).
         class_p: (N, C) posterior over classes.
         p_exists: (N,) probability of being a real object that is there.
+        box: (N, 4) length, width, height and heading; (N, 0) of points. box_variance: the same shape.
         static: (N,) whether it has been where it is for long enough to be static.
         n_missed: (N,) frames in a row without a detection.
     """
@@ -101,6 +109,10 @@ class Tracks(_Objects):
     Attributes:
         stamp_s: (R,) frames.
     """
+
+    def __getitem__(self, rows: IntArray | BoolArray) -> Self:
+        """Some of them, by number or by a mask."""
+        return type(self)(**{item.name: getattr(self, item.name)[rows] for item in fields(self)})
 
 
 class Recorder:
@@ -123,18 +135,34 @@ class Recorder:
         Raises:
             DataError: no frame was recorded.
         """
-        frames = self._frames
-        if not frames:
-            raise DataError("no frame was tracked")
-        counts = [len(f) for f in frames]
-        frame = np.repeat(np.arange(len(frames)), counts)
-        columns = {item.name: np.concatenate([getattr(f, item.name) for f in frames]) for item in fields(Followed)[1:]}
+        frame, columns = self._rows()
         ids = columns["track_id"]
         confirmed = np.isin(ids, np.unique(ids[columns["state"] != TrackState.BIRTH]))
         order = np.lexsort((frame, ids))
         order = order[confirmed[order]]
-        keep = order[~_given_up_after(ids[order], frame[order], columns["n_missed"][order], len(frames))]
-        stamps = np.array([f.stamp_s for f in frames])
+        keep = order[~_given_up_after(ids[order], frame[order], columns["n_missed"][order], len(self._frames))]
+        return self._of(keep, frame, columns)
+
+    def at_once(self, least_p: float) -> Tracks:
+        """Return what was said at once, frame by frame: every tracklet with a belief of at least `least_p`.
+
+        Raises:
+            DataError: no frame was recorded.
+        """
+        frame, columns = self._rows()
+        order = np.lexsort((frame, columns["track_id"]))
+        return self._of(order[columns["p_exists"][order] >= least_p], frame, columns)
+
+    def _rows(self) -> tuple[IntArray, dict[str, Any]]:
+        """(R,) frame of each row, and all columns."""
+        frames = self._frames
+        if not frames:
+            raise DataError("no frame was tracked")
+        frame = np.repeat(np.arange(len(frames)), [len(f) for f in frames])
+        return frame, {n.name: np.concatenate([getattr(f, n.name) for f in frames]) for n in fields(Followed)[1:]}
+
+    def _of(self, keep: IntArray, frame: IntArray, columns: dict[str, Any]) -> Tracks:
+        stamps = np.array([f.stamp_s for f in self._frames])
         return Tracks(stamp_s=stamps[frame[keep]], **{n: c[keep] for n, c in columns.items() if n != "n_missed"})
 
 

@@ -17,10 +17,14 @@ import numpy as np
 
 from evermap.tracking.frame import Frame
 from evermap.tracking.kalman import distance_and_log_det, inlined, kernel, sum_of, update
-from evermap.tracking.tracklets import Rules, SpellTable, Tracklets, TrackState
+from evermap.tracking.scores import LEVEL, begin_level, log_odds_real
+from evermap.tracking.shape import begin_shape
+from evermap.tracking.tracklets import YAW, Rules, SpellTable, Tracklets, TrackState
 from evermap.types import FloatArray, IntArray
 
-BIRTH = int(TrackState.BIRTH)
+BIRTH, ALIVE = int(TrackState.BIRTH), int(TrackState.ALIVE)
+LEAST = 1e-12
+"""Bound of inverse odds: however long an object was watched, a dozen misses may undo it."""
 FAST = 2.33
 """Standard deviations above the threshold from which a speed is above it: one error in a hundred."""
 DISPLACED = 30.66
@@ -117,6 +121,14 @@ def settle(t: Tracklets, i: int, frame: Frame, j: int, rules: Rules, spells: Spe
     return n_spells
 
 
+@inlined
+def believed(t: Tracklets, i: int, rules: Rules) -> bool:
+    """Return whether a tracklet is to be confirmed: by its scores, or without them by detections and belief."""
+    if t.level.shape[1] and t.level[i, LEVEL] < np.inf:
+        return log_odds_real(t, i, rules) >= rules.log_odds_believed
+    return bool(t.n_hits[i] >= rules.warm_up and t.inverse_odds[i] <= rules.odds_confirm)
+
+
 @kernel
 def start(t: Tracklets, i: int, track_id: int, frame: Frame, j: int, confusion: FloatArray, rules: Rules) -> None:
     """Begin a tracklet in row `i` with detection `j`: at rest as far as anybody knows, of any class that fits."""
@@ -124,31 +136,46 @@ def start(t: Tracklets, i: int, track_id: int, frame: Frame, j: int, confusion: 
     t.state[i] = BIRTH
     t.class_p[i] = 1.0 / t.class_p.shape[1]
     t.appearance[i] = 0.0
-    place_filter(t, i, frame.position[j], noise_of(frame, j), rules)
+    reset_filter(t, i, frame, j, rules)
+    if t.box.shape[1]:
+        begin_shape(t.box[i], frame.box[j], frame.box_noise[j])
     detected = frame.class_id[j]
     if detected >= 0:
         t.class_p[i] *= confusion[:, detected]
         t.class_p[i] /= max(t.class_p[i].sum(), 1e-300)
     t.appearance[i] = frame.appearance[j]
     t.inverse_odds[i] = rules.inverse_odds_new
+    if t.level.shape[1]:
+        begin_level(t, i, frame.level[j, 0])
+        if frame.level[j, 0] < np.inf:  # something is there; what the score doubts is that it is real
+            t.inverse_odds[i] = LEAST
     t.n_hits[i] = 1
     t.n_missed[i] = 0
     t.first_s[i] = frame.stamp_s
     t.elsewhere_s[i] = -np.inf
     t.slow[i] = 0
     start_rest(t, i, frame.stamp_s, frame.position[j], noise_of(frame, j))
+    if believed(t, i, rules):
+        t.state[i] = ALIVE
 
 
 @kernel
-def place_filter(t: Tracklets, i: int, position: FloatArray, covariance: FloatArray, rules: Rules) -> None:
-    """Set a filter to a position, and its derivatives to their usual spread."""
+def reset_filter(t: Tracklets, i: int, frame: Frame, j: int, rules: Rules) -> None:
+    """Set a filter to a detection, and its derivatives to their usual spread: along a box its length counts."""
     t.mean[i] = 0.0
     t.covariance[i] = 0.0
-    t.mean[i, :3] = position
-    t.covariance[i, :3, :3] = covariance
+    t.mean[i, :3] = frame.position[j]
+    t.covariance[i, :3, :3] = noise_of(frame, j)
     for k in range(3, t.mean.shape[1]):
         sigma = rules.sigma_velocity_mps if k < 6 else rules.sigma_acceleration_mps2
         t.covariance[i, k, k] = sigma * sigma
+    if t.box.shape[1]:
+        c, s = math.cos(frame.box[j, YAW]), math.sin(frame.box[j, YAW])
+        more = (rules.speed_per_length_hz * frame.box[j, 0]) ** 2
+        t.covariance[i, 3, 3] += more * c * c
+        t.covariance[i, 4, 4] += more * s * s
+        t.covariance[i, 3, 4] += more * c * s
+        t.covariance[i, 4, 3] += more * c * s
 
 
 @kernel

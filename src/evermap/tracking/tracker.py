@@ -15,9 +15,22 @@ from evermap.config import TrackerConfig
 from evermap.errors import ConfigError, InputError
 from evermap.show import Shown, draw
 from evermap.survival import GeneralPurpose, LifetimePrior
-from evermap.tracking.frame import Frame, appearances, classes, covariances, positions
+from evermap.tracking.frame import Frame, appearances, boxes, classes, covariances, positions, probabilities
 from evermap.tracking.record import Event, Followed, SpellLog, StaticSpells
-from evermap.tracking.tracklets import EventKind, EventTable, Rules, SpellTable, TrackState, grown, room_for, sweep
+from evermap.tracking.tracklets import (
+    N_DETECTED,
+    N_FILTERED,
+    N_LEVEL,
+    VARIANCE,
+    EventKind,
+    EventTable,
+    Rules,
+    SpellTable,
+    TrackState,
+    grown,
+    room_for,
+    sweep,
+)
 from evermap.tracking.views import View, ViewMemory
 from evermap.tracking.working_set import KEPT, WorkingSet
 from evermap.types import UNKNOWN, FloatArray, IntArray
@@ -38,6 +51,8 @@ class Tracker(Shown):
         n_classes: number of classes.
         confusion: (C, C) `P(detected class | true class)`, a row a true class; equal mistakes where None.
         n_appearance: length of the appearance vectors that come with detections, 0 for none.
+        boxes: whether detections are boxes rather than points.
+        scored: whether detections come with probabilities to be real.
         priors: lifetimes at rest, one for all classes or one a class; one that knows nothing where None.
 
     Raises:
@@ -51,15 +66,19 @@ class Tracker(Shown):
         n_classes: int = 1,
         confusion: FloatArray | None = None,
         n_appearance: int = 0,
+        boxes: bool = False,
+        scored: bool = False,
         priors: LifetimePrior | Sequence[LifetimePrior] | None = None,
     ) -> None:
-        from evermap.tracking import association, kalman, life, rows
+        from evermap.tracking import association, kalman, life, rows, scores, shape
 
         if n_classes < 1:
             raise ConfigError(f"{n_classes} classes", field="n_classes", hint="at least 1")
         self._association, self._kalman, self._life, self._rows = association, kalman, life, rows
+        self._scores, self._shape = scores, shape
         self.settings = s = settings or TrackerConfig()
         self._n_classes, self._n_appearance = n_classes, n_appearance
+        self._boxes, self._scored = boxes, scored
         lifetimes = _as_priors(priors, n_classes)
         self._likelihood = association.Likelihood(
             confusion=s.confusion_matrix(n_classes, confusion),
@@ -77,25 +96,15 @@ class Tracker(Shown):
             self._likelihood_at_rest = self._likelihood._replace(
                 moved_reach_m=float(s.moved_reach_m), log_moved=float(np.log(s.p_moved / volume_m3))
             )
-        self._rules = Rules(
-            odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
-            odds_dead=(1.0 - s.p_dead) / s.p_dead,
-            warm_up=int(s.warm_up),
-            lost_after=int(s.lost_after),
-            max_missed=int(s.max_missed),
-            class_speed_mps=s.class_speeds(n_classes).copy(),  # a read-only array would have all kernels compiled twice
-            rest_for_s=float(s.rest_for_s),
-            appearance_memory=float(s.appearance_memory),
-            sigma_velocity_mps=float(s.sigma_velocity_mps),
-            sigma_acceleration_mps2=float(s.sigma_acceleration_mps2),
-            inverse_odds_new=(1.0 - s.p_real) / s.p_real,
-        )
+        self._rules = _rules(s, n_classes)
         self._noise = np.eye(3)[None] * s.sigma_position_m**2
-        self._tracklets = room_for(ROOM, s.order, n_classes, n_appearance)
+        self._tracklets = room_for(ROOM, s.order, n_classes, n_appearance, boxes=boxes, scored=scored)
         self._n = 0
         self._next_id = 0
         self._stamp_s = -np.inf
-        self.working_set = WorkingSet(s.chunk_m, lifetimes, n_classes, n_appearance)
+        self.working_set = WorkingSet(
+            s.chunk_m, lifetimes, n_classes, n_appearance, n_box=N_FILTERED * boxes, n_level=N_LEVEL * scored
+        )
         self._views = ViewMemory()
         self._spells = SpellLog()
         self._tables(ROOM)
@@ -110,6 +119,8 @@ class Tracker(Shown):
         position_m: Any,
         class_id: Any = None,
         *,
+        box: Any = None,
+        p_real: Any = None,
         covariance_m2: Any = None,
         appearance: Any = None,
         view: View | None = None,
@@ -120,6 +131,8 @@ class Tracker(Shown):
             stamp_s: when, after the frame before.
             position_m: (M, 3) detected centroids, in the world.
             class_id: (M,) detected classes, `UNKNOWN` for none; all unknown where None.
+            box: (M, 4) length, width, height [m] and heading in the world [rad], of a tracker of boxes.
+            p_real: (M,) probabilities by the detector's scores to be real (`scores.p_real_of`), nan for none.
             covariance_m2: (M, 3, 3) of the positions; the settings' noise where None.
             appearance: (M, A) vectors of any length, zeros where there is none.
             view: what can be seen. Without it all that is followed is in view, and nothing is learned about the
@@ -131,12 +144,12 @@ class Tracker(Shown):
         Raises:
             InputError: time running back, or detections that are malformed.
         """
-        frame = self._frame(stamp_s, position_m, class_id, covariance_m2, appearance)
+        frame = self._frame(stamp_s, position_m, class_id, box, p_real, covariance_m2, appearance)
         events: list[Event] = []
         self._predict(frame.stamp_s)
         track_of_detection = self._associate(frame, view, events)
         self._find_again(frame, view, track_of_detection, events)
-        self._begin(frame, track_of_detection)
+        self._begin(frame, track_of_detection, events)
         if view is not None:
             self._judge(frame.stamp_s, view, events)
             self._views.add(frame.stamp_s, view)
@@ -145,6 +158,7 @@ class Tracker(Shown):
     def followed(self) -> Followed:
         """Return the active tracklets after the last frame."""
         t, n = self._tracklets, self._n
+        p_real = self._scores.p_real(t, n, self._rules)
         return Followed(
             stamp_s=self._stamp_s,
             track_id=t.track_id[:n].copy(),
@@ -154,7 +168,9 @@ class Tracker(Shown):
             position_covariance_m2=t.covariance[:n, :3, :3].copy(),
             velocity_covariance_m2ps2=t.covariance[:n, 3:6, 3:6].copy(),
             class_p=t.class_p[:n].copy(),
-            p_exists=1.0 / (1.0 + t.inverse_odds[:n]),
+            p_exists=p_real / (1.0 + t.inverse_odds[:n]),
+            box=t.box[:n, :N_DETECTED].copy(),
+            box_variance=t.box[:n, VARIANCE : VARIANCE + N_DETECTED].copy(),
             n_missed=t.n_missed[:n].copy(),
             static=t.static[:n] == 1,
         )
@@ -184,7 +200,9 @@ class Tracker(Shown):
         """Return all static spells so far: those that have ended, and those that go on, whose end is open."""
         return self._spells.with_open(self._tracklets, self._n, self.working_set)
 
-    def _frame(self, stamp_s: Any, position_m: Any, class_id: Any, covariance_m2: Any, appearance: Any) -> Frame:
+    def _frame(
+        self, stamp_s: Any, position_m: Any, class_id: Any, box: Any, p_real: Any, covariance_m2: Any, appearance: Any
+    ) -> Frame:
         stamp = float(stamp_s)
         if not (stamp > self._stamp_s and stamp < np.inf):
             raise InputError(
@@ -194,13 +212,26 @@ class Tracker(Shown):
             )
         position = positions(position_m)
         m = len(position)
+        shape = boxes(box, m) if self._boxes else np.empty((m, 0))
+        faces = self._shape.face_sigma(shape[:, :3], self.settings.sigma_face_m, self.settings.sigma_face_share)
+        noise = self._shape.noise_of_centres(shape, faces) if self._boxes and m else self._noise
         return Frame(
             stamp_s=stamp,
             position=position,
-            noise=covariances(covariance_m2, m, self._noise),
+            noise=covariances(covariance_m2, m, noise),
             class_id=classes(class_id, m, self._n_classes),
             appearance=appearances(appearance, m, self._n_appearance),
+            box=shape,
+            box_noise=self._shape.noise_of_shapes(shape, faces) if self._boxes else shape,
+            level=self._level(p_real, m),
         )
+
+    def _level(self, p_real: Any, m: int) -> FloatArray:
+        """(M, 1) log odds that detections are real, inf where nothing is known of that; (M, 0) without scores."""
+        if not self._scored:
+            return np.empty((m, 0))
+        p = np.clip(probabilities(p_real, m)[:, None], 1e-9, 1.0 - 1e-9)
+        return np.where(np.isnan(p), np.inf, np.log(p / (1.0 - p)))
 
     def _predict(self, stamp_s: float) -> None:
         """Move all filters on to the frame."""
@@ -208,6 +239,8 @@ class Tracker(Shown):
         self._stamp_s = stamp_s
         t = self._tracklets
         self._kalman.predict(t.mean, t.covariance, self._n, gap, self.settings.motion_density)
+        if self._boxes:
+            self._shape.predict_shapes(t.box, self._n, gap)
         self._death_odds = float(np.expm1(min(self.settings.vanish_rate_hz * gap, 600.0)))
 
     def _associate(self, frame: Frame, view: View | None, events: list[Event]) -> IntArray:
@@ -221,8 +254,8 @@ class Tracker(Shown):
         n_events, n_spells, n_gone = self._life.live(t, n, frame, in_sight, self._likelihood, self._rules, happened)
         for kind, row in zip(table.kind[:n_events].tolist(), table.row[:n_events].tolist(), strict=True):
             events.append(Event(frame.stamp_s, EventKind(kind), int(t.track_id[row])))
-            if kind == EventKind.BORN and np.isneginf(t.elsewhere_s[row]):
-                t.elsewhere_s[row] = self._views.last_empty_s(t.rest_mean[row], float(t.first_s[row]))
+            if kind == EventKind.BORN:
+                self._bound_arrival(row)
         self._spells.add(self._spell_table, n_spells)
         if n_gone:
             leaving = np.flatnonzero(t.state[:n] == TrackState.WORKING_SET)
@@ -250,14 +283,26 @@ class Tracker(Shown):
         covariance[:, [0, 1, 2], [0, 1, 2]] += place_m2
         place = w.stored.position[rows]
         p_detect = np.full(len(rows), s.p_detect) if view is None else view.probability(place)
-        appearance, inverse_odds = w.stored.appearance[rows].astype(np.float64), w.inverse_odds(rows, frame.stamp_s)
+        appearance, box = (column[rows].astype(np.float64) for column in (w.stored.appearance, w.stored.box))
+        inverse_odds = w.inverse_odds(rows, frame.stamp_s)
         found, detection, log_ratio, moved = self._life.match(
-            self._association.Targets(place, covariance, w.class_p(rows), appearance, inverse_odds, p_detect),
+            self._association.Targets(
+                place,
+                covariance,
+                w.class_p(rows),
+                appearance,
+                box,
+                inverse_odds,
+                p_detect,
+            ),
             frame._replace(
                 position=position,
                 noise=np.ascontiguousarray(noise),
                 class_id=frame.class_id[free],
                 appearance=frame.appearance[free],
+                box=frame.box[free],
+                box_noise=frame.box_noise[free],
+                level=frame.level[free],
             ),
             self._likelihood_at_rest,
         )
@@ -285,10 +330,10 @@ class Tracker(Shown):
         for name in KEPT:
             getattr(t, name)[into] = getattr(w.stored, name)[rows]
         t.class_p[into] = w.class_p(rows)
-        t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._life.LEAST)
+        t.inverse_odds[into] = np.maximum(w.inverse_odds(rows, stamp_s) * gain, self._rows.LEAST)
         t.rest_mean[into], t.rest_covariance[into] = w.stored.position[rows], covariance
 
-    def _begin(self, frame: Frame, track_of_detection: IntArray) -> None:
+    def _begin(self, frame: Frame, track_of_detection: IntArray, events: list[Event]) -> None:
         """A new tracklet for every detection that nobody had, in the order of their places."""
         free = np.flatnonzero(track_of_detection == UNKNOWN)
         if len(free) == 0:
@@ -299,8 +344,18 @@ class Tracker(Shown):
             self._tracklets, self._n, self._next_id, frame, free, self._likelihood.confusion, self._rules,
             track_of_detection,
         )  # fmt: skip
+        at_once = self._n + np.flatnonzero(self._tracklets.state[self._n : self._n + len(free)] == TrackState.ALIVE)
         self._n += len(free)
         self._next_id += len(free)
+        for row in at_once.tolist():
+            events.append(Event(frame.stamp_s, EventKind.BORN, int(self._tracklets.track_id[row])))
+            self._bound_arrival(row)
+
+    def _bound_arrival(self, row: int) -> None:
+        """Note when the place of a tracklet that is confirmed was last seen empty."""
+        t = self._tracklets
+        if np.isneginf(t.elsewhere_s[row]):
+            t.elsewhere_s[row] = self._views.last_empty_s(t.rest_mean[row], float(t.first_s[row]))
 
     def _judge(self, stamp_s: float, view: View, events: list[Event]) -> None:
         """Objects of the working set that should have been seen, and were not."""
@@ -333,6 +388,28 @@ class Tracker(Shown):
         self._spell_table = SpellTable(
             np.empty(room, dtype=np.int64), np.empty(room, dtype=np.int64), np.empty((room, 3)), np.empty((room, 4))
         )
+
+
+def _rules(s: TrackerConfig, n_classes: int) -> Rules:
+    """Numbers of the settings, as kernels take them."""
+    return Rules(
+        odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
+        odds_dead=(1.0 - s.p_dead) / s.p_dead,
+        warm_up=int(s.warm_up),
+        lost_after=int(s.lost_after),
+        max_missed=int(s.max_missed),
+        class_speed_mps=s.class_speeds(n_classes).copy(),  # a read-only array would have all kernels compiled twice
+        rest_for_s=float(s.rest_for_s),
+        appearance_memory=float(s.appearance_memory),
+        sigma_velocity_mps=float(s.sigma_velocity_mps),
+        sigma_acceleration_mps2=float(s.sigma_acceleration_mps2),
+        inverse_odds_new=(1.0 - s.p_real) / s.p_real,
+        speed_per_length_hz=float(s.speed_per_length_hz),
+        score_memory=float(s.score_memory),
+        seen_nats=float(s.seen_nats),
+        missed_nats=float(s.missed_nats),
+        log_odds_believed=float(np.log(s.p_believed / (1.0 - s.p_believed))),
+    )
 
 
 def _as_priors(priors: LifetimePrior | Sequence[LifetimePrior] | None, n_classes: int) -> tuple[LifetimePrior, ...]:

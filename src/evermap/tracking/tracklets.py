@@ -39,6 +39,12 @@ class EventKind(IntEnum):
     DIED = 5
 
 
+N_DETECTED, N_FILTERED, N_LEVEL = 4, 9, 3
+"""Numbers of a detected box, of one in the state, and of what scores say."""
+YAW, VARIANCE, FORWARD = 3, 4, 8
+"""Where a box in the state has its heading, its four variances, and the log odds that the heading is not opposite."""
+
+
 class Rules(NamedTuple):
     """When tracklets change their state; see `TrackerConfig`."""
 
@@ -53,6 +59,11 @@ class Rules(NamedTuple):
     sigma_velocity_mps: float
     sigma_acceleration_mps2: float
     inverse_odds_new: float
+    speed_per_length_hz: float
+    log_odds_believed: float
+    score_memory: float
+    seen_nats: float
+    missed_nats: float
 
 
 class Tracklets(NamedTuple):
@@ -66,6 +77,9 @@ class Tracklets(NamedTuple):
         mean: (N, D) filtered motion; covariance: (N, D, D).
         class_p: (N, C) posterior over classes.
         appearance: (N, A) unit vectors, zeros where none was given.
+        box: (N, 9) size and heading as `shape` says, (N, 0) of points.
+        level: (N, 3) mean log odds of its detections to be real, their weight, and what misses since the last one take
+            from them, see `scores`; (N, 0) where detections have no scores.
         inverse_odds: (N,) `(1 - p) / p` of being a real object that is there.
         n_hits: (N,) detections so far; n_missed: (N,) frames in a row without one.
         first_s: (N,) first detection.
@@ -82,6 +96,8 @@ class Tracklets(NamedTuple):
     covariance: FloatArray
     class_p: FloatArray
     appearance: FloatArray
+    box: FloatArray
+    level: FloatArray
     inverse_odds: FloatArray
     n_hits: IntArray
     n_missed: IntArray
@@ -95,11 +111,13 @@ class Tracklets(NamedTuple):
     slow: IntArray
 
 
-def room_for(n: int, order: int, n_classes: int, n_appearance: int) -> Tracklets:
+def room_for(
+    n: int, order: int, n_classes: int, n_appearance: int, *, boxes: bool = False, scored: bool = False
+) -> Tracklets:
     """Return room for `n` tracklets, with `order` derivatives of the position, itself included."""
     d = 3 * order
     shape = {"mean": (d,), "covariance": (d, d), "class_p": (n_classes,), "appearance": (n_appearance,)}
-    shape |= {"rest_mean": (3,), "rest_covariance": (3, 3)}
+    shape |= {"rest_mean": (3,), "rest_covariance": (3, 3), "box": (N_FILTERED * boxes,), "level": (N_LEVEL * scored,)}
     whole = {"track_id", "state", "n_hits", "n_missed", "static", "slow"}
     columns: dict[str, Any] = {
         name: np.zeros((n, *shape.get(name, ())), np.int64 if name in whole else np.float64)

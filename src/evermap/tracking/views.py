@@ -48,6 +48,18 @@ class View:
 
         return cls(centre_m, reach_m, within)
 
+    @classmethod
+    def sector(cls, centre_m: FloatArray, reach_m: float, p_detect: float, yaw_rad: float, fov_rad: float) -> Self:
+        """Return such a view of a sensor that looks along `yaw_rad` and sees the angle `fov_rad`, at any height."""
+
+        def within(position_m: FloatArray) -> FloatArray:
+            off = position_m - centre_m
+            turn = np.remainder(np.arctan2(off[:, 1], off[:, 0]) - yaw_rad + np.pi, 2.0 * np.pi) - np.pi
+            inside = (np.linalg.norm(off, axis=1) <= reach_m) & (np.abs(turn) <= 0.5 * fov_rad)
+            return np.where(inside, p_detect, 0.0)
+
+        return cls(centre_m, reach_m, within)
+
     def probability(self, position_m: FloatArray) -> FloatArray:
         """Return (N,) `p_detect`, checked.
 

@@ -26,6 +26,7 @@ class Stored(NamedTuple):
         position: (N, 3) place of rest; covariance: (N, 6) its covariance, upper triangle.
         class_id: (N,) the most probable class, and class_p: (N,) its probability; the others share the rest.
         appearance: (N, A) unit vectors.
+        box: (N, 9) size and heading; level: (N, 3) belief by scores; as in `Tracklets`.
         inverse_odds: (N,) of being there still, at `judged_s`.
         n_hits: (N,) detections.
         first_s, rest_seen_s, rest_since_s, elsewhere_s, static: (N,) as in `Tracklets`.
@@ -39,6 +40,8 @@ class Stored(NamedTuple):
     class_id: NDArray[np.int16]
     class_p: NDArray[np.float32]
     appearance: NDArray[np.float16]
+    box: NDArray[np.float32]
+    level: NDArray[np.float32]
     inverse_odds: FloatArray
     n_hits: NDArray[np.int32]
     first_s: FloatArray
@@ -50,11 +53,12 @@ class Stored(NamedTuple):
     following: NDArray[np.int32]
 
 
-def empty_rows(n: int, n_appearance: int) -> Stored:
-    """Return room for `n` objects with appearances of a length."""
+def empty_rows(n: int, n_appearance: int, n_box: int = 0, n_level: int = 0) -> Stored:
+    """Return room for `n` objects with appearances of a length, and with boxes and scores or without."""
     sizes: dict[str, tuple[Any, ...]] = {
         "track_id": (np.int64,), "position": (np.float64, 3), "covariance": (np.float32, 6), "class_id": (np.int16,),
-        "class_p": (np.float32,), "appearance": (np.float16, n_appearance), "n_hits": (np.int32,), "static": (np.int8,),
+        "class_p": (np.float32,), "appearance": (np.float16, n_appearance), "box": (np.float32, n_box),
+        "level": (np.float32, n_level), "n_hits": (np.int32,), "static": (np.int8,),
         "following": (np.int32,),
     }  # fmt: skip
     columns = {name: sizes.get(name, (np.float64,)) for name in Stored._fields}
@@ -63,7 +67,10 @@ def empty_rows(n: int, n_appearance: int) -> Stored:
     return rows
 
 
-KEPT = ("track_id", "appearance", "n_hits", "first_s", "rest_seen_s", "rest_since_s", "elsewhere_s", "static")
+KEPT = (
+    "track_id", "appearance", "box", "level", "n_hits", "first_s", "rest_seen_s", "rest_since_s", "elsewhere_s",
+    "static",
+)  # fmt: skip
 """Columns that an object keeps as it goes into the working set and comes back."""
 
 
@@ -77,14 +84,23 @@ class WorkingSet:
         n_appearance: length of appearance vectors.
     """
 
-    def __init__(self, chunk_m: float, priors: tuple[LifetimePrior, ...], n_classes: int, n_appearance: int) -> None:
+    def __init__(
+        self,
+        chunk_m: float,
+        priors: tuple[LifetimePrior, ...],
+        n_classes: int,
+        n_appearance: int,
+        *,
+        n_box: int = 0,
+        n_level: int = 0,
+    ) -> None:
         from evermap.tracking import grid as chunks
 
         self._chunks = chunks
         self._chunk_m = chunk_m
         self._priors = priors
         self._n_classes = n_classes
-        self._stored = empty_rows(SMALLEST_ROOM, n_appearance)
+        self._stored = empty_rows(SMALLEST_ROOM, n_appearance, n_box, n_level)
         self._head = np.full(SMALLEST_ROOM, chunks.END, dtype=np.int32)
         self._free: list[int] = []
         self._n_used = 0
@@ -198,7 +214,8 @@ class WorkingSet:
         size = before = len(self._head)
         while size < n:
             size *= 2
-        room = empty_rows(size, self._stored.appearance.shape[1])
+        s = self._stored
+        room = empty_rows(size, s.appearance.shape[1], s.box.shape[1], s.level.shape[1])
         for name in Stored._fields[:-1]:
             getattr(room, name)[:before] = getattr(self._stored, name)
         self._stored = room

@@ -122,7 +122,7 @@ def plot_track_run(result: Any) -> Figure:
 
 def _paths(result: Any) -> list[tuple[int, FloatArray]]:
     """Class and (K, 2) positions of each stretch in which an object was followed and did not rest."""
-    tracks = result.tracks
+    tracks = result.objects()
     frame = np.searchsorted(result.table.stamp_s, tracks.stamp_s)
     rows = np.flatnonzero(~tracks.static)
     ends = np.flatnonzero((np.diff(tracks.track_id[rows]) != 0) | (np.diff(frame[rows]) != 1)) + 1

@@ -66,7 +66,10 @@ def test_appearances_of_some(tmp_path: Path) -> None:
         (f"{HEAD}\n1e15,2,0,0\n", "stamps in seconds, not in milli- or nanoseconds"),
         ("stamp_s,x_m,y_m\n1,2,3\n", "field 'z_m': missing column"),
         (f"{HEAD},classid\n1,2,0,0,car\n", "unknown column (try: class_id)"),
-        (f"{HEAD},score\n1,2,0,0,93\n", ":2: field 'score': 93 is outside [0, 1]"),
+        (f"{HEAD},score\n1,2,0,0,high\n", ":2: field 'score': 'high' is not a number"),
+        (f"{HEAD},length_m\n1,2,0,0,1\n", "field 'width_m': missing column"),
+        (f"{HEAD},length_m,width_m,height_m,yaw_rad\n1,2,0,0,4,2,0,1\n", ":2: field 'height_m': 0 where"),
+        (f"{HEAD},length_m,width_m,height_m,yaw_rad\n1,2,0,0,4,2,1,\n", ":2: field 'yaw_rad': is empty (try: all four"),
         (f"{HEAD},cov_xx_m2\n1,2,0,0,1\n", "field 'cov_xy_m2': missing column"),
         (
             f"{HEAD},cov_xx_m2,cov_xy_m2,cov_xz_m2,cov_yy_m2,cov_yz_m2,cov_zz_m2\n1,2,0,0,1,2,0,1,0,1\n",

@@ -24,11 +24,21 @@ SENSOR = tuple(
     for name in ("sensor_x_m", "sensor_y_m", "sensor_z_m")
 )
 SIGMA = Quantity("sigma_m", 0.0, 1e6, positive=True, optional=True, hint="metres; empty where unknown")
-SCORE = Quantity("score", 0.0, 1.0, optional=True, hint="the detector's confidence, between 0 and 1")
+SCORE = Quantity("score", -1e9, 1e9, optional=True, hint="the detector's confidence, on any scale")
+SIZE = tuple(
+    Quantity(name, 0.0, 1e4, positive=True, optional=True, hint="metres, in every row with a position")
+    for name in ("length_m", "width_m", "height_m")
+)
+YAW = Quantity("yaw_rad", -1e4, 1e4, optional=True, hint="radians, anticlockwise from x")
+BOX = (*SIZE, YAW)
+IMAGE_BOX = ("left_px", "top_px", "right_px", "bottom_px")
+"""Columns of a detector's box in the image, which nothing here needs."""
 COVARIANCE = tuple(f"cov_{axes}_m2" for axes in ("xx", "xy", "xz", "yy", "yz", "zz"))
-_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
-_OPTIONAL = ("class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in SENSOR))
+_OPTIONAL = (
+    "class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in (*BOX, *SENSOR)), *IMAGE_BOX,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +54,9 @@ class DetectionTable:
         covariance_m2: (M, 3, 3) of the positions, nan where none is given; None if nowhere.
         appearance: (M, A) vectors, zeros where there is none; None if nowhere.
         sensor_m: (F, 3) where the sensor was; None where the table does not say.
+        box: (M, 4) length, width, height [m] and heading in the world [rad]; None where detections are points.
+        score: (M,) the detector's, nan where none is given; None where the table has none.
+        sensor_yaw_rad: (F,) where the sensor looked; None where the table is in the world.
         line: (M,) line of each detection in the file.
         source: file it came from, '' if none.
         n_weak: detections left out because of their score.
@@ -60,6 +73,9 @@ class DetectionTable:
     sensor_m: FloatArray | None
     line: IntArray
     source: str
+    box: FloatArray | None = None
+    score: FloatArray | None = None
+    sensor_yaw_rad: FloatArray | None = None
     n_weak: int = 0
     warnings: tuple[str, ...] = ()
 
@@ -72,9 +88,9 @@ class DetectionTable:
         return len(self.position_m)
 
 
-def read_detections(path: str | Path, *, min_score: float = 0.0) -> DetectionTable:
-    """Return a table with `stamp_s, x_m, y_m, z_m` and perhaps class, covariance, score, appearance and the sensor's
-    position.
+def read_detections(path: str | Path, *, min_score: float | None = None) -> DetectionTable:
+    """Return a table with `stamp_s, x_m, y_m, z_m` and perhaps class, box, covariance, score, appearance and the
+    sensor's position.
 
     A row without a position is a frame in which nothing was detected.
 
@@ -120,13 +136,35 @@ def read_detections(path: str | Path, *, min_score: float = 0.0) -> DetectionTab
         sensor_m=_sensor(table, frame, len(frames)),
         line=table.line[rows],
         source=str(path),
+        box=_boxes(table, rows),
+        score=table.numbers(SCORE)[rows] if SCORE.name in table else None,
         n_weak=int((kept & ~strong).sum()),
         warnings=tuple(warnings),
     )
 
 
-def _strong(table: Columns, min_score: float) -> BoolArray:
+def _boxes(table: Columns, rows: IntArray) -> FloatArray | None:
+    """(M, 4) sizes and headings."""
+    named = [quantity.name for quantity in BOX if quantity.name in table]
+    if not named:
+        return None
+    for quantity in BOX:
+        if quantity.name not in table:
+            hint = "length_m, width_m, height_m and yaw_rad, or none of them"
+            raise table.error("missing column", row=None, field=quantity.name, hint=hint)
+    box = np.stack([table.numbers(quantity) for quantity in BOX], axis=1)[rows]
+    missing = np.argwhere(np.isnan(box))
+    if len(missing):
+        row, column = (int(k) for k in missing[0])
+        hint = "all four, in every row with a position"
+        raise table.error("is empty", row=int(rows[row]), field=BOX[column].name, hint=hint)
+    return box
+
+
+def _strong(table: Columns, min_score: float | None) -> BoolArray:
     """(R,) whether the score, where there is one, is high enough."""
+    if min_score is None:
+        return np.ones(len(table), dtype=np.bool_)
     if SCORE.name not in table:
         if min_score > 0.0:
             raise ConfigError("the table has no scores", field="min_score", hint="a column score in the table")
@@ -163,7 +201,7 @@ def _covariances(table: Columns, rows: IntArray) -> FloatArray | None:
         if name not in table:
             raise table.error("missing column", row=None, field=name, hint=f"all of {', '.join(COVARIANCE)}, or none")
     matrix = np.empty((len(rows), 3, 3))
-    for name, (i, j) in zip(COVARIANCE, _ENTRIES, strict=True):
+    for name, (i, j) in zip(COVARIANCE, ENTRIES, strict=True):
         matrix[:, i, j] = matrix[:, j, i] = table.numbers(Quantity(name, -1e12, 1e12, optional=True))[rows]
     given = ~np.isnan(matrix)
     whole = np.atleast_1d(given.all(axis=(1, 2)))

@@ -19,8 +19,10 @@ from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
+from evermap.tracking.frame import p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
 from evermap.tracking.tracker import Tracker
+from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
@@ -38,7 +40,8 @@ class TrackResult(Shown):
     Attributes:
         table: what was tracked.
         config: the choices.
-        tracks: of objects that were confirmed, one row an object and frame.
+        tracks: one row an object and frame: of objects that were confirmed, sooner or later; where detections have
+            scores of all that were followed, as long as they were at all likely (`p_dead`), as it was said at once.
         track_of_detection: (M,) the object that each detection is of, `UNKNOWN` for one never confirmed.
         events: all that happened, in order.
         spells: times at which objects were seen to rest for at least `rest_for_s`.
@@ -88,14 +91,20 @@ class TrackResult(Shown):
             "warnings": self.warnings,
         }
 
+    def objects(self) -> Tracks:
+        """Return the rows of `tracks` that are of objects that were confirmed, sooner or later."""
+        t = self.tracks
+        return t[np.isin(t.track_id, t.track_id[t.state != TrackState.BIRTH])]
+
     def first_rows(self) -> IntArray:
-        """Return (T,) row of `tracks` at which each object begins."""
-        return np.unique(self.tracks.track_id, return_index=True)[1]
+        """Return (T,) row of `objects()` at which each object begins."""
+        return np.unique(self.objects().track_id, return_index=True)[1]
 
     def class_of_track(self) -> IntArray:
         """Return (T,) most probable class of each object in the end, in the order of their ids."""
-        ends = np.append(self.first_rows()[1:], len(self.tracks)) - 1
-        return np.asarray(self.tracks.class_p[ends].argmax(axis=1), dtype=np.int64)
+        objects = self.objects()
+        ends = np.append(self.first_rows()[1:], len(objects)) - 1
+        return np.asarray(objects.class_p[ends].argmax(axis=1), dtype=np.int64)
 
 
 def run_track(
@@ -121,25 +130,30 @@ def run_track(
     if config.range_m is not None and table.sensor_m is None:
         hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
         raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
+    if config.fov_deg is not None and (config.range_m is None or table.sensor_yaw_rad is None):
+        hint = "`range_m`, and a folder with poses in `odometry`"
+        raise ConfigError("what the sensor sees is unknown", field="fov_deg", hint=hint)
     names = table.class_names
     tracker = Tracker(
         config.model_copy(update={"class_speed_mps": _speeds(config, names)}),
         n_classes=len(names),
         confusion=confusion,
         n_appearance=0 if table.appearance is None else table.appearance.shape[1],
+        boxes=table.box is not None,
+        scored=table.score is not None,
         priors=_priors(config, names),
     )
     start = perf_counter()
     recorder, track_of_detection, n_gaps = _follow(tracker, table, config, progress)
-    tracks = recorder.tracks()
-    if len(tracks) == 0:
+    tracks = recorder.tracks() if table.score is None else recorder.at_once(config.p_dead)
+    if not (tracks.state != TrackState.BIRTH).any():
         hint = f"fewer detections to be believed: track.warm_up={max(1, config.warm_up - 1)}"
         if _usual_step_s(table) > _SLOW_STEP_S:
             hint = f"more frames: it takes several in a row, and these are {_usual_step_s(table):g} s apart"
         raise DataError("no object was seen often enough to be told from false alarms", path=table.source, hint=hint)
     spells = _long_enough(tracker.static_spells(), config.rest_for_s)
     lifetimes, spell_of_lifetime = _lifetimes(spells, config.rest_for_s)
-    confirmed = np.isin(track_of_detection, tracks.track_id)
+    confirmed = np.isin(track_of_detection, tracks.track_id[tracks.state != TrackState.BIRTH])
     return TrackResult(
         table=table,
         config=config,
@@ -190,12 +204,15 @@ def _follow(
     step_s = _usual_step_s(table)
     gap_s = config.gap_s or config.gap_steps * step_s
     recorder, found, n_gaps = Recorder(), np.full(len(table), UNKNOWN), 0
+    p_real = None if table.score is None else p_real_of(table.score, config.score_midpoint, config.score_scale)
     for k, stamp_s in enumerate(table.stamp_s.tolist()):
         rows = slice(int(table.first[k]), int(table.first[k + 1]))
         found[rows], events = tracker.step(
             stamp_s,
             table.position_m[rows],
             table.class_id[rows],
+            box=None if table.box is None else table.box[rows],
+            p_real=None if p_real is None else p_real[rows],
             covariance_m2=None if noise is None else noise[rows],
             appearance=None if table.appearance is None else table.appearance[rows],
             view=_view(table, config, k),
@@ -212,10 +229,13 @@ def _follow(
 
 
 def _view(table: DetectionTable, config: TrackConfig, k: int) -> View | None:
-    """What could be seen in frame `k`, if that is known: a ball around the sensor."""
+    """What could be seen in frame `k`, if that is known: a ball around the sensor, or a part of it."""
     if config.range_m is None or table.sensor_m is None:
         return None
-    return View.ball(table.sensor_m[k], config.range_m, config.p_detect)
+    if config.fov_deg is None or table.sensor_yaw_rad is None:
+        return View.ball(table.sensor_m[k], config.range_m, config.p_detect)
+    yaw_rad, fov_rad = float(table.sensor_yaw_rad[k]), float(np.radians(config.fov_deg))
+    return View.sector(table.sensor_m[k], config.range_m, config.p_detect, yaw_rad, fov_rad)
 
 
 def _close_eyes(tracker: Tracker, centre_m: FloatArray, stamp_s: float, until_s: float, step_s: float) -> list[Event]:
@@ -278,6 +298,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
 
 def warm_up() -> None:
     """Compile the kernels, or load them: a few frames with one object that comes, stays, goes, and comes back."""
+    Tracker(boxes=True, scored=True).step(0.0, np.zeros((1, 3)), box=np.ones((1, 4)), p_real=np.ones(1))
     tracker = Tracker()
     here, nothing = np.zeros((1, 3)), np.empty((0, 3))
     seen = View.ball(np.zeros(3), 1.0, 0.9)

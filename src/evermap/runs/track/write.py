@@ -15,8 +15,10 @@ from evermap.io.columns import csv_bytes, named
 from evermap.io.table import parquet_bytes
 from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
+from evermap.runs.track.detections import COVARIANCE, ENTRIES
 from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
 from evermap.runs.track.run import TrackResult
+from evermap.tracking.record import BOX_COLUMNS
 from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.types import UNKNOWN, FloatArray, IntArray
 from evermap.viz.plots import plot_track_run
@@ -139,7 +141,23 @@ def _tracks(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] |
         **_axes("v", "_mps", tracks.velocity_mps),
         "p_exists": tracks.p_exists,
         "static": tracks.static.astype(np.int64),
+        **_beliefs(result),
     }
+
+
+def _beliefs(result: TrackResult) -> dict[str, FloatArray]:
+    """Boxes, covariances and scores, where detections have boxes or scores."""
+    tracks, found = result.tracks, {}
+    if result.table.score is not None:
+        p = np.clip(tracks.p_exists, 1e-12, 1.0 - 1e-12)
+        found["score"] = np.log(p / (1.0 - p))
+    if result.table.box is not None:
+        found |= {name: tracks.box[:, k] for k, name in enumerate(BOX_COLUMNS)}
+        sigma = np.sqrt(tracks.box_variance)
+        found |= {f"sigma_{name}": sigma[:, k] for k, name in enumerate(BOX_COLUMNS)}
+        entries = zip(COVARIANCE, ENTRIES, strict=True)
+        found |= {name: tracks.position_covariance_m2[:, i, j] for name, (i, j) in entries}
+    return found
 
 
 def _spells(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
@@ -170,7 +188,7 @@ def _detections(result: TrackResult) -> dict[str, Any]:
 
 def _events(result: TrackResult) -> str:
     """One JSON object a line, of objects that were confirmed."""
-    known = set(np.unique(result.tracks.track_id).tolist())
+    known = set(np.unique(result.objects().track_id).tolist())
     return "".join(
         json.dumps({"stamp_s": event.stamp_s, "event": event.kind.name.lower(), "track_id": event.track_id}) + "\n"
         for event in result.events
@@ -213,7 +231,7 @@ def write_recording(result: TrackResult, path: Path) -> None:
     """
     from evermap.viz.rerun_scene import log_tracks
 
-    table, tracks = result.table, result.tracks
+    table, tracks = result.table, result.objects()
     rows = np.argsort(tracks.stamp_s, kind="stable")
     parts = np.searchsorted(tracks.stamp_s[rows], table.stamp_s[1:])
     log_tracks(
@@ -230,7 +248,7 @@ def write_recording(result: TrackResult, path: Path) -> None:
 
 def _resting(result: TrackResult) -> list[FloatArray]:
     """(F) of (K, 3) places of the objects in the working set at each frame, where they were last seen."""
-    tracks = result.tracks
+    tracks = result.objects()
     place = dict(zip(tracks.track_id.tolist(), tracks.position_m, strict=True))  # the last row of each
     events = iter(sorted(result.events, key=lambda event: event.stamp_s))
     event = next(events, None)

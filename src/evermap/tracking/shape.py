@@ -1,0 +1,120 @@
+"""What is filtered of a box beside its centre: size and heading; and what a detected one says about whose it is.
+
+A box in the state is nine numbers: length, width, height [m], heading [rad], their four variances, and the log odds
+that the heading is right rather than opposite, which detectors confuse. Every number has a filter of its own: sizes are
+constant but for what a changing view does to them, headings turn at random, the faster the shorter the box.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from evermap.tracking.kalman import inlined, kernel
+from evermap.tracking.tracklets import FORWARD, N_DETECTED, VARIANCE, YAW
+from evermap.types import FloatArray
+
+MOST_FORWARD = 7.0
+"""Log odds that a heading may be sure by: two opposite detections in a row shall not turn it, three shall."""
+FORWARD_STEP = 3.0
+"""Log odds of a detection: one of twenty is turned around."""
+OTHER_SIZE = 0.25
+"""Sizes of other objects differ by this share."""
+P_MISSHAPEN = 0.05
+"""Share of detections with a size or a heading that says nothing."""
+TURNING_MPS05 = 0.5
+"""Random walk of a heading: what the end of a box moves sideways in the square root of a second [m]."""
+RESIZING = 0.01
+"""Random walk of a size, as a share of it in the square root of a second."""
+SURE_OF_WAY = 9.0
+"""Squared ratio of the speed along a heading to its deviation from which on the way tells front from back."""
+
+
+@inlined
+def wrapped(angle: float, period: float) -> float:
+    """Return an angle within half a period of zero."""
+    return angle - period * math.floor(angle / period + 0.5)
+
+
+@inlined
+def shape_log_ratio(box: FloatArray, detected: FloatArray, noise: FloatArray) -> float:
+    """Return the log-likelihood ratio of a detected size and heading for this box, over those of any other object."""
+    total = 0.0
+    for k in range(3):
+        v = box[VARIANCE + k] + noise[k]
+        d, other = detected[k] - box[k], (OTHER_SIZE * box[k]) ** 2 + v
+        total += 0.5 * (math.log(other / v) - d * d / v + d * d / other)
+    v = box[VARIANCE + YAW] + noise[YAW]
+    e = wrapped(detected[YAW] - box[YAW], math.pi)
+    total += -0.5 * (e * e / v + math.log(2.0 * math.pi * v)) + math.log(math.pi)
+    return math.log((1.0 - P_MISSHAPEN) * math.exp(min(total, 50.0)) + P_MISSHAPEN)
+
+
+@inlined
+def begin_shape(box: FloatArray, detected: FloatArray, noise: FloatArray) -> None:
+    """Set a box to a detection."""
+    for k in range(N_DETECTED):
+        box[k], box[VARIANCE + k] = detected[k], noise[k]
+    box[FORWARD] = FORWARD_STEP
+
+
+@kernel
+def predict_shapes(box: FloatArray, n: int, gap_s: float) -> None:
+    """Move sizes and headings of the first `n` boxes (N, 9) on, in place."""
+    for i in range(n):
+        for k in range(3):
+            box[i, VARIANCE + k] += (RESIZING * box[i, k]) ** 2 * gap_s
+        turn = TURNING_MPS05 / max(box[i, 0], 0.1)
+        box[i, VARIANCE + YAW] = min(box[i, VARIANCE + YAW] + turn * turn * gap_s, math.pi**2 / 3.0)
+
+
+@inlined
+def update_shape(
+    box: FloatArray, detected: FloatArray, noise: FloatArray, mean: FloatArray, covariance: FloatArray
+) -> None:
+    """Update a box by a detection, and tell its front from its back by the way the object goes."""
+    for k in range(3):
+        gain = box[VARIANCE + k] / (box[VARIANCE + k] + noise[k])
+        box[k] += gain * (detected[k] - box[k])
+        box[VARIANCE + k] *= 1.0 - gain
+    off = wrapped(detected[YAW] - box[YAW], 2.0 * math.pi)
+    around = abs(off) > 0.5 * math.pi
+    gain = box[VARIANCE + YAW] / (box[VARIANCE + YAW] + noise[YAW])
+    box[YAW] += gain * wrapped(off, math.pi)
+    box[VARIANCE + YAW] *= 1.0 - gain
+    box[FORWARD] = min(box[FORWARD] + (-FORWARD_STEP if around else FORWARD_STEP), MOST_FORWARD)
+    c, s = math.cos(box[YAW]), math.sin(box[YAW])
+    along = c * mean[3] + s * mean[4]
+    v = c * c * covariance[3, 3] + 2.0 * c * s * covariance[3, 4] + s * s * covariance[4, 4]
+    if along * along > SURE_OF_WAY * v and abs(along) > box[0] / 4.0:
+        box[FORWARD] = MOST_FORWARD if along > 0.0 else -MOST_FORWARD
+    if box[FORWARD] < 0.0:
+        box[YAW] += math.pi
+        box[FORWARD] = -box[FORWARD]
+    box[YAW] = wrapped(box[YAW], 2.0 * math.pi)
+
+
+def face_sigma(size_m: FloatArray, sigma_m: float, share: float) -> FloatArray:
+    """Return (M, 3) standard deviations of where the faces of boxes (M, 3) are: `sigma_m` and a share of the size."""
+    return np.asarray(sigma_m + share * size_m)
+
+
+def noise_of_shapes(box: FloatArray, face_m: FloatArray) -> FloatArray:
+    """Return (M, 4) variances of detected sizes and headings: a size is the difference of two faces, a heading the
+    angle between two ends.
+    """
+    size = 2.0 * face_m**2
+    return np.column_stack([size, size[:, 0] / np.maximum(box[:, 0], 1e-3) ** 2])
+
+
+def noise_of_centres(box: FloatArray, face_m: FloatArray) -> FloatArray:
+    """Return (M, 3, 3) covariances of detected centres, the mean of two faces each."""
+    c, s = np.cos(box[:, YAW]), np.sin(box[:, YAW])
+    v = 0.5 * face_m**2
+    found = np.zeros((len(box), 3, 3))
+    found[:, 0, 0] = c * c * v[:, 0] + s * s * v[:, 1]
+    found[:, 1, 1] = s * s * v[:, 0] + c * c * v[:, 1]
+    found[:, 0, 1] = found[:, 1, 0] = c * s * (v[:, 0] - v[:, 1])
+    found[:, 2, 2] = v[:, 2]
+    return found

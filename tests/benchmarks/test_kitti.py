@@ -1,0 +1,158 @@
+"""The judge of boxes: overlaps by other means, scores worked out by hand; and the peer on a straight line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.ab3dmot import CLASSES, Ab3dmot, generalised_overlap
+from benchmarks.kitti_score import Clear, Judged, clear, identities, swept, thresholds
+from benchmarks.overlap import overlap
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from benchmarks import kitti
+
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_tracking"
+
+
+def halfspaces(box: np.ndarray) -> np.ndarray:
+    c, s = np.cos(box[6]), np.sin(box[6])
+    axes = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.array(
+        [[*(sign * a), -sign * a @ box[:3] - h / 2] for a, h in zip(axes, box[3:6], strict=True) for sign in (1, -1)]
+    )
+
+
+def volume_by_scipy(a: np.ndarray, b: np.ndarray) -> float:
+    """Of what two boxes share: the hull of the corners of all halfspaces, from a point found by linear programming."""
+    from scipy.optimize import linprog
+
+    sides = np.vstack([halfspaces(a), halfspaces(b)])
+    lengths = np.linalg.norm(sides[:, :3], axis=1)
+    found = linprog(
+        [0, 0, 0, -1], A_ub=np.c_[sides[:, :3], lengths], b_ub=-sides[:, 3], bounds=[(None, None)] * 3 + [(0, None)]
+    )
+    if not found.success or found.x[3] < 1e-9:
+        return 0.0
+    try:
+        return float(ConvexHull(HalfspaceIntersection(sides, found.x[:3]).intersections).volume)
+    except QhullError:
+        return 0.0
+
+
+number = st.floats(-2.0, 2.0)
+size = st.floats(0.3, 4.0)
+boxes = st.tuples(number, number, number, size, size, size, st.floats(-7.0, 7.0)).map(np.array)
+
+
+@given(boxes, boxes)
+def test_overlap_is_that_of_halfspaces(a: np.ndarray, b: np.ndarray) -> None:
+    shared = volume_by_scipy(a, b)
+    both = a[3:6].prod() + b[3:6].prod() - shared
+    assert overlap(a[None], b[None])[0, 0] == pytest.approx(shared / both, abs=1e-6)
+    assert overlap(b[None], a[None])[0, 0] == pytest.approx(overlap(a[None], b[None])[0, 0], abs=1e-9)
+
+
+def test_overlap_of_boxes_by_counting_points() -> None:
+    rng = np.random.default_rng(0)
+    a, b = np.array([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3]), np.array([0.5, 0.4, 0.2, 3.0, 2.5, 1.5, -0.9])
+    point = rng.uniform(-4.0, 4.0, (400_000, 3))
+
+    def inside(box: np.ndarray) -> np.ndarray:
+        sides = halfspaces(box)
+        return np.asarray((point @ sides[:, :3].T + sides[:, 3] <= 0.0).all(axis=1))
+
+    counted = (inside(a) & inside(b)).sum() / (inside(a) | inside(b)).sum()
+    assert overlap(a[None], b[None])[0, 0] == pytest.approx(counted, abs=0.01)
+    assert overlap(a[None], a[None])[0, 0] == pytest.approx(1.0)
+    assert generalised_overlap(a[None], a[None])[0, 0] == pytest.approx(1.0)
+    assert generalised_overlap(a[None], (a + [9, 0, 0, 0, 0, 0, 0])[None])[0, 0] < 0.0
+
+
+def one(
+    label: list[int], track: list[int], pairs: dict[tuple[int, int], float], counted: list[bool] | None = None
+) -> Judged:
+    overlaps = np.zeros((len(label), len(track)))
+    for (g, t), value in pairs.items():
+        overlaps[label.index(g), track.index(t)] = value
+    return Judged(
+        np.array(label, dtype=np.int64), np.array(counted or [True] * len(label), dtype=np.bool_),
+        np.array(track, dtype=np.int64), np.zeros(len(track), dtype=np.bool_), overlaps,
+    )  # fmt: skip
+
+
+SWITCHED = [
+    one([1], [7], {(1, 7): 0.8}),
+    one([1], [7], {(1, 7): 0.6}),
+    one([1], [8], {(1, 8): 0.4}),
+    one([1], [8], {(1, 8): 0.2}),
+]
+"""A label in four frames: track 7 twice, then track 8, at last too far off."""
+
+
+def test_clear_by_hand() -> None:
+    found = clear([SWITCHED], [{7: 5.0, 8: 1.0}], 0.0)
+    assert found[:6] == (4, 3, 1, 1, 1, 0)
+    assert found.mota == pytest.approx(1.0 - 3.0 / 4.0)
+    assert found.motp == pytest.approx((0.8 + 0.6 + 0.4) / 3.0)
+    assert clear([SWITCHED], [{7: 5.0, 8: 1.0}], 2.0)[:6] == (4, 2, 2, 0, 0, 0)
+
+
+def test_what_does_not_count_is_neither_right_nor_wrong() -> None:
+    frames = [one([1, 2], [7, 8], {(1, 7): 0.9, (2, 8): 0.9}, counted=[True, False])] * 3
+    assert clear([frames], [{7: 1.0, 8: 1.0}], 0.0)[:6] == (3, 3, 0, 0, 0, 0)
+    assert identities([frames])["IDF1"] == 1.0
+    excused = [frame._replace(overlap=0.0 * frame.overlap, excused=np.array([False, True])) for frame in frames]
+    assert clear([excused], [{7: 1.0, 8: 1.0}], 0.0)[:4] == (3, 0, 3, 3)
+
+
+def test_hota_and_idf1_by_hand() -> None:
+    """Of one label and two tracks: up to an overlap of .2 four matches, each track has half of the label."""
+    alphas = np.arange(0.05, 0.99, 0.05)
+    hota = []
+    for alpha in alphas:
+        of_7, of_8 = sum(v >= alpha - 1e-9 for v in (0.8, 0.6)), sum(v >= alpha - 1e-9 for v in (0.4, 0.2))
+        right = of_7 + of_8
+        det = right / (8 - right)
+        ass = sum(n * n / (4 + 2 - n) for n in (of_7, of_8)) / max(right, 1)
+        hota.append(np.sqrt(det * ass))
+    found = identities([SWITCHED])
+    assert found["HOTA"] == pytest.approx(np.mean(hota))
+    assert found["IDF1"] == pytest.approx(2 * 2 / (2 * 2 + 2 + 2))
+
+
+def test_recall_is_swept() -> None:
+    assert [recall for _, recall in thresholds([1.0] * 40, 40)] == pytest.approx(np.arange(1, 40) / 40)
+    perfect = [one([1], [7], {(1, 7): 1.0})] * 80
+    found = swept([perfect], [{7: 1.0}])
+    assert found["MOTA"] == 1.0
+    assert found["sAMOTA"] == pytest.approx(1.0)
+    assert Clear(100, 50, 50, 0, 0, 0, 50.0, []).smota(0.5) == 1.0
+
+
+def test_the_peer_follows_a_car_and_its_flips() -> None:
+    peer = Ab3dmot(CLASSES["Car"])
+    for k in range(20):
+        box = np.array([[0.8 * k, 0.0, 0.0, 4.0, 1.6, 1.5, np.pi * (k % 3 == 0)]])
+        ids, found, scores = peer.step(box, np.array([5.0]))
+        assert ids.tolist() == [0]
+        assert overlap(found, box)[0, 0] > 0.8
+        assert scores.tolist() == [5.0]
+    assert [len(peer.step(np.empty((0, 7)), np.empty(0))[0]) for _ in range(3)] == [1, 0, 0]
+
+
+@pytest.mark.data
+def test_ahead_of_the_peer_on_a_recording() -> None:
+    if not RECORDINGS.is_dir():
+        pytest.skip(f"no recordings in {RECORDINGS}")
+    _, shown = kitti.run(RECORDINGS, only=["0004", "0017"])
+    ours, peer = ([shown["classes"][name][who] for name in ("Car", "Pedestrian")] for who in ("evermap", "AB3DMOT"))
+    for mine, theirs in zip(ours, peer, strict=True):
+        for key in ("MOTA", "HOTA", "IDF1"):
+            assert mine["swept"][key] > theirs["swept"][key]
+            assert mine["at_once"][key] > theirs["at_once"][key]
+        assert mine["swept"]["IDS"] == 0
+    assert shown["ms_a_frame"]["evermap"] < 5.0
