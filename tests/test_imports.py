@@ -36,8 +36,8 @@ RULES = {
     "viz": "errors types geometry stamps survival metrics existence",
     "pipeline": "errors types config valid slam maps",
     "runs": (
-        "errors interrupts show types config geometry stamps survival valid io metrics existence maps tracking viz "
-        "pipeline"
+        "errors interrupts show types config geometry stamps survival valid io metrics existence maps "
+        "tracking viz pipeline"
     ),
     "cli": "errors interrupts plugins types config geometry stamps survival io existence slam maps viz pipeline runs",
 }
