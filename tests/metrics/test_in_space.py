@@ -106,6 +106,32 @@ def test_errors_equal_evo_end_to_end():
     assert np.isnan(errors.heading_error_rad).all()
 
 
+def test_what_has_no_pose_is_not_scored_as_evo_does_not():
+    truth = spiral_stair(STAMPS)
+    estimate = noisy(truth, np.random.default_rng(1))
+    seen = (STAMPS < 20.0) | ((STAMPS > 23.0) & (STAMPS < 60.0)) | (STAMPS > 60.5)
+    seen[400:500:3] = False
+    mine = spatial_trajectory(STAMPS[seen] + 1e-7, estimate[seen])  # as a sum of a start and a time since then
+    true = spatial_trajectory(STAMPS, truth)
+    errors = evaluate_trajectory(mine, true, rate_hz=10.0, looked_s=STAMPS)
+    reference, theirs = sync.associate_trajectories(
+        as_evo(STAMPS, truth), as_evo(mine.stamp_s, estimate[seen]), max_diff=1e-3
+    )
+    theirs.align(reference, correct_scale=False)
+    position = metrics.APE(metrics.PoseRelation.translation_part)
+    position.process_data((reference, theirs))
+    assert len(errors.stamp_s) == len(position.error)
+    assert errors.skipped == np.count_nonzero(~seen)
+    assert errors.rmse_m == pytest.approx(position.get_statistic(metrics.StatisticsType.rmse), abs=1e-6)
+    everywhere = evaluate_trajectory(mine, true, rate_hz=10.0)
+    assert everywhere.skipped == 0
+    assert everywhere.rmse_m > errors.rmse_m
+    # between frames that both have a pose, a truth of other stamps is scored
+    denser = spatial_trajectory(STAMPS + 0.05, spiral_stair(STAMPS + 0.05))
+    between = evaluate_trajectory(mine, denser, rate_hz=10.0, looked_s=STAMPS)
+    assert len(between.stamp_s) == np.count_nonzero(seen[:-1] & seen[1:])
+
+
 def test_drift_equals_evo_relative_error():
     rng = np.random.default_rng(6)
     stamps = np.arange(400.0)
@@ -216,3 +242,11 @@ def test_the_summary_has_the_keys_of_the_plane_and_says_null_of_headings(spatial
     by_hand = dataclasses.replace(result, dead_reckoning=nothing)
     without = metrics_dict(compare_with_truth(dataclasses.replace(recording, odometry=None), by_hand))
     assert without["dead_reckoning_rmse_m"] is None
+    seen = np.unique(recording.detections.frame)
+    told = result.trajectory
+    some = dataclasses.replace(
+        told, stamp_s=told.stamp_s[seen], pose_world_robot=told.pose_world_robot[seen], covariance=told.covariance[seen]
+    )
+    partial = metrics_dict(compare_with_truth(recording, dataclasses.replace(by_hand, trajectory=some), rate_hz=10.0))
+    assert partial["alignment"]["scored_stamps"] == len(seen)
+    assert partial["alignment"]["skipped_stamps"] == seen[-1] - seen[0] + 1 - len(seen)

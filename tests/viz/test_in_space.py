@@ -15,7 +15,7 @@ from synthetic_run import LOOKING_AHEAD, make_spatial_run, spatial_trajectory, w
 from evermap.geometry import se3
 from evermap.metrics.summary import compare_with_truth, metrics_dict
 from evermap.runs.summary import RunInfo, summary_dict, timing_dict
-from evermap.types import Landmarks
+from evermap.types import Landmarks, rows_of
 from evermap.viz.change_words import explanations
 from evermap.viz.living_map_figures import MapView, plot_living_map
 from evermap.viz.map_figure import moves
@@ -246,6 +246,16 @@ def test_objects_plot_themselves_in_space(spatial):
         ),
     )  # fmt: skip
     assert [axes.get_ylabel() for axes in by_hand.plot().axes] == ["column [px]", "landmark"]
+
+
+def test_no_line_crosses_where_the_robot_could_not_be_located(spatial):
+    recording, result = spatial
+    kept = np.abs(result.trajectory.stamp_s - 35.0) > 5.0
+    lost = dataclasses.replace(result, trajectory=rows_of(result.trajectory, kept))
+    above = draw_figures(recording, lost, compare_with_truth(recording, lost))[0].figure.axes[0]
+    path = line(above, "estimated path").get_xdata()
+    assert np.isnan(path).sum() == 1
+    assert np.isnan(path[np.count_nonzero(result.trajectory.stamp_s < 30.0)])
 
 
 def test_a_map_in_space_shows_other_places_in_both_panels_and_the_floor_from_above(spatial):

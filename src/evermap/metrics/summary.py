@@ -11,7 +11,7 @@ from evermap.metrics.consistency import NisSummary, share_in_band, summarise_nis
 from evermap.metrics.landmarks import MIN_SIGHTINGS, LandmarkErrors, by_recorded_identity, evaluate_landmarks
 from evermap.metrics.trajectory import PoseErrors, evaluate_trajectory
 from evermap.show import Shown
-from evermap.types import AnyRecording, BoolArray, FloatArray, SlamResult, json_number
+from evermap.types import AnyRecording, BoolArray, FloatArray, SlamResult, SpatialRecording, json_number
 
 RATE_HZ = 2.0
 IN_VIEW_S = 1.0
@@ -50,8 +50,12 @@ def compare_with_truth(recording: AnyRecording, result: SlamResult, *, rate_hz: 
     """Compare a run with all that the recording knows of the truth, poses at `rate_hz`."""
     poses = online = dead_reckoning = landmarks = anchored = own = None
     if recording.truth is not None:
-        poses = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=rate_hz)
-        online = evaluate_trajectory(result.online, recording.truth, rate_hz=rate_hz, max_gap_s=ONLINE_MAX_GAP_S)
+        # in space there may be no odometry, and then no pose where nothing was seen
+        within: dict[str, Any] = {"rate_hz": rate_hz, "max_gap_s": float("inf")}
+        if isinstance(recording, SpatialRecording):
+            within |= {"max_gap_s": ONLINE_MAX_GAP_S, "looked_s": recording.frames.stamp_s}
+        poses = evaluate_trajectory(result.trajectory, recording.truth, **within)
+        online = evaluate_trajectory(result.online, recording.truth, **within | {"max_gap_s": ONLINE_MAX_GAP_S})
         dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=rate_hz)
     if recording.true_landmarks is not None:
         mapped = by_recorded_identity(result.landmarks, result.innovations, recording)
@@ -142,6 +146,7 @@ def _alignment(evaluation: Evaluation) -> dict[str, Any]:
         "scored_stamps": 0,
         "scored_from_s": None,
         "scored_to_s": None,
+        "skipped_stamps": 0,
         "online_scored_stamps": 0,
         "online_skipped_stamps": 0,
     }
@@ -153,6 +158,7 @@ def _alignment(evaluation: Evaluation) -> dict[str, Any]:
             "scored_stamps": len(poses.stamp_s),
             "scored_from_s": json_number(poses.stamp_s[0]),
             "scored_to_s": json_number(poses.stamp_s[-1]),
+            "skipped_stamps": poses.skipped,
         }
     if odometry:
         out["pose_truth_dead_reckoning"] = _pose(odometry.pose_truth_estimate)

@@ -18,11 +18,13 @@ from evermap.geometry.group import PLANE, group_of
 from evermap.geometry.rigid import rigid
 from evermap.metrics.consistency import nees
 from evermap.show import ShownTable
-from evermap.types import BoolArray, FloatArray, IntArray, Trajectory
+from evermap.types import BoolArray, FloatArray, IntArray, Trajectory, rows_of
 
 ANCHOR_SLACK_S = 1.0
 """Errors can be anchored at the first pose if the truth begins within this of it."""
 DRIFT_DISTANCE_M = 10.0
+SAME_S = 1e-3
+"""Stamps of the truth and of the estimate that are this close are one."""
 
 
 def align_points(source_m: FloatArray, target_m: FloatArray) -> FloatArray:
@@ -93,8 +95,7 @@ def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray
     """
     group = group_of(trajectory.pose_world_robot)
     knots = trajectory.stamp_s
-    after = np.clip(np.searchsorted(knots, stamp_s, side="left"), 0, len(knots) - 1)
-    before = np.where(knots[after] <= stamp_s, after, np.maximum(after - 1, 0))
+    before, after = _neighbours(knots, stamp_s)
     gap_s = knots[after] - knots[before]
     share = np.where(gap_s > 0, (stamp_s - knots[before]) / np.where(gap_s > 0, gap_s, 1.0), 0.0)
     start = trajectory.pose_world_robot[before]
@@ -103,6 +104,12 @@ def interpolate(trajectory: Trajectory, stamp_s: FloatArray) -> tuple[FloatArray
     mix = share[:, None, None]
     covariance = (1.0 - mix) * trajectory.covariance[before] + mix * trajectory.covariance[after]
     return poses, covariance, gap_s
+
+
+def _neighbours(knot_s: FloatArray, stamp_s: FloatArray) -> tuple[IntArray, IntArray]:
+    """Rows (K,) of the knots before and after each stamp, the same at a knot."""
+    after = np.clip(np.searchsorted(knot_s, stamp_s, side="left"), 0, len(knot_s) - 1)
+    return np.where(knot_s[after] <= stamp_s, after, np.maximum(after - 1, 0)), after
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +226,7 @@ def evaluate_trajectory(
     rate_hz: float = 2.0,
     align: bool = True,
     max_gap_s: float = float("inf"),
+    looked_s: FloatArray | None = None,
 ) -> PoseErrors | None:
     """Compute pose errors at stamps of the truth, after a rigid alignment; None where fewer than two can be scored.
 
@@ -229,18 +237,17 @@ def evaluate_trajectory(
         align: estimate rotation and translation on the positions first; False compares as it stands.
         max_gap_s: leave out stamps whose neighbouring estimates are further apart than this (for causal poses,
             which exist only where the sensor looked). The whole overlap is scored by default.
+        looked_s: (F,) stamps at which the robot was to be located; stamps of the truth are left out between poses that
+            have one of these between them. None where no pose is missing.
     """
     if len(estimate) == 0 or len(truth) == 0 or estimate.clock != truth.clock:
         return None
-    rows = scored_stamps(truth, estimate.stamp_s[0], estimate.stamp_s[-1], rate_hz)
-    raw, covariance, gap_s = interpolate(estimate, truth.stamp_s[rows])
-    usable: BoolArray = gap_s <= max_gap_s
-    skipped = int(np.count_nonzero(~usable))
-    rows, raw, covariance = rows[usable], raw[usable], covariance[usable]
+    rows, skipped = _rows_to_score(estimate, truth, rate_hz, max_gap_s, looked_s)
     if len(rows) < 2:
         return None
     stamps, reference = truth.stamp_s[rows], truth.pose_world_robot[rows]
 
+    raw, covariance, _ = interpolate(estimate, stamps)
     group = group_of(raw)
     size = group.point_dim
     pose_truth_estimate, how = align_poses(raw, reference) if align else (group.identity(), "none")
@@ -267,6 +274,38 @@ def evaluate_trajectory(
         drift_m_per_m=drift_per_metre(aligned, reference),
         skipped=skipped,
     )
+
+
+def _rows_to_score(
+    estimate: Trajectory, truth: Trajectory, rate_hz: float, max_gap_s: float, looked_s: FloatArray | None
+) -> tuple[IntArray, int]:
+    """Rows of the truth, and how many are left out; see `evaluate_trajectory`."""
+    knots = estimate.stamp_s
+    slack_s = 0.0 if looked_s is None else SAME_S
+    rows = scored_stamps(truth, knots[0] - slack_s, knots[-1] + slack_s, rate_hz)
+    if looked_s is None:
+        before, after = _neighbours(knots, truth.stamp_s[rows])
+        found = rows[knots[after] - knots[before] <= max_gap_s]
+    else:
+        known = np.flatnonzero(_supported(knots, truth.stamp_s, max_gap_s, looked_s))
+        found = known[scored_stamps(rows_of(truth, known), knots[0] - slack_s, knots[-1] + slack_s, rate_hz)]
+    return found, max(len(rows) - len(found), 0)
+
+
+def _supported(knot_s: FloatArray, stamp_s: FloatArray, max_gap_s: float, looked_s: FloatArray) -> BoolArray:
+    """(K,) whether the poses on both sides of each stamp are near neighbours, or one is at the stamp itself."""
+    missing = looked_s[~_same(knot_s, looked_s)]
+    last = len(knot_s) - 1
+    after = np.clip(np.searchsorted(knot_s, stamp_s), min(1, last), last)
+    first_s, second_s = knot_s[np.maximum(after - 1, 0)], knot_s[after]
+    next_to = np.searchsorted(missing, first_s) == np.searchsorted(missing, second_s)
+    return np.asarray((next_to & (second_s - first_s <= max_gap_s)) | _same(knot_s, stamp_s))
+
+
+def _same(knot_s: FloatArray, stamp_s: FloatArray) -> BoolArray:
+    """(K,) whether there is a knot at each stamp."""
+    after = np.searchsorted(knot_s, stamp_s - SAME_S)
+    return np.asarray(np.append(knot_s, np.inf)[after] <= stamp_s + SAME_S)
 
 
 def _position_nees(estimate: FloatArray, truth: FloatArray, covariance: FloatArray) -> FloatArray:

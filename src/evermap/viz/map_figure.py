@@ -14,7 +14,7 @@ from evermap.geometry.group import PLANE, Group, group_of
 from evermap.metrics.summary import Evaluation
 from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
-from evermap.viz.panels import View, corners_of, draw_shapes, height_over_width, lay_out, moved_map, seen
+from evermap.viz.panels import View, corners_of, draw_shapes, height_over_width, lay_out, moved_map, seen, with_breaks
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -46,7 +46,7 @@ class _Scene:
     """What a map shows, in the frame of the picture; all with two or all with three coordinates.
 
     Attributes:
-        path_m: (N, D) positions of the robot; odometry_m: as odometry alone has them.
+        path_m: (N, D) positions of the robot, nan between stretches of it; odometry_m: as odometry alone has them.
         truth_m, survey_m: true positions of robot and landmarks; None where there are none, or nothing ties the frames.
         mapped: (S,) which of the surveyed landmarks the map has.
         landmarks, gone: the map.
@@ -95,20 +95,22 @@ def _scene(recording: AnyRecording, result: SlamResult, evaluation: Evaluation) 
     group = group_of(result.trajectory.pose_world_robot)
     size = group.point_dim
     pose_truth_map = _alignment(evaluation, group)
-    truth = None if recording.truth is None else recording.truth.pose_world_robot[:, :size]
+    path = group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size]
+    truth = recording.truth
+    way = None if truth is None else with_breaks(truth.stamp_s, truth.pose_world_robot[:, :size])[1]
     known = Landmarks.at([], np.zeros((0, 2))) if recording.true_landmarks is None else recording.true_landmarks
     survey = None if recording.true_landmarks is None else known.position_m
     if evaluation.poses is None and evaluation.landmarks_own is None:
-        truth = survey = None  # nothing ties the frames together
+        way = survey = None  # nothing ties the frames together
     odometry = evaluation.dead_reckoning
     pose_truth_odometry = pose_truth_map if odometry is None else odometry.pose_truth_estimate
     drifted = result.dead_reckoning.pose_world_robot
     if len(drifted):  # a run without odometry need not say how many coordinates it has
         drifted = group.compose(pose_truth_odometry, drifted)
     return _Scene(
-        path_m=group.compose(pose_truth_map, result.trajectory.pose_world_robot)[:, :size],
+        path_m=with_breaks(result.trajectory.stamp_s, path)[1],
         odometry_m=drifted[:, :size],
-        truth_m=truth,
+        truth_m=way,
         survey_m=survey,
         mapped=np.isin(known.landmark_id, result.landmarks.landmark_id),
         landmarks=moved_map(result.landmarks, pose_truth_map),

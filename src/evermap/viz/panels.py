@@ -11,12 +11,15 @@ import numpy as np
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.metrics.trajectory import rotate_covariance
-from evermap.types import BoolArray, FloatArray, Landmarks
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
+
+BLIND_S = 5.0
+"""A gap longer than this is shown as such."""
 
 View = list[int]
 """Which two coordinates a panel shows: to the right, and upwards."""
@@ -24,6 +27,19 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _EDGES = np.array([[i, i | bit] for bit in (1, 2, 4) for i in range(8) if not i & bit])
 _NORMAL = 0.04
 """Length of the line that shows where a tag faces, as a share of the picture."""
+
+
+def long_gaps(stamp_s: FloatArray) -> IntArray:
+    """Return the rows after which nothing is known for longer than usual, and for longer than `BLIND_S`."""
+    step_s = np.diff(stamp_s)
+    usual_s = float(np.median(step_s)) if len(step_s) else 0.0
+    return np.flatnonzero(step_s > max(BLIND_S, 5.0 * usual_s))
+
+
+def with_breaks(stamp_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return stamps and values (N,) or (N, D) with a row of nan in every long gap, so that a line does not cross it."""
+    at = long_gaps(stamp_s) + 1
+    return np.insert(stamp_s, at, stamp_s[at] - 1e-3), np.insert(values, at, np.nan, axis=0)
 
 
 def height_over_width(size: FloatArray) -> float:
@@ -127,7 +143,7 @@ def draw_shapes(
     for row in np.flatnonzero(oriented & ~sized):
         start, normal = landmarks.position_m[row], se3.rotation_of(landmark_poses(landmarks)[row])[:, 2]
         if path_m is not None and len(path_m):
-            nearest = path_m[np.argmin(np.sum((path_m - start) ** 2, axis=1))]
+            nearest = path_m[np.nanargmin(np.sum((path_m - start) ** 2, axis=1))]
             normal = normal * (-1.0 if (nearest - start) @ normal < 0.0 else 1.0)
         lines.append(np.stack([start, start + _NORMAL * reach_m * normal])[:, view])
         looks.append(colours[row])

@@ -27,7 +27,7 @@ from evermap.types import (
     rows_of,
 )
 from evermap.viz.map_figure import class_names_of, moves
-from evermap.viz.panels import box_sizes, corners_of, landmark_poses, moved_map
+from evermap.viz.panels import box_sizes, corners_of, landmark_poses, long_gaps, moved_map
 from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, class_looks
 from evermap.viz.track_figures import DYNAMIC, STATIC
 
@@ -223,9 +223,9 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
     stream.log("world/robot/heading", heading, static=True)
     if len(rows) > 1:
         points = _flat(at, 0.01)
-        pieces = np.stack([points[:-1], points[1:]], axis=1)
+        pieces = np.delete(np.stack([points[:-1], points[1:]], axis=1), long_gaps(stamps), axis=0)
         columns = rr.LineStrips3D.columns(strips=pieces)
-        stream.send_columns("world/path", [_time(stamps[1:], clock)], columns)
+        stream.send_columns("world/path", [_time(np.delete(stamps[1:], long_gaps(stamps)), clock)], columns)
         stream.log("world/path", rr.LineStrips3D.from_fields(colors=rgb(ESTIMATE), radii=0.012), static=True)
 
 

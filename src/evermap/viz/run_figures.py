@@ -14,6 +14,7 @@ from evermap.metrics.trajectory import PoseErrors
 from evermap.stamps import stamp_text
 from evermap.types import AnyRecording, Clock, FloatArray, ParameterEstimate, SlamResult
 from evermap.viz.map_figure import draw_map
+from evermap.viz.panels import BLIND_S, with_breaks
 from evermap.viz.style import (
     ALERT,
     ESTIMATE,
@@ -59,9 +60,6 @@ def draw_figures(
     return figures
 
 
-BLIND_S = 5.0
-"""A gap between frames longer than this is shaded as a blind stretch."""
-
 _RASTER_FROM = 1500
 """Clouds of more points than this are embedded as pixels, to keep vector files small."""
 
@@ -99,11 +97,11 @@ def draw_errors(recording: AnyRecording, result: SlamResult, evaluation: Evaluat
     if poses is not None:
         online = evaluation.online
         if online is not None:
-            causal = _with_breaks(online.stamp_s, online.position_error_m)
+            causal = with_breaks(online.stamp_s, online.position_error_m)
             above.plot(
                 causal[0] - start_s, causal[1], color=ONLINE, lw=0.8, label=f"online (RMSE {online.rmse_m:.3f} m)"
             )
-            causal = _with_breaks(online.stamp_s, _turn_deg(online))
+            causal = with_breaks(online.stamp_s, _turn_deg(online))
             below.plot(causal[0] - start_s, causal[1], color=ONLINE, lw=0.8)
         turned = _turn_deg(poses)
         above.plot(time, poses.position_error_m, color=ESTIMATE, lw=1.1, label=f"smoothed (RMSE {poses.rmse_m:.3f} m)")
@@ -150,7 +148,7 @@ def draw_consistency(result: SlamResult) -> NamedFigure | None:
     window = int(np.clip(np.count_nonzero(inlier) // 20, 10, 200))
     smooth = running_mean(nis[inlier], window)
     mean_low, mean_high = chi2_interval(2, window)
-    left.plot(*_with_breaks(time[inlier], smooth), color=INK, lw=1.3, label=f"running mean of {window}", zorder=4)
+    left.plot(*with_breaks(time[inlier], smooth), color=INK, lw=1.3, label=f"running mean of {window}", zorder=4)
     left.axhspan(mean_low, mean_high, color=ODOMETRY, alpha=0.35, lw=0, zorder=3, label="its 95% band")
     left.set_yscale("log")
     left.set(xlabel="time since the first [s]", ylabel="NIS [1]", ylim=(max(nis.min(), 3e-3), max(nis.max(), 20) * 1.6))
@@ -237,12 +235,6 @@ def _span(axes: Axes, recording: AnyRecording) -> None:
 
 def _limit(band: FloatArray) -> float:
     return 1.12 * float(np.max(band, initial=0.0))
-
-
-def _with_breaks(stamp_s: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A nan in every long gap, so that a line does not cross it."""
-    at = np.flatnonzero(np.diff(stamp_s) > BLIND_S) + 1
-    return np.insert(stamp_s, at, stamp_s[at] - 1e-3), np.insert(values, at, np.nan)
 
 
 def _error_caption(evaluation: Evaluation, blind: int) -> str:
