@@ -25,7 +25,7 @@ def odometry_residual(
     pose: FloatArray, following: FloatArray, increment: FloatArray, residual: FloatArray, j1: FloatArray, j2: FloatArray
 ) -> None:
     """Compute `log(increment^-1 * between(pose, following))` (6,), with (6, 6) derivatives by both poses."""
-    r_pose, r_increment = _matrix(_quaternion(pose)), _matrix(_quaternion(increment))
+    r_pose, r_increment = matrix_of(pose), matrix_of(increment)
     moved = _times(_conjugate(_quaternion(pose)), _quaternion(following))
     x, y, z = _turned_back(r_pose, following[0] - pose[0], following[1] - pose[1], following[2] - pose[2])
     ex, ey, ez = _turned_back(r_increment, x - increment[0], y - increment[1], z - increment[2])
@@ -71,7 +71,7 @@ def point_residual(
     j_mount: FloatArray,
 ) -> None:
     """Compute (x, y, z) in the sensor's frame, derivatives by pose (3, 6), point (3, 3) and mount (3, 6)."""
-    _position(pose, landmark, mount, measured, residual, j_pose, j_mount)
+    position_residual(pose, landmark, mount, measured, residual, j_pose, j_mount)
     sensor = _matrix(_times(_quaternion(pose), _quaternion(mount)))
     for i in range(3):
         for k in range(3):
@@ -94,9 +94,9 @@ def pose_residual(
     The first three rows are those of its position. The others are the rotation vector, in the sensor's axes, that turns
     the predicted orientation into the measured one.
     """
-    _position(pose, landmark, mount, measured, residual, j_pose, j_mount)
+    position_residual(pose, landmark, mount, measured, residual, j_pose, j_mount)
     seen = _times(_conjugate(_times(_quaternion(pose), _quaternion(mount))), _quaternion(landmark))
-    r_mount, r_seen = _matrix(_quaternion(mount)), _matrix(seen)
+    r_mount, r_seen = matrix_of(mount), _matrix(seen)
     a, b, c = _rotation_vector(_times(_quaternion(measured), _conjugate(seen)))
     residual[3], residual[4], residual[5] = a, b, c
     turning = _inverse_jacobian(a, b, c)
@@ -114,7 +114,7 @@ def pose_residual(
 @kernel
 def compose(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Compute `a * b` as `se3.compose`; may be in place."""
-    x, y, z = _turned(_matrix(_quaternion(a)), b[0], b[1], b[2])
+    x, y, z = _turned(matrix_of(a), b[0], b[1], b[2])
     _put(out, a[0] + x, a[1] + y, a[2] + z, _times(_quaternion(a), _quaternion(b)))
 
 
@@ -135,7 +135,7 @@ def retract(pose: FloatArray, twist: FloatArray, out: FloatArray) -> None:
     x = u + once * (b * w - c * v) + twice * (a * along - q * u)
     y = v + once * (c * u - a * w) + twice * (b * along - q * v)
     z = w + once * (a * v - b * u) + twice * (c * along - q * w)
-    x, y, z = _turned(_matrix(_quaternion(pose)), x, y, z)
+    x, y, z = _turned(matrix_of(pose), x, y, z)
     turned = _times(_quaternion(pose), (scale * a, scale * b, scale * c, math.cos(half)))
     _put(out, pose[0] + x, pose[1] + y, pose[2] + z, turned)
 
@@ -153,7 +153,7 @@ def _put(out: FloatArray, x: float, y: float, z: float, a: Quaternion) -> None:
 
 
 @kernel
-def _position(
+def position_residual(
     pose: FloatArray,
     landmark: FloatArray,
     mount: FloatArray,
@@ -162,8 +162,8 @@ def _position(
     j_pose: FloatArray,
     j_mount: FloatArray,
 ) -> None:
-    """First three rows of a detection, and of its derivatives by the robot's and the sensor's pose."""
-    r_pose, r_mount = _matrix(_quaternion(pose)), _matrix(_quaternion(mount))
+    """Compute the first three rows of a detection, with derivatives by the robot's and the sensor's pose (3, 6)."""
+    r_pose, r_mount = matrix_of(pose), matrix_of(mount)
     x, y, z = _turned_back(r_pose, landmark[0] - pose[0], landmark[1] - pose[1], landmark[2] - pose[2])
     for i in range(3):
         f, g, h = r_mount[i], r_mount[3 + i], r_mount[6 + i]
@@ -197,6 +197,12 @@ def _times(a: Quaternion, b: Quaternion) -> Quaternion:
         a[3] * b[2] + a[2] * b[3] + a[0] * b[1] - a[1] * b[0],
         a[3] * b[3] - a[0] * b[0] - a[1] * b[1] - a[2] * b[2],
     )
+
+
+@kernel
+def matrix_of(pose: FloatArray) -> Matrix:
+    """Return the rotation matrix of a pose, row after row."""
+    return _matrix(_quaternion(pose))
 
 
 @kernel

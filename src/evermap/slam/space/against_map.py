@@ -1,0 +1,117 @@
+"""Which places of a given map are where it says: each is asked as if the others alone had located the robot.
+
+A landmark stands where the map has it, to within the map's own accuracy, or it was moved somewhere. With all other
+places and the session fixed, its position is Gaussian in both cases, so the odds follow from two densities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.problem import PlacePrior, SpatialProblem
+from evermap.types import FloatArray
+
+P_MOVED = 0.03
+"""Probability that a landmark moved since the map was made."""
+MOVED_M, MOVED_RAD = (0.15, 0.5, 2.0), (0.05, 0.5)
+"""How far things are moved and turned: standard deviations, all combinations alike."""
+ROUNDS = 8
+SETTLED = 0.01
+"""Change of all probabilities that ends it."""
+PRIOR_COUNT = 6.0
+"""Numbers that the stated accuracy of the map is worth where it is estimated."""
+LEAST_WEIGHT = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class MapComparison:
+    """The map's places beside those of the session.
+
+    Attributes:
+        p_stands: (K,) probability that each is where the map has it.
+        off: (K, 6) twist from where the map has it to where it is, by the session and the other places.
+        covariance: (K, 6, 6) of that.
+        factor: by which the map's stated standard deviations were multiplied.
+    """
+
+    p_stands: FloatArray
+    off: FloatArray
+    covariance: FloatArray
+    factor: float
+
+
+def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimum, MapComparison]:
+    """Return the optimum with every place of the map weighted by the probability that it stands, and these.
+
+    Args:
+        optimum: of a problem with a prior map.
+        stated: (K, 6) standard deviations of the map's places.
+    """
+    problem = optimum.smoother.problem
+    factor, found = 1.0, _asked(optimum, stated)
+    for _ in range(ROUNDS):
+        factor = _accuracy(found, stated, problem)
+        prior = replace(problem.prior, sigma=factor * stated, weight=np.maximum(found.p_stands, LEAST_WEIGHT))
+        problem = replace(problem, prior=prior)
+        optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
+        before, found = found, replace(_asked(optimum, factor * stated), factor=factor)
+        if np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
+            break
+    return optimum, found
+
+
+def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
+    """Every place as the others and the session have it."""
+    problem, prior = optimum.smoother.problem, optimum.smoother.problem.prior
+    spread = optimum.smoother.spread(optimum.now)
+    count, n = len(prior.place), len(problem.stamp_s)
+    p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
+    for k, place in enumerate(prior.place):
+        dim = 6 if problem.oriented[place] else 3
+        at = spread.own_first[n + place]
+        own = spread.own[at : at + dim * dim].reshape(dim, dim)
+        mean, information = _twist(problem, prior, k, optimum), np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2)
+        # the map's own word on it is taken back; what is left may be little, but is something
+        rest = np.linalg.inv(own) - information
+        values, vectors = np.linalg.eigh(rest)
+        least = 1.0 / np.array([25.0] * 3 + [4.0] * (dim - 3)).max()
+        rest = (vectors * np.maximum(values, least)) @ vectors.T
+        alone = np.linalg.inv(rest)
+        mean = alone @ (np.linalg.inv(own) @ mean)
+        stands = _log_density(mean, alone + np.diag(sigma[k, :dim] ** 2))
+        scales = [(m, rad) for m in MOVED_M for rad in (MOVED_RAD if dim == 6 else MOVED_RAD[:1])]
+        wide = [np.diag(sigma[k, :dim] ** 2 + np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
+        moved = np.logaddexp.reduce([_log_density(mean, alone + extra) for extra in wide]) - np.log(len(scales))
+        odds = moved - stands + np.log(P_MOVED / (1.0 - P_MOVED))
+        p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
+        off[k, :dim], covariance[k, :dim, :dim] = mean, alone
+    return MapComparison(p_stands, off, covariance, 1.0)
+
+
+def _twist(problem: SpatialProblem, prior: PlacePrior, k: int, optimum: SpatialOptimum) -> FloatArray:
+    """From where the map has a place to where it is estimated."""
+    place = optimum.estimate.place[prior.place[k]]
+    if problem.oriented[prior.place[k]]:
+        return se3.local(prior.pose[k], place)
+    return np.asarray(place[:3] - prior.pose[k, :3])
+
+
+def _log_density(off: FloatArray, covariance: FloatArray) -> float:
+    root = np.linalg.cholesky(covariance)
+    return float(-0.5 * np.sum(np.linalg.solve(root, off) ** 2) - np.log(np.diag(root)).sum())
+
+
+def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem) -> float:
+    """The factor on the map's stated deviations that fits the places which stand; 1 counts for some."""
+    total, count = PRIOR_COUNT, PRIOR_COUNT
+    for k, place in enumerate(problem.prior.place):
+        dim = 6 if problem.oriented[place] else 3
+        spread = np.diag(found.covariance[k])[:dim]
+        excess = np.maximum(found.off[k, :dim] ** 2 - spread, 0.0) / stated[k, :dim] ** 2
+        total += found.p_stands[k] * float(np.minimum(excess, 16.0).sum())
+        count += found.p_stands[k] * dim
+    return float(np.sqrt(total / count))

@@ -1,0 +1,166 @@
+"""From a start that may be metres off to the optimum in space: positions first, then orientations, then corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSITION, ROWS
+from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
+from evermap.types import FloatArray, IntArray
+
+ROUNDS = 12
+"""Optimum and noise levels in turns, at most."""
+CONVERGED = 0.02
+"""Relative change of all noise levels that ends it."""
+PRIOR_WEIGHT = 10.0
+"""Numbers that the noise level before the first frame is worth."""
+FLOOR = np.array([1e-4, 1e-5, 0.05, 0.05, 0.03])
+"""No noise level is lower: nothing is that good for long."""
+MOST_CANDIDATES = 60
+ANGLE_FLOOR = 0.05
+"""Orientations that agree to within this [rad] are the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialOptimum:
+    """Values, noise, and what was linearised there."""
+
+    estimate: SpatialEstimate
+    noise: SpatialNoise
+    smoother: SpatialSmoother
+    now: SpatialLinear
+
+
+def converged(
+    problem: SpatialProblem, start: SpatialEstimate, noise: SpatialNoise, *, heavy_rounds: int = 2
+) -> SpatialOptimum:
+    """Return the optimum and its noise levels, in turns until neither changes.
+
+    Args:
+        problem: the measurements.
+        start: values to start from.
+        noise: levels to start from, which count as a weak prior.
+        heavy_rounds: rounds with tails that never let go, before it is decided what is an outlier.
+    """
+    estimate, begun = start, noise
+    smoother = SpatialSmoother(problem, start.pose)
+    for round_ in range(ROUNDS):
+        heavy = round_ < heavy_rounds
+        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=15 if round_ == 0 else 6)
+        following = refined(smoother, now, noise, begun)
+        settled = np.abs(np.log(following.levels / noise.levels)).max() < CONVERGED
+        noise = following
+        if settled and not heavy:
+            break
+    estimate, now = smoother.optimum(estimate, noise, heavy=False, iterations=6)
+    return SpatialOptimum(estimate, noise, smoother, now)
+
+
+def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
+    """Return noise levels by expectation-maximisation: residuals, and what is not known of them, by inlier weight."""
+    problem, seen = smoother.problem, smoother.problem.sightings
+    n_steps, spread = len(problem.increment), smoother.spread(now)
+    trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
+    levels, before, start = noise.levels.copy(), noise.levels, begun.levels
+    # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
+    block = now.values[: 78 * n_steps].reshape(n_steps, 6, 13)
+    weight = now.odometry_weight
+    for level, rows in ((0, slice(0, 3)), (1, slice(3, 6))):
+        if problem.driven:  # else how fast a robot may move is no noise that shows in how it did
+            total = float((block[:, rows, 12] ** 2).sum() + trace[0][:, rows].sum())
+            count = 3.0 * float(weight.sum())
+            levels[level] = _level(before[level], start[level], total, count)
+    of_detection = trace[1]
+    for level, some, rows in (
+        (POSITION, seen.kind != CORNERS, slice(0, 3)),
+        (ORIENTATION, seen.kind == 1, slice(3, 6)),
+        (PIXEL, seen.kind == CORNERS, slice(0, 8)),
+    ):
+        if some.any():
+            w = now.weight[some]
+            squares = (now.residual[some, rows] ** 2).sum(axis=1)
+            total = float(w @ squares + of_detection[some, rows].sum())
+            count = float(w.sum()) * (rows.stop - rows.start)
+            levels[level] = _level(before[level], start[level], total, count)
+    return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
+
+
+def _level(before: float, start: float, total: float, count: float) -> float:
+    """A standard deviation: `total` are squares by the one before, `start` counts for some numbers."""
+    return float(np.sqrt((total * before**2 + PRIOR_WEIGHT * start**2) / (count + PRIOR_WEIGHT)))
+
+
+def _traces(smoother: SpatialSmoother, of_factors: FloatArray, first: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Diagonals of `A S A'` of odometry (N - 1, 6) and detections (M, 8); weighted, as the Jacobians are."""
+    problem = smoother.problem
+    n_steps, kind = len(problem.increment), problem.kind
+    steps = of_factors[: 36 * n_steps].reshape(n_steps, 6, 6)
+    found = np.zeros((len(kind), 8))
+    begin = first[n_steps : n_steps + len(kind)]
+    for k in range(3):
+        some, rows = kind == k, int(ROWS[k])
+        at = begin[some][:, None] + (rows + 1) * np.arange(rows)
+        found[some, :rows] = of_factors[at]
+    return np.einsum("nii->ni", steps), found
+
+
+def as_seen(problem: SpatialProblem, estimate: SpatialEstimate, measured: FloatArray) -> FloatArray:
+    """Return (M, 7) where each detection puts its place in the world."""
+    mount = estimate.mount(problem)[problem.sensor]
+    return se3.compose(se3.compose(estimate.pose[problem.pose_row], mount), measured)
+
+
+def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatArray) -> FloatArray:
+    """Return (P, 7) places with the orientation that most of their detections agree on.
+
+    A far tag looks the same from two sides; of each detection both orientations are asked.
+
+    Args:
+        problem: the measurements, with orientations.
+        estimate: with places that may have none yet.
+        weight: (M,) of detections, by their positions.
+    """
+    found = estimate.place.copy()
+    first, other = as_seen(problem, estimate, problem.measured), as_seen(problem, estimate, problem.other)
+    has_other = np.isfinite(problem.other[:, 3])
+    gives = np.isfinite(problem.measured[:, 3]) & problem.oriented[problem.place]
+    first_share = 1.0 / (1.0 + np.exp(-np.minimum(problem.other_log_odds, 50.0)))
+    first_share, other = np.where(has_other, first_share, 1.0), np.where(has_other[:, None], other, first)
+    sigma = np.hypot(problem.sigma_rad, ANGLE_FLOOR)
+    for place in np.flatnonzero(problem.oriented):
+        mine = np.flatnonzero(gives & (problem.place == place))
+        if not len(mine):
+            continue
+        some = mine[:: max(1, len(mine) // MOST_CANDIDATES)]
+        candidate = np.vstack([first[some], other[some][has_other[some]]])
+        score = np.zeros(len(candidate))
+        far = [
+            _likeness(candidate, seen[mine], sigma[mine])
+            for seen in (first, np.where(has_other[:, None], other, first))
+        ]
+        mixed = first_share[mine] * far[0] + (1.0 - first_share[mine]) * far[1]
+        score = np.log(mixed + 1e-6) @ weight[mine]
+        found[place, 3:] = candidate[int(np.argmax(score)), 3:]
+    return found
+
+
+def _likeness(candidate: FloatArray, seen: FloatArray, sigma: FloatArray) -> FloatArray:
+    """(C, D) likelihood ratios of orientations seen, by the angle from candidates."""
+    dot = np.abs(candidate[:, 3:] @ seen[:, 3:].T)
+    angle = 2.0 * np.arccos(np.clip(dot, 0.0, 1.0))
+    return np.asarray(np.exp(-0.5 * (angle / sigma) ** 2))
+
+
+def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
+    """Return places where their first detections put them, along given poses (N, 7)."""
+    state = np.zeros((len(problem.mount), 7))
+    place = se3.identity(len(problem.oriented))
+    estimate = SpatialEstimate(pose, place, state)
+    at = as_seen(problem, estimate, np.where(np.isfinite(problem.measured), problem.measured, se3.identity()))
+    place[problem.place[::-1]] = at[::-1]
+    place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    return replace(estimate, place=place)

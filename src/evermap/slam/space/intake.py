@@ -1,0 +1,230 @@
+"""What goes into the estimator in space: the usable part of a recording, with what each detection is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from evermap.errors import DataError
+from evermap.geometry import se3
+from evermap.geometry.camera import project_each, unproject
+from evermap.geometry.square import SquarePoses, square_poses
+from evermap.slam.space.linearise import CORNERS, POINT, POSE
+from evermap.slam.space.problem import SpatialProblem
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
+
+NEAREST_M = 0.02
+NOMINAL_ALONG, NOMINAL_ACROSS, NOMINAL_RAD = 0.02, 0.01, 0.05
+"""Noise of positions along and across the ray, as shares of the range, and of orientations, where nothing is stated;
+levels are learned."""
+NOMINAL_M = 0.005
+"""Noise of positions at no range."""
+ONE_PX_M = 1e-3
+"""A tag's position from its corners is no better than this."""
+WIDEST = 3.0
+"""Corners beyond this much off the axis (at depth 1) are not used: pixels say little there."""
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialIntake:
+    """A recording as the estimator wants it.
+
+    Attributes:
+        problem: stamps count from `start_s`.
+        start_s: stamp of the first pose.
+        pose_frame: (N,) rows of `Frames` that get a pose.
+        used: (M,) rows of the detections that are used, in the order of the problem.
+        landmark_id: (P,) ids behind the places.
+        driven_pose: (N, 7) poses by the odometry, from the identity; all identity without.
+        warnings: what was left out, counted.
+        names: texts behind landmark ids.
+    """
+
+    problem: SpatialProblem
+    start_s: float
+    pose_frame: IntArray
+    used: IntArray
+    landmark_id: IntArray
+    driven_pose: FloatArray
+    warnings: tuple[str, ...]
+    names: Mapping[int, str] = field(default_factory=dict)
+
+
+def prepare_space(recording: SpatialRecording, mount_sigma: FloatArray, remarks: tuple[str, ...] = ()) -> SpatialIntake:
+    """Sort out what can be used: detections of known identity, while there is odometry.
+
+    Args:
+        recording: as read.
+        mount_sigma: (7,) standard deviations of the twist of every sensor's mount, and of the delay of its stamps; 0
+            where exact.
+        remarks: on the recording, before those on what was left out.
+
+    Raises:
+        DataError: fewer than two frames with a landmark of known identity.
+    """
+    detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
+    usable = detections.landmark_id != UNKNOWN
+    if not usable.all():
+        warnings.append(f"{int((~usable).sum())} detections without identity not used")
+    moving = np.ones(len(stamps), dtype=np.bool_)
+    if recording.odometry is not None:
+        driven_s = recording.odometry.stamp_s
+        moving = (stamps >= driven_s[0]) & (stamps <= driven_s[-1])
+        outside = usable & ~moving[detections.frame]
+        if outside.any():
+            warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
+        usable &= ~outside
+    where, broken = _where(recording, usable)
+    if broken.any():
+        warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
+        usable &= ~broken
+    seen_in = np.unique(detections.frame[usable])
+    if len(seen_in) < 2:
+        raise DataError(
+            f"{recording.name}: landmarks of known identity were seen in {len(seen_in)} frames, at least 2 needed",
+            hint="check landmark ids, and that detections and odometry share one clock",
+        )
+    pose_frame = seen_in if recording.odometry is None else np.flatnonzero(moving)
+    used = np.flatnonzero(usable)
+    landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
+    some = where.rows(used)
+    oriented = np.zeros(len(landmark_id), dtype=np.bool_)
+    oriented[place[some.kind != POINT]] = True
+    driven = recording.odometry is not None
+    driven_pose, increment = _driven(recording, stamps[pose_frame])
+    problem = SpatialProblem(
+        stamp_s=stamps[pose_frame] - stamps[pose_frame[0]],
+        increment=increment,
+        lasted_s=np.diff(stamps[pose_frame]) ** (1 if driven else 2),
+        driven=driven,
+        pose_row=np.searchsorted(pose_frame, detections.frame[used]),
+        place=place.astype(np.int64),
+        sensor=detections.sensor[used],
+        kind=some.kind,
+        measured=some.measured,
+        measured_root=_roots(some.covariance),
+        sigma_rad=some.sigma_rad,
+        corner=some.corner,
+        corner_root=some.corner_root,
+        half_m=0.5 * np.nan_to_num(detections.tag_size_m[used]),
+        other=some.other,
+        other_log_odds=some.other_log_odds,
+        oriented=oriented,
+        mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
+        mount_sigma=np.tile(mount_sigma, (len(recording.sensors), 1)),
+    )
+    return SpatialIntake(
+        problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
+        recording.landmark_names,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Where:
+    """What each detection says, for all rows; see `SpatialProblem`."""
+
+    kind: IntArray
+    measured: FloatArray
+    covariance: FloatArray
+    sigma_rad: FloatArray
+    corner: FloatArray
+    corner_root: FloatArray
+    other: FloatArray
+    other_log_odds: FloatArray
+
+    def rows(self, rows: IntArray) -> _Where:
+        return _Where(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+
+def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, BoolArray]:
+    """What the detections say, and which of the usable ones say nothing."""
+    given = recording.detections
+    count = len(given)
+    found = _Where(
+        kind=np.where(np.isfinite(given.rotation[:, 0]), POSE, POINT).astype(np.int64),
+        measured=np.hstack(
+            [given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, [0, 0, 0, 1])]
+        ),
+        covariance=_covariance(recording),
+        sigma_rad=_sigma_rad(recording),
+        corner=np.zeros((count, 4, 2)),
+        corner_root=np.zeros((count, 4, 2, 2)),
+        other=np.full((count, 7), np.nan),
+        other_log_odds=np.zeros(count),
+    )
+    for row, sensor in enumerate(recording.sensors):
+        some = np.flatnonzero(usable & (given.sensor == row) & np.isfinite(given.corner_px[:, 0, 0]))
+        if sensor.intrinsics is None or not len(some):
+            continue
+        ray = unproject(given.corner_px[some], sensor)
+        plane = ray / ray[..., 2:]
+        good = (
+            np.isfinite(plane).all(axis=(1, 2))
+            & (ray[..., 2] > 0.0).all(axis=1)
+            & (np.abs(plane).max(axis=(1, 2)) < WIDEST)
+        )
+        some, plane = some[good], plane[good]
+        _, slope = project_each(plane, np.full(len(some), row), recording.sensors)
+        _put(found, some, plane, slope, square_poses(given.corner_px[some], given.tag_size_m[some], sensor))
+    broken = usable & ~(np.isfinite(found.measured).all(axis=1) & np.isfinite(found.covariance).all(axis=(1, 2)))
+    near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < NEAREST_M
+    return found, broken | (usable & near)
+
+
+def _put(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, poses: SquarePoses) -> None:
+    """Enter tags that are seen by their corners."""
+    good = np.isfinite(poses.pose[0]).all(axis=1)
+    rows = rows[good]
+    found.kind[rows] = CORNERS
+    found.corner[rows], found.corner_root[rows] = plane[good, :, :2], slope[good, :, :, :2]
+    found.measured[rows], found.other[rows] = poses.pose[0][good], poses.pose[1][good]
+    covariance = np.linalg.pinv(poses.information[0][good], hermitian=True)
+    # in the tag's own axes: turned into the camera's
+    turn = se3.rotation_of(poses.pose[0][good])
+    found.covariance[rows] = turn @ covariance[:, :3, :3] @ np.swapaxes(turn, 1, 2) + ONE_PX_M**2 * np.eye(3)
+    found.sigma_rad[rows] = np.sqrt(np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2) / 3.0)
+    gap = 4.0 * (np.nan_to_num(poses.error_px[1][good], nan=1e3) ** 2 - poses.error_px[0][good] ** 2)
+    found.other_log_odds[rows] = gap
+
+
+def _covariance(recording: SpatialRecording) -> FloatArray:
+    """(M, 3, 3) of positions: as given, or by what is usual of such sensors."""
+    given = recording.detections
+    at = given.position_sensor_m
+    range_m = np.maximum(np.linalg.norm(at, axis=1), NEAREST_M)
+    ray = at / range_m[:, None]
+    along, across = (NOMINAL_M + share * range_m for share in (NOMINAL_ALONG, NOMINAL_ACROSS))
+    outer = ray[:, :, None] * ray[:, None, :]
+    usual = (along**2)[:, None, None] * outer + (across**2)[:, None, None] * (np.eye(3) - outer)
+    stated = np.array([np.nan if sensor.sigma_m is None else sensor.sigma_m for sensor in recording.sensors])
+    of_sensor = stated[given.sensor][:, None, None] ** 2 * np.eye(3)
+    usual = np.where(np.isfinite(of_sensor), of_sensor, usual)
+    return np.where(np.isfinite(given.covariance_sensor_m2), given.covariance_sensor_m2, usual)
+
+
+def _sigma_rad(recording: SpatialRecording) -> FloatArray:
+    """(M,) of orientations: as given, by the sensor, or as usual."""
+    stated = np.array([NOMINAL_RAD if sensor.sigma_rad is None else sensor.sigma_rad for sensor in recording.sensors])
+    given = recording.detections
+    return np.where(np.isfinite(given.sigma_rad), given.sigma_rad, stated[given.sensor])
+
+
+def _roots(covariance: FloatArray) -> FloatArray:
+    """Upper triangular (M, 3, 3) that whiten."""
+    information = np.linalg.inv(covariance)
+    return np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(information), 1, 2))
+
+
+def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Poses (N, 7) by the odometry, from the identity, and motions (N - 1, 7) between them."""
+    odometry, count = recording.odometry, len(stamp_s)
+    if odometry is None or len(odometry) < 2:
+        return se3.identity(count), se3.identity(count - 1)
+    knots, pose = odometry.stamp_s, odometry.pose_world_robot
+    row = np.clip(np.searchsorted(knots, stamp_s, side="right") - 1, 0, len(knots) - 2)
+    share = (stamp_s - knots[row]) / (knots[row + 1] - knots[row])
+    found = se3.retract(pose[row], share[:, None] * se3.local(pose[row], pose[row + 1]))
+    return se3.between(found[0], found), se3.between(found[:-1], found[1:])

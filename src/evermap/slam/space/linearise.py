@@ -1,0 +1,256 @@
+"""Measurements in space as whitened linear factors, in the layout of `slam.sparse`; compiled."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.compiled import kept
+from evermap.slam.kernels3d import (
+    matrix_of,
+    odometry_residual,
+    point_residual,
+    pose_residual,
+    position_residual,
+)
+from evermap.types import FloatArray, IntArray
+
+POINT, POSE, CORNERS = 0, 1, 2
+"""What a detection gives: a position, a position and an orientation, or the corners of a tag in an image."""
+ROWS = np.array([3, 6, 8])
+"""Residuals of each."""
+STATES = 7
+"""Numbers of a sensor's calibration: a twist of its mount, and seconds by which its stamps are late."""
+TRANSLATION, ROTATION, POSITION, ORIENTATION, PIXEL = range(5)
+"""Rows of the noise levels."""
+BEHIND = 0.02
+"""A corner must be this far ahead of the camera [m]; of one that is not nothing can be said."""
+JUMP_SHARE = 1e-4
+"""Information of odometry that jumped, as a share of what it has else: it may be wrong by a hundred times as much."""
+HEAVY = 3.0
+"""Scale of the Cauchy's tails, in standard deviations a number, while the estimate may be far off."""
+
+kernel = kept(effort=1, error_model="numpy")
+
+
+class Sightings(NamedTuple):
+    """M detections as the kernel reads them.
+
+    Attributes:
+        pose_row, place, sensor, kind: (M,) what saw which place how.
+        oriented: (M,) 1 where the place has an orientation, 0 of points.
+        measured: (M, 7) the place in the sensor's frame.
+        root: (M, 3, 3) upper triangular, whitens the position but for the noise level.
+        sigma_rad: (M,) of the orientation, but for the noise level.
+        corner: (M, 4, 2) corners at depth 1.
+        corner_root: (M, 4, 2, 2) pixels by these.
+        half_m: (M,) half of the tag's edge.
+        first: (M + 1,) where the values of each begin, counted from the first detection.
+        log_odds: (3,) of each kind, beyond which half of the squared residual makes an outlier.
+    """
+
+    pose_row: IntArray
+    place: IntArray
+    sensor: IntArray
+    kind: IntArray
+    oriented: IntArray
+    measured: FloatArray
+    root: FloatArray
+    sigma_rad: FloatArray
+    corner: FloatArray
+    corner_root: FloatArray
+    half_m: FloatArray
+    first: IntArray
+    log_odds: FloatArray
+
+
+@kernel
+def weighed(squared: float, log_odds: float, n_rows: int, share: float, heavy: bool) -> tuple[float, float]:
+    """Return the weight of a factor with `n_rows` normalised residuals, and its negative log likelihood.
+
+    It is a mixture of what the noise levels say and of an outlier, whose information is `share` of that.
+    """
+    if heavy:
+        scale = HEAVY * HEAVY * n_rows
+        return 1.0 / (1.0 + squared / scale), 0.5 * scale * math.log1p(squared / scale)
+    d = 0.5 * squared * (1.0 - share) - log_odds
+    log_sum = math.log1p(math.exp(d)) if d < 0 else d + math.log1p(math.exp(-d))
+    inlier = 1.0 / (1.0 + math.exp(min(d, 700.0)))
+    return inlier + (1.0 - inlier) * share, 0.5 * squared - log_sum
+
+
+@kernel
+def linearise_odometry(
+    pose: FloatArray, increment: FloatArray, sigma: FloatArray, log_odds: float, heavy: bool, values: FloatArray,
+    weight: FloatArray,
+) -> float:  # fmt: skip
+    """Linearise the odometry between consecutive poses.
+
+    Args:
+        pose: (N, 7) poses.
+        increment: (N - 1, 7) measured motions.
+        sigma: (N - 1, 6) their standard deviations.
+        log_odds: beyond which half of the squared residual makes a jump of the odometry.
+        heavy: tails that never let go, while the estimate may be far off.
+        values: filled in: 6 rows by two poses and the right side each.
+        weight: (N - 1,) filled in.
+
+    Returns:
+        Negative log likelihood, up to a constant.
+    """
+    e, j1, j2 = np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6))
+    cost, at = 0.0, 0
+    for i in range(len(increment)):
+        odometry_residual(pose[i], pose[i + 1], increment[i], e, j1, j2)
+        squared = 0.0
+        for a in range(6):
+            squared += (e[a] / sigma[i, a]) ** 2
+        weight[i], loss = weighed(squared, log_odds, 6, JUMP_SHARE, heavy)
+        cost += loss
+        for a in range(6):
+            scale = math.sqrt(weight[i]) / sigma[i, a]
+            for b in range(6):
+                values[at + b] = scale * j1[a, b]
+                values[at + 6 + b] = scale * j2[a, b]
+            values[at + 12] = -scale * e[a]
+            at += 13
+    return cost
+
+
+@kernel
+def linearise_sightings(
+    pose: FloatArray, place: FloatArray, mount: FloatArray, velocity: FloatArray, level: FloatArray, seen: Sightings,
+    heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
+) -> float:  # fmt: skip
+    """Linearise the detections.
+
+    Args:
+        pose: (N, 7) poses.
+        place: (P, 7) places; of points the orientation is not looked at.
+        mount: (S, 7) poses of the sensors on the robot.
+        velocity: (N, 6) twist of the robot a second, by which late stamps count.
+        level: (5,) noise levels.
+        seen: the detections.
+        heavy: tails that never let go, while the estimate may be far off.
+        values: filled in: rows of each by its pose, place, sensor and the right side.
+        weight: (M,) filled in.
+        residual: (M, 8) filled in, whitened, but not weighted.
+
+    Returns:
+        Negative log likelihood, up to a constant.
+    """
+    e, jx, jl, jm = np.zeros(8), np.zeros((8, 6)), np.zeros((8, 6)), np.zeros((8, 6))
+    cost = 0.0
+    for m in range(len(seen.kind)):
+        kind, i, p, s = seen.kind[m], seen.pose_row[m], seen.place[m], seen.sensor[m]
+        dim = 6 if seen.oriented[m] else 3
+        if kind == CORNERS:
+            rows = 8
+            _corners(pose[i], place[p], mount[s], seen, m, level[PIXEL], e, jx, jl, jm)
+        else:
+            rows = 6 if kind == POSE else 3
+            _position_or_pose(pose[i], place[p], mount[s], seen, m, level, e, jx, jl, jm)
+        squared = 0.0
+        for a in range(rows):
+            squared += e[a] * e[a]
+            residual[m, a] = e[a]
+        weight[m], loss = weighed(squared, seen.log_odds[kind], rows, 0.0, heavy)
+        cost += loss
+        scale, at = math.sqrt(weight[m]), seen.first[m]
+        for a in range(rows):
+            late = 0.0
+            for b in range(6):
+                values[at + b] = scale * jx[a, b]
+                late += jx[a, b] * velocity[i, b]
+                values[at + 6 + dim + b] = scale * jm[a, b]
+            for b in range(dim):
+                values[at + 6 + b] = scale * jl[a, b]
+            values[at + 12 + dim] = scale * late
+            values[at + 13 + dim] = -scale * e[a]
+            at += 14 + dim
+    return cost
+
+
+@kernel
+def _position_or_pose(
+    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: Sightings, m: int, level: FloatArray, e: FloatArray,
+    jx: FloatArray, jl: FloatArray, jm: FloatArray,
+) -> None:  # fmt: skip
+    """Whitened residuals and Jacobians of a position, or of a position and an orientation."""
+    if seen.oriented[m]:
+        pose_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
+    else:
+        point_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
+    for a in range(3):  # upper triangular: rows below a are still to come
+        factor = 1.0 / level[POSITION]
+        total = 0.0
+        for k in range(a, 3):
+            total += seen.root[m, a, k] * e[k]
+        e[a] = factor * total
+        for b in range(6):
+            x, y, z = 0.0, 0.0, 0.0
+            for k in range(a, 3):
+                x += seen.root[m, a, k] * jx[k, b]
+                y += seen.root[m, a, k] * jl[k, b]
+                z += seen.root[m, a, k] * jm[k, b]
+            jx[a, b], jl[a, b], jm[a, b] = factor * x, factor * y, factor * z
+    if seen.kind[m] == POSE:
+        factor = 1.0 / (level[ORIENTATION] * seen.sigma_rad[m])
+        for a in range(3, 6):
+            e[a] *= factor
+            for b in range(6):
+                jx[a, b] *= factor
+                jl[a, b] *= factor
+                jm[a, b] *= factor
+
+
+@kernel
+def _corners(
+    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: Sightings, m: int, sigma_px: float, e: FloatArray,
+    jx: FloatArray, jl: FloatArray, jm: FloatArray,
+) -> None:  # fmt: skip
+    """Residuals (8,) of four corners of a tag, in standard deviations, with their Jacobians (8, 6)."""
+    nothing, point, seen_at = np.zeros(3), np.zeros(3), np.zeros(3)
+    by_robot, by_mount = np.zeros((3, 6)), np.zeros((3, 6))
+    r, into, onto = matrix_of(place), matrix_of(pose), matrix_of(mount)
+    turn = np.zeros((3, 3))  # of the tag in the sensor's frame
+    for a in range(3):
+        for b in range(3):
+            total = 0.0
+            for c in range(3):
+                for d in range(3):
+                    total += onto[3 * d + a] * into[3 * c + d] * r[3 * c + b]
+            turn[a, b] = total
+    for k in range(4):
+        x, y = seen.half_m[m] * (-1.0, 1.0, 1.0, -1.0)[k], seen.half_m[m] * (-1.0, -1.0, 1.0, 1.0)[k]
+        for a in range(3):
+            point[a] = place[a] + r[3 * a] * x + r[3 * a + 1] * y
+        position_residual(pose, point, mount, nothing, seen_at, by_robot, by_mount)
+        px, py, pz = -seen_at[0], -seen_at[1], -seen_at[2]
+        for a in range(2):
+            row = 2 * k + a
+            e[row] = 0.0
+            for b in range(6):
+                jx[row, b] = jl[row, b] = jm[row, b] = 0.0
+        if pz < BEHIND:
+            for a in range(2):
+                e[2 * k + a] = 1e3
+            continue
+        u, v = px / pz, py / pz
+        for a in range(2):
+            row = 2 * k + a
+            w0, w1 = seen.corner_root[m, k, a, 0] / sigma_px, seen.corner_root[m, k, a, 1] / sigma_px
+            e[row] = w0 * (seen.corner[m, k, 0] - u) + w1 * (seen.corner[m, k, 1] - v)
+            # derivatives of the residual by the point in the sensor's frame, which `position_residual` has with a minus
+            d0, d1, d2 = w0 / pz, w1 / pz, -(w0 * u + w1 * v) / pz
+            for b in range(6):
+                jx[row, b] = d0 * by_robot[0, b] + d1 * by_robot[1, b] + d2 * by_robot[2, b]
+                jm[row, b] = d0 * by_mount[0, b] + d1 * by_mount[1, b] + d2 * by_mount[2, b]
+            t0 = -(d0 * turn[0, 0] + d1 * turn[1, 0] + d2 * turn[2, 0])
+            t1 = -(d0 * turn[0, 1] + d1 * turn[1, 1] + d2 * turn[2, 1])
+            t2 = -(d0 * turn[0, 2] + d1 * turn[1, 2] + d2 * turn[2, 2])
+            jl[row, 0], jl[row, 1], jl[row, 2] = t0, t1, t2
+            # a turn of the tag by w moves the corner by w x c, with c = (x, y, 0)
+            jl[row, 3], jl[row, 4], jl[row, 5] = t2 * y, -t2 * x, t1 * x - t0 * y

@@ -1,0 +1,166 @@
+"""What is measured in space, what is sought, and how noisy: the nouns that the modules of this package exchange."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.linearise import CORNERS, POINT, POSE, ROWS, Sightings
+from evermap.types import BoolArray, FloatArray, IntArray
+
+OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
+"""Half of the squared residual of which a detection with 3, 6 or 8 numbers is as likely an outlier: exceeded by one of
+10,000 that are none."""
+JUMP_LOG_ODDS = 14.0
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialNoise:
+    """Standard deviations.
+
+    Attributes:
+        translation: of the odometry, metres for the square root of a second.
+        rotation: of the odometry, radians for the square root of a second.
+        position: factor on the stated standard deviations of positions.
+        orientation: factor on those of orientations.
+        pixel: of corners in an image [px].
+    """
+
+    translation: float = 0.05
+    rotation: float = 0.02
+    position: float = 1.0
+    orientation: float = 1.0
+    pixel: float = 1.0
+
+    @property
+    def levels(self) -> FloatArray:
+        """Return them as (5,)."""
+        return np.array([self.translation, self.rotation, self.position, self.orientation, self.pixel])
+
+
+@dataclass(frozen=True, slots=True)
+class PlacePrior:
+    """Where some places are by a map that is given.
+
+    Attributes:
+        place: (K,) rows of places.
+        pose: (K, 7) where they are; of points the orientation is not looked at.
+        sigma: (K, 6) standard deviations in the place's own frame, the axes of the map for points.
+        weight: (K,) probability that each still is there.
+    """
+
+    place: IntArray
+    pose: FloatArray
+    sigma: FloatArray
+    weight: FloatArray
+
+    @classmethod
+    def none(cls) -> PlacePrior:
+        """Return a map that says nothing."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialProblem:
+    """Everything measured and believed beforehand.
+
+    Attributes:
+        stamp_s: (N,) instants of the poses.
+        increment: (N - 1, 7) motion by the odometry; identity where there is none.
+        lasted_s: (N - 1,) what its variance grows with: the time; without odometry the time squared, at a speed of
+            which nothing is known but its size.
+        driven: True if there is odometry.
+        pose_row, place, sensor, kind: (M,) which pose saw which place how; sorted by pose.
+        measured: (M, 7) the place in the sensor's frame.
+        measured_root: (M, 3, 3) upper triangular, whitens the position but for its noise level.
+        sigma_rad: (M,) of the orientation, but for its noise level.
+        corner, corner_root, half_m: of tags in an image; see `Sightings`.
+        other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.
+        other_log_odds: (M,) of the first against the other.
+        oriented: (P,) places with an orientation; the others are points.
+        mount: (S, 7) nominal poses of the sensors on the robot.
+        mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
+        prior: on places.
+        start_sigma: (6,) how firmly the first pose is held where it is.
+    """
+
+    stamp_s: FloatArray
+    increment: FloatArray
+    lasted_s: FloatArray
+    driven: bool
+    pose_row: IntArray
+    place: IntArray
+    sensor: IntArray
+    kind: IntArray
+    measured: FloatArray
+    measured_root: FloatArray
+    sigma_rad: FloatArray
+    corner: FloatArray
+    corner_root: FloatArray
+    half_m: FloatArray
+    other: FloatArray
+    other_log_odds: FloatArray
+    oriented: BoolArray
+    mount: FloatArray
+    mount_sigma: FloatArray
+    prior: PlacePrior = field(default_factory=PlacePrior.none)
+    start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
+
+    @property
+    def velocity(self) -> FloatArray:
+        """Return (N, 6) twist a second by the odometry; zeros without."""
+        twist = se3.log(self.increment) / np.maximum(np.diff(self.stamp_s), 1e-6)[:, None]
+        if not self.driven or not len(twist):
+            return np.zeros((len(self.stamp_s), 6))
+        ends = np.vstack([twist[:1], twist, twist[-1:]])
+        return np.asarray(0.5 * (ends[:-1] + ends[1:]))
+
+    @property
+    def sightings(self) -> Sightings:
+        """Return the detections as the kernel reads them."""
+        oriented = self.oriented[self.place].astype(np.int64)
+        width = 14 + np.where(oriented, 6, 3)
+        first = np.append(0, np.cumsum(ROWS[self.kind] * width))
+        return Sightings(
+            self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
+            self.sigma_rad, self.corner, self.corner_root, self.half_m, first, OUTLIER_LOG_ODDS,
+        )  # fmt: skip
+
+    def as_points(self) -> SpatialProblem:
+        """Return the same with positions only: what is left has one optimum, near any start."""
+        prior = replace(self.prior, sigma=np.hstack([self.prior.sigma[:, :3].max(axis=1, keepdims=True)] * 6))
+        return replace(self, kind=np.full_like(self.kind, POINT), oriented=np.zeros_like(self.oriented), prior=prior)
+
+    def as_poses(self) -> SpatialProblem:
+        """Return the same with the poses of tags for their corners."""
+        return replace(self, kind=np.where(self.kind == CORNERS, POSE, self.kind))
+
+    def without(self, dropped: BoolArray) -> SpatialProblem:
+        """Return the same without some detections (M,)."""
+        rows = np.flatnonzero(~dropped)
+        names = (
+            "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
+            "half_m", "other", "other_log_odds",
+        )  # fmt: skip
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialEstimate:
+    """Values of all variables.
+
+    Attributes:
+        pose: (N, 7) of the robot.
+        place: (P, 7) of places; of points the orientation is the identity.
+        state: (S, 7) twist of each sensor's mount, and delay of its stamps [s].
+    """
+
+    pose: FloatArray
+    place: FloatArray
+    state: FloatArray
+
+    def mount(self, problem: SpatialProblem) -> FloatArray:
+        """Return (S, 7) the sensors' poses on the robot."""
+        return se3.retract(problem.mount, self.state[:, :6])

@@ -1,0 +1,223 @@
+"""Batch smoothing in space: damped Gauss-Newton on the sparse normal equations, and the covariances there.
+
+The border of the elimination tree are the sensors' mounts and delays, which all detections share.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.errors import NumericalError
+from evermap.geometry import se3
+from evermap.slam.space.linearise import STATES, linearise_odometry, linearise_sightings
+from evermap.slam.space.problem import JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.sparse.elimination import Spread, curvature
+from evermap.slam.sparse.system import Factorised, System, exhausted
+from evermap.slam.sparse.tree import Factors
+from evermap.types import FloatArray, IntArray
+
+POSES_A_LEAF = 4
+HELD = 1e-9
+"""Information that keeps a place whose every detection is an outlier from going anywhere."""
+FIXED = 1e12
+"""Information on a calibration state that is known exactly."""
+LARGEST_TURN = 0.5
+"""A step turns no pose by more [rad]."""
+COST_SLACK = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialLinear:
+    """A problem at some values: Jacobians and right sides, weights of detections and of odometry, residuals, cost."""
+
+    values: FloatArray
+    weight: FloatArray
+    odometry_weight: FloatArray
+    residual: FloatArray
+    states_right: FloatArray
+    cost: float
+
+
+class SpatialSmoother:
+    """Optimum and covariances of one `SpatialProblem`.
+
+    Args:
+        problem: the measurements.
+        coordinate: (N, 3) rough positions of the poses, along which the elimination may be cut.
+    """
+
+    def __init__(self, problem: SpatialProblem, coordinate: FloatArray) -> None:
+        self.problem = problem
+        self._seen = problem.sightings
+        self._velocity = problem.velocity
+        self._states = _information(problem.mount_sigma).ravel()
+        self.system = self._structured(coordinate)
+
+    def optimum(
+        self, start: SpatialEstimate, noise: SpatialNoise, *, heavy: bool, iterations: int = 20, tolerance: float = 1e-5
+    ) -> tuple[SpatialEstimate, SpatialLinear]:
+        """Run damped Gauss-Newton from `start`, until steps are small.
+
+        Args:
+            start: values to start from.
+            noise: standard deviations.
+            heavy: outliers have the Cauchy's tails.
+            iterations: at most.
+            tolerance: largest move (m or rad) that ends it.
+
+        Raises:
+            NumericalError: no finite optimum.
+        """
+        estimate, now, damping = start, self.linearised(start, noise, heavy=heavy), 0.0
+        for _ in range(iterations):
+            step = exhausted(self.factorised(now, damping).solution())
+            trial, size = self._moved(estimate, step)
+            following = self.linearised(trial, noise, heavy=heavy)
+            if np.isfinite(following.cost) and following.cost <= now.cost + COST_SLACK * (1.0 + abs(now.cost)):
+                estimate, now = trial, following
+                damping = 0.0 if damping < 1e-5 else damping / 10.0
+                if size < tolerance:
+                    break
+            else:
+                damping = max(1e-4, 10.0 * damping)
+                if damping > 1e6:
+                    break
+        if not np.isfinite(now.cost):
+            raise NumericalError("the smoother found no finite optimum", hint="check units and time stamps")
+        return estimate, now
+
+    def linearised(self, estimate: SpatialEstimate, noise: SpatialNoise, *, heavy: bool) -> SpatialLinear:
+        """Return the problem linearised at `estimate`."""
+        problem, tree = self.problem, self.system.tree
+        n, count = len(problem.stamp_s), len(problem.place)
+        values = np.zeros(tree.value_first[-1])
+        odometry_weight, weight, residual = np.ones(n - 1), np.ones(count), np.zeros((count, 8))
+        sigma = odometry_sigma(problem, noise)
+        odometry = 6 * 13 * (n - 1)
+        cost = linearise_odometry(
+            estimate.pose, problem.increment, sigma, JUMP_LOG_ODDS, heavy, values[:odometry], odometry_weight
+        )
+        end = odometry + int(self._seen.first[-1])
+        cost += linearise_sightings(
+            estimate.pose, estimate.place, estimate.mount(problem), self._velocity, noise.levels, self._seen, heavy,
+            values[odometry:end], weight, residual,
+        )  # fmt: skip
+        held = se3.local(self._start, estimate.pose[0])
+        root = 1.0 / problem.start_sigma
+        block = np.column_stack([root[:, None] * se3.right_jacobian_inverse(held), -root * held])
+        values[end : end + 42] = block.ravel()
+        cost += 0.5 * float(np.sum((root * held) ** 2)) + self._priors(estimate, values, end + 42)
+        off = estimate.state.ravel()
+        cost += 0.5 * float(off @ (self._states * off))
+        return SpatialLinear(values, weight, odometry_weight, residual, -self._states * off, float(cost))
+
+    def factorised(self, now: SpatialLinear, damping: float = 0.0) -> Factorised:
+        """Eliminate everything but the sensors' states."""
+        tree = self.system.tree
+        extra = np.zeros(tree.begin[-1])
+        extra[6 * len(self.problem.stamp_s) : -len(self._states)] = HELD
+        if damping > 0.0:
+            own = extra + curvature(tree, self.system.factors, now.values)
+            own[-len(self._states) :] += self._states
+            extra = extra + damping * own
+        work = self.system.factorised(
+            now.values, extra=extra, border_information=np.diag(self._states), border_right=now.states_right
+        )
+        return exhausted(work)
+
+    def spread(self, now: SpatialLinear) -> Spread:
+        """Return covariances of all variables and of what each factor ties."""
+        return exhausted(self.factorised(now).spread(len(self.problem.increment)))
+
+    def covariance_of_poses(self, spread: Spread) -> FloatArray:
+        """Return (N, 6, 6)."""
+        n = len(self.problem.stamp_s)
+        return spread.own[: 36 * n].reshape(n, 6, 6)
+
+    def rows_of_places(self) -> IntArray:
+        """Return (P,) the variables that places are."""
+        return len(self.problem.stamp_s) + np.arange(len(self.problem.oriented))
+
+    def _priors(self, estimate: SpatialEstimate, values: FloatArray, at: int) -> float:
+        """Fill in what the given map says; returns its cost."""
+        prior, cost = self.problem.prior, 0.0
+        for k, place in enumerate(prior.place):
+            dim = 6 if self.problem.oriented[place] else 3
+            off, root = np.zeros(6), np.sqrt(prior.weight[k]) / prior.sigma[k]
+            off[:3] = estimate.place[place, :3] - prior.pose[k, :3]
+            jacobian = np.eye(6)
+            if dim == 6:
+                off = se3.local(prior.pose[k], estimate.place[place])
+                jacobian = se3.right_jacobian_inverse(off)
+            block = np.column_stack([root[:, None] * jacobian[:, :dim], -root * off])[:dim]
+            values[at : at + block.size] = block.ravel()
+            at += block.size
+            cost += 0.5 * float(np.sum((root * off)[:dim] ** 2))
+        return cost
+
+    def _structured(self, coordinate: FloatArray) -> System:
+        problem, seen = self.problem, self._seen
+        n, count = len(problem.stamp_s), len(problem.oriented)
+        self._start = np.array(coordinate[0]) if coordinate.shape[1] == 7 else se3.identity()
+        steps, prior = np.arange(n - 1), problem.prior.place
+        dims = np.where(problem.oriented, 6, 3)
+        leaf_of_pose = np.minimum(np.arange(n), max(n - 2, 0)) // POSES_A_LEAF
+        tied = [
+            np.column_stack([steps, steps + 1]),
+            np.column_stack([problem.pose_row, n + problem.place, n + count + problem.sensor]),
+            np.zeros((1, 1), dtype=np.int64),
+            (n + prior)[:, None],
+        ]
+        first_seen = np.zeros(count, dtype=np.int64)
+        first_seen[problem.place[::-1]] = leaf_of_pose[problem.pose_row[::-1]]
+        width = np.concatenate([np.full(len(part), part.shape[1]) for part in tied])
+        rows = np.concatenate([np.full(n - 1, 6), np.array([3, 6, 8])[seen.kind], [6], dims[prior]])
+        leaf = np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], first_seen[prior]])
+        n_leaves = int(leaf_of_pose[-1]) + 1
+        factors = Factors(
+            np.append(0, np.cumsum(width)).astype(np.int64),
+            np.concatenate([part.ravel() for part in tied]).astype(np.int64),
+            rows.astype(np.int64),
+            leaf.astype(np.int64),
+        )
+        at = np.zeros((n_leaves, 4))
+        at[:, 0] = np.arange(n_leaves)
+        weight = np.bincount(leaf_of_pose, minlength=n_leaves)
+        for axis in range(3):
+            total = np.bincount(leaf_of_pose, coordinate[:, axis], minlength=n_leaves)
+            at[:, 1 + axis] = total / np.maximum(weight, 1)
+        dim = np.concatenate([np.full(n, 6), dims, np.full(len(problem.mount), STATES)])
+        border = n + count + np.arange(len(problem.mount))
+        return System(dim, factors, at, border)
+
+    def _moved(self, estimate: SpatialEstimate, step: FloatArray) -> tuple[SpatialEstimate, float]:
+        """The estimate after a step, and how far it went."""
+        problem, tree = self.problem, self.system.tree
+        n, count = len(problem.stamp_s), len(problem.oriented)
+        by = step[: 6 * n].reshape(n, 6)
+        begin = tree.begin[n : n + count]
+        turned = np.zeros((count, 6))
+        for k in range(6):
+            some = problem.oriented if k >= 3 else np.ones(count, dtype=np.bool_)
+            turned[some, k] = step[begin[some] + k]
+        size = float(max(np.abs(by).max(), np.abs(turned).max(initial=0.0)))
+        most = max(np.abs(by[:, 3:]).max(), np.abs(turned[:, 3:]).max(initial=0.0))
+        share = min(1.0, LARGEST_TURN / max(float(most), 1e-12))
+        place = estimate.place.copy()
+        on = problem.oriented
+        place[on] = se3.retract(place[on], share * turned[on])
+        place[~on, :3] += share * turned[~on, :3]
+        state = estimate.state + share * step[tree.begin[n + count] :].reshape(-1, STATES)
+        return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state), size
+
+
+def odometry_sigma(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
+    """Return (N - 1, 6) standard deviations of the odometry between consecutive poses."""
+    root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
+    return np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)
+
+
+def _information(sigma: FloatArray) -> FloatArray:
+    return np.where(sigma > 0.0, 1.0 / np.maximum(sigma, 1e-12) ** 2, FIXED)

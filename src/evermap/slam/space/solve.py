@@ -1,0 +1,159 @@
+"""A recording in space, from its first values to the optimum, beside a map that may be given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.against_map import MapComparison, compared
+from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
+from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.linearise import POINT
+from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.repair import repaired, split
+from evermap.slam.space.smoother import SpatialSmoother
+from evermap.slam.space.start import incremental
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+
+BY_HAND = SpatialNoise(translation=1.0, rotation=0.7, pixel=2.0)
+"""Without odometry: metres and radians that a robot may go a second."""
+DRIVEN = SpatialNoise(pixel=2.0)
+"""With odometry: metres and radians of drift for the square root of a second."""
+SURE = 1e-4
+"""Deviation by which the first pose is held, where no map says where it is [m, rad]."""
+FREE = 1e3
+LOOSE_M = 0.05
+"""A given map is believed no better than this until it is known what stands."""
+MOST_TRIED = 200
+GROSS_M = 1.0
+SPLITS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class SpatialSolved:
+    """What a session in space came to.
+
+    Attributes:
+        optimum: values, noise and covariances of the last problem.
+        identity: (P,) rows of `SpatialIntake.landmark_id` that the places are of.
+        from_map: what of the given map stands; None without a map.
+        map_rows: (K,) rows of the given map behind its comparison.
+        online_pose: (N, 7) poses as each frame had them.
+    """
+
+    optimum: SpatialOptimum
+    identity: IntArray
+    from_map: MapComparison | None
+    map_rows: IntArray
+    online_pose: FloatArray
+
+
+def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, sigma: float = 0.02) -> SpatialSolved:
+    """Estimate poses, places and noise of a recording in space.
+
+    Args:
+        intake: the recording as the estimator wants it.
+        prior_map: landmarks to localise in; None maps from scratch, in the frame of the first pose.
+        sigma: deviation [m, rad] of map landmarks that state none.
+
+    Raises:
+        NumericalError: no finite optimum.
+    """
+    problem, stated, rows = _with_map(intake, prior_map, sigma)
+    identity = np.arange(len(intake.landmark_id))
+    noise = DRIVEN if problem.driven else BY_HAND
+    start = _start(problem, intake, noise)
+    online = start.pose
+    estimate = start
+    if problem.driven:
+        points = converged(problem.as_points(), start, noise)
+        estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
+        voted = oriented(problem, estimate, points.now.weight)
+        estimate = replace(estimate, place=voted)
+    optimum = repaired(converged(problem, estimate, noise))
+    for _ in range(SPLITS):
+        found = split(optimum, identity)
+        if found is None:
+            break
+        problem, estimate, identity = found
+        optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
+    from_map = None
+    if len(stated):
+        optimum, from_map = compared(optimum, stated)
+    return SpatialSolved(optimum, identity, from_map, rows, online)
+
+
+def _with_map(
+    intake: SpatialIntake, prior_map: Landmarks | None, sigma: float
+) -> tuple[SpatialProblem, FloatArray, IntArray]:
+    """The problem with the landmarks of a map, their standard deviations (K, 6) as stated, and their rows there."""
+    problem = intake.problem
+    shared, place, rows = np.intersect1d(
+        intake.landmark_id, [] if prior_map is None else prior_map.landmark_id, return_indices=True
+    )
+    if prior_map is None or not len(shared):
+        return problem, np.zeros((0, 6)), np.zeros(0, dtype=np.int64)
+    pose = se3.identity(len(rows))
+    pose[:, :3] = prior_map.position_m[rows]
+    stated = np.full((len(rows), 6), sigma)
+    own = np.sqrt(np.einsum("kii->ki", prior_map.covariance_m2[rows]))
+    stated[:, :3] = np.where(own > 0.0, own, sigma)
+    turned = np.zeros(len(rows), dtype=np.bool_)
+    if prior_map.rotation is not None:
+        turned = np.isfinite(prior_map.rotation[rows, 0])
+        pose[turned, 3:] = prior_map.rotation[rows][turned]
+        if prior_map.rotation_covariance is not None:
+            own = np.sqrt(np.einsum("kii->ki", np.nan_to_num(prior_map.rotation_covariance[rows])))
+            stated[:, 3:] = np.where(own > 0.0, own, sigma)
+    stated[problem.oriented[place] & ~turned, 3:] = np.pi  # a map of points knows no orientation
+    # positions of a map are in its axes, those of tags in their own: all alike
+    stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
+    prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, LOOSE_M), np.ones(len(rows)))
+    return replace(problem, prior=prior, start_sigma=np.full(6, FREE)), stated, rows.astype(np.int64)
+
+
+def _start(problem: SpatialProblem, intake: SpatialIntake, noise: SpatialNoise) -> SpatialEstimate:
+    """First values: frame after frame, or along the odometry as a whole; what is more probable."""
+    known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
+    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    stepwise = incremental(problem, noise, se3.identity(), known, place)
+    if not problem.driven:
+        return stepwise
+    whole = _along(problem, intake.driven_pose, known, place)
+    points = problem.as_points()
+    cost = []
+    for start in (stepwise, whole):
+        smoother = SpatialSmoother(points, start.pose)
+        cost.append(smoother.optimum(start, noise, heavy=True, iterations=10)[1].cost)
+    return whole if cost[1] <= cost[0] else stepwise
+
+
+def _along(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> SpatialEstimate:
+    """Poses along the odometry, from where the known places put it as a whole."""
+    if known.any():
+        driven = se3.compose(_whole(problem, driven, known, place), driven)
+    estimate = first_places(problem, driven)
+    estimate.place[known] = place[known]
+    return estimate
+
+
+def _whole(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place: FloatArray) -> FloatArray:
+    """The pose (7,) of the odometry's frame in the map on which most sightings of known places agree."""
+    met = np.flatnonzero(known[problem.place] & problem.oriented[problem.place] & (problem.kind != POINT))
+    if not len(met):
+        return se3.identity()
+    some = met[:: max(1, len(met) // MOST_TRIED)]
+    mount = problem.mount[problem.sensor]
+    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.measured))
+    other = np.where(np.isfinite(problem.other), problem.other, problem.measured)
+    suggested = [
+        se3.compose(driven[problem.pose_row[some]], se3.compose(mount[some], m[some]))
+        for m in (problem.measured, other)
+    ]
+    trial = se3.compose(np.tile(place[problem.place[some]], (2, 1)), se3.inverse(np.vstack(suggested)))
+    at = se3.transform(trial[:, None], seen[None, some, :3])
+    gap = np.linalg.norm(at - place[problem.place[some], :3], axis=2)
+    best = int(np.argmin(np.minimum((gap / GROSS_M) ** 2, 1.0).sum(axis=1)))
+    return np.asarray(trial[best])

@@ -1,0 +1,110 @@
+"""Where to start in space: frame after frame, each pose by the odometry and by the tags that are known by then.
+
+Without odometry the robot stands still until its tags say otherwise. A tag puts the robot in one of two places, where
+its view has two explanations; the one that agrees with the other tags and with the motion is taken.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.types import BoolArray, FloatArray
+
+SLACK_M, SLACK_RAD = 0.15, 0.15
+"""What places of a map in the making are off by."""
+STILL_M, STILL_RAD = 0.03, 0.03
+"""What a robot is off by that was there a moment ago."""
+OUTLIER, LOST = 10.0, 15.0
+"""Nats that a detection, and a motion, cost at most: a wrong identity, a robot that was carried."""
+WORTH = 3.0
+"""Nats by which a candidate must beat the predicted pose."""
+
+
+def incremental(
+    problem: SpatialProblem, noise: SpatialNoise, start_pose: FloatArray, known: BoolArray, place: FloatArray
+) -> SpatialEstimate:
+    """Return poses and places, one frame after the other.
+
+    Args:
+        problem: the measurements.
+        noise: how far the robot may be from where the odometry puts it.
+        start_pose: (7,) of the first frame, unless known places say otherwise.
+        known: (P,) places of a map that is given.
+        place: (P, 7) where they are.
+    """
+    n, mount = len(problem.stamp_s), problem.mount[problem.sensor]
+    place, known = place.copy(), known.copy()
+    either = np.stack([se3.compose(mount, problem.measured), _with_other(problem, mount)])
+    share = np.exp(-np.clip(problem.other_log_odds / noise.pixel**2, 0.0, 30.0))
+    log_share = np.stack([-np.log1p(share), np.log(share + 1e-12) - np.log1p(share)])
+    sigma_m = np.hypot(_sigma_m(problem.measured_root) * noise.position, SLACK_M)
+    sigma_rad = np.hypot(problem.sigma_rad * noise.pixel, SLACK_RAD)
+    turned = problem.oriented[problem.place]
+    first = np.searchsorted(problem.pose_row, np.arange(n + 1))
+    pose, unsure_s = np.empty((n, 7)), 1e6 if known.any() else 0.0
+    pose[0] = start_pose
+    for row in range(n):
+        if row:
+            pose[row] = se3.compose(pose[row - 1], problem.increment[row - 1])
+            unsure_s += problem.lasted_s[row - 1]
+        mine = np.arange(first[row], first[row + 1])
+        if not len(mine):
+            continue
+        met = mine[known[problem.place[mine]]]
+        if len(met):
+            spread = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
+            candidate = _candidates(pose[row], either[:, met], place[problem.place[met]], turned[met])
+            cost = _moved(candidate, spread)
+            cost += _seen(
+                candidate, either[:, met], place[problem.place[met]], log_share[:, met], sigma_m[met], sigma_rad[met],
+                turned[met],
+            ).sum(axis=1)  # fmt: skip
+            cost[0] -= WORTH
+            best = int(np.argmin(cost))
+            pose[row] = candidate[best]
+            unsure_s = 0.0 if best else unsure_s
+        new = mine[~known[problem.place[mine]]]
+        place[problem.place[new]] = se3.compose(pose[row], either[0, new])
+        known[problem.place[new]] = True
+    place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7)))
+
+
+def _with_other(problem: SpatialProblem, mount: FloatArray) -> FloatArray:
+    """(M, 7) the second explanations in the robot's frame; the first where there is none."""
+    some = np.isfinite(problem.other[:, :1])
+    return se3.compose(mount, np.where(some, problem.other, problem.measured))
+
+
+def _sigma_m(root: FloatArray) -> FloatArray:
+    """(M,) of positions, all axes alike."""
+    inverse = np.linalg.inv(root)
+    return np.asarray(np.sqrt((inverse**2).sum(axis=(1, 2)) / 3.0))
+
+
+def _candidates(predicted: FloatArray, either: FloatArray, place: FloatArray, turned: BoolArray) -> FloatArray:
+    """(C, 7) the predicted pose, then where each detection (2, K, 7) of a place with an orientation puts the robot."""
+    by_places = se3.compose(place[None], se3.inverse(either))[:, turned].reshape(-1, 7)
+    return np.vstack([predicted[None], by_places])
+
+
+def _moved(candidate: FloatArray, spread: tuple[float, float]) -> FloatArray:
+    """(C,) nats that it costs to be there rather than where the odometry says, the first."""
+    off = se3.local(candidate[:1], candidate)
+    squared = (off[:, :3] ** 2).sum(axis=1) / spread[0] ** 2 + (off[:, 3:] ** 2).sum(axis=1) / spread[1] ** 2
+    return np.asarray(np.minimum(0.5 * squared, LOST))
+
+
+def _seen(
+    candidate: FloatArray, either: FloatArray, place: FloatArray, log_share: FloatArray, sigma_m: FloatArray,
+    sigma_rad: FloatArray, turned: BoolArray,
+) -> FloatArray:  # fmt: skip
+    """(C, K) nats that the detections cost."""
+    at = se3.compose(candidate[:, None, None, :], either[None])
+    away = np.linalg.norm(at[..., :3] - place[:, :3], axis=-1) / sigma_m
+    dot = np.abs((at[..., 3:] * place[:, 3:]).sum(axis=-1))
+    angle = np.where(turned, 2.0 * np.arccos(np.clip(dot, 0.0, 1.0)), 0.0) / sigma_rad
+    cost = 0.5 * away**2 + 0.5 * angle**2 - log_share[None]
+    return np.asarray(np.minimum(cost.min(axis=1), OUTLIER))
