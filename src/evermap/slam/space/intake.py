@@ -112,6 +112,7 @@ def prepare_space(recording: SpatialRecording, mount_sigma: FloatArray, remarks:
         half_m=0.5 * np.nan_to_num(detections.tag_size_m[used]),
         other=some.other,
         other_log_odds=some.other_log_odds,
+        share=np.ones(len(used)),
         oriented=oriented,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(mount_sigma, (len(recording.sensors), 1)),

@@ -48,6 +48,7 @@ class Sightings(NamedTuple):
         corner_root: (M, 4, 2, 2) pixels by these.
         half_m: (M,) half of the tag's edge.
         first: (M + 1,) where the values of each begin, counted from the first detection.
+        share: (M,) of the information of each that is new: errors of consecutive detections are alike.
         log_odds: (3,) of each kind, beyond which half of the squared residual makes an outlier.
     """
 
@@ -63,6 +64,7 @@ class Sightings(NamedTuple):
     corner_root: FloatArray
     half_m: FloatArray
     first: IntArray
+    share: FloatArray
     log_odds: FloatArray
 
 
@@ -157,8 +159,8 @@ def linearise_sightings(
             squared += e[a] * e[a]
             residual[m, a] = e[a]
         weight[m], loss = weighed(squared, seen.log_odds[kind], rows, 0.0, heavy)
-        cost += loss
-        scale, at = math.sqrt(weight[m]), seen.first[m]
+        cost += seen.share[m] * loss
+        scale, at = math.sqrt(weight[m] * seen.share[m]), seen.first[m]
         for a in range(rows):
             late = 0.0
             for b in range(6):

@@ -79,6 +79,7 @@ class SpatialProblem:
         corner, corner_root, half_m: of tags in an image; see `Sightings`.
         other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.
         other_log_odds: (M,) of the first against the other.
+        share: (M,) of the information of each detection that is new.
         oriented: (P,) places with an orientation; the others are points.
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
@@ -102,6 +103,7 @@ class SpatialProblem:
     half_m: FloatArray
     other: FloatArray
     other_log_odds: FloatArray
+    share: FloatArray
     oriented: BoolArray
     mount: FloatArray
     mount_sigma: FloatArray
@@ -125,7 +127,7 @@ class SpatialProblem:
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
         return Sightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
-            self.sigma_rad, self.corner, self.corner_root, self.half_m, first, OUTLIER_LOG_ODDS,
+            self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share, OUTLIER_LOG_ODDS,
         )  # fmt: skip
 
     def as_points(self) -> SpatialProblem:
@@ -142,7 +144,7 @@ class SpatialProblem:
         rows = np.flatnonzero(~dropped)
         names = (
             "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
-            "half_m", "other", "other_log_odds",
+            "half_m", "other", "other_log_odds", "share",
         )  # fmt: skip
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 

@@ -98,7 +98,7 @@ def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: S
     squared = (residual**2).sum(axis=1)
     d = 0.5 * squared - seen.log_odds[seen.kind]
     loss = 0.5 * squared - np.logaddexp(0.0, d)
-    return np.bincount(problem.pose_row, loss, minlength=len(estimate.pose)).astype(np.float64)
+    return np.bincount(problem.pose_row, problem.share * loss, minlength=len(estimate.pose)).astype(np.float64)
 
 
 def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, SpatialEstimate, IntArray] | None:

@@ -8,9 +8,10 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.slam.space.against_map import MapComparison, compared
+from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake
-from evermap.slam.space.linearise import POINT
+from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import repaired, split
 from evermap.slam.space.smoother import SpatialSmoother
@@ -64,6 +65,12 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, sigma: float
     problem, stated, rows = _with_map(intake, prior_map, sigma)
     identity = np.arange(len(intake.landmark_id))
     noise = DRIVEN if problem.driven else BY_HAND
+    by_corners = problem.kind == CORNERS
+    if problem.driven and np.mean(by_corners) < 0.5:  # pixels err by themselves, detectors of objects by the view
+        drift = drift_of(problem, intake.driven_pose)
+        problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
+        if drift.translation is not None and drift.rotation is not None:
+            noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     start = _start(problem, intake, noise)
     online = start.pose
     estimate = start
