@@ -17,10 +17,10 @@ from evermap.geometry import se3
 from evermap.slam.space.problem import SpatialProblem
 from evermap.types import FloatArray
 
-PERSIST_S = (1.0, 3.0, 10.0, 30.0)
-"""Correlation times of detection errors that are tried together."""
+PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+"""Correlation times of detection errors that are tried together; the last two only where the drift is known."""
 SIGHTINGS_A_PLACE = 150
-BINS, FEWEST_PAIRS = 14, 30
+BINS, FEWEST_BINS, FEWEST_PAIRS = 14, 4, 30
 MEDIAN = 2.366
 """Of the chi-square distribution with three degrees of freedom."""
 LEAST_DRIFT = 3e-4
@@ -42,28 +42,41 @@ class Drift(NamedTuple):
 
 def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
     """Return the drift of the odometry, poses (N, 7), and how much of each detection is new."""
-    count = len(problem.place)
     sensor = se3.compose(driven[problem.pose_row], problem.mount[problem.sensor])
     at, stamp_s = se3.transform(sensor, problem.measured[:, :3]), problem.stamp_s[problem.pose_row]
-    lags, squares = [], []
+    medians = {}
     for place in range(len(problem.oriented)):
         mine = np.flatnonzero(problem.place == place)
-        mine = mine[:: max(1, len(mine) // SIGHTINGS_A_PLACE)]
-        i, j = np.triu_indices(len(mine), 1)
-        lags.append(np.abs(stamp_s[mine[j]] - stamp_s[mine[i]]))
-        squares.append(((at[mine[j]] - at[mine[i]]) ** 2).sum(axis=1))
-    lag_s, square = _medians(np.concatenate(lags), np.concatenate(squares) / MEDIAN)
-    if len(lag_s) < 4:
-        return Drift(None, None, np.ones(count))
-    columns = [np.ones(len(lag_s)), *(1.0 - np.exp(-lag_s / persist_s) for persist_s in PERSIST_S), lag_s]
-    fitted, _ = nnls(np.column_stack(columns) / square[:, None], np.ones(len(lag_s)))
-    variance = 0.5 * fitted[-1]
-    rate_hz = _rate(problem, stamp_s)
-    of_noise = fitted[0] + fitted[1:-1].sum()
-    repeated = (fitted[1:-1] * np.array(PERSIST_S)).sum() / of_noise if of_noise > 0.0 else 0.0
-    translation = float(np.sqrt(max(variance, LEAST_DRIFT**2)))
+        some = mine[:: max(1, len(mine) // SIGHTINGS_A_PLACE)]
+        i, j = np.triu_indices(len(some), 1)
+        square = ((at[some[j]] - at[some[i]]) ** 2).sum(axis=1) / MEDIAN
+        lag_s, square = _medians(np.abs(stamp_s[some[j]] - stamp_s[some[i]]), square)
+        if len(lag_s) >= FEWEST_BINS:
+            medians[place] = lag_s, square
+    share = np.ones(len(problem.place))
+    if not medians:
+        return Drift(None, None, share)
+    # all landmarks drift alike: what one of them stays behind, others moved by errors of their own
+    growth = min(_fitted(lag_s, square, PERSIST_S[:-2], 0.0)[-1] for lag_s, square in medians.values())
+    for place, (lag_s, square) in medians.items():
+        mine = np.flatnonzero(problem.place == place)
+        parts = _fitted(lag_s, square, PERSIST_S, growth)
+        repeated = (parts[1:-1] * np.array(PERSIST_S)).sum() / max(parts[:-1].sum(), 1e-12)
+        share[mine] = 1.0 / (1.0 + 2.0 * repeated * _rate(stamp_s[mine]))
+    translation = float(np.sqrt(max(0.5 * growth, LEAST_DRIFT**2)))
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
-    return Drift(translation, translation / max(range_m, 1.0), 1.0 / (1.0 + 2.0 * repeated * rate_hz))
+    return Drift(translation, translation / max(range_m, 1.0), share)
+
+
+def _fitted(lag_s: FloatArray, square: FloatArray, persist_s: tuple[float, ...], growth: float) -> FloatArray:
+    """Parts of a variogram: white, persistent for each of some times, and growing without end; the last is given,
+    unless it is 0.
+    """
+    columns = [np.ones(len(lag_s)), *(1.0 - np.exp(-lag_s / each_s) for each_s in persist_s)]
+    rest = np.maximum(square - growth * lag_s, 0.0)
+    columns += [] if growth > 0.0 else [lag_s]
+    found, _ = nnls(np.column_stack(columns) / square[:, None], rest / square)
+    return np.append(found, growth) if growth > 0.0 else np.asarray(found)
 
 
 def _medians(lag_s: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -79,14 +92,8 @@ def _medians(lag_s: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatAr
     return median[:, 0], np.maximum(median[:, 1], 1e-12)
 
 
-def _rate(problem: SpatialProblem, stamp_s: FloatArray) -> FloatArray:
-    """(M,) detections of the same place a second, around each."""
-    rate = np.zeros(len(stamp_s))
-    for place in range(len(problem.oriented)):
-        mine = np.flatnonzero(problem.place == place)
-        near = stamp_s[mine]
-        within = np.searchsorted(near, near + 0.5 * PERSIST_S[1], side="right") - np.searchsorted(
-            near, near - 0.5 * PERSIST_S[1]
-        )
-        rate[mine] = (within - 1) / PERSIST_S[1]
-    return rate
+def _rate(stamp_s: FloatArray) -> FloatArray:
+    """(K,) detections of one place a second, around each."""
+    half_s = 0.5 * PERSIST_S[1]
+    first, last = np.searchsorted(stamp_s, stamp_s - half_s), np.searchsorted(stamp_s, stamp_s + half_s, side="right")
+    return np.asarray((last - first - 1) / PERSIST_S[1])
