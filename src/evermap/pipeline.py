@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.config import Config
-from evermap.types import Landmarks, Progress, Recording, SlamResult
+from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def run_slam(
-    recording: Recording,
+    recording: AnyRecording,
     config: Config | None = None,
     *,
     prior_map: Landmarks | None = None,
     realtime: bool = False,
     progress: Progress | None = None,
 ) -> SlamResult:
-    """Estimate trajectory, landmarks, calibration and noise of one recording.
+    """Estimate trajectory, landmarks, calibration and noise of one recording, in the plane or in space.
 
     Args:
         recording: what a reader returned; its truth is not looked at.
@@ -52,6 +52,8 @@ def run_slam(
     from evermap.slam.result import concluded
 
     config = config or Config()
+    if isinstance(recording, SpatialRecording):
+        return _run_in_space(recording, config, prior_map, progress)
     recording = valid(recording, config.sensor, prior_map)
     remarks = odd(recording, identities=not config.slam.unknown_ids, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
@@ -62,6 +64,21 @@ def run_slam(
     with threadpool_limits(limits=1, user_api="blas"):
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
         return existing(solved, concluded(solved), config.living)
+
+
+def _run_in_space(
+    recording: SpatialRecording, config: Config, prior_map: Landmarks | None, progress: Progress | None
+) -> SlamResult:
+    """The same in space: all frames are read, then solved together."""
+    from threadpoolctl import threadpool_limits
+
+    from evermap.slam.space.intake import prepare_space
+    from evermap.slam.space.result import concluded_in_space
+    from evermap.slam.space.solve import solve_space
+
+    intake = prepare_space(recording, config.slam.space)
+    with threadpool_limits(limits=1, user_api="blas"):
+        return concluded_in_space(recording, intake, solve_space(intake, prior_map, progress=progress))
 
 
 def run_session(

@@ -112,6 +112,20 @@ class CleaningConfig(Section):
         return around
 
 
+class SpaceConfig(Section):
+    """What is estimated of sensors in space, beside poses and landmarks."""
+
+    mount_sigma_m: float = Field(
+        default=0.0, ge=0, le=10, description="how far sensors may sit from where their mounts say [m]; 0: exactly there"
+    )
+    mount_sigma_rad: float = Field(
+        default=0.0, ge=0, le=3, description="how far they may be turned from there [rad]; 0: not at all"
+    )
+    delay_sigma_s: float = Field(
+        default=0.0, ge=0, le=10, description="how late a sensor's stamps may be against the odometry's [s]; 0: not at all"
+    )
+
+
 class NoiseConfig(Section):
     """Noise levels that a run starts from, where the sensor states none."""
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from evermap.config import SpaceConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
@@ -53,13 +54,12 @@ class SpatialIntake:
     names: Mapping[int, str] = field(default_factory=dict)
 
 
-def prepare_space(recording: SpatialRecording, mount_sigma: FloatArray, remarks: tuple[str, ...] = ()) -> SpatialIntake:
+def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...] = ()) -> SpatialIntake:
     """Sort out what can be used: detections of known identity, while there is odometry.
 
     Args:
         recording: as read.
-        mount_sigma: (7,) standard deviations of the twist of every sensor's mount, and of the delay of its stamps; 0
-            where exact.
+        settings: what may be wrong with the mounts and stamps of the sensors.
         remarks: on the recording, before those on what was left out.
 
     Raises:
@@ -115,7 +115,7 @@ def prepare_space(recording: SpatialRecording, mount_sigma: FloatArray, remarks:
         share=np.ones(len(used)),
         oriented=oriented,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
-        mount_sigma=np.tile(mount_sigma, (len(recording.sensors), 1)),
+        mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
     )
     return SpatialIntake(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
@@ -217,6 +217,11 @@ def _roots(covariance: FloatArray) -> FloatArray:
     """Upper triangular (M, 3, 3) that whiten."""
     information = np.linalg.inv(covariance)
     return np.ascontiguousarray(np.swapaxes(np.linalg.cholesky(information), 1, 2))
+
+
+def _mount_sigma(settings: SpaceConfig) -> FloatArray:
+    """(7,) of a mount's twist, and of the delay."""
+    return np.array([settings.mount_sigma_m] * 3 + [settings.mount_sigma_rad] * 3 + [settings.delay_sigma_s])
 
 
 def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -16,7 +16,7 @@ from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise
 from evermap.slam.space.repair import repaired, split
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.start import incremental
-from evermap.types import BoolArray, FloatArray, IntArray, Landmarks
+from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
 
 BY_HAND = SpatialNoise(translation=1.0, rotation=0.7, pixel=2.0)
 """Without odometry: metres and radians that a robot may go a second."""
@@ -42,6 +42,7 @@ class SpatialSolved:
         from_map: what of the given map stands; None without a map.
         map_rows: (K,) rows of the given map behind its comparison.
         online_pose: (N, 7) poses as each frame had them.
+        step_s: (N,) seconds that each frame took.
     """
 
     optimum: SpatialOptimum
@@ -49,15 +50,19 @@ class SpatialSolved:
     from_map: MapComparison | None
     map_rows: IntArray
     online_pose: FloatArray
+    step_s: FloatArray
 
 
-def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, sigma: float = 0.02) -> SpatialSolved:
+def solve_space(
+    intake: SpatialIntake, prior_map: Landmarks | None, sigma: float = 0.02, progress: Progress | None = None
+) -> SpatialSolved:
     """Estimate poses, places and noise of a recording in space.
 
     Args:
         intake: the recording as the estimator wants it.
         prior_map: landmarks to localise in; None maps from scratch, in the frame of the first pose.
         sigma: deviation [m, rad] of map landmarks that state none.
+        progress: told after every frame.
 
     Raises:
         NumericalError: no finite optimum.
@@ -71,9 +76,10 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, sigma: float
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
         if drift.translation is not None and drift.rotation is not None:
             noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
-    start = _start(problem, intake, noise)
-    online = start.pose
-    estimate = start
+    known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
+    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
+    stepwise, step_s = incremental(problem, noise, known, place, progress)
+    start = estimate = _start(problem, intake, noise, stepwise)
     if problem.driven:
         points = converged(problem.as_points(), start, noise)
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
@@ -89,7 +95,7 @@ def solve_space(intake: SpatialIntake, prior_map: Landmarks | None, sigma: float
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
-    return SpatialSolved(optimum, identity, from_map, rows, online)
+    return SpatialSolved(optimum, identity, from_map, rows, stepwise.pose, step_s)
 
 
 def _with_map(
@@ -121,13 +127,14 @@ def _with_map(
     return replace(problem, prior=prior, start_sigma=np.full(6, FREE)), stated, rows.astype(np.int64)
 
 
-def _start(problem: SpatialProblem, intake: SpatialIntake, noise: SpatialNoise) -> SpatialEstimate:
+def _start(
+    problem: SpatialProblem, intake: SpatialIntake, noise: SpatialNoise, stepwise: SpatialEstimate
+) -> SpatialEstimate:
     """First values: frame after frame, or along the odometry as a whole; what is more probable."""
-    known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
-    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
-    stepwise = incremental(problem, noise, se3.identity(), known, place)
     if not problem.driven:
         return stepwise
+    known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
+    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
     whole = _along(problem, intake.driven_pose, known, place)
     points = problem.as_points()
     cost = []

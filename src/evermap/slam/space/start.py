@@ -6,11 +6,13 @@ its view has two explanations; the one that agrees with the other tags and with 
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
 from evermap.geometry import se3
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.types import BoolArray, FloatArray
+from evermap.types import BoolArray, FloatArray, Progress
 
 SLACK_M, SLACK_RAD = 0.15, 0.15
 """What places of a map in the making are off by."""
@@ -23,16 +25,16 @@ WORTH = 3.0
 
 
 def incremental(
-    problem: SpatialProblem, noise: SpatialNoise, start_pose: FloatArray, known: BoolArray, place: FloatArray
-) -> SpatialEstimate:
-    """Return poses and places, one frame after the other.
+    problem: SpatialProblem, noise: SpatialNoise, known: BoolArray, place: FloatArray, progress: Progress | None = None
+) -> tuple[SpatialEstimate, FloatArray]:
+    """Return poses and places, one frame after the other, and the seconds (N,) that each frame took.
 
     Args:
         problem: the measurements.
         noise: how far the robot may be from where the odometry puts it.
-        start_pose: (7,) of the first frame, unless known places say otherwise.
         known: (P,) places of a map that is given.
         place: (P, 7) where they are.
+        progress: told after every frame.
     """
     n, mount = len(problem.stamp_s), problem.mount[problem.sensor]
     place, known = place.copy(), known.copy()
@@ -44,14 +46,13 @@ def incremental(
     turned = problem.oriented[problem.place]
     first = np.searchsorted(problem.pose_row, np.arange(n + 1))
     pose, unsure_s = np.empty((n, 7)), 1e6 if known.any() else 0.0
-    pose[0] = start_pose
+    pose[0], step_s = se3.identity(), np.zeros(n)
     for row in range(n):
+        began = time.perf_counter()
         if row:
             pose[row] = se3.compose(pose[row - 1], problem.increment[row - 1])
             unsure_s += problem.lasted_s[row - 1]
         mine = np.arange(first[row], first[row + 1])
-        if not len(mine):
-            continue
         met = mine[known[problem.place[mine]]]
         if len(met):
             spread = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
@@ -68,8 +69,11 @@ def incremental(
         new = mine[~known[problem.place[mine]]]
         place[problem.place[new]] = se3.compose(pose[row], either[0, new])
         known[problem.place[new]] = True
+        step_s[row] = time.perf_counter() - began
+        if progress is not None:
+            progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7)))
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), step_s
 
 
 def _with_other(problem: SpatialProblem, mount: FloatArray) -> FloatArray:

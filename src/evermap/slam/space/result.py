@@ -1,0 +1,277 @@
+"""What comes out of the estimator in space, as plain arrays with the recording's ids and stamps, in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSE, POSITION, ROTATION, ROWS, TRANSLATION
+from evermap.slam.space.solve import SpatialSolved
+from evermap.slam.sparse.elimination import Spread
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    ChangeKind,
+    FloatArray,
+    Innovations,
+    IntArray,
+    Landmarks,
+    MapChange,
+    Misses,
+    ParameterEstimate,
+    SlamResult,
+    SpatialRecording,
+    Trajectory,
+    landmark_id_of,
+)
+
+SEEN = 0.5
+"""A pose without odometry is told where its detections' inlier probabilities sum to this."""
+TOLD = 0.5
+"""Probability from which on a landmark of the map is told to have moved."""
+MOUNT = "correction of the sensor's stated mount, or delay of its stamps"
+_LEVELS = {
+    TRANSLATION: ("sigma_odometry_m", "m/sqrt(s)", "noise of the odometry's translation"),
+    ROTATION: ("sigma_odometry_rad", "rad/sqrt(s)", "noise of the odometry's rotation"),
+    POSITION: ("position_noise_factor", "1", "noise of detected positions over what is stated"),
+    ORIENTATION: ("orientation_noise_factor", "1", "noise of detected orientations over what is stated"),
+    PIXEL: ("sigma_corner_px", "px", "noise of tag corners in the image"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """A solved recording with what several tables need of it."""
+
+    recording: SpatialRecording
+    intake: SpatialIntake
+    solved: SpatialSolved
+    spread: Spread
+    frame: str
+    stamp_s: FloatArray
+
+
+def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
+    """Return trajectory and map, and what stands elsewhere than a given map says."""
+    frame = "first_pose" if solved.from_map is None else "prior_map"
+    optimum = solved.optimum
+    told = _Told(
+        recording, intake, solved, optimum.smoother.spread(optimum.now), frame,
+        intake.start_s + optimum.smoother.problem.stamp_s,
+    )  # fmt: skip
+    identities, names = _identities(told)
+    located = _located(told)
+    warnings = list(intake.warnings)
+    if not located.all():
+        warnings.append(f"{int((~located).sum())} frames in which the robot could not be located left out")
+    twice = [_called(names, int(identity)) for identity in identities[len(intake.landmark_id) :]]
+    if twice:
+        warnings.append(f"identities that several landmarks carry, told apart by their places: {', '.join(twice)}")
+    n = len(told.stamp_s)
+    return SlamResult(
+        trajectory=Trajectory(
+            told.stamp_s[located],
+            optimum.estimate.pose[located],
+            optimum.smoother.covariance_of_poses(told.spread)[located],
+            frame=frame,
+            clock=recording.clock,
+        ),
+        online=Trajectory(told.stamp_s, solved.online_pose, np.zeros((n, 6, 6)), frame=frame, clock=recording.clock),
+        landmarks=_landmarks(told, identities, names),
+        parameters=_parameters(told),
+        innovations=_innovations(told, identities),
+        misses=Misses.empty(),
+        step_s=solved.step_s,
+        dead_reckoning=_dead_reckoning(told),
+        warnings=tuple(warnings),
+        changes=_changes(told, identities, names),
+        gone=Landmarks.in_space([], np.zeros((0, 3)), clock=recording.clock),
+    )
+
+
+def _identities(told: _Told) -> tuple[IntArray, dict[int, str]]:
+    """Ids (P,) of the places, and names: a second landmark with the identity 7 is called '7#2'."""
+    intake, whose = told.intake, told.solved.identity
+    names, identities = dict(intake.names), intake.landmark_id[whose].copy()
+    for row in range(len(intake.landmark_id), len(whose)):
+        number = 1 + int(np.count_nonzero(whose[:row] == whose[row]))
+        own = int(intake.landmark_id[whose[row]])
+        name = f"{names.get(own, own)}#{number}"
+        identities[row] = landmark_id_of(name)
+        names[int(identities[row])] = name
+    return identities, names
+
+
+def _called(names: Mapping[int, str], identity: int) -> str:
+    return names.get(identity, str(identity))
+
+
+def _located(told: _Told) -> BoolArray:
+    """(N,) poses of which something is known: by odometry, or by detections that are no outliers."""
+    problem, now = told.solved.optimum.smoother.problem, told.solved.optimum.now
+    if problem.driven:
+        return np.ones(len(problem.stamp_s), dtype=np.bool_)
+    seen = np.bincount(problem.pose_row, now.weight, minlength=len(problem.stamp_s))
+    return np.asarray(seen > SEEN)
+
+
+def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> Landmarks:
+    optimum, recording = told.solved.optimum, told.recording
+    problem, place = optimum.smoother.problem, optimum.estimate.place
+    count, n = len(place), len(problem.stamp_s)
+    used = optimum.now.weight > SEEN
+    hits = np.bincount(problem.place[used], minlength=count)
+    covariance, turned = np.zeros((count, 3, 3)), np.full((count, 3, 3), np.nan)
+    for k in range(count):
+        dim, at = (6 if problem.oriented[k] else 3), told.spread.own_first[n + k]
+        own = told.spread.own[at : at + dim * dim].reshape(dim, dim)
+        covariance[k] = own[:3, :3]
+        if dim == 6:  # a twist's translation is in the place's own axes
+            turn = se3.rotation_of(place[k])
+            covariance[k] = turn @ own[:3, :3] @ turn.T
+            turned[k] = own[3:, 3:]
+    first, last = np.full(count, np.nan), np.full(count, np.nan)
+    stamp_s = told.stamp_s[problem.pose_row]
+    np.fmin.at(first, problem.place[used], stamp_s[used])
+    np.fmax.at(last, problem.place[used], stamp_s[used])
+    order = np.argsort(identities, kind="stable")
+    order = order[hits[order] > 0]
+    oriented = bool(problem.oriented.any())
+    rotation = np.where(problem.oriented[:, None], place[:, 3:], np.nan)
+    return Landmarks(
+        landmark_id=identities[order],
+        position_m=place[order, :3],
+        covariance_m2=covariance[order],
+        class_id=_most(problem.place, recording.detections.class_id[told.intake.used], count)[order],
+        p_exists=np.ones(len(order)),
+        n_hits=hits[order],
+        n_misses=np.zeros(len(order), dtype=np.int64),
+        first_seen_s=first[order],
+        last_seen_s=last[order],
+        class_names=recording.class_names,
+        frame=told.frame,
+        clock=recording.clock,
+        names=names,
+        rotation=rotation[order] if oriented else None,
+        rotation_covariance=turned[order] if oriented else None,
+        size_m=_sizes(told, count)[order] if np.isfinite(recording.detections.size_m).any() else None,
+    )
+
+
+def _most(place: IntArray, class_id: IntArray, count: int) -> IntArray:
+    """(P,) the class that most detections of each place say."""
+    found = np.full(count, UNKNOWN)
+    for row in range(count):
+        own = class_id[(place == row) & (class_id != UNKNOWN)]
+        if len(own):
+            found[row] = int(np.argmax(np.bincount(own)))
+    return found
+
+
+def _sizes(told: _Told, count: int) -> FloatArray:
+    """(P, 3) median sizes of boxes."""
+    size, place = told.recording.detections.size_m[told.intake.used], told.solved.optimum.smoother.problem.place
+    found = np.full((count, 3), np.nan)
+    for row in range(count):
+        own = size[(place == row) & np.isfinite(size[:, 0])]
+        if len(own):
+            found[row] = np.median(own, axis=0)
+    return found
+
+
+def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
+    problem, levels = told.solved.optimum.smoother.problem, told.solved.optimum.noise.levels
+    has = {
+        TRANSLATION: problem.driven,
+        ROTATION: problem.driven,
+        POSITION: bool((problem.kind != CORNERS).any()),
+        ORIENTATION: bool((problem.kind == POSE).any()),
+        PIXEL: bool((problem.kind == CORNERS).any()),
+    }
+    found = [
+        ParameterEstimate(name, float(levels[row]), 0.0, np.nan, np.nan, unit, meaning=meaning)
+        for row, (name, unit, meaning) in _LEVELS.items()
+        if has[row]
+    ]
+    border = told.solved.optimum.smoother.factorised(told.solved.optimum.now).border_covariance()
+    sigma = np.sqrt(np.diag(border)).reshape(-1, 7)
+    parts = [*((f"mount_{axis}_m", "m") for axis in "xyz"), *((f"mount_r{axis}_rad", "rad") for axis in "xyz")]
+    parts += [("delay_s", "s")]
+    for row, sensor in enumerate(told.recording.sensors):
+        for column, (part, unit) in enumerate(parts):
+            prior = float(problem.mount_sigma[row, column])
+            if prior > 0.0:
+                value = float(told.solved.optimum.estimate.state[row, column])
+                name, spread = f"{sensor.name}_{part}", float(sigma[row, column])
+                found.append(ParameterEstimate(name, value, spread, 0.0, prior, unit, meaning=MOUNT))
+    return tuple(found)
+
+
+def _innovations(told: _Told, identities: IntArray) -> Innovations:
+    """NIS of all detections, each as if it had not been used, from residuals r and what it leaned on itself.
+
+    With H = J S J' of whitened Jacobians and the covariance S, used with the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+    """
+    smoother, now = told.solved.optimum.smoother, told.solved.optimum.now
+    problem, first = smoother.problem, told.spread.of_factors_first[len(smoother.problem.increment) :]
+    nis = np.zeros(len(problem.kind))
+    for kind in range(3):
+        some, rows = np.flatnonzero(problem.kind == kind), int(ROWS[kind])
+        if not len(some):
+            continue
+        at = first[some][:, None] + np.arange(rows * rows)
+        weight = np.maximum((now.weight * problem.share)[some], 1e-6)[:, None, None]
+        used = told.spread.of_factors[at].reshape(-1, rows, rows)
+        rest = (1.0 + 1e-9) * np.eye(rows) - used
+        r = now.residual[some, :rows, None]
+        nis[some] = (np.linalg.solve(rest, r) * np.linalg.solve(rest + used / weight, r)).sum(axis=(1, 2))
+    return Innovations(
+        stamp_s=told.stamp_s[problem.pose_row],
+        detection=told.intake.used,
+        landmark_id=identities[problem.place],
+        nis=np.maximum(nis, 0.0),
+        p_inlier=np.clip(now.weight, 0.0, 1.0),
+        dof=ROWS[problem.kind].astype(np.int64),
+    )
+
+
+def _dead_reckoning(told: _Told) -> Trajectory:
+    """Odometry alone from the first pose; nothing without."""
+    problem, pose = told.solved.optimum.smoother.problem, told.solved.optimum.estimate.pose
+    count = len(pose) if problem.driven else 0
+    path = se3.compose(pose[:1], told.intake.driven_pose[:count])
+    return Trajectory(told.stamp_s[:count], path, np.zeros((count, 6, 6)), frame=told.frame, clock=told.recording.clock)
+
+
+def _changes(told: _Told, identities: IntArray, names: Mapping[int, str]) -> tuple[MapChange, ...]:
+    """Landmarks that stand elsewhere than the given map says, the most certain first."""
+    found = told.solved.from_map
+    if found is None:
+        return ()
+    problem, optimum = told.solved.optimum.smoother.problem, told.solved.optimum
+    used = optimum.now.weight > SEEN
+    changes = []
+    for k in np.argsort(found.p_stands, kind="stable"):
+        if 1.0 - found.p_stands[k] < TOLD:
+            break
+        place = int(problem.prior.place[k])
+        identity = int(identities[place])
+        shift = optimum.estimate.place[place, :3] - problem.prior.pose[k, :3]
+        turn = float(np.linalg.norm(found.off[k, 3:])) if problem.oriented[place] else 0.0
+        changes.append(
+            MapChange(
+                landmark_ids=(identity,),
+                kind=ChangeKind.MOVED,
+                stamp_from_s=float("nan"),
+                stamp_to_s=float(told.stamp_s[0]),
+                displacement_m=tuple(shift.tolist()),
+                rotation_rad=turn,
+                probability=float(1.0 - found.p_stands[k]),
+                n_hits=int(np.count_nonzero(used & (problem.place == place))),
+            ).named(names)
+        )
+    return tuple(changes)
