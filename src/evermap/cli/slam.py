@@ -169,27 +169,27 @@ def slam(
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if shift and prior_map is None:
         raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
-    from evermap.io import parse_shift, read_planar, shifted
+    from evermap.io import parse_shift, read_recording, shifted
     from evermap.runs.folder import check_replaceable
 
     shifts = [parse_shift(text) for text in shift or []]
     inputs = [input, config, None if prior_map == "truth" else prior_map, map_file]
     if out is not None:  # better now than after the run
         check_replaceable(out, force=force, inputs=inputs)
-    recording = read_planar(input, robot=robot)
+    recording = read_recording(input, robot=robot)
     if out is None:
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
     if map_file is not None:
-        run_in_map(recording, chosen, MapOptions(map_file, prior or [], localize, realtime), out, **how)
+        run_in_map(_planar(recording), chosen, MapOptions(map_file, prior or [], localize, realtime), out, **how)
         return
     known = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
     run_and_write(recording, chosen, out, prior=known, realtime=realtime, **how)
 
 
 def run_and_write(
-    recording: Recording,
+    recording: AnyRecording,
     config: Config,
     out: Path,
     *,
@@ -272,6 +272,16 @@ def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str 
         )
 
 
+def _planar(recording: AnyRecording) -> Recording:
+    """Return a recording in the plane: living maps are planar so far."""
+    from evermap.types import Recording
+
+    if not isinstance(recording, Recording):
+        problem = "the recording is in space, living maps are in the plane so far"
+        raise ConfigError(problem, field="map", hint="--prior-map FILE reports what of a map in space has moved")
+    return recording
+
+
 def _write_template(folder: Path, *, in_space: bool) -> None:
     from evermap.io import write_template
 
@@ -279,7 +289,7 @@ def _write_template(folder: Path, *, in_space: bool) -> None:
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
 
 
-def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> Landmarks:
+def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:
     from evermap.io import read_prior_map
     from evermap.types import Landmarks
 
@@ -289,6 +299,12 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: Recording) -> La
     if survey is None:
         problem = "this recording has no surveyed landmarks"
         raise ConfigError(problem, field="prior_map", hint="a landmarks.csv of your own: --prior-map FILE")
+    if survey.position_m.shape[1] == 3:
+        import numpy as np
+
+        known = np.broadcast_to(sigma_m**2 * np.eye(3), (len(survey), 3, 3)).copy()
+        turned = None if survey.rotation is None else known.copy()
+        return replace(survey, covariance_m2=known, rotation_covariance=turned, frame="prior_map")
     return Landmarks.at(
         survey.landmark_id,
         survey.position_m,

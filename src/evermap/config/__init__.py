@@ -40,6 +40,7 @@ from evermap.config.slam import (
     OutputConfig,
     SensorConfig,
     SlamConfig,
+    SpaceConfig,
 )
 from evermap.config.tables import PersistConfig, SurvivalConfig, TrackConfig, TrackerConfig
 from evermap.errors import ConfigError
@@ -208,6 +209,7 @@ __all__ = [
     "SensorConfig",
     "SightConfig",
     "SlamConfig",
+    "SpaceConfig",
     "SurvivalConfig",
     "TrackConfig",
     "TrackerConfig",

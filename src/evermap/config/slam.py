@@ -116,13 +116,19 @@ class SpaceConfig(Section):
     """What is estimated of sensors in space, beside poses and landmarks."""
 
     mount_sigma_m: float = Field(
-        default=0.0, ge=0, le=10, description="how far sensors may sit from where their mounts say [m]; 0: exactly there"
+        default=0.0,
+        ge=0,
+        le=10,
+        description="how far sensors may be from their mounts as stated [m]; 0: exactly there",
     )
     mount_sigma_rad: float = Field(
         default=0.0, ge=0, le=3, description="how far they may be turned from there [rad]; 0: not at all"
     )
     delay_sigma_s: float = Field(
-        default=0.0, ge=0, le=10, description="how late a sensor's stamps may be against the odometry's [s]; 0: not at all"
+        default=0.0,
+        ge=0,
+        le=10,
+        description="how late the stamps of sensors may be [s]; 0: not at all",
     )
 
 
@@ -178,6 +184,7 @@ class SlamConfig(Section):
         default_factory=ChangesConfig, description="method 'joint': which landmarks moved together"
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise levels to start from")
+    space: SpaceConfig = Field(default_factory=SpaceConfig, description="sensors in space")
     check: CheckConfig = Field(default_factory=CheckConfig, description="what makes a recording odd")
     cleaning: CleaningConfig = Field(
         default_factory=CleaningConfig, description="what is impossible in the recording of a session"

@@ -214,7 +214,7 @@ def _parameters(told: _Told) -> tuple[ParameterEstimate, ...]:
 def _innovations(told: _Told, identities: IntArray) -> Innovations:
     """NIS of all detections, each as if it had not been used, from residuals r and what it leaned on itself.
 
-    With H = J S J' of whitened Jacobians and the covariance S, used with the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
+    With H = J S J' of whitened Jacobians and the covariance S, and the weight w: r' (1 - w H)^-1 (1 - w H + H)^-1 r.
     """
     smoother, now = told.solved.optimum.smoother, told.solved.optimum.now
     problem, first = smoother.problem, told.spread.of_factors_first[len(smoother.problem.increment) :]
