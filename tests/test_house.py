@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 240
-MOST_LINES = 54_200
+MOST_MODULES = 250
+MOST_LINES = 57_000
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

@@ -65,18 +65,8 @@ def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: t
     Raises:
         DataError: fewer than two frames with a landmark of known identity.
     """
-    detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
-    usable = detections.landmark_id != UNKNOWN
-    if not usable.all():
-        warnings.append(f"{int((~usable).sum())} detections without identity not used")
-    moving = np.ones(len(stamps), dtype=np.bool_)
-    if recording.odometry is not None:
-        driven_s = recording.odometry.stamp_s
-        moving = (stamps >= driven_s[0]) & (stamps <= driven_s[-1])
-        outside = usable & ~moving[detections.frame]
-        if outside.any():
-            warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
-        usable &= ~outside
+    detections, stamps = recording.detections, recording.frames.stamp_s
+    usable, moving, warnings = _usable(recording, remarks)
     where, broken = _where(recording, usable)
     if broken.any():
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
@@ -121,6 +111,23 @@ def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: t
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
         recording.landmark_names,
     )  # fmt: skip
+
+
+def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
+    """Detections (M,) of known identity while there is odometry, frames (F,) while there is, and what is left out."""
+    detections, stamps, warnings = recording.detections, recording.frames.stamp_s, list(remarks)
+    usable = detections.landmark_id != UNKNOWN
+    if not usable.all():
+        warnings.append(f"{int((~usable).sum())} detections without identity not used")
+    moving = np.ones(len(stamps), dtype=np.bool_)
+    if recording.odometry is not None:
+        driven_s = recording.odometry.stamp_s
+        moving = (stamps >= driven_s[0]) & (stamps <= driven_s[-1])
+        outside = usable & ~moving[detections.frame]
+        if outside.any():
+            warnings.append(f"{int(outside.sum())} detections before the first or after the last odometry not used")
+        usable &= ~outside
+    return usable, moving, warnings
 
 
 @dataclass(frozen=True, slots=True)

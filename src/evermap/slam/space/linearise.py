@@ -35,7 +35,7 @@ HEAVY = 3.0
 kernel = kept(effort=1, error_model="numpy")
 
 
-class Sightings(NamedTuple):
+class SpatialSightings(NamedTuple):
     """M detections as the kernel reads them.
 
     Attributes:
@@ -123,8 +123,8 @@ def linearise_odometry(
 
 @kernel
 def linearise_sightings(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, velocity: FloatArray, level: FloatArray, seen: Sightings,
-    heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, velocity: FloatArray, level: FloatArray,
+    seen: SpatialSightings, heavy: bool, values: FloatArray, weight: FloatArray, residual: FloatArray,
 ) -> float:  # fmt: skip
     """Linearise the detections.
 
@@ -177,8 +177,8 @@ def linearise_sightings(
 
 @kernel
 def _position_or_pose(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: Sightings, m: int, level: FloatArray, e: FloatArray,
-    jx: FloatArray, jl: FloatArray, jm: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: SpatialSightings, m: int, level: FloatArray,
+    e: FloatArray, jx: FloatArray, jl: FloatArray, jm: FloatArray,
 ) -> None:  # fmt: skip
     """Whitened residuals and Jacobians of a position, or of a position and an orientation."""
     if seen.oriented[m]:
@@ -210,8 +210,8 @@ def _position_or_pose(
 
 @kernel
 def _corners(
-    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: Sightings, m: int, sigma_px: float, e: FloatArray,
-    jx: FloatArray, jl: FloatArray, jm: FloatArray,
+    pose: FloatArray, place: FloatArray, mount: FloatArray, seen: SpatialSightings, m: int, sigma_px: float,
+    e: FloatArray, jx: FloatArray, jl: FloatArray, jm: FloatArray,
 ) -> None:  # fmt: skip
     """Residuals (8,) of four corners of a tag, in standard deviations, with their Jacobians (8, 6)."""
     nothing, point, seen_at = np.zeros(3), np.zeros(3), np.zeros(3)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.slam.space.linearise import CORNERS, POINT, POSE, ROWS, Sightings
+from evermap.slam.space.linearise import CORNERS, POINT, POSE, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
@@ -76,7 +76,7 @@ class SpatialProblem:
         measured: (M, 7) the place in the sensor's frame.
         measured_root: (M, 3, 3) upper triangular, whitens the position but for its noise level.
         sigma_rad: (M,) of the orientation, but for its noise level.
-        corner, corner_root, half_m: of tags in an image; see `Sightings`.
+        corner, corner_root, half_m: of tags in an image; see `SpatialSightings`.
         other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.
         other_log_odds: (M,) of the first against the other.
         share: (M,) of the information of each detection that is new.
@@ -120,12 +120,12 @@ class SpatialProblem:
         return np.asarray(0.5 * (ends[:-1] + ends[1:]))
 
     @property
-    def sightings(self) -> Sightings:
+    def sightings(self) -> SpatialSightings:
         """Return the detections as the kernel reads them."""
         oriented = self.oriented[self.place].astype(np.int64)
         width = 14 + np.where(oriented, 6, 3)
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
-        return Sightings(
+        return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
             self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share, OUTLIER_LOG_ODDS,
         )  # fmt: skip
