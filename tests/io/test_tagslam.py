@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from evermap.errors import InputError, MissingExtraError
-from evermap.io import list_robots, read_recording, reader_for
+from evermap.io import list_robots, read_prior_map, read_recording, reader_for
 from evermap.io.yaml import parse_yaml
 from evermap.types import SpatialRecording, landmark_id_of
 
@@ -200,6 +200,41 @@ def test_a_bag_says_what_its_tables_say(packed: bool, lay_out: Callable, tagslam
         for column in columns:
             ours, theirs = (getattr(getattr(one, part), column) for one in (recording, tables))
             np.testing.assert_allclose(ours, theirs, atol=1e-12, err_msg=column)
+
+
+def test_a_folder_with_nothing_but_a_bag(lay_out: Callable, tagslam: Files) -> None:
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    tables = read(lay_out(tagslam))
+    folder = lay_out(tagslam)
+    write_bag(folder / "tags.bag", tagslam)
+    (folder / "detections.csv").unlink()
+    assert reader_for(folder).name == "tagslam"
+    np.testing.assert_allclose(read(folder).detections.corner_px, tables.detections.corner_px)
+    (folder / "more.bag").write_bytes(b"")
+    with pytest.raises(InputError, match=r"holds 2 bags: more\.bag, tags\.bag"):
+        read_recording(folder)
+
+
+def test_without_frames_nothing_is_known_of_misses(lay_out: Callable, tagslam: Files) -> None:
+    del tagslam["frames.csv"]
+    frames = read(lay_out(tagslam)).frames
+    assert not frames.complete
+    np.testing.assert_array_equal(frames.stamp_s, [0.5, 1.0])
+
+
+def test_a_survey_is_a_prior_map(lay_out: Callable, tagslam: Files) -> None:
+    folder = lay_out(tagslam)
+    for path in (folder, folder / "survey.csv"):
+        prior = read_prior_map(path, sigma_m=0.1, sigma_rad=0.2)
+        assert prior.rotation is not None
+        assert prior.size_m is not None
+        np.testing.assert_array_equal(prior.landmark_id, [7])
+        np.testing.assert_allclose(prior.covariance_m2, [0.01 * np.eye(3)])
+        np.testing.assert_allclose(prior.rotation_covariance, [0.04 * np.eye(3)])
+        np.testing.assert_allclose(prior.rotation, [[0, 0, np.sqrt(0.5), np.sqrt(0.5)]], atol=1e-12)
+        np.testing.assert_array_equal(prior.size_m, [[0.3, 0.3, 0.0]])
+    with pytest.raises(InputError, match="must be a positive number of radians"):
+        read_prior_map(folder, sigma_rad=0.0)
 
 
 def test_bags_that_cannot_be_read(lay_out: Callable, tagslam: Files, monkeypatch: pytest.MonkeyPatch) -> None:

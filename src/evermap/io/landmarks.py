@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError
+from evermap.geometry import se3
 from evermap.io.assemble import repeats
 from evermap.io.files import unpacked, write_atomic
 from evermap.io.spatial import (
@@ -41,35 +42,46 @@ _OPTIONAL = (
     "sigma_m", *COVARIANCE_COLUMNS, "class_id", "p_exists", "n_hits", "n_misses", "first_seen_s", "last_seen_s",
     "name",
 )  # fmt: skip
-_MAP_FILES = ("map.parquet", "landmarks.parquet", "landmarks.csv", "landmarks.csv.gz", "map.geojson")
+_MAP_FILES = (
+    "map.parquet",
+    "landmarks.parquet",
+    "landmarks.csv",
+    "landmarks.csv.gz",
+    "map.geojson",
+    "survey.csv",
+    "survey.csv.gz",
+)
 
 _SIGMA_M = Quantity("sigma_m", 0.0, 1e6, optional=True, hint="standard deviation in metres, empty where unknown")
 _SIGMA_RAD = Quantity("sigma_rad", 0.0, 1e3, optional=True, hint="standard deviation in radians")
 _P_EXISTS = Quantity("p_exists", 0.0, 1.0, hint="a probability")
 
 
-def read_prior_map(path: str | Path, sigma_m: float = 0.02) -> Landmarks:
+def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0.05) -> Landmarks:
     """Return landmark positions to start from, for `--prior-map FILE`. Their frame becomes 'prior_map'.
 
     Args:
         path: CSV, Parquet or GeoJSON with `landmark_id, x_m, y_m` and optionally `sigma_m` or all of `cov_xx_m2,
             cov_xy_m2, cov_yy_m2`, `class_id`, and the other columns of `map.parquet`; or a run or recording folder
-            that has such a file.
+            that has such a file. In space with `z_m` and the columns that go with it; or TagSLAM's `survey`.
         sigma_m: standard deviation of positions for which the file gives none.
+        sigma_rad: standard deviation of orientations in space for which the file gives none.
 
     Raises:
-        InputError: the file is missing or malformed, or `sigma_m` is not positive.
+        InputError: the file is missing or malformed, or a standard deviation is not positive.
         DataError: it holds no landmark.
     """
     if not (np.isfinite(sigma_m) and sigma_m > 0):
         raise InputError(f"sigma of the prior map must be a positive number of metres, not {sigma_m}")
-    landmarks = read_landmarks(path, sigma_m=sigma_m)
+    if not (np.isfinite(sigma_rad) and sigma_rad > 0):
+        raise InputError(f"sigma of its orientations must be a positive number of radians, not {sigma_rad}")
+    landmarks = read_landmarks(path, sigma_m=sigma_m, sigma_rad=sigma_rad)
     if len(landmarks) == 0:
         raise DataError("the map holds no landmark", path=path)
     return replace(landmarks, frame="prior_map")
 
 
-def read_landmarks(path: str | Path, *, sigma_m: float = 0.0) -> Landmarks:
+def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float = 0.0) -> Landmarks:
     """Return a map in the frame that its file states ('truth' where it states none). Arguments as `read_prior_map`."""
     path = _map_file(Path(path))
     try:
@@ -91,8 +103,9 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0) -> Landmarks:
     else:
         raise InputError(f"no map format ends in '{ending}'", path=path, hint=".csv, .parquet or .geojson")
     return landmarks_from_table(
-        table,
+        map_of_survey(table) if "tag_id" in table and "landmark_id" not in table else table,
         sigma_m=sigma_m,
+        sigma_rad=sigma_rad,
         class_names=tuple(about["class_names"]) if "class_names" in about else None,
         frame=about.get("frame", "truth"),
         clock=Clock(about.get("clock", Clock.RECORDING)),
@@ -103,6 +116,7 @@ def landmarks_from_table(
     table: Table,
     *,
     sigma_m: float,
+    sigma_rad: float = 0.0,
     class_names: tuple[str, ...] | None = None,
     frame: str = "truth",
     clock: Clock = Clock.RECORDING,
@@ -144,9 +158,27 @@ def landmarks_from_table(
         frame=frame,
         clock=clock,
         names=names,
-        **(_pose_columns(table) if in_space else {}),
+        **(_pose_columns(table, sigma_rad) if in_space else {}),
     )
     return rows_of(landmarks, order)
+
+
+def map_of_survey(table: Table) -> Table:
+    """Return TagSLAM's table of surveyed tags, `tag_id, size_m, x_m, y_m, z_m` and rotation vectors `rx_rad, ry_rad,
+    rz_rad`, with the columns of a map.
+    """
+    turns = ("rx_rad", "ry_rad", "rz_rad")
+    table.expect(("tag_id", "size_m", *AT, *turns))
+    turn = np.stack([table.numbers(Quantity(name, -10.0, 10.0, hint="radians")) for name in turns], axis=1)
+    rotation = se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=1))[:, 3:]
+    size = Quantity("size_m", 0.0, 1e3, positive=True, hint="metres")
+    columns: dict[str, Sequence[str] | FloatArray] = {
+        "landmark_id": table.ids("tag_id", optional=False).astype(np.float64),
+        **{name: table.columns[name] for name in AT},
+        **dict(zip(QUATERNION, rotation.T, strict=True)),
+        "tag_size_m": table.numbers(size),
+    }
+    return Table(table.path, columns, table.line, table.header_line)
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:
@@ -291,15 +323,15 @@ def _covariance(table: Table, sigma_m: float) -> FloatArray:
     return np.where(np.isnan(sigma), sigma_m, sigma)[:, None, None] ** 2 * np.eye(3 if "z_m" in table else 2)
 
 
-def _pose_columns(table: Table) -> dict[str, FloatArray]:
+def _pose_columns(table: Table, sigma_rad: float) -> dict[str, FloatArray]:
     """Orientations, their covariances and sizes, as far as a table in space has them."""
     found: dict[str, FloatArray] = {}
     if table.has_any(QUATERNION):
         found["rotation"] = quaternions(table, optional=True)
         turn = covariances(table, TURN_COVARIANCE, optional=True)
         if turn is None:
-            sigma = table.numbers(_SIGMA_RAD) if "sigma_rad" in table else np.zeros(len(table))
-            turn = np.where(np.isnan(sigma), 0.0, sigma)[:, None, None] ** 2 * np.eye(3)
+            sigma = table.numbers(_SIGMA_RAD) if "sigma_rad" in table else np.full(len(table), np.nan)
+            turn = np.where(np.isnan(sigma), sigma_rad, sigma)[:, None, None] ** 2 * np.eye(3)
         turn[np.isnan(found["rotation"]).any(axis=1)] = np.nan
         found["rotation_covariance"] = turn
     if table.has_any(BOX):

@@ -26,6 +26,7 @@ class TagSightings(NamedTuple):
         hamming: (M,) bits that were corrected.
         corner_px: (M, 4, 2) counter-clockwise from the tag's lower left.
         line: (M,) in the file.
+        complete: whether images without a tag are listed.
     """
 
     looked_s: FloatArray
@@ -35,6 +36,7 @@ class TagSightings(NamedTuple):
     hamming: IntArray
     corner_px: FloatArray
     line: IntArray
+    complete: bool = True
 
 
 def read_tag_bag(

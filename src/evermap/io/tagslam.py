@@ -20,8 +20,9 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se3
 from evermap.io.assemble import SAME_STAMP_S, finish_spatial, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
+from evermap.io.landmarks import landmarks_from_table, map_of_survey
 from evermap.io.rosbag import TagSightings, read_tag_bag
-from evermap.io.spatial import AT, poses, positions, spatial_detections, with_tag_poses
+from evermap.io.spatial import poses, spatial_detections, with_tag_poses
 from evermap.io.table import Table, parse_csv, parse_parquet
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
@@ -93,6 +94,7 @@ def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording
     files = find_file_set(path if bag is None else path.parent, is_tagslam if bag is None else _is_calibrated)
     if files is None:
         raise InputError("no TagSLAM recording here", path=path, hint=TAGSLAM.looks_for)
+    bag = bag or _only_bag(files)
     warnings: list[str] = []
     setup = _setup(files)
     if bag is None:
@@ -106,8 +108,26 @@ def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording
 
 
 def is_tagslam(files: FileSet) -> bool:
-    """Return whether files look like a TagSLAM recording in tables."""
-    return _is_calibrated(files) and any(f"detections{ending}" in files for ending in _ENDINGS)
+    """Return whether files look like a TagSLAM recording, in tables or as a bag."""
+    return _is_calibrated(files) and (
+        _has_detections(files) or any(name.endswith(BAG_ENDINGS) for name in files.members)
+    )
+
+
+def _has_detections(files: FileSet) -> bool:
+    return any(f"detections{ending}" in files for ending in _ENDINGS)
+
+
+def _only_bag(files: FileSet) -> Path | None:
+    """The bag of a folder that has no tables."""
+    bags = sorted(name for name in files.members if name.endswith(BAG_ENDINGS))
+    if _has_detections(files) or not bags:
+        return None
+    if len(bags) > 1:
+        raise InputError(f"holds {len(bags)} bags: {', '.join(bags)}", path=files.root, hint="give one of them")
+    if files.zipped:
+        raise InputError("a bag inside a zip is not read", path=files.path_of(bags[0]), hint="unpack the zip")
+    return files.path_of(bags[0])
 
 
 def _is_calibrated(files: FileSet) -> bool:
@@ -152,7 +172,7 @@ def _recording(
     recording = SpatialRecording(
         name=f"TagSLAM {files.title}",
         odometry=odometry,
-        frames=Frames(looked, complete=True, clock=Clock.UNIX),
+        frames=Frames(looked, complete=seen.complete, clock=Clock.UNIX),
         detections=with_tag_poses(detections, setup.sensors, warnings),
         sensors=setup.sensors,
         truth=_reference(files, warnings),
@@ -255,6 +275,7 @@ def _sightings(files: FileSet, setup: TagRig, warnings: list[str]) -> TagSightin
         hamming=table.ids("hamming", optional=False) if "hamming" in table else np.zeros(count, dtype=np.int64),
         corner_px=corner.reshape(-1, 4, 2),
         line=np.asarray(table.line, dtype=np.int64),
+        complete=frames is not None,
     )
 
 
@@ -304,19 +325,10 @@ def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:
 
 
 def _survey(files: FileSet, warnings: list[str]) -> Landmarks | None:
-    """The surveyed tags, their orientations given as rotation vectors."""
     table = _table(files, "survey", warnings)
     if table is None or len(table) == 0:
         return None
-    turns = ("rx_rad", "ry_rad", "rz_rad")
-    table.expect(("tag_id", "size_m", *AT, *turns), tuple(table.columns))
-    ids = table.ids("tag_id", optional=False)
-    turn = np.stack([table.numbers(Quantity(name, -10.0, 10.0, hint="radians")) for name in turns], axis=1)
-    size = table.numbers(Quantity("size_m", 0.0, 1e3, positive=True, hint="metres"))
-    rotation = se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=1))[:, 3:]
-    return Landmarks.in_space(
-        ids, positions(table), rotation=rotation, size_m=size[:, None] * [1.0, 1.0, 0.0], clock=Clock.UNIX
-    )
+    return landmarks_from_table(map_of_survey(table), sigma_m=0.0, clock=Clock.UNIX)
 
 
 def _table(files: FileSet, name: str, warnings: list[str]) -> Table | None:
