@@ -103,6 +103,17 @@ def test_ellipses_are_two_sigma_of_what_a_panel_shows(drawn, spatial):
     assert label.endswith(f"{factors[0]:.0f} × larger")
 
 
+def test_ellipses_wider_than_the_panel_are_counted_not_drawn(spatial):
+    recording, result = spatial
+    covariance = result.landmarks.covariance_m2.copy()
+    covariance[:3] *= 1e6
+    unsure = dataclasses.replace(result, landmarks=dataclasses.replace(result.landmarks, covariance_m2=covariance))
+    above = draw_figures(recording, unsure, compare_with_truth(recording, unsure))[0].figure.axes[0]
+    ellipses = next(item for item in above.collections if isinstance(item, EllipseCollection))
+    assert len(ellipses._widths) == len(result.landmarks) - 3
+    assert line(above, "2σ").get_label().endswith("(3 wider than the panel)")
+
+
 def test_tags_face_the_path_and_boxes_are_as_large_as_they_are(drawn, spatial):
     landmarks = spatial[1].landmarks
     pose, places = aligned(*spatial)

@@ -212,10 +212,10 @@ def magnification(covariance: FloatArray, reach_m: float) -> int:
 
 
 def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colours: Any, factor: int) -> str:
-    """Draw 2-sigma ellipses about points (K, 2) and return their label.
+    """Draw 2-sigma ellipses about points (K, 2) and return their label; those wider than the panel are left out.
 
     Args:
-        axes: a panel.
+        axes: a panel, with its limits.
         points: (K, 2).
         covariance: (K, 2, 2) [m²].
         colours: (K,).
@@ -227,18 +227,20 @@ def draw_ellipses(axes: Axes, points: FloatArray, covariance: FloatArray, colour
     sigma = np.sqrt(np.maximum(variance, 0.0))
     angle = np.degrees(np.arctan2(axis[:, 1, 1], axis[:, 0, 1]))
     full = 2.0 * 2.0 * factor * sigma
+    fits = full[:, 1] <= max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     ellipses = EllipseCollection(
-        full[:, 1], full[:, 0], angle, units="xy", offsets=points, offset_transform=axes.transData,
-        facecolors="none", edgecolors=colours, linewidths=0.9, zorder=5,
+        full[fits, 1], full[fits, 0], angle[fits], units="xy", offsets=points[fits], offset_transform=axes.transData,
+        facecolors="none", edgecolors=np.asarray(colours)[fits], linewidths=0.9, zorder=5,
     )  # fmt: skip
     axes.add_collection(ellipses)
-    return "2σ of its position" + (f", drawn {factor} × larger" if factor > 1 else "")
+    larger = f", drawn {factor} × larger" if factor > 1 else ""
+    return "2σ of its position" + larger + ("" if fits.all() else f" ({np.count_nonzero(~fits)} wider than the panel)")
 
 
 def _caption(recording: AnyRecording, evaluation: Evaluation, scene: _Scene) -> str:
     text = _frame_caption(recording, evaluation, scene.path_m.shape[1])
     if scene.landmarks.rotation is not None:
-        text += " Short lines show where tags face; boxes have their edges."
+        text += " Short lines show which way landmarks with an orientation face, along their z; boxes have their edges."
     if scene.changed:
         text += (
             " Arrows lead from where a landmark was (diamond) to where it is now; a plus is what appeared, a cross what"
