@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.existence.elementary import inlined, kernel
-from evermap.existence.phase_kernels import NEGLIGIBLE, PhaseLooks, advance, jump, observe
+from evermap.existence.phase_kernels import NEGLIGIBLE, PhaseLooks, advance, copy_row, jump, observe
 from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
@@ -93,9 +93,14 @@ def piece_integral(
     fastest = exits.max()
     mean = fastest * span_s
     if mean <= 0.0:
-        probability = float((forward * backward).sum())
-        integral[:] = np.outer(span_s / probability * forward, backward)
-        backward /= probability
+        probability = 0.0
+        for i in range(n):
+            probability += forward[i] * backward[i]
+        for i in range(n):
+            for j in range(n):
+                integral[i, j] = span_s / probability * forward[i] * backward[j]
+        for j in range(n):
+            backward[j] /= probability
         return probability
     last = 0
     weight[0] = np.exp(-mean)
@@ -194,7 +199,7 @@ def expect_feature(
     integrals, smoothed, last = out
     m, n = look_s.size, present.size
     forward = np.empty((m + 1, n))
-    forward[0] = begin
+    copy_row(begin, forward[0])
     spare = np.empty((3, n))
     spans, bins = np.empty(256), np.empty(256, dtype=np.int64)
     evidence = 0.0
@@ -205,14 +210,14 @@ def expect_feature(
             spans, bins = np.empty(2 * pieces), np.empty(2 * pieces, dtype=np.int64)
             pieces = _cut(from_s, look_s[k], exits, spans, bins)
         row = forward[k + 1]
-        row[:] = forward[k]
+        copy_row(forward[k], row)
         for p in range(pieces):
             advance(row, rates[bins[p]], exits[bins[p]], spans[p], spare)
         likelihood = observe(row, present, there[k], gone[k])
         if not likelihood > 0.0:
             return evidence, k
         evidence += np.log(likelihood)
-    last[:] = forward[m]
+    copy_row(forward[m], last)
     backward = np.ones(n)
     starts = np.empty((spans.size, n))
     integral = np.empty((n, n))
@@ -221,9 +226,9 @@ def expect_feature(
         from_s = look_s[k - 1] if k else begin_s
         pieces = _cut(from_s, look_s[k], exits, spans, bins)
         observe(backward, present, there[k], gone[k])
-        starts[0] = forward[k]
+        copy_row(forward[k], starts[0])
         for p in range(1, pieces):
-            starts[p] = starts[p - 1]
+            copy_row(starts[p - 1], starts[p])
             advance(starts[p], rates[bins[p - 1]], exits[bins[p - 1]], spans[p - 1], spare)
         at_s = look_s[k]
         for p in range(pieces - 1, -1, -1):
@@ -231,9 +236,15 @@ def expect_feature(
             piece_integral(starts[p], backward, rates[b], exits[b], span, work, integral)
             weight = 2.0 ** (-(end_s - (at_s - 0.5 * span)) / half_life_s)
             at_s -= span
-            integrals[b] += weight * integral
-    smoothed[:] = begin * backward
-    smoothed /= smoothed.sum()
+            for i in range(n):
+                for j in range(n):
+                    integrals[b, i, j] += weight * integral[i, j]
+    total = 0.0
+    for i in range(n):
+        smoothed[i] = begin[i] * backward[i]
+        total += smoothed[i]
+    for i in range(n):
+        smoothed[i] /= total
     return evidence, -1
 
 

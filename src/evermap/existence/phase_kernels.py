@@ -81,6 +81,13 @@ def multiply(belief: FloatArray, matrix: FloatArray, spare: FloatArray) -> None:
 
 
 @inlined
+def copy_row(row: Any, out: Any) -> None:
+    """Copy numbers; assigning a whole array compiles for longer, for the message of shapes that do not fit."""
+    for i in range(row.size):
+        out[i] = row[i]
+
+
+@inlined
 def jump(row: Any, rates: Any, exits: Any, fastest: Any, out: Any) -> None:
     """Fill `out` with a row after one jump of the uniformised chain, `row @ U`."""
     per_fastest = 1.0 / fastest
@@ -227,11 +234,11 @@ def observe(belief: FloatArray, present: FloatArray, there: float, gone: float) 
 def first_belief(start: FloatArray, chain: Any, at_s: float, belief: FloatArray, spare: FloatArray) -> None:
     """Fill in the belief before anything was seen: one row of `start`, or one of 1008 at their ten minutes' begin."""
     if len(start) == 1:
-        belief[:] = start[0]
+        copy_row(start[0], belief)
         return
     phase = (at_s - MONDAY_S) % WEEK_S
     b = min(int(phase / BIN_S), BINS - 1)
-    belief[:] = start[b]
+    copy_row(start[b], belief)
     leap(belief, chain.rates_hz[b], chain.exit_hz[b], phase - b * BIN_S, spare)
 
 

@@ -111,6 +111,15 @@ class KeptSteps(NamedTuple):
 
 
 @kernel
+def _copy(held: RunHypotheses, out: RunHypotheses) -> None:
+    """Copy hypotheses number by number, see `phase_kernels.copy_row`."""
+    for s in range(2):
+        out.number[s] = held.number[s]
+        for j in range(held.start.shape[1]):
+            out.start[s, j], out.weight[s, j] = held.start[s, j], held.weight[s, j]
+
+
+@kernel
 def _forward(
     steps: tuple[int, int],
     looks: Lattice,
@@ -127,10 +136,10 @@ def _forward(
     before, merges, scales = kept
     for k in range(a, b):
         i = k - a
-        before.start[i], before.weight[i], before.number[i] = held
+        _copy(held, RunHypotheses(before.start[i], before.weight[i], before.number[i]))
         scale = (level[0, period[k]], level[1, period[k]])
         _step(held, stamp_s[k], stamp_s[k + 1], law, scale, space)
-        merges[i] = space.merged
+        merges[i, 0], merges[i, 1] = space.merged[0], space.merged[1]
         scales[i] = _look(held.weight, held.number, absent[k + 1], present[k + 1])
 
 
@@ -175,7 +184,7 @@ def expectations(
     begin(held, stamp_s[0], prior)
     evidence = np.log(_look(weight, count, absent[0], present[0]))
     for c in range(stretches):
-        kept_start[c], kept_weight[c], kept_count[c] = start, weight, count
+        _copy(held, RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]))
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
         _forward((a, b), looks, calendar, law, held, space, kept)
         for i in range(b - a):
@@ -197,7 +206,7 @@ def expectations(
     usual, lived, died, part = (np.empty((2, slots)), np.empty(slots), np.empty(slots), np.empty(slots))
     for c in range(stretches - 1, -1, -1):
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
-        start[:], weight[:], count[:] = kept_start[c], kept_weight[c], kept_count[c]
+        _copy(RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]), held)
         _forward((a, b), looks, calendar, law, held, space, kept)
         for k in range(b - 1, a - 1, -1):
             i = k - a
