@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 from pathlib import Path
 
 import pytest
+import typer.testing
 from hypothesis import settings
 
 # an example may take as long as it takes: a slow machine, or a kernel that is compiled first, is no failure
 settings.register_profile("no clock", deadline=None)
 settings.load_profile("no clock")
+
+# a process builds its command line once; CliRunner would do it again for each of a thousand commands
+setattr(typer.testing, "_get_command", functools.cache(typer.testing._get_command))  # noqa: B010
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
