@@ -129,8 +129,8 @@ def thresholds(scores: list[float], n_labels: int) -> list[tuple[float, float]]:
     return found[1:]
 
 
-def swept(sequences: Sequences, mean_score: list[dict[int, float]]) -> dict[str, float]:
-    """sAMOTA, AMOTA, AMOTP over recall; the others where MOTA is best."""
+def swept(sequences: Sequences, mean_score: list[dict[int, float]]) -> dict[str, Any]:
+    """sAMOTA, AMOTA, AMOTP over recall; the others where MOTA is best; and MOTA over recall, the `curve`."""
     everything = clear(sequences, mean_score, -np.inf)
     steps = [
         (recall, score, clear(sequences, mean_score, score))
@@ -143,6 +143,7 @@ def swept(sequences: Sequences, mean_score: list[dict[int, float]]) -> dict[str,
         "AMOTP": sum(found.motp for _, _, found in steps) / N_RECALLS,
         **told(best),
         "threshold": score,
+        "curve": [(recall, found.mota) for recall, _, found in steps],
     }
 
 

@@ -28,6 +28,7 @@ STUDIES = (
     "presence",
     "lifetimes",
     "tracking",
+    "kitti",
     "persistence-speed",
     "soak",
     "scale",

@@ -31,7 +31,7 @@ def bench(
         typer.Option(help="Landmarks of the worlds of 'scale', with commas; with it DLR and maps are measured too."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write the table and the figure of 'scale' into, as its results.")
+        Path | None, typer.Option(help="Folder to write table and figure of 'scale' or 'kitti' into, as its results.")
     ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
@@ -44,14 +44,18 @@ def bench(
       evermap bench --only scale --sizes 400,1000,4000 --out out/scale
     """
     landmarks = None if sizes is None else _numbers(sizes)
-    if (landmarks is not None or out is not None) and only not in (None, "scale"):
-        raise InputError("--sizes and --out belong to 'scale'", field="--only", hint="--only scale")
+    if landmarks is not None and only not in (None, "scale"):
+        raise InputError("--sizes belongs to 'scale'", field="--only", hint="--only scale")
+    if out is not None and only not in (None, "scale", "kitti"):
+        raise InputError("--out belongs to one part", field="--only", hint="--only scale or --only kitti")
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, below
     runner = load_benchmarks()
     measured = runner.run(update_baseline=update_baseline, only=only, sizes=landmarks)
     if out is not None:
-        runner.scale_report.write(measured["shown"]["scale"], out)
+        {"scale": runner.scale_report, "kitti": runner.kitti}[only or "scale"].write(
+            measured["shown"][only or "scale"], out
+        )
     if as_json:
         print_json(measured)
     else:

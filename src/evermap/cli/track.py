@@ -29,7 +29,11 @@ if TYPE_CHECKING:
 
 Seen = Annotated[
     Path | None,
-    typer.Argument(metavar="INPUT", help="Table of detections: .csv, .csv.gz or .parquet.", show_default=False),
+    typer.Argument(
+        metavar="INPUT",
+        help="Table of detections (.csv, .csv.gz, .parquet), or a folder with one and poses.",
+        show_default=False,
+    ),
 ]
 Reach = Annotated[
     float | None,
@@ -51,7 +55,7 @@ Confusion = Annotated[
         show_default="5 % mistakes",
     ),
 ]
-MinScore = Annotated[float | None, typer.Option(help="Leave out detections of a lower score.", show_default="0")]
+MinScore = Annotated[float | None, typer.Option(help="Leave out detections of a lower score.", show_default="none")]
 Gap = Annotated[
     float | None,
     typer.Option(
@@ -67,9 +71,11 @@ HELP = """\
 Follow objects in space, and learn how long they stay.
 
 \b
-The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a covariance
-(cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m, sensor_y_m, sensor_z_m. A row without a
-position is a frame in which nothing was detected. The folder gets tracks.csv and tracks.parquet, detections.csv,
+The table has a row a detection: stamp_s, x_m, y_m, z_m in the world; it may have class_id, a box (length_m,
+width_m, height_m, yaw_rad), a covariance (cov_xx_m2 ... or sigma_m), score, appearance_0 ..., and sensor_x_m,
+sensor_y_m, sensor_z_m. A row without a position is a frame in which nothing was detected. A folder has such a
+table, detections, in the frame of a moving sensor, and its poses, odometry (stamp_s, x_m, y_m, z_m, qx, qy, qz,
+qw). The folder gets tracks.csv and tracks.parquet, detections.csv,
 events.jsonl, spells.csv, lifetimes.csv (for `evermap survival fit`), summary.json and figures.
 
 \b
@@ -82,12 +88,15 @@ Most useful with --set:
   max_missed=10           frames without a detection until it is kept in mind, or given up if it moved
   rest_for_s=2            time without motion before an object counts as resting [s]
   place_sigma_m=0.2       how exactly a resting object is found again in its place, beside the noise [m]
+  fov_deg=80              what the sensor sees to both sides of ahead; with --range-m and poses [deg]
+  score_midpoint=3.7      score of a detection that is as likely real as false; score_scale=1.2 how steep
   moved_reach_m=0         how far objects may be moved between looks; wants appearances [m]
 
 \b
 Examples:
   evermap track --init detections.csv
   evermap track detections.csv --range-m 12 --out out/yard
+  evermap track kitti_tracking/0000 --out out/0000
   evermap survival fit out/yard/lifetimes.csv --by class --estimator best
 """
 

@@ -22,6 +22,7 @@ from evermap.tracking.tracklets import (
     N_FILTERED,
     N_LEVEL,
     VARIANCE,
+    YAW,
     EventKind,
     EventTable,
     Rules,
@@ -174,6 +175,26 @@ class Tracker(Shown):
             n_missed=t.n_missed[:n].copy(),
             static=t.static[:n] == 1,
         )
+
+    def p_static(self, prior: float = 0.5) -> FloatArray:
+        """Return (N,) probabilities that what is `followed` stands still, in the same order.
+
+        That an object stands is a special case of its filter: the density of velocity zero after all detections, over
+        that before, is the Bayes factor (Dickey 1971).
+
+        Args:
+            prior: probability that any object stands.
+        """
+        t, n, s = self._tracklets, self._n, self.settings
+        before = np.repeat(s.sigma_velocity_mps**2 * np.eye(3)[None], n, axis=0)
+        if self._boxes:
+            ahead = np.column_stack([np.cos(t.box[:n, YAW]), np.sin(t.box[:n, YAW]), np.zeros(n)])
+            ahead *= s.speed_per_length_hz * t.box[:n, :1]
+            before += ahead[:, :, None] * ahead[:, None, :]
+        v, p = t.mean[:n, 3:6], t.covariance[:n, 3:6, 3:6]
+        squared = np.einsum("ni,ni->n", v, np.linalg.solve(p, v[:, :, None])[:, :, 0])
+        log_factor = 0.5 * (np.linalg.slogdet(before)[1] - np.linalg.slogdet(p)[1] - squared)
+        return np.asarray(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0)) * (1.0 - prior) / prior))
 
     def to_pandas(self) -> Any:
         """Return a data frame with a row an active tracklet, after the last frame.

@@ -27,7 +27,8 @@ stamp_s   seconds, of any clock; rows of one stamp are a frame
 x_m, y_m, z_m  where in the world; a row without is a frame in which nothing was detected, and as important
 optional  class_id: any name or number
 optional  cov_xx_m2, cov_xy_m2, cov_xz_m2, cov_yy_m2, cov_yz_m2, cov_zz_m2, or sigma_m: how exact
-optional  score: between 0 and 1, for --min-score
+optional  score: how sure the detector is, on any scale; from 0 to 1 it is the probability to be real
+optional  length_m, width_m, height_m, yaw_rad: a box around the position
 optional  appearance_0, appearance_1, ...: any vector that looks alike for things that do
 optional  sensor_x_m, sensor_y_m, sensor_z_m: where the sensor was; with --range-m, what is missed in view is gone"""
 

@@ -287,7 +287,7 @@ def _remarks(table: DetectionTable, config: TrackConfig, spells: StaticSpells) -
     step_s = _usual_step_s(table)
     if step_s > _SLOW_STEP_S:
         remarks.append(f"frames are {step_s:.3g} s apart: moving objects are hardly tracked at that rate")
-    if config.range_m is None and table.sensor_m is not None:
+    if config.range_m is None and table.sensor_m is not None and table.score is None:
         remarks.append("without `range_m`, a missed detection is no evidence")
     unknown = int((~_bounded(spells)).sum())
     if unknown:
