@@ -180,7 +180,7 @@ FEW = "stamp_s,x_m,y_m,z_m,class_id\n" + "".join(f"{0.1 * k:.1f},1,2,3,car\n" fo
         (FEW, ("--range-m", "5"), "field '--range-m': the position of the sensor is unknown"),
         (FEW, ("--range-m", "-5"), "field '--range-m': input should be greater than 0"),
         (FEW, ("--gap-s", "0"), "field '--gap-s': input should be greater than 0"),
-        (FEW, ("--min-score", "2"), "field '--min-score': input should be less than or equal to 1"),
+        (FEW, ("--min-score", "2"), "field '--min-score': the table has no scores"),
         (FEW, ("--prior", "bus=never-leaves"), "no detection is of class 'bus' (try: one of car)"),
         (FEW, ("--prior", "exponentail:mean=1h"), "try: exponential"),
         (FEW, ("--speed", "bus=0.2"), "no detection is of class 'bus'"),

@@ -24,7 +24,7 @@ from evermap.tracking.association import (
     is_misplaced,
 )
 from evermap.tracking.frame import Frame
-from evermap.tracking.kalman import inlined, kernel, update
+from evermap.tracking.kalman import kernel, update
 from evermap.tracking.rows import (
     DISPLACED,
     LEAST,
@@ -100,18 +100,6 @@ def recognise(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray,
         t.appearance[i] /= max(math.sqrt(length), 1e-12)
 
 
-@inlined
-def renew(t: Tracklets, i: int, frame: Frame, j: int, confusion: FloatArray, rules: Rules) -> None:
-    """Update all of tracklet `i` but its place by detection `j`: class, appearance, box, score, counts."""
-    recognise(t, i, frame, j, confusion, rules.appearance_memory)
-    if t.box.shape[1]:
-        update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
-    t.n_hits[i] += 1
-    t.n_missed[i] = 0
-    if t.level.shape[1]:
-        update_level(t, i, frame.level[j, 0], rules)
-
-
 @kernel
 def live(
     t: Tracklets, n: int, frame: Frame, in_sight: InSight, likelihood: Likelihood, rules: Rules, happened: Happened
@@ -136,6 +124,7 @@ def live(
     pairs = candidates(targets, n, frame, likelihood)
     chosen = assign(pairs.start, pairs.column, pairs.cost, frame.position.shape[0])
     n_events, n_gone = 0, 0
+    boxes, scored = t.box.shape[1] > 0, t.level.shape[1] > 0  # in the loop it costs a tenth
     n_spells = int(0)  # noqa: RUF046, UP018 (of a literal, `settle` and `end_spell` would be compiled once more)
     for i in range(n):
         predicted = aged(t.inverse_odds[i], death_odds)
@@ -145,11 +134,17 @@ def live(
             gone = math.exp(-min(max(pairs.log_ratio[chosen[i]], -60.0), 60.0))
             after, _ = observed(predicted, max(p_detect[i], NEVER_SURE), gone)
             t.inverse_odds[i] = max(after, LEAST)
-            if t.box.shape[1] and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j)):
+            if boxes and is_misplaced(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j)):
                 update(t.mean[i], t.covariance[i], frame.position[j], MISPLACED * noise_of(frame, j))
             else:
                 update(t.mean[i], t.covariance[i], frame.position[j], noise_of(frame, j))
-            renew(t, i, frame, j, likelihood.confusion, rules)
+            recognise(t, i, frame, j, likelihood.confusion, rules.appearance_memory)
+            t.n_hits[i] += 1
+            t.n_missed[i] = 0
+            if boxes:
+                update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
+            if scored:
+                update_level(t, i, frame.level[j, 0], rules)
             n_spells = settle(t, i, frame, j, rules, spells, n_spells)
             if t.state[i] == LOST:
                 t.state[i] = ALIVE
@@ -164,7 +159,7 @@ def live(
             after, _ = observed(predicted, max(1.0 - p_detect[i], 1e-12), 1.0)
             t.inverse_odds[i] = min(after, MOST)
         t.n_missed[i] += 1
-        if t.level.shape[1]:
+        if scored:
             t.level[i, MISSED] += rules.missed_nats if p_detect[i] > 0.0 else 0.0
         what = NOTHING
         if t.inverse_odds[i] > rules.odds_dead:
@@ -238,6 +233,7 @@ def resume(
     Returns:
         How many spells there are.
     """
+    boxes, scored = t.box.shape[1] > 0, t.level.shape[1] > 0
     n_spells = int(0)  # noqa: RUF046, UP018 (as in `live`)
     for k in range(detection.shape[0]):
         i, j = n + k, detection[k]
@@ -250,7 +246,13 @@ def resume(
             update(t.rest_mean[i], t.rest_covariance[i], frame.position[j], noise_of(frame, j))
         t.state[i] = ALIVE
         reset_filter(t, i, frame, j, rules)
-        renew(t, i, frame, j, confusion, rules)
+        recognise(t, i, frame, j, confusion, rules.appearance_memory)
+        t.n_hits[i] += 1
+        t.n_missed[i] = 0
+        if boxes:
+            update_shape(t.box[i], frame.box[j], frame.box_noise[j], t.mean[i], t.covariance[i])
+        if scored:
+            update_level(t, i, frame.level[j, 0], rules)
         t.rest_seen_s[i] = frame.stamp_s
         t.slow[i] = 1
     return n_spells

@@ -50,9 +50,8 @@ def log_odds_real(t: Tracklets, i: int, rules: Rules) -> float:
 
 @kernel
 def p_real(t: Tracklets, n: int, rules: Rules) -> FloatArray:
-    """Return (n,) probabilities that tracklets are real."""
-    found = np.ones(n)
-    if t.level.shape[1]:
-        for i in range(n):
-            found[i] = 1.0 / (1.0 + math.exp(-min(max(log_odds_real(t, i, rules), -700.0), 700.0)))
+    """Return (n,) probabilities that tracklets of a tracker with scores are real."""
+    found = np.empty(n)
+    for i in range(n):
+        found[i] = 1.0 / (1.0 + math.exp(-min(max(log_odds_real(t, i, rules), -700.0), 700.0)))
     return found

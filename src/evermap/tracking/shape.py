@@ -95,14 +95,14 @@ def update_shape(
     box[YAW] = wrapped(box[YAW], 2.0 * math.pi)
 
 
-def face_sigma(size_m: FloatArray, sigma_m: float, share: float) -> FloatArray:
-    """Return (M, 3) standard deviations of where the faces of boxes (M, 3) are: `sigma_m` and a share of the size."""
-    return np.asarray(sigma_m + share * size_m)
-
-
 def noise_of_shapes(box: FloatArray, face_m: FloatArray) -> FloatArray:
-    """Return (M, 4) variances of detected sizes and headings: a size is the difference of two faces, a heading the
-    angle between two ends.
+    """Return (M, 4) variances of detected sizes and headings.
+
+    A size is the difference of two faces, a heading the angle between two ends.
+
+    Args:
+        box: (M, 4).
+        face_m: (M, 3) standard deviations of where faces are, along, across, and up.
     """
     size = 2.0 * face_m**2
     return np.column_stack([size, size[:, 0] / np.maximum(box[:, 0], 1e-3) ** 2])

@@ -159,7 +159,7 @@ class Tracker(Shown):
     def followed(self) -> Followed:
         """Return the active tracklets after the last frame."""
         t, n = self._tracklets, self._n
-        p_real = self._scores.p_real(t, n, self._rules)
+        p_real = self._scores.p_real(t, n, self._rules) if self._scored else 1.0
         return Followed(
             stamp_s=self._stamp_s,
             track_id=t.track_id[:n].copy(),
@@ -233,9 +233,13 @@ class Tracker(Shown):
             )
         position = positions(position_m)
         m = len(position)
-        shape = boxes(box, m) if self._boxes else np.empty((m, 0))
-        faces = self._shape.face_sigma(shape[:, :3], self.settings.sigma_face_m, self.settings.sigma_face_share)
-        noise = self._shape.noise_of_centres(shape, faces) if self._boxes and m else self._noise
+        shape = box_noise = np.empty((m, 0))
+        noise = self._noise
+        if self._boxes:
+            shape = boxes(box, m)
+            faces = self.settings.sigma_face_m + self.settings.sigma_face_share * shape[:, :3]
+            box_noise = self._shape.noise_of_shapes(shape, faces)
+            noise = self._shape.noise_of_centres(shape, faces) if m else noise
         return Frame(
             stamp_s=stamp,
             position=position,
@@ -243,7 +247,7 @@ class Tracker(Shown):
             class_id=classes(class_id, m, self._n_classes),
             appearance=appearances(appearance, m, self._n_appearance),
             box=shape,
-            box_noise=self._shape.noise_of_shapes(shape, faces) if self._boxes else shape,
+            box_noise=box_noise,
             level=self._level(p_real, m),
         )
 
