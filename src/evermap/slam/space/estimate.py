@@ -50,7 +50,7 @@ def converged(
     smoother = SpatialSmoother(problem, start.pose)
     for round_ in range(ROUNDS):
         heavy = round_ < heavy_rounds
-        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=15 if round_ == 0 else 6)
+        estimate, now = smoother.optimum(estimate, noise, heavy=heavy, iterations=15 if round_ == 0 else 2)
         following = refined(smoother, now, noise, begun)
         settled = np.abs(np.log(following.levels / noise.levels)).max() < CONVERGED
         noise = following

@@ -26,6 +26,8 @@ FIXED = 1e12
 LARGEST_TURN = 0.5
 """A step turns no pose by more [rad]."""
 COST_SLACK = 1e-3
+SETTLED = 0.02
+"""Nats that a step must gain, or it was the last."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +78,11 @@ class SpatialSmoother:
             trial, size = self._moved(estimate, step)
             following = self.linearised(trial, noise, heavy=heavy)
             if np.isfinite(following.cost) and following.cost <= now.cost + COST_SLACK * (1.0 + abs(now.cost)):
+                gain = now.cost - following.cost
                 estimate, now = trial, following
-                damping = 0.0 if damping < 1e-5 else damping / 10.0
-                if size < tolerance:
+                if size < tolerance or (damping == 0.0 and abs(gain) < SETTLED):
                     break
+                damping = 0.0 if damping < 1e-5 else damping / 10.0
             else:
                 damping = max(1e-4, 10.0 * damping)
                 if damping > 1e6:
