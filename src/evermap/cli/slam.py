@@ -201,9 +201,13 @@ def run_and_write(
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
+    from evermap.types import SpatialRecording
 
-    search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
-    warm_up(lambda: compile_kernels(search=search, unknown_ids=config.slam.unknown_ids))
+    if isinstance(recording, SpatialRecording):
+        warm_up(lambda: compile_kernels(in_space=True))
+    else:
+        search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
+        warm_up(lambda: compile_kernels(search=search, unknown_ids=config.slam.unknown_ids))
     start = time.perf_counter()
     with progress_bar(recording.name) as progress:
         result = run_slam(recording, config, prior_map=prior, realtime=realtime, progress=progress)

@@ -10,7 +10,18 @@ from evermap.config import Config
 from evermap.pipeline import run_session, run_slam
 from evermap.slam.localize_recording import warm_up as of_the_localizer
 from evermap.slam.warmup import warm_up as of_the_estimator
-from evermap.types import UNKNOWN, Detections, Frames, Odometry, Recording, Sensor
+from evermap.types import (
+    UNKNOWN,
+    Detections,
+    Frames,
+    Odometry,
+    Recording,
+    Sensor,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
+)
 
 FRAMES = 24
 """So many that a cell of the lines of sight is looked along more than once."""
@@ -19,7 +30,14 @@ PLACES = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 1.5], [4.0, 0.5]])
 
 
 @functools.cache
-def warm_up(*, search: bool = True, unknown_ids: bool = False, sessions: bool = False, localize: bool = False) -> None:
+def warm_up(
+    *,
+    search: bool = True,
+    unknown_ids: bool = False,
+    sessions: bool = False,
+    localize: bool = False,
+    in_space: bool = False,
+) -> None:
     """Compile what a job needs, or load it where that was done before; the job does it by itself, while it is timed.
 
     Args:
@@ -27,7 +45,11 @@ def warm_up(*, search: bool = True, unknown_ids: bool = False, sessions: bool = 
         unknown_ids: what landmarks without identities need.
         sessions: what sessions of a living map need.
         localize: what the frames of localising in one need, and nothing else.
+        in_space: what recordings in space need, and nothing else.
     """
+    if in_space:
+        run_slam(_flight())
+        return
     if localize:
         of_the_localizer()
         return
@@ -62,3 +84,30 @@ def _drive(start_s: float) -> Recording:
         ),
         Sensor(range_max_m=8.0, sigma_range_m=0.05, sigma_bearing_rad=0.02),
     )
+
+
+def _flight() -> SpatialRecording:
+    """The same in space, with objects that have an orientation."""
+    planar = _drive(0.0)
+    seen, count = planar.detections, len(planar.detections)
+    pose = np.zeros((FRAMES, 7))
+    pose[:, 0], pose[:, 6] = 0.1 * np.arange(FRAMES), 1.0
+    position = np.column_stack([PLACES[seen.landmark_id], np.ones(count)]) - pose[seen.frame, :3]
+    unsaid = np.full(count, np.nan)
+    detections = SpatialDetections(
+        frame=seen.frame,
+        sensor=seen.source_line,
+        landmark_id=seen.landmark_id,
+        position_sensor_m=position,
+        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        covariance_sensor_m2=np.full((count, 3, 3), np.nan),
+        sigma_rad=unsaid,
+        corner_px=np.full((count, 4, 2), np.nan),
+        tag_size_m=unsaid,
+        size_m=np.full((count, 3), np.nan),
+        class_id=seen.class_id,
+        score=unsaid,
+        source_line=seen.source_line,
+    )
+    odometry = SpatialOdometry(planar.frames.stamp_s, pose, np.full((FRAMES, 6), np.nan))
+    return SpatialRecording("warm-up", odometry, planar.frames, detections, (SpatialSensor(),))

@@ -1,0 +1,117 @@
+"""Whitened factors in space: their Jacobians against differences, their weights against the mixture they come from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from evermap.geometry import se3
+from evermap.slam.space.linearise import (
+    CORNERS,
+    POINT,
+    POSE,
+    ROWS,
+    SpatialSightings,
+    linearise_odometry,
+    linearise_sightings,
+    weighed,
+)
+
+LEVEL = np.array([0.1, 0.05, 0.7, 1.3, 0.4])
+STEP = 1e-6
+
+
+def a_sighting(kind: int, oriented: bool, seed: int) -> tuple[SpatialSightings, np.ndarray, np.ndarray, np.ndarray]:
+    random = np.random.default_rng(seed)
+    pose = se3.exp(random.normal(0.0, 0.5, (1, 6)))
+    mount = se3.exp(random.normal(0.0, 0.5, (1, 6)))
+    measured = se3.exp(np.array([[0.3, -0.2, 3.0, *random.normal(0.0, 0.4, 3)]]))
+    place = se3.retract(se3.compose(se3.compose(pose, mount), measured), random.normal(0.0, 0.05, (1, 6)))
+    if not oriented:
+        place[:, 3:] = [0.0, 0.0, 0.0, 1.0]
+    width = 14 + (6 if oriented else 3)
+    seen = SpatialSightings(
+        pose_row=np.zeros(1, dtype=np.int64),
+        place=np.zeros(1, dtype=np.int64),
+        sensor=np.zeros(1, dtype=np.int64),
+        kind=np.array([kind]),
+        oriented=np.array([int(oriented)]),
+        measured=measured,
+        root=np.triu(random.normal(0.0, 3.0, (1, 3, 3))),
+        sigma_rad=np.array([0.3]),
+        corner=random.normal(0.0, 0.3, (1, 4, 2)),
+        corner_root=random.normal(0.0, 20.0, (1, 4, 2, 2)),
+        half_m=np.array([0.2]),
+        first=np.array([0, ROWS[kind] * width]),
+        share=np.array([1.0]),
+        log_odds=np.full(3, 1e9),
+    )
+    return seen, pose, place, mount
+
+
+def residuals(seen, pose, place, mount, velocity) -> tuple[np.ndarray, np.ndarray]:
+    values, weight, residual = np.zeros(seen.first[-1]), np.zeros(1), np.zeros((1, 8))
+    linearise_sightings(pose, place, mount, velocity, LEVEL, seen, False, values, weight, residual)
+    rows = int(ROWS[seen.kind[0]])
+    return residual[0, :rows], values.reshape(rows, -1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("kind", "oriented"), [(POINT, False), (POINT, True), (POSE, True), (CORNERS, True)])
+def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, seed):
+    seen, pose, place, mount = a_sighting(kind, oriented, seed)
+    velocity = np.random.default_rng(seed).normal(0.0, 1.0, (1, 6))
+    at, block = residuals(seen, pose, place, mount, velocity)
+    assert block[:, -1] == pytest.approx(-at, abs=1e-9)
+    dim = 6 if oriented else 3
+    columns = []
+    for which, size in (("pose", 6), ("place", dim), ("mount", 6), ("late", 1)):
+        for k in range(size):
+            ends = []
+            for sign in (1.0, -1.0):
+                by = np.zeros((1, 6))
+                by[0, k] = sign * STEP
+                moved = {"pose": pose, "place": place.copy(), "mount": mount}
+                if which == "late":
+                    moved["pose"] = se3.retract(pose, sign * STEP * velocity)
+                elif which == "place" and not oriented:
+                    moved["place"][:, :3] += by[:, :3]
+                else:
+                    moved[which] = se3.retract(moved[which], by)
+                ends.append(residuals(seen, moved["pose"], moved["place"], moved["mount"], velocity)[0])
+            columns.append((ends[0] - ends[1]) / (2.0 * STEP))
+    assert block[:, :-1] == pytest.approx(np.column_stack(columns), abs=2e-4 * max(1.0, np.abs(block).max()))
+
+
+def test_jacobians_of_odometry_are_those_of_differences():
+    random = np.random.default_rng(5)
+    pose = se3.exp(random.normal(0.0, 0.5, (2, 6)))
+    increment = se3.retract(se3.between(pose[:1], pose[1:]), random.normal(0.0, 0.1, (1, 6)))
+    sigma = random.uniform(0.1, 0.5, (1, 6))
+
+    def at(both):
+        values, weight = np.zeros(78), np.zeros(1)
+        linearise_odometry(both, increment, sigma, 1e9, False, values, weight)
+        return values.reshape(6, 13)
+
+    block = at(pose)
+    for row in range(2):
+        for k in range(6):
+            ends = []
+            for sign in (1.0, -1.0):
+                moved, by = pose.copy(), np.zeros(6)
+                by[k] = sign * STEP
+                moved[row] = se3.retract(pose[row], by)
+                ends.append(-at(moved)[:, 12])
+            assert block[:, 6 * row + k] == pytest.approx((ends[0] - ends[1]) / (2.0 * STEP), abs=1e-4)
+
+
+@pytest.mark.parametrize("share", [0.0, 1e-4, 0.1])
+@pytest.mark.parametrize("squared", [0.0, 3.0, 20.0, 60.0, 5000.0])
+def test_weights_are_twice_the_slope_of_the_loss(squared, share):
+    log_odds, step = 14.0, 1e-4
+    weight, loss = weighed(squared, log_odds, 6, share, False)
+    mixture = -np.logaddexp(-0.5 * squared, -log_odds - 0.5 * share * squared)
+    assert loss == pytest.approx(mixture, rel=1e-9, abs=1e-9)
+    after, before = (weighed(squared + sign * step, log_odds, 6, share, False)[1] for sign in (1.0, -1.0))
+    assert weight == pytest.approx((after - before) / step, abs=1e-5)

@@ -1,0 +1,139 @@
+"""Drives through a tagged corridor: where robot and tags are, what is wrong with identities, and with a map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from worlds import World, tagged_corridor
+
+from evermap import run_slam
+from evermap.metrics.summary import compare_with_truth
+from evermap.types import Landmarks, SlamResult
+
+
+def errors(result: SlamResult, world: World) -> tuple[float, float]:
+    """Position RMSE of robot and of tags, with the frame of the result aligned where it is its own."""
+    found = compare_with_truth(world.recording, result, rate_hz=10.0)
+    assert found.poses is not None
+    robot = float(np.sqrt(np.mean(found.poses.position_error_m**2)))
+    assert found.landmarks is not None
+    return robot, float(found.landmarks.rmse_m)
+
+
+def as_map(tags: Landmarks, sigma: float = 0.01) -> Landmarks:
+    known = np.broadcast_to(sigma**2 * np.eye(3), (len(tags), 3, 3)).copy()
+    return replace(tags, covariance_m2=known, rotation_covariance=known.copy(), frame="prior_map")
+
+
+def moved(tags: Landmarks, shift: dict[int, tuple[float, float, float]]) -> Landmarks:
+    """The map before some tags were moved by `shift`."""
+    position = tags.position_m.copy()
+    for tag, by in shift.items():
+        position[tag] -= by
+    return replace(as_map(tags), position_m=position)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_drive_with_odometry_is_mapped_from_scratch(seed):
+    world = tagged_corridor(seed, drift=0.03)
+    result = run_slam(world.recording)
+    robot, tags = errors(result, world)
+    dead = compare_with_truth(world.recording, result, rate_hz=10.0).dead_reckoning
+    assert dead is not None
+    assert robot < 0.3 * float(np.sqrt(np.mean(dead.position_error_m**2)))
+    assert robot < 0.06
+    assert tags < 0.06
+    assert result.trajectory.frame == "first_pose"
+    assert result.landmarks.rotation is not None
+
+
+def test_noise_levels_are_those_of_the_world():
+    world = tagged_corridor(3, sigma_px=0.5, drift=0.04)
+    levels = {p.name: p.value for p in run_slam(world.recording).parameters}
+    assert levels["sigma_corner_px"] == pytest.approx(0.5, rel=0.1)
+    assert levels["sigma_odometry_m"] == pytest.approx(0.04, rel=0.35)
+
+
+def test_wrong_identities_are_outliers():
+    world = tagged_corridor(4, p_wrong=0.05, drift=0.03)
+    robot, tags = errors(run_slam(world.recording), world)
+    assert robot < 0.04
+    assert tags < 0.04
+
+
+def test_without_odometry_a_map_is_enough():
+    world = tagged_corridor(5, odometry=False)
+    result = run_slam(world.recording, prior_map=as_map(world.tags))
+    off = result.trajectory.pose_world_robot
+    rows = np.searchsorted(world.recording.frames.stamp_s, result.trajectory.stamp_s)
+    gap = np.linalg.norm(off[:, :3] - world.true_pose[rows, :3], axis=1)
+    assert np.median(gap) < 0.04  # one tag in view: a pixel of it is 5 mrad
+    assert np.mean(gap < 0.2) > 0.98
+    assert len(result.dead_reckoning) == 0
+    assert not result.changes
+
+
+def test_two_tags_with_one_identity_are_two_landmarks():
+    world = tagged_corridor(6, rename={10: 1})
+    result = run_slam(world.recording)
+    called = {result.landmarks.names.get(int(i), str(i)) for i in result.landmarks.landmark_id}
+    assert "1#2" in called
+    assert any("1#2" in warning for warning in result.warnings)
+    at = {
+        result.landmarks.names.get(int(i), str(i)): p
+        for i, p in zip(result.landmarks.landmark_id, result.landmarks.position_m, strict=True)
+    }
+    apart = np.linalg.norm(world.tags.position_m[10] - world.tags.position_m[1])
+    assert np.linalg.norm(at["1#2"] - at["1"]) == pytest.approx(apart, abs=0.1)
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
+    world = tagged_corridor(7, odometry=odometry)
+    shift = {3: (0.3, 0.0, 0.0), 8: (0.0, -0.1, 0.4)}
+    result = run_slam(world.recording, prior_map=moved(world.tags, shift))
+    told = {change.landmark_ids[0]: change for change in result.changes}
+    assert told.keys() == shift.keys()
+    for tag, by in shift.items():
+        assert told[tag].displacement_m == pytest.approx(by, abs=0.06)
+        assert told[tag].probability > 0.95
+
+
+@pytest.mark.slow
+def test_probabilities_of_moves_are_calibrated():
+    """Maps that err by what they say, tags moved by some decimetres, wrong identities: who is told, and how surely."""
+    told, truth = [], []
+    for seed in range(200, 216):
+        random = np.random.default_rng(seed)
+        world = tagged_corridor(seed, drift=0.04, p_wrong=0.03, odometry=seed % 2 == 0)
+        shift = {int(tag): random.normal(0.0, 0.2, 3) for tag in random.choice(12, 2, replace=False)}
+        known = moved(world.tags, shift)
+        surveyed = replace(as_map(known, 0.02), position_m=known.position_m + random.normal(0.0, 0.02, (12, 3)))
+        changes = {c.landmark_ids[0]: c.probability for c in run_slam(world.recording, prior_map=surveyed).changes}
+        told += [changes.get(tag, 0.0) for tag in range(12)]
+        truth += [tag in shift for tag in range(12)]
+    p, true = np.array(told), np.array(truth)
+    assert np.mean(p[~true] > 0.5) <= 0.01
+    assert np.mean(p[true] > 0.5) > 0.85
+    assert np.mean(true[p > 0.9]) > 0.95
+
+
+@pytest.mark.slow
+def test_places_and_poses_are_as_sure_as_they_say():
+    """Squared errors by their covariances average their degrees of freedom, over worlds and tags."""
+    of_tags, of_poses = [], []
+    for seed in range(100, 112):
+        world = tagged_corridor(seed, drift=0.03)
+        result = run_slam(world.recording, prior_map=as_map(world.tags, 0.01))
+        off = result.landmarks.position_m - world.tags.position_m[result.landmarks.landmark_id]
+        # where the map was drawn: its own errors are zero here, so the estimate leans on it by what it says
+        of_tags += [d @ np.linalg.solve(c, d) for d, c in zip(off, result.landmarks.covariance_m2, strict=True)]
+        turn = Rotation.from_quat(result.trajectory.pose_world_robot[:, 3:])
+        gap = turn.inv().apply(world.true_pose[:, :3] - result.trajectory.pose_world_robot[:, :3])
+        cov = result.trajectory.covariance[:, :3, :3]
+        of_poses += [float(g @ np.linalg.solve(c, g)) for g, c in zip(gap[::10], cov[::10], strict=True)]
+    assert np.mean(of_tags) < 3.0
+    assert 1.0 < np.mean(of_poses) < 3.6

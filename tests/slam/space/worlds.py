@@ -1,0 +1,135 @@
+"""A corridor with square tags on its walls, driven along twice by a robot with a pinhole camera; rotations by scipy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from evermap.types import (
+    Frames,
+    Landmarks,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
+    Trajectory,
+)
+
+FOCAL, CENTRE, SIZE_M = 500.0, (320.0, 240.0), 0.2
+INTRINSICS = (FOCAL, FOCAL, *CENTRE)
+SQUARE = 0.5 * SIZE_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+# the camera looks along the robot's left: z ahead is the robot's y, x right its x, y down its -z
+MOUNT = Rotation.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]))
+MOUNT_AT = np.array([0.1, 0.05, 0.3])
+
+
+@dataclass
+class World:
+    """What there is, and what a robot records of it."""
+
+    recording: SpatialRecording
+    true_pose: np.ndarray
+    """(N, 7) in the frame of the tags."""
+    tags: Landmarks
+    """Where the tags are."""
+
+
+def poses(at: np.ndarray, turn: Rotation) -> np.ndarray:
+    return np.hstack([at, turn.as_quat()])
+
+
+def tagged_corridor(
+    seed: int,
+    *,
+    n_tags: int = 12,
+    n_frames: int = 160,
+    sigma_px: float = 0.3,
+    drift: float = 0.01,
+    p_wrong: float = 0.0,
+    odometry: bool = True,
+    rename: dict[int, int] | None = None,
+) -> World:
+    """Make a world and a drive through it.
+
+    Args:
+        seed: of everything.
+        n_tags: along 15 m of wall.
+        n_frames: of the drive there and back.
+        sigma_px: noise of corners.
+        drift: noise of the odometry, metres and a third of that in radians, for each square root of a second.
+        p_wrong: share of detections with the identity of another tag.
+        odometry: whether there is any.
+        rename: identities that tags carry instead of their own.
+    """
+    random = np.random.default_rng(seed)
+    place = np.column_stack([np.linspace(0.0, 15.0, n_tags), np.full(n_tags, 2.0), random.uniform(0.0, 0.8, n_tags)])
+    # a tag's z points into the wall, away from who looks at it; some are tilted
+    facing = MOUNT * Rotation.from_rotvec(random.normal(0.0, 0.25, (n_tags, 3)))
+    stamp_s = np.linspace(0.0, 40.0, n_frames)
+    along = 7.5 - 8.0 * np.cos(2.0 * np.pi * stamp_s / stamp_s[-1])
+    at = np.column_stack([along, 0.3 * np.sin(stamp_s), 0.1 * np.sin(0.7 * stamp_s)])
+    turn = Rotation.from_euler(
+        "xyz", np.column_stack([0.05 * np.sin(stamp_s), 0.05 * np.cos(stamp_s), 0.2 * np.sin(0.5 * stamp_s)])
+    )
+    frame, tag, corner = _seen(at, turn, place, facing)
+    corner = corner + random.normal(0.0, sigma_px, corner.shape)
+    identity = np.arange(n_tags) if rename is None else np.array([rename.get(k, k) for k in range(n_tags)])
+    said = identity[tag]
+    wrong = random.random(len(tag)) < p_wrong
+    said = np.where(wrong, identity[random.integers(0, n_tags, len(tag))], said)
+    count = len(frame)
+    detections = SpatialDetections(
+        frame=frame,
+        sensor=np.zeros(count, dtype=np.int64),
+        landmark_id=said,
+        position_sensor_m=np.full((count, 3), np.nan),
+        rotation=np.full((count, 4), np.nan),
+        covariance_sensor_m2=np.full((count, 3, 3), np.nan),
+        sigma_rad=np.full(count, np.nan),
+        corner_px=corner,
+        tag_size_m=np.full(count, SIZE_M),
+        size_m=np.full((count, 3), np.nan),
+        class_id=np.full(count, -1),
+        score=np.full(count, np.nan),
+        source_line=np.zeros(count, dtype=np.int64),
+    )
+    camera = SpatialSensor("left", tuple(np.hstack([MOUNT_AT, MOUNT.as_quat()]).tolist()), INTRINSICS)
+    pose = poses(at, turn)
+    driven = _drifting(pose, stamp_s, drift, random) if odometry else None
+    truth = Trajectory(stamp_s, pose, np.zeros((n_frames, 6, 6)), frame="truth")
+    tags = Landmarks.in_space(np.arange(n_tags), place, rotation=facing.as_quat())
+    return World(SpatialRecording("corridor", driven, Frames(stamp_s), detections, (camera,), truth, tags), pose, tags)
+
+
+def _seen(
+    at: np.ndarray, turn: Rotation, place: np.ndarray, facing: Rotation
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frames, tags and exact corners of all sightings, by the pinhole formula."""
+    frames, tags, corners = [], [], []
+    for row in range(len(at)):
+        camera, origin = turn[row] * MOUNT, at[row] + turn[row].apply(MOUNT_AT)
+        for k in range(len(place)):
+            ahead = camera.inv().apply(place[k] + facing[k].apply(SQUARE) - origin)
+            if ahead[:, 2].min() < 0.3:
+                continue
+            pixel = FOCAL * ahead[:, :2] / ahead[:, 2:] + CENTRE
+            if pixel.min() > 0.0 and (pixel < 2.0 * np.array(CENTRE)).all():
+                frames.append(row)
+                tags.append(k)
+                corners.append(pixel)
+    return np.array(frames), np.array(tags), np.array(corners)
+
+
+def _drifting(pose: np.ndarray, stamp_s: np.ndarray, drift: float, random: np.random.Generator) -> SpatialOdometry:
+    at, turn = pose[:, :3], Rotation.from_quat(pose[:, 3:])
+    found_at, found = [np.array([5.0, -3.0, 1.0])], [Rotation.from_euler("xyz", [0.1, -0.2, 1.0])]
+    for k in range(len(at) - 1):
+        root = np.sqrt(stamp_s[k + 1] - stamp_s[k])
+        step = turn[k].inv().apply(at[k + 1] - at[k]) + random.normal(0.0, drift * root, 3)
+        bend = turn[k].inv() * turn[k + 1] * Rotation.from_rotvec(random.normal(0.0, drift / 3.0 * root, 3))
+        found_at.append(found_at[-1] + found[-1].apply(step))
+        found.append(found[-1] * bend)
+    whole = poses(np.array(found_at), Rotation.concatenate(found))
+    return SpatialOdometry(stamp_s, whole, np.full((len(at), 6), np.nan))
