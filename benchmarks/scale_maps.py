@@ -30,6 +30,9 @@ from evermap.maps.living import Members, Places, Sites, Stays
 from evermap.maps.store import Provenance, RevisionKind
 from evermap.maps.vicinity import in_chunks
 from evermap.sensing.sightlines import SightLines, Views
+from evermap.slam.association.associator import density_of_unmet
+from evermap.slam.association.constellation import LocalMap
+from evermap.slam.association.place_index import PlaceIndex
 from evermap.types import UNKNOWN, FloatArray, IntArray, Recording, rows_of
 from evermap_studies.sim import BuildingConfig, WarehouseConfig, simulate_building, simulate_warehouse
 from evermap_studies.sim.warehouse import warehouse_landmarks
@@ -44,6 +47,9 @@ LOCALISE_S = 120.0
 """Of the drive, when localising."""
 START_FRAMES = 20
 """Frames in which the start pose is found, and that no step is counted in."""
+LOCAL = (8, 12, 20)
+TRIED = 50
+"""Landmarks of local maps that are looked for without identities, and how many of each size."""
 SIGMA_MAP_M = 0.03
 CORRELATED_M = 30.0
 """Distance over which errors of places are correlated, half of their variance; sessions leave no two independent."""
@@ -171,6 +177,51 @@ def localise(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, floa
     }
 
 
+def constellations(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
+    """Measure finding local maps of landmarks without identities in a map that lacks a tenth of them.
+
+    Local maps hold the `LOCAL` landmarks around a random one, a tenth of them new, in a frame of their own; as many are
+    of a warehouse that is not in the map. Shares are of `TRIED` each.
+    """
+    config, rng = replace(config, n_landmarks=n_places), np.random.default_rng(n_places)
+    true, foreign = warehouse_landmarks(config), warehouse_landmarks(config, seed=1)
+    mapped = np.flatnonzero(rng.random(n_places) >= 0.1)
+    position = true[mapped] + SIGMA_MAP_M * rng.normal(size=(len(mapped), 2))
+    before_mb = peak_mb()
+    built = spent(lambda: PlaceIndex(position, np.tile(SIGMA_MAP_M**2 * np.eye(2), (len(mapped), 1, 1))))
+    found: dict[str, float] = {"build_s": built.cpu_s, "grown_mb": peak_mb() - before_mb}
+    for count in LOCAL:
+        cpu_s, right, wrong, invented = [], 0, 0, 0
+        for world in (true, foreign) * TRIED:
+            local, name = _local_map(rng, world, count)
+            density = density_of_unmet(local.place)
+            asked = spent(
+                lambda local=local, density=density: built.result.pairs(local, density=density, probability=0.97)
+            )
+            cpu_s.append(asked.cpu_s)
+            good = sum(int(name[k]) == int(mapped[m]) for k, m in asked.result)
+            if world is true:
+                right += good > 0
+                wrong += bool(asked.result) and good == 0
+            else:
+                invented += bool(asked.result)
+        found |= {f"median_s_{count}": float(np.median(cpu_s)), f"longest_s_{count}": max(cpu_s)}
+        found |= {
+            f"{who}_{count}": n / TRIED for who, n in (("found", right), ("wrong", wrong), ("invented", invented))
+        }
+    return found
+
+
+def _local_map(rng: np.random.Generator, world: FloatArray, count: int) -> tuple[LocalMap, IntArray]:
+    """The landmarks around one of them, a tenth of them new, and which they are, -1 for new."""
+    name = np.argsort(np.hypot(*(world - world[rng.integers(len(world))]).T))[:count]
+    place, new = world[name].copy(), rng.random(count) < 0.1
+    place[new] = rng.uniform(place.min(axis=0), place.max(axis=0), (int(new.sum()), 2))
+    place = se2.transform(MAP_POSE, place) + SIGMA_MAP_M * rng.normal(size=place.shape)
+    order = rng.permutation(count)
+    return LocalMap(place[order], SIGMA_MAP_M**2 * np.eye(2 * count)), np.where(new, -1, name)[order]
+
+
 def opened(n_places: int, config: WarehouseConfig = SESSION) -> dict[str, float]:
     """Measure opening a stored map, until a localisation in it has gone on for three seconds."""
     recording = _until(simulate_warehouse(config), 3.0)
@@ -260,7 +311,7 @@ def measure(work: str, number: int, *, timeout_s: float | None = None) -> dict[s
     """Return a row, measured in a process of its own; `not_run` says why where it was not.
 
     Args:
-        work: 'bring_in', 'localise', 'opened' or 'building'.
+        work: 'bring_in', 'localise', 'opened', 'constellations' or 'building'.
         number: places of the map, or sessions.
         timeout_s: after which it is given up.
     """
@@ -326,7 +377,7 @@ def _child(*arguments: str, timeout_s: float | None = None) -> str:
 
 def _main(work: str, number: int) -> None:
     """In the child: the same work on a small map first, so that nothing is compiled while the clock runs."""
-    in_map = {"bring_in": bring_in, "localise": localise, "opened": opened}
+    in_map = {"bring_in": bring_in, "localise": localise, "opened": opened, "constellations": constellations}
     if work in in_map:
         in_map[work](SMALL.n_landmarks, SMALL)
     print(json.dumps(in_map[work](number) if work in in_map else building(number)))

@@ -157,6 +157,9 @@ def test_a_filled_map_can_be_kept_and_entered(scale_maps: ModuleType, tmp_path: 
     assert found["changes"] == 0.0
     assert 0.0 < found["recording_mb"] <= found["file_grown_mb"]
     assert scale_maps.localise(60, config)["off_m"] < 0.2
+    found = scale_maps.constellations(60, config)
+    assert found["found_20"] > 0.8
+    assert found["wrong_20"] == found["invented_20"] == 0.0
 
 
 def test_sessions_of_a_building_are_compared_at_both_ends(scale_maps: ModuleType) -> None:

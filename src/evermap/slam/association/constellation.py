@@ -9,6 +9,7 @@ what they explain, so that a chance agreement of two does not beat the right one
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +61,14 @@ class Alignment:
     log_evidence: float
 
 
-def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float) -> list[Alignment]:
+def overlays(
+    source: LocalMap,
+    target: LocalMap,
+    allowed: BoolArray,
+    *,
+    density: float,
+    motions: Sequence[FloatArray] | None = None,
+) -> list[Alignment]:
     """Return ways to lay `source` over `target`, the one with most evidence first; each set of pairs once.
 
     Args:
@@ -68,9 +76,10 @@ def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density:
         target: the map.
         allowed: (n, m) which pairs may be the same at all.
         density: landmarks a square metre that one expects where they are not the same.
+        motions: those that are weighed; None tries all pairs.
     """
     found: dict[tuple[tuple[int, int], ...], Alignment] = {}
-    for motion in _motions(source, target, allowed):
+    for motion in _motions(source, target, allowed) if motions is None else motions:
         overlay = _weighed(motion, source, target, allowed, density)
         known = found.get(overlay.pairs)
         if known is None or known.log_evidence < overlay.log_evidence:
@@ -79,7 +88,15 @@ def overlays(source: LocalMap, target: LocalMap, allowed: BoolArray, *, density:
 
 
 def agreed_pairs(
-    source: LocalMap, target: LocalMap, allowed: BoolArray, *, density: float, probability: float
+    source: LocalMap,
+    target: LocalMap,
+    allowed: BoolArray,
+    *,
+    density: float,
+    probability: float,
+    motions: Sequence[FloatArray] | None = None,
+    least_nats: float = CERTAIN_NATS,
+    lead_nats: float = CERTAIN_NATS,
 ) -> list[tuple[int, int]]:
     """Return pairs (source, target) that are certain: of an overlay far better than any other, without doubt in it.
 
@@ -91,13 +108,17 @@ def agreed_pairs(
         allowed: (n, m) which pairs may be the same at all.
         density: landmarks a square metre that one expects where they are not the same.
         probability: least probability of a pair beside all overlays that differ in it alone.
+        motions: those that are weighed; None tries all pairs.
+        least_nats: evidence of an overlay, over 'all new', from which it may be meant at all.
+        lead_nats: by how much it must beat its best rival.
     """
-    found = [overlay for overlay in overlays(source, target, allowed, density=density) if len(overlay.pairs) > 1]
-    if not found or found[0].log_evidence < CERTAIN_NATS:
+    every = overlays(source, target, allowed, density=density, motions=motions)
+    found = [overlay for overlay in every if len(overlay.pairs) > 1]
+    if not found or found[0].log_evidence < least_nats:
         return []
     best = found[0]
     rivals = [other for other in found[1:] if not set(other.pairs) & set(best.pairs)]
-    if rivals and best.log_evidence - rivals[0].log_evidence < CERTAIN_NATS:
+    if rivals and best.log_evidence - rivals[0].log_evidence < lead_nats:
         return []
     sure = _without_doubt(best, source, target, allowed, density, math.log(probability / (1.0 - probability)))
     return sure if len(sure) > 1 else []

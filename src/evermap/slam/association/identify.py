@@ -8,16 +8,20 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from evermap.slam.association.assignment import Assignment
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
+from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
 from evermap.slam.problem import Noise
 from evermap.slam.smoother import Smoother
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
 
+ALL_TRIED = 100
+"""Landmarks of a prior map up to which every pair of them is tried; beyond, an index over constellations is asked."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
 
@@ -75,13 +79,13 @@ def _found_in(
     mine = _in_metres(assignment, noise, prior)
     columns = np.column_stack([2 * trusted, 2 * trusted + 1]).ravel()
     source = LocalMap(mine.place[trusted], mine.covariance[np.ix_(columns, columns)])
-    count = len(prior_map)
-    joint = np.zeros((count, 2, count, 2))
-    rows = np.arange(count)
-    joint[rows, :, rows, :] = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2)
-    target = LocalMap(prior_map.position_m, joint.reshape(2 * count, 2 * count))
-    allowed = np.ones((len(trusted), count), dtype=bool)
-    pairs = agreed_pairs(source, target, allowed, density=density_of_unmet(source.place), probability=P_MERGE)
+    known, density = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2), density_of_unmet(source.place)
+    if len(prior_map) > ALL_TRIED:
+        pairs = PlaceIndex(prior_map.position_m, known).pairs(source, density=density, probability=P_MERGE)
+    else:
+        target = LocalMap(prior_map.position_m, block_diag(*known))
+        allowed = np.ones((len(trusted), len(prior_map)), dtype=bool)
+        pairs = agreed_pairs(source, target, allowed, density=density, probability=P_MERGE)
     return [(int(trusted[k]), m) for k, m in pairs]
 
 

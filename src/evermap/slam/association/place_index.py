@@ -1,0 +1,250 @@
+"""Where a local map may lie in a large one: an index over constellations, triangles of near places by their sides.
+
+Trying every pair of places is quadratic in the map. A triangle of near landmarks has three lengths that no motion
+changes; a k-d tree of the triangles of the map answers which of them have the lengths of one of the local map. Each is
+a motion, and counts the landmarks of the local map that come to lie at a place. The best of them, one for each part of
+the map, are weighed exactly (`constellation`): where two are nearly as good, as in aisles that repeat, or where what
+agrees may do so by chance somewhere in a map of this size, the answer is that nothing is known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
+from evermap.slam.association.constellation import (
+    CERTAIN_NATS,
+    MAX_MOTIONS,
+    MIN_SPAN_M,
+    MOTION_SIGMA,
+    NEAR_M,
+    LocalMap,
+    agreed_pairs,
+)
+from evermap.types import BoolArray, FloatArray, IntArray
+
+NEIGHBOURS = 7
+"""Places, the nearest, that make triangles with each place."""
+LONGEST_M = 25.0
+"""Longest side of a triangle."""
+FLATTEST = 0.05
+"""Least area of a triangle over its longest side squared: what lies on a line fixes no turn."""
+LOOKED_UP = 80
+"""Triangles of the local map that are looked up, at most."""
+MOST_MATCHES = 30_000
+"""Matches of these that are followed, those of the rarest triangles first."""
+SIDE_SIGMAS, SIDE_SLACK_M = 3.4, 0.02
+"""Three lengths within both maps differ by this many standard deviations in all, and a little, in 99 of 100 cases."""
+PART_M = 5.0
+"""Motions that take the local map this near to each other are one place of the map."""
+PATCH = 20
+"""Landmarks of the local map, those around the first, that are laid over the map at a time."""
+TRIES = 3
+"""Patches that are looked for in the whole map, at most."""
+LEAD_NATS = 20.0
+"""By which a place must beat all others, about three landmarks. In aisles that resemble each other the best of wrong
+places is ahead of the next by some nats, by 8 in a tenth of the cases and by up to 15 in 320."""
+SEEN_AGAIN = 0.4
+"""Share of a patch that has to be found in the map."""
+REACH_M = 15.0
+"""How far around a patch places are compared, once it is known where in the map it is."""
+
+
+class PlaceIndex:
+    """Places (P, 2) of a map with covariances (P, 2, 2) each; it keeps about 1 kB a place."""
+
+    def __init__(self, position_m: FloatArray, covariance_m2: FloatArray) -> None:
+        self._position, self._covariance = np.ascontiguousarray(position_m), covariance_m2
+        self._tree = KDTree(self._position)
+        self._sigma_m = (
+            math.sqrt(float(np.median(np.trace(covariance_m2, axis1=1, axis2=2)))) if len(position_m) else 0.0
+        )
+        self._corners = _triangles(self._position, self._tree, NEIGHBOURS)
+        sides, order = _sides(self._position[self._corners])
+        self._corners = np.take_along_axis(self._corners, order, axis=1)
+        self._by_sides = KDTree(sides, balanced_tree=False)
+
+    def pairs(self, source: LocalMap, *, density: float, probability: float) -> list[tuple[int, int]]:
+        """Return landmarks (rows of `source`) that surely stand at places of the map; none where that is not sure.
+
+        Args:
+            source: the local map, its landmarks in order of trust.
+            density: landmarks a square metre that one expects where they are not the same.
+            probability: least probability of a pair beside all overlays that differ in it alone.
+        """
+        done = np.zeros(len(source.place), dtype=bool)
+        for _ in range(TRIES):
+            if len(source.place) - int(done.sum()) < 3 or not len(self._corners):
+                break
+            rows = _patch(source.place, source.place[np.argmin(done)], done)
+            done[rows] = True
+            found = self._first(source, rows, density, probability)
+            if found:
+                mine, theirs = np.array(found).T
+                left = np.ones(len(source.place), dtype=bool)
+                left[rows] = False
+                return found + self._further(source, mine, theirs, ~left, density, probability)
+        return []
+
+    def motions(self, place: FloatArray, sigma_m: float) -> FloatArray:
+        """Return (K, 3) motions that take places (n, 2), `sigma_m` off, to the map; the best in each part of it."""
+        corners = _triangles(place, KDTree(place), min(NEIGHBOURS + 2, len(place) - 1))
+        sides, order = _sides(place[corners])
+        corners = np.take_along_axis(corners, order, axis=1)
+        within = SIDE_SIGMAS * math.hypot(sigma_m, self._sigma_m) + SIDE_SLACK_M
+        mine, theirs = self._alike(corners, sides, within)
+        motion = rigid(place[mine], self._position[theirs])
+        best = np.zeros(0, dtype=np.int64)
+        count, error = np.zeros(len(motion)), np.zeros(len(motion))
+        for begin in range(0, len(motion), 4096):
+            part = slice(begin, begin + 4096)
+            gap = self._tree.query(se2.transform(motion[part, None], place), distance_upper_bound=NEAR_M)[0]
+            count[part] = np.sum(np.isfinite(gap), axis=1)
+            error[part] = np.sum(np.minimum(gap, NEAR_M), axis=1)
+        middle = se2.transform(motion, place.mean(axis=0))
+        left = np.lexsort((error, -count))
+        while len(left) and len(best) < MAX_MOTIONS:
+            best = np.append(best, left[0])
+            left = left[np.hypot(*(middle[left] - middle[left[0]]).T) > PART_M]
+        return motion[best]
+
+    def _first(self, source: LocalMap, rows: IntArray, density: float, probability: float) -> list[tuple[int, int]]:
+        """Pairs of some landmarks, wherever in the map they are."""
+        local = _part(source, rows)
+        motions = self.motions(local.place, _sigma(local))
+        places = self._around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
+        area_m2 = float(np.prod(np.ptp(self._position, axis=0)))
+        elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * MOTION_SIGMA[0] * MOTION_SIGMA[1])))
+        least = CERTAIN_NATS + elsewhere
+        found = self._agreed(
+            local,
+            places,
+            list(motions),
+            density=density,
+            probability=probability,
+            least_nats=least,
+            lead_nats=LEAD_NATS,
+        )
+        return [(int(rows[k]), m) for k, m in found] if len(found) >= max(3, SEEN_AGAIN * len(rows)) else []
+
+    def _further(
+        self, source: LocalMap, mine: IntArray, theirs: IntArray, done: BoolArray, density: float, probability: float
+    ) -> list[tuple[int, int]]:
+        """Pairs of the other landmarks, patch after patch outwards from those that were found."""
+        found: list[tuple[int, int]] = []
+        at, to = mine, theirs
+        while not done.all():
+            left = np.flatnonzero(~done)
+            away = np.hypot(*(source.place[left, None] - source.place[at][None]).transpose(2, 0, 1)).min(axis=1)
+            start = source.place[left[np.argmin(away)]]
+            new = _patch(source.place, start, done)
+            done[new] = True
+            near = np.argsort(np.hypot(*(source.place[at] - start).T), kind="stable")[:PATCH]
+            motion = rigid(source.place[at[near]], self._position[to[near]])
+            rows = np.append(at[near], new)
+            places = self._around(se2.transform(motion, source.place[rows]), REACH_M)
+            pairs = self._agreed(_part(source, rows), places, [motion], density=density, probability=probability)
+            fresh = [(int(rows[k]), m) for k, m in pairs if k >= len(near) and m not in to]
+            if fresh:
+                found += fresh
+                at, to = np.append(at, [k for k, _ in fresh]), np.append(to, [m for _, m in fresh])
+        return found
+
+    def _around(self, at_m: FloatArray, reach_m: float) -> IntArray:
+        """Rows of the places near any of some points (n, 2)."""
+        near: Any = self._tree.query_ball_point(at_m, reach_m)
+        return np.unique(np.fromiter(itertools.chain.from_iterable(near), dtype=np.int64))
+
+    def _agreed(
+        self, local: LocalMap, places: IntArray, motions: list[FloatArray], **rules: float
+    ) -> list[tuple[int, int]]:
+        joint = np.zeros((len(places), 2, len(places), 2))
+        rows = np.arange(len(places))
+        joint[rows, :, rows, :] = self._covariance[places]
+        target = LocalMap(self._position[places], joint.reshape(2 * len(places), 2 * len(places)))
+        allowed = np.ones((len(local.place), len(places)), dtype=bool)
+        pairs = agreed_pairs(local, target, allowed, motions=motions, **rules)
+        return [(k, int(places[m])) for k, m in pairs]
+
+    def _alike(self, corners: IntArray, sides: FloatArray, within: float) -> tuple[IntArray, IntArray]:
+        """(K, 3) corners of local triangles and (K, 3) of those of the map that are alike; of the rarest first."""
+        mine: list[IntArray] = []
+        theirs: list[IntArray] = []
+        total = 0
+        # spread over the landmarks: what is new here, or gone there, is in none of some
+        chosen = np.arange(len(corners))[:: max(1, len(corners) // LOOKED_UP)][:LOOKED_UP]
+        looked: list[Any] = [self._by_sides.query_ball_point(sides[chosen][:, list(turn)], within) for turn in _TURNS]
+        count = np.array([sum(len(each[k]) for each in looked) for k in range(len(chosen))])
+        for k in np.argsort(count, kind="stable").tolist():
+            total += int(count[k])
+            if total > MOST_MATCHES and mine:
+                break
+            for turn, each in zip(_TURNS, looked, strict=True):
+                found = np.asarray(each[k], dtype=np.int64)
+                mine.append(np.tile(corners[chosen[k]][list(turn)], (len(found), 1)))
+                theirs.append(self._corners[found])
+        one = np.concatenate(mine) if mine else np.zeros((0, 3), dtype=np.int64)
+        return one, np.concatenate(theirs) if theirs else one
+
+
+_TURNS = tuple(itertools.permutations(range(3)))
+"""Ways in which corners may correspond: sides of nearly one length may be either."""
+
+
+def _triangles(place: FloatArray, tree: KDTree, neighbours: int) -> IntArray:
+    """(T, 3) corners of different triangles of each place with two of its nearest, none too large, small or flat."""
+    n = len(place)
+    if n < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    near: IntArray = np.asarray(tree.query(place, k=min(neighbours, n - 1) + 1)[1])[:, 1:]
+    two = np.array(list(itertools.combinations(range(near.shape[1]), 2)))
+    corners = np.concatenate([np.repeat(np.arange(n), len(two))[:, None], near[:, two].reshape(-1, 2)], axis=1)
+    corners = np.sort(corners, axis=1)
+    key = (corners[:, 0] * n + corners[:, 1]) * n + corners[:, 2]
+    corners = corners[np.unique(key, return_index=True)[1]]
+    at = place[corners]
+    a, b = at[:, 1] - at[:, 0], at[:, 2] - at[:, 0]
+    area = 0.5 * np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    length = np.linalg.norm(at - np.roll(at, 1, axis=1), axis=2)
+    longest = length.max(axis=1)
+    good = (longest < LONGEST_M) & (length.min(axis=1) > MIN_SPAN_M) & (area > FLATTEST * longest**2)
+    kept: IntArray = corners[good]
+    return kept
+
+
+def _sides(at: FloatArray) -> tuple[FloatArray, IntArray]:
+    """(T, 3) lengths of the sides of triangles (T, 3, 2), falling, and (T, 3) the corners opposite to them."""
+    length = np.linalg.norm(np.roll(at, -1, axis=1) - np.roll(at, -2, axis=1), axis=2)
+    order = np.argsort(-length, axis=1, kind="stable")
+    return np.take_along_axis(length, order, axis=1), order
+
+
+def _patch(place: FloatArray, start: FloatArray, done: BoolArray) -> IntArray:
+    """Rows of the nearest landmarks around a point that are not done."""
+    away = np.where(done, np.inf, np.hypot(*(place - start).T))
+    near = np.argsort(away, kind="stable")[:PATCH]
+    rows: IntArray = near[np.isfinite(away[near])]
+    return rows
+
+
+def _part(source: LocalMap, rows: IntArray) -> LocalMap:
+    at = se2.xy_rows(rows)
+    return LocalMap(source.place[rows], source.covariance[np.ix_(at, at)])
+
+
+def _sigma(local: LocalMap) -> float:
+    """Of the position of a landmark beside its neighbours [m]: of the differences to the nearest."""
+    n = len(local.place)
+    near: IntArray = np.asarray(KDTree(local.place).query(local.place, k=2)[1])[:, 1]
+    by = np.zeros((2 * n, 2 * n))
+    for k in range(n):
+        by[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.eye(2)
+        by[2 * k : 2 * k + 2, 2 * near[k] : 2 * near[k] + 2] = -np.eye(2)
+    spread = np.diag(by @ local.covariance @ by.T).reshape(n, 2).sum(axis=1)
+    return math.sqrt(0.5 * max(float(np.median(spread)), 0.0))
