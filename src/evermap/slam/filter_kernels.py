@@ -38,9 +38,10 @@ whether the detection is an outlier is better asked of the others of the frame."
 LEAST_WEIGHT = 1e-6
 LARGE = 32
 """Rows from which a matrix is factorised by LAPACK."""
-BELIEVED, HEAVY, BY_OTHERS = 0, 1, 2
+BELIEVED, HEAVY, BY_OTHERS, GATED = 0, 1, 2, 3
 """How detections are weighed: not at all; by the Cauchy's tails, as in the smoother's first rounds; as inliers or
-outliers, where the pose is uncertain by what the others of the frame say."""
+outliers, where the pose is uncertain by what the others of the frame say; not at all, but as linear as the joint gates
+that they passed: iterated, a wrong pairing leads farther astray (MRCLAM 6, robot 4: 0.7 m for 0.12 m)."""
 
 
 @kernel
@@ -222,7 +223,7 @@ def update(
     jacobian, column = np.zeros((2 * count, 10)), np.zeros((count, 10), dtype=np.int64)
     root, gain, spread = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size)), np.zeros((0, 0))
     unsure = False
-    for iteration in range(ITERATIONS):
+    for iteration in range(1 if weighing == GATED else ITERATIONS):
         linearise_frame(pose, states, place, own, reading, mount, free, step[2], innovation, jacobian, column)
         spread_of_frame(part, jacobian, column, gain, root)
         if weighing == BY_OTHERS and iteration == 0:

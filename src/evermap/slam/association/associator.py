@@ -16,6 +16,7 @@ from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.constellation import RISE_NATS, propose_constellation, propose_merges
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
@@ -190,13 +191,13 @@ class Associator:
         problem, local, pairings = self._problem, self._filter, frame.pairings
         known, target = detections[pairings.source[frame.taken]], pairings.target[frame.taken]
         self._row[known] = target
-        local.update(target, problem.reading[known], frame.sigma[known])
+        local.update(target, problem.reading[known], frame.sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
         self._row[new] = len(local.position) + np.arange(len(new))
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
-        local.update(self._row[new], problem.reading[new], frame.sigma[new])
+        local.update(self._row[new], problem.reading[new], frame.sigma[new], weighing=GATED)
 
     def _take_stock(self) -> None:
         """Solve everything so far, merge what is one, and go on from there."""
