@@ -224,7 +224,8 @@ class Placer:
         span = np.arange(-math.ceil(ROUTE_CLEARANCE_M / CELL_M) - 1, math.ceil(ROUTE_CLEARANCE_M / CELL_M) + 2)
         disc = np.stack(np.meshgrid(span, span), axis=-1).reshape(-1, 2)
         disc = disc[np.hypot(disc[:, 0], disc[:, 1]) * CELL_M <= ROUTE_CLEARANCE_M + CELL_M]
-        cells = ((route_m[:, None] / CELL_M).astype(np.int64) + disc).reshape(-1, 2)
+        passed = np.unique((route_m / CELL_M).astype(np.int64), axis=0)
+        cells = (passed[:, None] + disc).reshape(-1, 2)
         self._route = np.zeros((math.ceil(plan.length_m / CELL_M) + 1, math.ceil(plan.depth_m / CELL_M) + 1), np.bool_)
         inside = np.all((cells >= 0) & (cells < self._route.shape), axis=1)
         self._route[tuple(cells[inside].T)] = True
