@@ -192,3 +192,35 @@ def test_malformed_boxes_are_named(box: np.ndarray | None, p_real: np.ndarray, n
     with pytest.raises(EvermapError) as error:
         Tracker(boxes=True, scored=True).step(0.0, np.zeros((1, 3)), box=box, p_real=p_real)
     assert named in error.value.one_line()
+
+
+def test_a_parked_box_whose_centre_wanders_rests_and_a_creeping_one_does_not() -> None:
+    """As the car drives by, another side is seen, and the centre of what is parked shifts by 0.25 m."""
+    rng, tracker = np.random.default_rng(5), Tracker(boxes=True)
+    for k in range(80):
+        t = STEP_S * k
+        parked, creeping = [0.25 * np.tanh(t - 4.0), 0.0, 0.8], [0.9 * t, 8.0, 0.8]
+        centre = np.array([parked, creeping]) + rng.normal(0.0, 0.05, (2, 3))
+        tracker.step(t, centre, box=np.array([[*CAR, 0.0], [*CAR, 0.0]]))
+    followed = tracker.followed()
+    order = np.argsort(followed.position_m[:, 1])
+    assert followed.static[order].tolist() == [True, False]
+    assert tracker.p_static()[order][0] > 0.9
+    assert tracker.p_static()[order][1] < 0.3
+
+
+def test_standing_still_is_a_bayes_factor() -> None:
+    """Against densities by scipy, of a filter that has seen two detections; and the prior moves the odds."""
+    from scipy.stats import multivariate_normal
+
+    s, tracker = TrackerConfig(), Tracker(boxes=True)
+    for k in range(2):
+        tracker.step(STEP_S * k, np.array([[0.1 * k, 0.0, 0.8]]), box=np.array([[*CAR, 0.4]]))
+    followed = tracker.followed()
+    yaw = followed.box[0, 3]
+    ahead = s.speed_per_length_hz * followed.box[0, 0] * np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    before = s.sigma_velocity_mps**2 * np.eye(3) + np.outer(ahead, ahead)
+    after = multivariate_normal(followed.velocity_mps[0], followed.velocity_covariance_m2ps2[0]).logpdf(np.zeros(3))
+    factor = np.exp(after - multivariate_normal(np.zeros(3), before).logpdf(np.zeros(3)))
+    np.testing.assert_allclose(tracker.p_static(), factor / (1.0 + factor), rtol=1e-9)
+    np.testing.assert_allclose(tracker.p_static(0.8), 4.0 * factor / (1.0 + 4.0 * factor), rtol=1e-9)

@@ -202,6 +202,7 @@ def match(targets: Targets, frame: Frame, likelihood: Likelihood) -> tuple[IntAr
             noise_of(frame, detection[k]),
             targets.mean[found[k]],
             targets.covariance[found[k]],
+            0.0,
         )
         moved[k] = squared > DISPLACED
     return found, detection, pairs.log_ratio[pair], moved

@@ -56,12 +56,18 @@ def speed_score(mean: FloatArray, covariance: FloatArray, threshold_mps: float) 
 
 
 @inlined
-def displacement(mean: FloatArray, covariance: FloatArray, place: FloatArray, place_covariance: FloatArray) -> float:
+def displacement(
+    mean: FloatArray, covariance: FloatArray, place: FloatArray, place_covariance: FloatArray, place_m2: float
+) -> float:
     """Return the squared Mahalanobis distance of a filter from a place; both have seen the same, so it comes out too
     small.
+
+    `place_m2` is the variance of what detections of an object at rest have in common for a while: the centre of a box
+    wanders with the side that is seen.
     """
     offset = mean[0] - place[0], mean[1] - place[1], mean[2] - place[2]
-    squared, _ = distance_and_log_det(offset, sum_of(covariance, place_covariance))
+    xx, xy, xz, yy, yz, zz = sum_of(covariance, place_covariance)
+    squared, _ = distance_and_log_det(offset, (xx + place_m2, xy, xz, yy + place_m2, yz, zz + place_m2))
     return squared
 
 
@@ -104,7 +110,7 @@ def settle(t: Tracklets, i: int, frame: Frame, j: int, rules: Rules, spells: Spe
     stamp_s, position, noise = frame.stamp_s, frame.position[j], noise_of(frame, j)
     score = speed_score(t.mean[i], t.covariance[i], rules.class_speed_mps[np.argmax(t.class_p[i])])
     t.slow[i] = 1 if score <= 0.0 else 0
-    squared = displacement(t.mean[i], t.covariance[i], t.rest_mean[i], t.rest_covariance[i])
+    squared = displacement(t.mean[i], t.covariance[i], t.rest_mean[i], t.rest_covariance[i], rules.place_m2)
     if score > FAST or squared > DISPLACED:
         if t.static[i] == 1:
             t.rest_seen_s[i] = max(t.rest_since_s[i], min(t.rest_seen_s[i], departure(t, i, stamp_s)))

@@ -97,7 +97,7 @@ class Tracker(Shown):
             self._likelihood_at_rest = self._likelihood._replace(
                 moved_reach_m=float(s.moved_reach_m), log_moved=float(np.log(s.p_moved / volume_m3))
             )
-        self._rules = _rules(s, n_classes)
+        self._rules = _rules(s, n_classes, boxes=boxes)
         self._noise = np.eye(3)[None] * s.sigma_position_m**2
         self._tracklets = room_for(ROOM, s.order, n_classes, n_appearance, boxes=boxes, scored=scored)
         self._n = 0
@@ -415,7 +415,7 @@ class Tracker(Shown):
         )
 
 
-def _rules(s: TrackerConfig, n_classes: int) -> Rules:
+def _rules(s: TrackerConfig, n_classes: int, *, boxes: bool) -> Rules:
     """Numbers of the settings, as kernels take them."""
     return Rules(
         odds_confirm=(1.0 - s.p_confirm) / s.p_confirm,
@@ -430,6 +430,7 @@ def _rules(s: TrackerConfig, n_classes: int) -> Rules:
         sigma_acceleration_mps2=float(s.sigma_acceleration_mps2),
         inverse_odds_new=(1.0 - s.p_real) / s.p_real,
         speed_per_length_hz=float(s.speed_per_length_hz),
+        place_m2=float(s.place_sigma_m**2) if boxes else 0.0,
         score_memory=float(s.score_memory),
         seen_nats=float(s.seen_nats),
         missed_nats=float(s.missed_nats),

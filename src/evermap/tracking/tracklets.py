@@ -60,6 +60,7 @@ class Rules(NamedTuple):
     sigma_acceleration_mps2: float
     inverse_odds_new: float
     speed_per_length_hz: float
+    place_m2: float
     log_odds_believed: float
     score_memory: float
     seen_nats: float
