@@ -336,10 +336,10 @@ def figure(shown: dict[str, Any]) -> Figure:
     from evermap.viz.style import ESTIMATE, ODOMETRY
 
     drawn = Figure(figsize=(9.0, 3.0), layout="constrained")
-    panels = drawn.subplots(1, len(shown["classes"]), sharex=True)
+    panels = drawn.subplots(1, len(shown["classes"]), sharex=True, squeeze=False)[0]
     for axes, (name, rows) in zip(panels, shown["classes"].items(), strict=True):
         for who, colour in (("evermap", ESTIMATE), ("AB3DMOT", ODOMETRY)):
-            axes.plot(*zip(*rows[who]["swept"]["curve"], strict=True), color=colour, label=who)
+            axes.plot(*np.array(rows[who]["swept"]["curve"]).reshape(-1, 2).T, color=colour, label=who)
         axes.set(title=name, xlabel="recall", xlim=(0.0, 1.0), ylim=(-0.2, 0.9))
         axes.grid(alpha=0.3)
     drawn.axes[0].set_ylabel("MOTA")

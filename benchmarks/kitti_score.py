@@ -143,7 +143,7 @@ def swept(sequences: Sequences, mean_score: list[dict[int, float]]) -> dict[str,
         "AMOTP": sum(found.motp for _, _, found in steps) / N_RECALLS,
         **told(best),
         "threshold": score,
-        "curve": [(recall, found.mota) for recall, _, found in steps],
+        "curve": [[recall, found.mota] for recall, _, found in steps],
     }
 
 

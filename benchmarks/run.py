@@ -64,7 +64,7 @@ def run(
 
     Args:
         update_baseline: make these measurements the baseline; what is not measured stays.
-        only: one of `PARTS`; all where None.
+        only: one of `PARTS`; all where None, `kitti` where its recordings are there.
         n_poses, turns: size of the world and repetitions; the baseline belongs to the defaults.
         n_features, seconds, n_cliques: the same for the persistence filter, and for the filters of cliques.
         n_lifetimes: censored samples of each kind.
@@ -114,7 +114,7 @@ def run(
         ratios, shown["scale"] = scale.run(sizes)
         measured |= ratios
     if update_baseline:
-        kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only else {}
+        kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only or "kitti" not in shown else {}
         write_atomic(BASELINE, json.dumps(_as_baseline(kept | measured), indent=2) + "\n")
     metrics = compare(measured, read_baseline())
     return {

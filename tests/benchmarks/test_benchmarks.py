@@ -284,6 +284,9 @@ def test_a_small_run_writes_compares_and_reports(
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
     monkeypatch.setattr(run.scale, "SIZES", (20, 40))
+    boxes = dict.fromkeys(run.kitti.METRICS, 1.0), {"classes": {}, "ms_a_frame": {"evermap": 0.3}}
+    monkeypatch.setattr(run.kitti, "FOLDER", tmp_path)
+    monkeypatch.setattr(run.kitti, "run", lambda: boxes)
     measured = run.run(
         update_baseline=True,
         n_poses=80,

@@ -164,3 +164,15 @@ def test_ahead_of_the_peer_in_every_class() -> None:
 def test_a_folder_without_sequences_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no sequences"):
         kitti.run(tmp_path)
+
+
+def test_tables_and_figure_of_a_run_are_written(tmp_path: Path) -> None:
+    row = swept([SWITCHED], [{7: 5.0, 8: 1.0}]) | identities([SWITCHED])
+    both = {"swept": row, "at_once": row}
+    shown = {"classes": {"Car": {"evermap": both, "AB3DMOT": both}}, "ms_a_frame": {"evermap": 9.0, "AB3DMOT": 1.0}}
+    kitti.write(shown, tmp_path / "out")
+    text = (tmp_path / "out" / "table.md").read_text()
+    assert "| least lead over AB3DMOT in MOTA, IDF1 and HOTA | ≥ 0 | 0.0000 | yes |" in text
+    assert "| CPU time of a frame [ms] | ≤ 5 | 9.00 | **no** |" in text
+    assert "| Car | evermap |" in text
+    assert (tmp_path / "out" / "kitti.png").stat().st_size > 1000
