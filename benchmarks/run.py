@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, kitti, localize, npmle, persistence, scale, scale_report, selectors, tracking
+from benchmarks import cliques, kitti, localize, npmle, persistence, scale, scale_report, selectors, space, tracking
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -38,10 +38,11 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **kitti.METRICS,
     **localize.METRICS,
     **scale.METRICS,
+    **space.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "kitti", "localize", "scale")
+PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "kitti", "localize", "scale", "space")
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -112,6 +113,9 @@ def run(
         measured |= ratios
     if only in (None, "scale"):
         ratios, shown["scale"] = scale.run(sizes)
+        measured |= ratios
+    if only == "space" or (only is None and (space.FOLDER / "tagslam").is_dir()):
+        ratios, shown["space"] = space.run()
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only or "kitti" not in shown else {}
@@ -202,6 +206,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", localize.as_markdown(shown["localize"])]
     if "scale" in shown:
         lines += ["", scale_report.as_markdown(shown["scale"])]
+    if "space" in shown:
+        lines += ["", space.as_markdown(shown["space"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

@@ -29,6 +29,7 @@ STUDIES = (
     "lifetimes",
     "tracking",
     "kitti",
+    "space",
     "persistence-speed",
     "soak",
     "scale",

@@ -23,7 +23,7 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize or scale."
+            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale or space."
         ),
     ] = None,
     sizes: Annotated[
@@ -31,7 +31,8 @@ def bench(
         typer.Option(help="Landmarks of the worlds of 'scale', with commas; with it DLR and maps are measured too."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder to write table and figure of 'scale' or 'kitti' into, as its results.")
+        Path | None,
+        typer.Option(help="Folder to write tables and figures of 'scale', 'kitti' or 'space' into, as its results."),
     ] = None,
 ) -> None:
     """Compare speed and memory with the baseline.
@@ -46,14 +47,14 @@ def bench(
     landmarks = None if sizes is None else _numbers(sizes)
     if landmarks is not None and only not in (None, "scale"):
         raise InputError("--sizes belongs to 'scale'", field="--only", hint="--only scale")
-    if out is not None and only not in (None, "scale", "kitti"):
-        raise InputError("--out belongs to one part", field="--only", hint="--only scale or --only kitti")
+    if out is not None and only not in (None, "scale", "kitti", "space"):
+        raise InputError("--out belongs to one part", field="--only", hint="--only scale, --only kitti or --only space")
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")  # read when the libraries are loaded, below
     runner = load_benchmarks()
     measured = runner.run(update_baseline=update_baseline, only=only, sizes=landmarks)
     if out is not None:
-        {"scale": runner.scale_report, "kitti": runner.kitti}[only or "scale"].write(
+        {"scale": runner.scale_report, "kitti": runner.kitti, "space": runner.space}[only or "scale"].write(
             measured["shown"][only or "scale"], out
         )
     if as_json:
