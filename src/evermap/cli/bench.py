@@ -23,7 +23,8 @@ def bench(
     only: Annotated[
         str | None,
         typer.Option(
-            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale or space."
+            help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale, "
+            "space."
         ),
     ] = None,
     sizes: Annotated[

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from worlds import World, tagged_corridor
+from corridors import World, tagged_corridor
 
 from evermap import run_slam
 from evermap.metrics.summary import compare_with_truth

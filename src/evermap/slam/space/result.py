@@ -71,7 +71,7 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
     twice = [_called(names, int(identity)) for identity in identities[len(intake.landmark_id) :]]
     if twice:
         warnings.append(f"identities that several landmarks carry, told apart by their places: {', '.join(twice)}")
-    n = len(told.stamp_s)
+    rough = np.repeat(solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
     return SlamResult(
         trajectory=Trajectory(
             told.stamp_s[located],
@@ -80,7 +80,7 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
             frame=frame,
             clock=recording.clock,
         ),
-        online=Trajectory(told.stamp_s, solved.online_pose, np.zeros((n, 6, 6)), frame=frame, clock=recording.clock),
+        online=Trajectory(told.stamp_s, solved.online_pose, rough, frame=frame, clock=recording.clock),
         landmarks=_landmarks(told, identities, names),
         parameters=_parameters(told),
         innovations=_innovations(told, identities),

@@ -42,6 +42,7 @@ class SpatialSolved:
         from_map: what of the given map stands; None without a map.
         map_rows: (K,) rows of the given map behind its comparison.
         online_pose: (N, 7) poses as each frame had them.
+        online_spread: (N, 2) roughly how far off these may be [m, rad].
         step_s: (N,) seconds that each frame took.
     """
 
@@ -50,6 +51,7 @@ class SpatialSolved:
     from_map: MapComparison | None
     map_rows: IntArray
     online_pose: FloatArray
+    online_spread: FloatArray
     step_s: FloatArray
 
 
@@ -78,7 +80,7 @@ def solve_space(
             noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
-    stepwise, step_s = incremental(problem, noise, known, place, progress)
+    stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
     start = estimate = _start(problem, intake, noise, stepwise)
     if problem.driven:
         points = converged(problem.as_points(), start, noise)
@@ -95,7 +97,7 @@ def solve_space(
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
-    return SpatialSolved(optimum, identity, from_map, rows, stepwise.pose, step_s)
+    return SpatialSolved(optimum, identity, from_map, rows, stepwise.pose, spread, step_s)
 
 
 def _with_map(

@@ -26,8 +26,8 @@ WORTH = 3.0
 
 def incremental(
     problem: SpatialProblem, noise: SpatialNoise, known: BoolArray, place: FloatArray, progress: Progress | None = None
-) -> tuple[SpatialEstimate, FloatArray]:
-    """Return poses and places, one frame after the other, and the seconds (N,) that each frame took.
+) -> tuple[SpatialEstimate, FloatArray, FloatArray]:
+    """Return poses and places, one frame after the other; their spread (N, 2) [m, rad]; seconds (N,) of each frame.
 
     Args:
         problem: the measurements.
@@ -46,7 +46,7 @@ def incremental(
     turned = problem.oriented[problem.place]
     first = np.searchsorted(problem.pose_row, np.arange(n + 1))
     pose, unsure_s = np.empty((n, 7)), 1e6 if known.any() else 0.0
-    pose[0], step_s = se3.identity(), np.zeros(n)
+    pose[0], step_s, spread = se3.identity(), np.zeros(n), np.zeros((n, 2))
     for row in range(n):
         began = time.perf_counter()
         if row:
@@ -55,9 +55,9 @@ def incremental(
         mine = np.arange(first[row], first[row + 1])
         met = mine[known[problem.place[mine]]]
         if len(met):
-            spread = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
+            within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
             candidate = _candidates(pose[row], either[:, met], place[problem.place[met]], turned[met])
-            cost = _moved(candidate, spread)
+            cost = _moved(candidate, within)
             cost += _seen(
                 candidate, either[:, met], place[problem.place[met]], log_share[:, met], sigma_m[met], sigma_rad[met],
                 turned[met],
@@ -69,11 +69,12 @@ def incremental(
         new = mine[~known[problem.place[mine]]]
         place[problem.place[new]] = se3.compose(pose[row], either[0, new])
         known[problem.place[new]] = True
+        spread[row] = SLACK_M + noise.translation * np.sqrt(unsure_s), SLACK_RAD + noise.rotation * np.sqrt(unsure_s)
         step_s[row] = time.perf_counter() - began
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
     place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
-    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), step_s
+    return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), spread, step_s
 
 
 def _with_other(problem: SpatialProblem, mount: FloatArray) -> FloatArray:
