@@ -38,9 +38,7 @@ PROVENANCE = re.compile(r"Computed by `(?P<command>[^`]+)`\. Tables of commit `(
 HEAD = """# Results
 
 Every number that is claimed, what was expected before it was computed, and whether it is met. Truth is used for scoring
-only: no estimate, prior or noise level has seen it. This page is generated from the pages of the studies, which have
-the settings, all tables and what limits the numbers (`python docs/gen/results.py`). `evermap demo` adds its own table
-of expectations to its report ([what was expected](demo.md#what-was-expected)).
+only. Generated from the studies' pages by `python docs/gen/results.py`; `evermap demo` has [its own](demo.md#what-was-expected).
 """
 UNKNOWN = "–"
 
@@ -82,7 +80,7 @@ def claims(text: str) -> list[Claim]:
             found += _claim(head, row)
     if not found:
         raise ValueError("no table with a column 'expected'")
-    return found
+    return [claim for claim in found if not claim.expected.startswith(UNKNOWN)] or found
 
 
 def _claim(head: list[str], row: list[str]) -> list[Claim]:

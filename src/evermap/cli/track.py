@@ -175,7 +175,7 @@ def _run(
     from evermap.runs.summary import RunInfo
     from evermap.runs.track.detections import read_confusion
     from evermap.runs.track.poses import read_input
-    from evermap.runs.track.run import run_track
+    from evermap.runs.track.run import check_choices, run_track
     from evermap.runs.track.run import warm_up as compile_kernels
     from evermap.runs.track.write import write_track
 
@@ -184,6 +184,7 @@ def _run(
     table = read_input(path, min_score=config.min_score)
     confusion = None if confusion_path is None else read_confusion(confusion_path, table.class_names)
     info = RunInfo(command=command_line(), read_s=time.perf_counter() - start)
+    check_choices(config, table)  # compiling takes a while: first say what is missing
     warm_up(compile_kernels)
     with progress_bar(f"{path.name}: tracking", speed=False) as progress:
         result = run_track(table, config, confusion=confusion, progress=progress)

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from corridors import World, tagged_corridor
+from scipy.spatial.transform import Rotation
 
 from evermap import run_slam
 from evermap.metrics.summary import compare_with_truth

@@ -107,6 +107,20 @@ class TrackResult(Shown):
         return np.asarray(objects.class_p[ends].argmax(axis=1), dtype=np.int64)
 
 
+def check_choices(config: TrackConfig, table: DetectionTable) -> None:
+    """Refuse choices that need what the table does not have, before anything takes long.
+
+    Raises:
+        ConfigError: the position or the heading of the sensor is not known.
+    """
+    if config.range_m is not None and table.sensor_m is None:
+        hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
+        raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
+    if config.fov_deg is not None and (config.range_m is None or table.sensor_yaw_rad is None):
+        hint = "`range_m`, and a folder with poses in `odometry`"
+        raise ConfigError("what the sensor sees is unknown", field="fov_deg", hint=hint)
+
+
 def run_track(
     table: DetectionTable,
     config: TrackConfig | None = None,
@@ -127,12 +141,7 @@ def run_track(
         DataError: nothing was seen often enough to be an object.
     """
     config = config or TrackConfig()
-    if config.range_m is not None and table.sensor_m is None:
-        hint = "columns sensor_x_m, sensor_y_m, sensor_z_m in the table"
-        raise ConfigError("the position of the sensor is unknown", field="range_m", hint=hint)
-    if config.fov_deg is not None and (config.range_m is None or table.sensor_yaw_rad is None):
-        hint = "`range_m`, and a folder with poses in `odometry`"
-        raise ConfigError("what the sensor sees is unknown", field="fov_deg", hint=hint)
+    check_choices(config, table)
     names = table.class_names
     tracker = Tracker(
         config.model_copy(update={"class_speed_mps": _speeds(config, names)}),
