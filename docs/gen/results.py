@@ -38,7 +38,7 @@ PROVENANCE = re.compile(r"Computed by `(?P<command>[^`]+)`\. Tables of commit `(
 HEAD = """# Results
 
 Every number that is claimed, what was expected before it was computed, and whether it is met. Truth is used for scoring
-only. Generated from the studies' pages (`docs/gen/results.py`); `evermap demo` has [its own](demo.md#what-was-expected).
+only. Generated from the studies' pages by `docs/gen/results.py`; `evermap demo` has [more](demo.md#what-was-expected).
 """
 UNKNOWN = "–"
 
