@@ -83,7 +83,7 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
         if some.any():
             w = now.weight[some]
             squares = (now.residual[some, rows] ** 2).sum(axis=1)
-            total = float(w @ squares + (of_detection[some, rows].sum(axis=1) / problem.share[some]).sum())
+            total = float(w @ squares + of_detection[some, rows].sum())
             count = float(w.sum()) * (rows.stop - rows.start)
             levels[level] = _level(before[level], start[level], total, count)
     return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
