@@ -73,9 +73,12 @@ def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: t
         usable &= ~broken
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < 2:
+        boxes = np.isfinite(detections.size_m).any()
         raise DataError(
             f"{recording.name}: landmarks of known identity were seen in {len(seen_in)} frames, at least 2 needed",
-            hint="check landmark ids, and that detections and odometry share one clock",
+            hint="evermap track follows boxes without identities"
+            if boxes
+            else "check landmark ids, and that detections and odometry share one clock",
         )
     pose_frame = seen_in if recording.odometry is None else np.flatnonzero(moving)
     used = np.flatnonzero(usable)
