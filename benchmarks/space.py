@@ -65,7 +65,7 @@ def _tags(folder: Path, name: str, *, mapped: bool, changes: dict[str, Any] | No
     cpu_s = time.process_time() - began
     if changes is not None:
         changes[name] = [
-            (result.landmarks.names.get(c.landmark_ids[0], str(c.landmark_ids[0])), c.displacement_m, c.probability)
+            [result.landmarks.names.get(c.landmark_ids[0], str(c.landmark_ids[0])), [*c.displacement_m], c.probability]
             for c in result.changes
         ]
     found = compare_with_truth(recording, result, rate_hz=RATE_HZ)

@@ -287,6 +287,10 @@ def test_a_small_run_writes_compares_and_reports(
     boxes = dict.fromkeys(run.kitti.METRICS, 1.0), {"classes": {}, "ms_a_frame": {"evermap": 0.3}}
     monkeypatch.setattr(run.kitti, "FOLDER", tmp_path)
     monkeypatch.setattr(run.kitti, "run", lambda: boxes)
+    tags = dict.fromkeys(run.space.METRICS, 1.0), {"tags": [], "changes": {}, "objects": []}
+    (tmp_path / "tagslam").mkdir()
+    monkeypatch.setattr(run.space, "FOLDER", tmp_path)
+    monkeypatch.setattr(run.space, "run", lambda: tags)
     measured = run.run(
         update_baseline=True,
         n_poses=80,
