@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from evermap import run_slam
 from evermap.metrics.summary import compare_with_truth
-from evermap.types import Landmarks, SlamResult
+from evermap.types import Landmarks, SlamResult, SpatialSensor
 
 
 def errors(result: SlamResult, world: World) -> tuple[float, float]:
@@ -88,6 +88,38 @@ def test_two_tags_with_one_identity_are_two_landmarks():
     }
     apart = np.linalg.norm(world.tags.position_m[10] - world.tags.position_m[1])
     assert np.linalg.norm(at["1#2"] - at["1"]) == pytest.approx(apart, abs=0.1)
+
+
+def test_points_without_odometry_locate_the_robot_where_three_are_in_view():
+    random = np.random.default_rng(9)
+    world = tagged_corridor(8, odometry=False)
+    n, count = len(world.true_pose), 20
+    point = np.column_stack([random.uniform(0.0, 15.0, count), *random.uniform(-3.0, 3.0, (2, count))])
+    frame, place = np.nonzero(np.abs(world.true_pose[:, None, 0] - point[:, 0]) < 4.0)
+    turn = Rotation.from_quat(world.true_pose[frame, 3:])
+    seen = turn.inv().apply(point[place] - world.true_pose[frame, :3]) + random.normal(0.0, 0.02, (len(frame), 3))
+    rows, unsaid = len(frame), np.full(len(frame), np.nan)
+    detections = replace(
+        world.recording.detections,
+        frame=frame,
+        sensor=np.zeros(rows, dtype=np.int64),
+        landmark_id=place,
+        position_sensor_m=seen,
+        rotation=np.full((rows, 4), np.nan),
+        covariance_sensor_m2=np.full((rows, 3, 3), np.nan),
+        sigma_rad=unsaid,
+        corner_px=np.full((rows, 4, 2), np.nan),
+        tag_size_m=unsaid,
+        size_m=np.full((rows, 3), np.nan),
+        class_id=np.full(rows, -1),
+        score=unsaid,
+        source_line=np.zeros(rows, dtype=np.int64),
+    )
+    recording = replace(world.recording, detections=detections, sensors=(SpatialSensor(sigma_m=0.02),))
+    result = run_slam(recording, prior_map=as_map(Landmarks.in_space(np.arange(count), point)))
+    assert len(result.trajectory) == n
+    gap = np.linalg.norm(result.trajectory.pose_world_robot[:, :3] - world.true_pose[:, :3], axis=1)
+    assert np.max(gap) < 0.1
 
 
 @pytest.mark.parametrize("odometry", [True, False])

@@ -11,6 +11,7 @@ import time
 import numpy as np
 
 from evermap.geometry import se3
+from evermap.geometry.rigid import rigid
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, Progress
 
@@ -90,9 +91,12 @@ def _sigma_m(root: FloatArray) -> FloatArray:
 
 
 def _candidates(predicted: FloatArray, either: FloatArray, place: FloatArray, turned: BoolArray) -> FloatArray:
-    """(C, 7) the predicted pose, then where each detection (2, K, 7) of a place with an orientation puts the robot."""
+    """(C, 7) the predicted pose, then where each detection (2, K, 7) of a place with an orientation puts the robot, and
+    where the positions of three or more put it.
+    """
     by_places = se3.compose(place[None], se3.inverse(either))[:, turned].reshape(-1, 7)
-    return np.vstack([predicted[None], by_places])
+    by_all = rigid(either[0, :, :3], place[:, :3])[None] if len(place) >= 3 else np.zeros((0, 7))
+    return np.vstack([predicted[None], by_places, by_all])
 
 
 def _moved(candidate: FloatArray, spread: tuple[float, float]) -> FloatArray:
