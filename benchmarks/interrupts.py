@@ -45,6 +45,9 @@ SHARES = {"slam": 8, "slam --map": 3}
 
 PYTHON_STARTS_S = 0.3
 """Only so early can an interrupt hit Python itself, before the first line of ours: .02 s on an idle machine."""
+PYTHON_ENDS_S = 0.1
+"""A command that ends well so soon after the signal had reported its result: Python was clearing up, and heard nothing.
+One that swallowed the signal still had to write its output."""
 BEFORE_OURS = "interrupted while Python itself was starting"
 
 
@@ -135,7 +138,10 @@ def _interrupted(folder: Path, verb: str, after_s: float) -> Ending | None:
             process.communicate()
             return None
         process.send_signal(signal.SIGINT)
+        sent_s = time.perf_counter()
         _, stderr = process.communicate(timeout=300)
+        if process.returncode == 0 and time.perf_counter() - sent_s < PYTHON_ENDS_S:
+            return None
         return process.returncode, stderr
 
     ended = _keeping_the_map(folder, run)
