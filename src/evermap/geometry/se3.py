@@ -102,6 +102,21 @@ def local(pose: ArrayLike, other: ArrayLike) -> FloatArray:
     return log(between(pose, other))
 
 
+def angle_between(pose: ArrayLike, other: ArrayLike) -> FloatArray:
+    """Return the angles [rad] between the orientations of poses (..., 7), broadcast."""
+    a, b = np.asarray(pose, dtype=np.float64), np.asarray(other, dtype=np.float64)
+    return np.asarray(2.0 * np.arccos(np.clip(np.abs((a[..., 3:] * b[..., 3:]).sum(axis=-1)), 0.0, 1.0)))
+
+
+def interpolate(knot_s: FloatArray, pose: FloatArray, stamp_s: FloatArray) -> FloatArray:
+    """Return poses (F, 7) at stamps, along the screws between knots (P,); before and after them the end poses."""
+    if len(knot_s) == 1:
+        return np.repeat(pose, len(stamp_s), axis=0)
+    before = np.clip(np.searchsorted(knot_s, stamp_s, side="right") - 1, 0, len(knot_s) - 2)
+    share = np.clip((stamp_s - knot_s[before]) / (knot_s[before + 1] - knot_s[before]), 0.0, 1.0)
+    return retract(pose[before], share[:, None] * local(pose[before], pose[before + 1]))
+
+
 def adjoint(pose: ArrayLike) -> FloatArray:
     """Return adjoint matrices (..., 6, 6): `pose * exp(xi) = exp(Ad xi) * pose`."""
     pose = np.asarray(pose, dtype=np.float64)

@@ -37,6 +37,7 @@ ODOMETRY_GAP_S: float = 10.0
 
 
 _Seen = TypeVar("_Seen", Detections, SpatialDetections)
+_Recorded = TypeVar("_Recorded", Recording, SpatialRecording)
 
 
 def check_forward(stamp_s: FloatArray, *, path: Path, line: IntArray, field: str = "stamp_s") -> None:
@@ -113,35 +114,23 @@ def frames_of(
     return Frames(looked_s[is_first], complete=complete, clock=clock), np.asarray(frame, dtype=np.int64)
 
 
-def finish_spatial(recording: SpatialRecording, *, warnings: list[str]) -> SpatialRecording:
-    """Return a recording in space as `finish_recording` does one of the plane; there may be no odometry at all."""
-    source = recording.source
-    validate_spatial(recording)
-    if recording.odometry is not None:
-        _warn_of_gaps(recording.odometry, warnings)
-        frames, detections = _without_far_frames(
-            recording.odometry, recording.frames, recording.detections, source, warnings
-        )
-        recording = replace(recording, frames=frames, detections=detections)
-    if len(recording.detections) == 0:
-        raise DataError("no landmark was seen while there was odometry", path=source)
-    _warn_of_repeats(recording.detections, warnings)
-    return replace(recording, warnings=tuple(warnings))
-
-
-def finish_recording(recording: Recording, *, warnings: list[str]) -> Recording:
+def finish_recording(recording: _Recorded, *, warnings: list[str]) -> _Recorded:
     """Return the recording with frames that have no odometry near them left out and all remarks counted.
+
+    A recording in space may have no odometry at all.
 
     Raises:
         DataError: fewer than two odometry rows, no frame within the odometry's time, or no landmark seen.
     """
-    source = recording.source
-    validate(recording)
-    _warn_of_gaps(recording.odometry, warnings)
-    frames, detections = _without_far_frames(
-        recording.odometry, recording.frames, recording.detections, source, warnings
-    )
-    recording = replace(recording, frames=frames, detections=detections)
+    if isinstance(recording, SpatialRecording):
+        validate_spatial(recording)
+    else:
+        validate(recording)
+    odometry, source = recording.odometry, recording.source
+    if odometry is not None:
+        _warn_of_gaps(odometry, warnings)
+        frames, detections = _without_far_frames(odometry, recording.frames, recording.detections, source, warnings)
+        recording = replace(recording, frames=frames, detections=detections)
     if len(recording.detections) == 0:
         raise DataError("no landmark was seen while there was odometry", path=source)
     _warn_of_repeats(recording.detections, warnings)

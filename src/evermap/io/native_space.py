@@ -11,7 +11,7 @@ from evermap import valid as q
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.camera import unproject
-from evermap.io.assemble import finish_spatial, forward_stamps, frames_of, last_of_equal
+from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
 from evermap.io.landmarks import class_ids, distinct_labels, landmarks_from_table
 from evermap.io.rig_toml import CAMERA_FILE, Rig
@@ -127,7 +127,7 @@ def spatial_recording(
         clock=settings.clock,
         landmark_names=names,
     )
-    return finish_spatial(recording, warnings=warnings)
+    return finish_recording(recording, warnings=warnings)
 
 
 def _frames(table: Table, frame_table: Table | None, rig: Rig, warnings: list[str]) -> tuple[Frames, IntArray]:

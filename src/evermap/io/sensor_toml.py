@@ -74,7 +74,7 @@ def sensor_toml(settings: Settings) -> str:
 
 
 def toml_text(sections: dict[str, dict[str, Any]]) -> str:
-    """Return sections of a TOML file; values that are None, and sections without any, are left out."""
+    """Return sections of a TOML file; values that are None and empty sections are left out."""
     blocks = []
     for name, content in sections.items():
         lines = [f"{key} = {_toml_value(value)}" for key, value in content.items() if value is not None]

@@ -18,7 +18,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, finish_spatial, forward_stamps, last_of_equal
+from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import landmarks_from_table, map_of_survey
 from evermap.io.rosbag import TagSightings, read_tag_bag
@@ -180,7 +180,7 @@ def _recording(
         source=str(path),
         clock=Clock.UNIX,
     )
-    return finish_spatial(recording, warnings=warnings)
+    return finish_recording(recording, warnings=warnings)
 
 
 def _setup(files: FileSet) -> TagRig:

@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.geometry import se3
-from evermap.io.assemble import SAME_STAMP_S, check_forward, finish_spatial, last_of_equal
+from evermap.io.assemble import SAME_STAMP_S, check_forward, finish_recording, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.rows import Rows
 from evermap.io.spatial import spatial_detections
@@ -72,7 +72,7 @@ def read_ycbv(path: str | Path, robot: int | None = None) -> SpatialRecording:
         source=str(path),
         landmark_names={landmark_id_of(name): name for name in names},
     )
-    return finish_spatial(recording, warnings=warnings)
+    return finish_recording(recording, warnings=warnings)
 
 
 def _is_ycbv(files: FileSet) -> bool:

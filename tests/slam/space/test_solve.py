@@ -136,7 +136,7 @@ def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
 
 @pytest.mark.slow
 def test_probabilities_of_moves_are_calibrated():
-    """Maps that err by what they say, tags moved by some decimetres, wrong identities: who is told, and how surely."""
+    """Moves are reported right, and as surely as they should be, of maps with stated errors and wrong identities."""
     told, truth = [], []
     for seed in range(200, 216):
         random = np.random.default_rng(seed)

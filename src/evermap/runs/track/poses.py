@@ -46,13 +46,7 @@ class Poses:
         if outside.any():
             problem = f"has no pose at {stamp_s[np.argmax(outside)]:g} s, where there are detections"
             raise InputError(problem, path=self.path, field=STAMP_S.name, hint="poses from the first frame to the last")
-        if len(self.stamp_s) == 1:
-            return np.repeat(self.pose, len(stamp_s), axis=0)
-        before = np.clip(np.searchsorted(self.stamp_s, stamp_s, side="right") - 1, 0, len(self.stamp_s) - 2)
-        share = (stamp_s - self.stamp_s[before]) / (self.stamp_s[before + 1] - self.stamp_s[before])
-        share = np.clip(share, 0.0, 1.0)
-        step = se3.local(self.pose[before], self.pose[before + 1])
-        return se3.retract(self.pose[before], share[:, None] * step)
+        return se3.interpolate(self.stamp_s, self.pose, stamp_s)
 
 
 def read_input(path: str | Path, *, min_score: float | None = None) -> DetectionTable:

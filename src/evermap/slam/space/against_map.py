@@ -10,9 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.problem import PlacePrior, SpatialProblem
+from evermap.slam.space.problem import SpatialProblem
 from evermap.types import FloatArray
 
 P_MOVED = 0.03
@@ -25,6 +24,8 @@ SETTLED = 0.01
 PRIOR_COUNT = 6.0
 """Numbers that the stated accuracy of the map is worth where it is estimated."""
 LEAST_WEIGHT = 1e-6
+LEAST_INFORMATION = 1.0 / 25.0
+"""Of a place by the others alone: it is somewhere within 5 m, or 5 rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimu
         stated: (K, 6) standard deviations of the map's places.
     """
     problem = optimum.smoother.problem
-    factor, found = 1.0, _asked(optimum, stated)
+    found = _asked(optimum, stated)
     for _ in range(ROUNDS):
         factor = _accuracy(found, stated, problem)
         prior = replace(problem.prior, sigma=factor * stated, weight=np.maximum(found.p_stands, LEAST_WEIGHT))
@@ -71,17 +72,13 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
     count, n = len(prior.place), len(problem.stamp_s)
     p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
     for k, place in enumerate(prior.place):
-        dim = 6 if problem.oriented[place] else 3
-        at = spread.own_first[n + place]
-        own = spread.own[at : at + dim * dim].reshape(dim, dim)
-        mean, information = _twist(problem, prior, k, optimum), np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2)
+        mean = prior.off(k, optimum.estimate.place[place], oriented=bool(problem.oriented[place]))
+        dim, at = len(mean), spread.own_first[n + place]
+        own = np.linalg.inv(spread.own[at : at + dim * dim].reshape(dim, dim))
         # the map's own word on it is taken back; what is left may be little, but is something
-        rest = np.linalg.inv(own) - information
-        values, vectors = np.linalg.eigh(rest)
-        least = 1.0 / np.array([25.0] * 3 + [4.0] * (dim - 3)).max()
-        rest = (vectors * np.maximum(values, least)) @ vectors.T
-        alone = np.linalg.inv(rest)
-        mean = alone @ (np.linalg.inv(own) @ mean)
+        values, vectors = np.linalg.eigh(own - np.diag(prior.weight[k] / prior.sigma[k, :dim] ** 2))
+        alone = np.linalg.inv((vectors * np.maximum(values, LEAST_INFORMATION)) @ vectors.T)
+        mean = alone @ (own @ mean)
         stands = _log_density(mean, alone + np.diag(sigma[k, :dim] ** 2))
         scales = [(m, rad) for m in MOVED_M for rad in (MOVED_RAD if dim == 6 else MOVED_RAD[:1])]
         wide = [np.diag(sigma[k, :dim] ** 2 + np.array([m] * 3 + [rad] * (dim - 3)) ** 2) for m, rad in scales]
@@ -90,14 +87,6 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
     return MapComparison(p_stands, off, covariance, 1.0)
-
-
-def _twist(problem: SpatialProblem, prior: PlacePrior, k: int, optimum: SpatialOptimum) -> FloatArray:
-    """From where the map has a place to where it is estimated."""
-    place = optimum.estimate.place[prior.place[k]]
-    if problem.oriented[prior.place[k]]:
-        return se3.local(prior.pose[k], place)
-    return np.asarray(place[:3] - prior.pose[k, :3])
 
 
 def _log_density(off: FloatArray, covariance: FloatArray) -> float:

@@ -7,7 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSITION, ROWS
+from evermap.slam.space.linearise import (
+    CORNERS,
+    ODOMETRY,
+    ORIENTATION,
+    PIXEL,
+    POSE,
+    POSITION,
+    ROTATION,
+    ROWS,
+    TRANSLATION,
+)
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear, SpatialSmoother
 from evermap.types import FloatArray, IntArray
@@ -62,23 +72,23 @@ def converged(
 
 def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, begun: SpatialNoise) -> SpatialNoise:
     """Return noise levels by expectation-maximisation: residuals, and what is not known of them, by inlier weight."""
-    problem, seen = smoother.problem, smoother.problem.sightings
+    problem, kind = smoother.problem, smoother.problem.kind
     n_steps, spread = len(problem.increment), smoother.spread(now)
     trace = _traces(smoother, spread.of_factors, spread.of_factors_first)
     levels, before, start = noise.levels.copy(), noise.levels, begun.levels
     # odometry: its whitened residuals are in the right sides of its rows, with the root of their weights
-    block = now.values[: 78 * n_steps].reshape(n_steps, 6, 13)
+    block = now.values[: ODOMETRY * n_steps].reshape(n_steps, 6, 13)
     weight = now.odometry_weight
-    for level, rows in ((0, slice(0, 3)), (1, slice(3, 6))):
-        if problem.driven:  # else how fast a robot may move is no noise that shows in how it did
+    if problem.driven:  # else how fast a robot may move is no noise that shows in how it did
+        for level, rows in ((TRANSLATION, slice(0, 3)), (ROTATION, slice(3, 6))):
             total = float((block[:, rows, 12] ** 2).sum() + trace[0][:, rows].sum())
             count = 3.0 * float(weight.sum())
             levels[level] = _level(before[level], start[level], total, count)
     of_detection = trace[1]
     for level, some, rows in (
-        (POSITION, seen.kind != CORNERS, slice(0, 3)),
-        (ORIENTATION, seen.kind == 1, slice(3, 6)),
-        (PIXEL, seen.kind == CORNERS, slice(0, 8)),
+        (POSITION, kind != CORNERS, slice(0, 3)),
+        (ORIENTATION, kind == POSE, slice(3, 6)),
+        (PIXEL, kind == CORNERS, slice(0, 8)),
     ):
         if some.any():
             w = now.weight[some]
@@ -125,11 +135,11 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
         weight: (M,) of detections, by their positions.
     """
     found = estimate.place.copy()
-    first, other = as_seen(problem, estimate, problem.measured), as_seen(problem, estimate, problem.other)
+    first, other = (as_seen(problem, estimate, measured) for measured in problem.either)
     has_other = np.isfinite(problem.other[:, 3])
     gives = np.isfinite(problem.measured[:, 3]) & problem.oriented[problem.place]
     first_share = 1.0 / (1.0 + np.exp(-np.minimum(problem.other_log_odds, 50.0)))
-    first_share, other = np.where(has_other, first_share, 1.0), np.where(has_other[:, None], other, first)
+    first_share = np.where(has_other, first_share, 1.0)
     sigma = np.hypot(problem.sigma_rad, ANGLE_FLOOR)
     for place in np.flatnonzero(problem.oriented):
         mine = np.flatnonzero(gives & (problem.place == place))
@@ -150,9 +160,7 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
 
 def _likeness(candidate: FloatArray, seen: FloatArray, sigma: FloatArray) -> FloatArray:
     """(C, D) likelihood ratios of orientations seen, by the angle from candidates."""
-    dot = np.abs(candidate[:, 3:] @ seen[:, 3:].T)
-    angle = 2.0 * np.arccos(np.clip(dot, 0.0, 1.0))
-    return np.asarray(np.exp(-0.5 * (angle / sigma) ** 2))
+    return np.asarray(np.exp(-0.5 * (se3.angle_between(candidate[:, None], seen) / sigma) ** 2))
 
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:

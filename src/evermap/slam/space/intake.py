@@ -156,9 +156,7 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
     count = len(given)
     found = _Where(
         kind=np.where(np.isfinite(given.rotation[:, 0]), POSE, POINT).astype(np.int64),
-        measured=np.hstack(
-            [given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, [0, 0, 0, 1])]
-        ),
+        measured=np.hstack([given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, NO_TURN)]),
         covariance=_covariance(recording),
         sigma_rad=_sigma_rad(recording),
         corner=np.zeros((count, 4, 2)),
@@ -239,8 +237,5 @@ def _driven(recording: SpatialRecording, stamp_s: FloatArray) -> tuple[FloatArra
     odometry, count = recording.odometry, len(stamp_s)
     if odometry is None or len(odometry) < 2:
         return se3.identity(count), se3.identity(count - 1)
-    knots, pose = odometry.stamp_s, odometry.pose_world_robot
-    row = np.clip(np.searchsorted(knots, stamp_s, side="right") - 1, 0, len(knots) - 2)
-    share = (stamp_s - knots[row]) / (knots[row + 1] - knots[row])
-    found = se3.retract(pose[row], share[:, None] * se3.local(pose[row], pose[row + 1]))
+    found = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, stamp_s)
     return se3.between(found[0], found), se3.between(found[:-1], found[1:])

@@ -23,6 +23,8 @@ ROWS = np.array([3, 6, 8])
 """Residuals of each."""
 STATES = 7
 """Numbers of a sensor's calibration: a twist of its mount, and seconds by which its stamps are late."""
+ODOMETRY = 78
+"""Numbers of an odometry factor: six rows by two poses and the right side."""
 TRANSLATION, ROTATION, POSITION, ORIENTATION, PIXEL = range(5)
 """Rows of the noise levels."""
 BEHIND = 0.02

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.slam.space.linearise import CORNERS, POINT, POSE, ROWS, SpatialSightings
+from evermap.slam.space.linearise import POINT, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
-"""Half of the squared residual of which a detection with 3, 6 or 8 numbers is as likely an outlier: exceeded by one of
-10,000 that are none."""
+"""Half of the squared residual of which a detection with 3, 6 or 8 numbers is as likely an outlier: which one of
+10,000 right detections exceeds."""
 JUMP_LOG_ODDS = 14.0
 
 
@@ -60,6 +60,12 @@ class PlacePrior:
     def none(cls) -> PlacePrior:
         """Return a map that says nothing."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
+
+    def off(self, row: int, place: FloatArray, *, oriented: bool) -> FloatArray:
+        """Return the twist (6,) from where the map has a place to `place` (7,); the shift (3,) of a point."""
+        if oriented:
+            return se3.local(self.pose[row], place)
+        return np.asarray(place[:3] - self.pose[row, :3])
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +126,11 @@ class SpatialProblem:
         return np.asarray(0.5 * (ends[:-1] + ends[1:]))
 
     @property
+    def either(self) -> FloatArray:
+        """Return (2, M, 7) both explanations of each detection; the first twice where there is one only."""
+        return np.stack([self.measured, np.where(np.isfinite(self.other), self.other, self.measured)])
+
+    @property
     def sightings(self) -> SpatialSightings:
         """Return the detections as the kernel reads them."""
         oriented = self.oriented[self.place].astype(np.int64)
@@ -134,19 +145,6 @@ class SpatialProblem:
         """Return the same with positions only: what is left has one optimum, near any start."""
         prior = replace(self.prior, sigma=np.hstack([self.prior.sigma[:, :3].max(axis=1, keepdims=True)] * 6))
         return replace(self, kind=np.full_like(self.kind, POINT), oriented=np.zeros_like(self.oriented), prior=prior)
-
-    def as_poses(self) -> SpatialProblem:
-        """Return the same with the poses of tags for their corners."""
-        return replace(self, kind=np.where(self.kind == CORNERS, POSE, self.kind))
-
-    def without(self, dropped: BoolArray) -> SpatialProblem:
-        """Return the same without some detections (M,)."""
-        rows = np.flatnonzero(~dropped)
-        names = (
-            "pose_row", "place", "sensor", "kind", "measured", "measured_root", "sigma_rad", "corner", "corner_root",
-            "half_m", "other", "other_log_odds", "share",
-        )  # fmt: skip
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 @dataclass(frozen=True, slots=True)

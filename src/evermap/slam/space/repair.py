@@ -49,7 +49,7 @@ def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tupl
     """Return the values with poses and orientations that fit better by themselves, and whether there are any."""
     estimate, noise = optimum.estimate, optimum.noise
     voted = oriented(problem, estimate, optimum.now.weight)
-    turned = 2.0 * np.arccos(np.clip(np.abs((voted[:, 3:] * estimate.place[:, 3:]).sum(axis=1)), 0.0, 1.0))
+    turned = se3.angle_between(voted, estimate.place)
     place = np.where((turned > OTHER_RAD)[:, None], voted, estimate.place)
     pose, n_better = _better_poses(problem, replace(estimate, place=place), noise)
     return replace(estimate, pose=pose, place=place), n_better + int((turned > OTHER_RAD).sum()) > 0
@@ -57,15 +57,13 @@ def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tupl
 
 def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> tuple[FloatArray, int]:
     """Poses (N, 7), other ones where a stretch of frames fits them better; and in how many frames."""
-    n = len(estimate.pose)
     cost = _cost_of_frames(problem, estimate, noise)
     best, pose = cost.copy(), estimate.pose.copy()
     mount = estimate.mount(problem)[problem.sensor]
     oriented_place = problem.oriented[problem.place]
     rank = np.arange(len(problem.place)) - np.searchsorted(problem.pose_row, problem.pose_row)
-    for measured in (problem.measured, problem.other):
-        seen = se3.compose(mount, np.where(np.isfinite(measured), measured, problem.measured))
-        suggested = se3.compose(estimate.place[problem.place], se3.inverse(seen))
+    for measured in problem.either:
+        suggested = se3.compose(estimate.place[problem.place], se3.inverse(se3.compose(mount, measured)))
         for k in range(int(rank.max(initial=-1)) + 1):
             some = np.flatnonzero((rank == k) & oriented_place)
             rows = problem.pose_row[some]
@@ -83,7 +81,7 @@ def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: Spa
     taken = seen_in[jumps & (total[stretch] > BETTER)]
     mixed = estimate.pose.copy()
     mixed[taken] = pose[taken]
-    return mixed, len(taken) if n else 0
+    return mixed, len(taken)
 
 
 def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: SpatialNoise) -> FloatArray:

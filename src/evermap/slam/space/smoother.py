@@ -11,12 +11,12 @@ import numpy as np
 
 from evermap.errors import NumericalError
 from evermap.geometry import se3
-from evermap.slam.space.linearise import STATES, linearise_odometry, linearise_sightings
+from evermap.slam.space.linearise import ODOMETRY, ROWS, STATES, linearise_odometry, linearise_sightings
 from evermap.slam.space.problem import JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.sparse.elimination import Spread, curvature
 from evermap.slam.sparse.system import Factorised, System, exhausted
 from evermap.slam.sparse.tree import Factors
-from evermap.types import FloatArray, IntArray
+from evermap.types import FloatArray
 
 POSES_A_LEAF = 4
 HELD = 1e-9
@@ -47,15 +47,16 @@ class SpatialSmoother:
 
     Args:
         problem: the measurements.
-        coordinate: (N, 3) rough positions of the poses, along which the elimination may be cut.
+        around: (N, 7) rough poses, along whose positions the elimination may be cut; the first is held where it is.
     """
 
-    def __init__(self, problem: SpatialProblem, coordinate: FloatArray) -> None:
+    def __init__(self, problem: SpatialProblem, around: FloatArray) -> None:
         self.problem = problem
         self._seen = problem.sightings
         self._velocity = problem.velocity
         self._states = _information(problem.mount_sigma).ravel()
-        self.system = self._structured(coordinate)
+        self._start = np.array(around[0])
+        self.system = self._structured(around)
 
     def optimum(
         self, start: SpatialEstimate, noise: SpatialNoise, *, heavy: bool, iterations: int = 20, tolerance: float = 1e-5
@@ -97,8 +98,8 @@ class SpatialSmoother:
         n, count = len(problem.stamp_s), len(problem.place)
         values = np.zeros(tree.value_first[-1])
         odometry_weight, weight, residual = np.ones(n - 1), np.ones(count), np.zeros((count, 8))
-        sigma = odometry_sigma(problem, noise)
-        odometry = 6 * 13 * (n - 1)
+        sigma = _odometry_sigma(problem, noise)
+        odometry = ODOMETRY * (n - 1)
         cost = linearise_odometry(
             estimate.pose, problem.increment, sigma, JUMP_LOG_ODDS, heavy, values[:odometry], odometry_weight
         )
@@ -139,31 +140,22 @@ class SpatialSmoother:
         n = len(self.problem.stamp_s)
         return spread.own[: 36 * n].reshape(n, 6, 6)
 
-    def rows_of_places(self) -> IntArray:
-        """Return (P,) the variables that places are."""
-        return len(self.problem.stamp_s) + np.arange(len(self.problem.oriented))
-
     def _priors(self, estimate: SpatialEstimate, values: FloatArray, at: int) -> float:
         """Fill in what the given map says; returns its cost."""
         prior, cost = self.problem.prior, 0.0
         for k, place in enumerate(prior.place):
-            dim = 6 if self.problem.oriented[place] else 3
-            off, root = np.zeros(6), np.sqrt(prior.weight[k]) / prior.sigma[k]
-            off[:3] = estimate.place[place, :3] - prior.pose[k, :3]
-            jacobian = np.eye(6)
-            if dim == 6:
-                off = se3.local(prior.pose[k], estimate.place[place])
-                jacobian = se3.right_jacobian_inverse(off)
-            block = np.column_stack([root[:, None] * jacobian[:, :dim], -root * off])[:dim]
+            off = prior.off(k, estimate.place[place], oriented=bool(self.problem.oriented[place]))
+            root = (np.sqrt(prior.weight[k]) / prior.sigma[k])[: len(off)]
+            jacobian = se3.right_jacobian_inverse(off) if len(off) == 6 else np.eye(3)
+            block = np.column_stack([root[:, None] * jacobian, -root * off])
             values[at : at + block.size] = block.ravel()
             at += block.size
-            cost += 0.5 * float(np.sum((root * off)[:dim] ** 2))
+            cost += 0.5 * float(np.sum((root * off) ** 2))
         return cost
 
-    def _structured(self, coordinate: FloatArray) -> System:
-        problem, seen = self.problem, self._seen
+    def _structured(self, around: FloatArray) -> System:
+        problem = self.problem
         n, count = len(problem.stamp_s), len(problem.oriented)
-        self._start = np.array(coordinate[0]) if coordinate.shape[1] == 7 else se3.identity()
         steps, prior = np.arange(n - 1), problem.prior.place
         dims = np.where(problem.oriented, 6, 3)
         leaf_of_pose = np.minimum(np.arange(n), max(n - 2, 0)) // POSES_A_LEAF
@@ -176,7 +168,7 @@ class SpatialSmoother:
         first_seen = np.zeros(count, dtype=np.int64)
         first_seen[problem.place[::-1]] = leaf_of_pose[problem.pose_row[::-1]]
         width = np.concatenate([np.full(len(part), part.shape[1]) for part in tied])
-        rows = np.concatenate([np.full(n - 1, 6), np.array([3, 6, 8])[seen.kind], [6], dims[prior]])
+        rows = np.concatenate([np.full(n - 1, 6), ROWS[problem.kind], [6], dims[prior]])
         leaf = np.concatenate([leaf_of_pose[steps], leaf_of_pose[problem.pose_row], [0], first_seen[prior]])
         n_leaves = int(leaf_of_pose[-1]) + 1
         factors = Factors(
@@ -189,7 +181,7 @@ class SpatialSmoother:
         at[:, 0] = np.arange(n_leaves)
         weight = np.bincount(leaf_of_pose, minlength=n_leaves)
         for axis in range(3):
-            total = np.bincount(leaf_of_pose, coordinate[:, axis], minlength=n_leaves)
+            total = np.bincount(leaf_of_pose, around[:, axis], minlength=n_leaves)
             at[:, 1 + axis] = total / np.maximum(weight, 1)
         dim = np.concatenate([np.full(n, 6), dims, np.full(len(problem.mount), STATES)])
         border = n + count + np.arange(len(problem.mount))
@@ -216,7 +208,7 @@ class SpatialSmoother:
         return SpatialEstimate(se3.retract(estimate.pose, share * by), place, state), size
 
 
-def odometry_sigma(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
+def _odometry_sigma(problem: SpatialProblem, noise: SpatialNoise) -> FloatArray:
     """Return (N - 1, 6) standard deviations of the odometry between consecutive poses."""
     root = np.sqrt(np.maximum(problem.lasted_s, 1e-3))
     return np.repeat(np.column_stack([noise.translation * root, noise.rotation * root]), 3, axis=1)

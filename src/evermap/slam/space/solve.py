@@ -22,9 +22,8 @@ BY_HAND = SpatialNoise(translation=1.0, rotation=0.7, pixel=2.0)
 """Without odometry: metres and radians that a robot may go a second."""
 DRIVEN = SpatialNoise(pixel=2.0)
 """With odometry: metres and radians of drift for the square root of a second."""
-SURE = 1e-4
-"""Deviation by which the first pose is held, where no map says where it is [m, rad]."""
 FREE = 1e3
+"""Deviation by which the first pose is held where a map says where it is [m, rad]."""
 LOOSE_M = 0.05
 """A given map is believed no better than this until it is known what stands."""
 MOST_TRIED = 200
@@ -81,9 +80,10 @@ def solve_space(
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
     stepwise, spread, step_s = incremental(problem, noise, known, place, progress)
-    start = estimate = _start(problem, intake, noise, stepwise)
+    estimate = stepwise
     if problem.driven:
-        points = converged(problem.as_points(), start, noise)
+        whole = _along(problem, intake.driven_pose, known, place)
+        points = converged(problem.as_points(), _likelier(problem, noise, stepwise, whole), noise)
         estimate, noise = points.estimate, replace(points.noise, pixel=noise.pixel)
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
@@ -129,15 +129,10 @@ def _with_map(
     return replace(problem, prior=prior, start_sigma=np.full(6, FREE)), stated, rows.astype(np.int64)
 
 
-def _start(
-    problem: SpatialProblem, intake: SpatialIntake, noise: SpatialNoise, stepwise: SpatialEstimate
+def _likelier(
+    problem: SpatialProblem, noise: SpatialNoise, stepwise: SpatialEstimate, whole: SpatialEstimate
 ) -> SpatialEstimate:
     """First values: frame after frame, or along the odometry as a whole; what is more probable."""
-    if not problem.driven:
-        return stepwise
-    known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
-    known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
-    whole = _along(problem, intake.driven_pose, known, place)
     points = problem.as_points()
     cost = []
     for start in (stepwise, whole):
@@ -162,14 +157,9 @@ def _whole(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place:
         return se3.identity()
     some = met[:: max(1, len(met) // MOST_TRIED)]
     mount = problem.mount[problem.sensor]
-    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.measured))
-    other = np.where(np.isfinite(problem.other), problem.other, problem.measured)
-    suggested = [
-        se3.compose(driven[problem.pose_row[some]], se3.compose(mount[some], m[some]))
-        for m in (problem.measured, other)
-    ]
-    trial = se3.compose(np.tile(place[problem.place[some]], (2, 1)), se3.inverse(np.vstack(suggested)))
-    at = se3.transform(trial[:, None], seen[None, some, :3])
+    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.either))
+    trial = se3.compose(place[problem.place[some]], se3.inverse(seen[:, some])).reshape(-1, 7)
+    at = se3.transform(trial[:, None], seen[0, some, :3])
     gap = np.linalg.norm(at - place[problem.place[some], :3], axis=2)
     best = int(np.argmin(np.minimum((gap / GROSS_M) ** 2, 1.0).sum(axis=1)))
     return np.asarray(trial[best])

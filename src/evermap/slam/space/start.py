@@ -39,7 +39,7 @@ def incremental(
     """
     n, mount = len(problem.stamp_s), problem.mount[problem.sensor]
     place, known = place.copy(), known.copy()
-    either = np.stack([se3.compose(mount, problem.measured), _with_other(problem, mount)])
+    either = se3.compose(mount, problem.either)
     share = np.exp(-np.clip(problem.other_log_odds / noise.pixel**2, 0.0, 30.0))
     log_share = np.stack([-np.log1p(share), np.log(share + 1e-12) - np.log1p(share)])
     sigma_m = np.hypot(_sigma_m(problem.measured_root) * noise.position, SLACK_M)
@@ -78,12 +78,6 @@ def incremental(
     return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), spread, step_s
 
 
-def _with_other(problem: SpatialProblem, mount: FloatArray) -> FloatArray:
-    """(M, 7) the second explanations in the robot's frame; the first where there is none."""
-    some = np.isfinite(problem.other[:, :1])
-    return se3.compose(mount, np.where(some, problem.other, problem.measured))
-
-
 def _sigma_m(root: FloatArray) -> FloatArray:
     """(M,) of positions, all axes alike."""
     inverse = np.linalg.inv(root)
@@ -113,7 +107,6 @@ def _seen(
     """(C, K) nats that the detections cost."""
     at = se3.compose(candidate[:, None, None, :], either[None])
     away = np.linalg.norm(at[..., :3] - place[:, :3], axis=-1) / sigma_m
-    dot = np.abs((at[..., 3:] * place[:, 3:]).sum(axis=-1))
-    angle = np.where(turned, 2.0 * np.arccos(np.clip(dot, 0.0, 1.0)), 0.0) / sigma_rad
+    angle = np.where(turned, se3.angle_between(at, place), 0.0) / sigma_rad
     cost = 0.5 * away**2 + 0.5 * angle**2 - log_share[None]
     return np.asarray(np.minimum(cost.min(axis=1), OUTLIER))
