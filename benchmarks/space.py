@@ -29,6 +29,7 @@ METRICS: dict[str, tuple[str, float, str]] = {
 RATE_HZ = 20.0
 SIGMA_STEP, SIGMA_TURN = 0.05, 0.02
 SIGMA_RAD, SIGMA_RANGE = 0.02, 0.1
+SIGMA_SURVEY = 0.02
 
 
 def run(folder: Path = FOLDER) -> tuple[dict[str, float], dict[str, Any]]:
@@ -58,7 +59,7 @@ def _tags(folder: Path, name: str, *, mapped: bool, changes: dict[str, Any] | No
     assert isinstance(recording, SpatialRecording)
     survey = recording.true_landmarks
     assert survey is not None
-    known = _as_map(survey) if mapped else None
+    known = survey.as_prior(SIGMA_SURVEY) if mapped else None
     em.run_slam(recording, prior_map=known)  # kernels are compiled, files are in memory
     began = time.process_time()
     result = em.run_slam(recording, prior_map=known)
@@ -81,13 +82,6 @@ def _tags(folder: Path, name: str, *, mapped: bool, changes: dict[str, Any] | No
         "cpu_s": cpu_s,
         "lasted_s": float(np.ptp(recording.frames.stamp_s)),
     }
-
-
-def _as_map(survey: Landmarks, sigma: float = 0.02) -> Landmarks:
-    from dataclasses import replace
-
-    known = np.broadcast_to(sigma**2 * np.eye(3), (len(survey), 3, 3)).copy()
-    return replace(survey, covariance_m2=known, rotation_covariance=known.copy(), frame="prior_map")
 
 
 def _rms(error: FloatArray) -> float:

@@ -391,6 +391,12 @@ class Landmarks(_Columns):
             frame=frame,
         )
 
+    def as_prior(self, sigma_m: float) -> Landmarks:
+        """Return landmarks in space as a map to localise in, with one standard deviation in all directions [m, rad]."""
+        known = np.broadcast_to(sigma_m**2 * np.eye(3), (len(self), 3, 3)).copy()
+        turned = None if self.rotation is None else known.copy()
+        return replace(self, covariance_m2=known, rotation_covariance=turned, frame="prior_map")
+
     @classmethod
     def in_space(
         cls,

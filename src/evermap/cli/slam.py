@@ -304,11 +304,7 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
         problem = "this recording has no surveyed landmarks"
         raise ConfigError(problem, field="prior_map", hint="a landmarks.csv of your own: --prior-map FILE")
     if survey.position_m.shape[1] == 3:
-        import numpy as np
-
-        known = np.broadcast_to(sigma_m**2 * np.eye(3), (len(survey), 3, 3)).copy()
-        turned = None if survey.rotation is None else known.copy()
-        return replace(survey, covariance_m2=known, rotation_covariance=turned, frame="prior_map")
+        return survey.as_prior(sigma_m)
     return Landmarks.at(
         survey.landmark_id,
         survey.position_m,

@@ -23,17 +23,12 @@ def errors(result: SlamResult, world: World) -> tuple[float, float]:
     return robot, float(found.landmarks.rmse_m)
 
 
-def as_map(tags: Landmarks, sigma: float = 0.01) -> Landmarks:
-    known = np.broadcast_to(sigma**2 * np.eye(3), (len(tags), 3, 3)).copy()
-    return replace(tags, covariance_m2=known, rotation_covariance=known.copy(), frame="prior_map")
-
-
 def moved(tags: Landmarks, shift: dict[int, tuple[float, float, float]]) -> Landmarks:
     """The map before some tags were moved by `shift`."""
     position = tags.position_m.copy()
     for tag, by in shift.items():
         position[tag] -= by
-    return replace(as_map(tags), position_m=position)
+    return replace(tags.as_prior(0.01), position_m=position)
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -66,7 +61,7 @@ def test_wrong_identities_are_outliers():
 
 def test_without_odometry_a_map_is_enough():
     world = tagged_corridor(5, odometry=False)
-    result = run_slam(world.recording, prior_map=as_map(world.tags))
+    result = run_slam(world.recording, prior_map=world.tags.as_prior(0.01))
     off = result.trajectory.pose_world_robot
     rows = np.searchsorted(world.recording.frames.stamp_s, result.trajectory.stamp_s)
     gap = np.linalg.norm(off[:, :3] - world.true_pose[rows, :3], axis=1)
@@ -116,7 +111,7 @@ def test_points_without_odometry_locate_the_robot_where_three_are_in_view():
         source_line=np.zeros(rows, dtype=np.int64),
     )
     recording = replace(world.recording, detections=detections, sensors=(SpatialSensor(sigma_m=0.02),))
-    result = run_slam(recording, prior_map=as_map(Landmarks.in_space(np.arange(count), point)))
+    result = run_slam(recording, prior_map=Landmarks.in_space(np.arange(count), point).as_prior(0.01))
     assert len(result.trajectory) == n
     gap = np.linalg.norm(result.trajectory.pose_world_robot[:, :3] - world.true_pose[:, :3], axis=1)
     assert np.max(gap) < 0.1
@@ -143,7 +138,7 @@ def test_probabilities_of_moves_are_calibrated():
         world = tagged_corridor(seed, drift=0.04, p_wrong=0.03, odometry=seed % 2 == 0)
         shift = {int(tag): random.normal(0.0, 0.2, 3) for tag in random.choice(12, 2, replace=False)}
         known = moved(world.tags, shift)
-        surveyed = replace(as_map(known, 0.02), position_m=known.position_m + random.normal(0.0, 0.02, (12, 3)))
+        surveyed = replace(known.as_prior(0.02), position_m=known.position_m + random.normal(0.0, 0.02, (12, 3)))
         changes = {c.landmark_ids[0]: c.probability for c in run_slam(world.recording, prior_map=surveyed).changes}
         told += [changes.get(tag, 0.0) for tag in range(12)]
         truth += [tag in shift for tag in range(12)]
@@ -159,7 +154,7 @@ def test_places_and_poses_are_as_sure_as_they_say():
     of_tags, of_poses = [], []
     for seed in range(100, 112):
         world = tagged_corridor(seed, drift=0.03)
-        result = run_slam(world.recording, prior_map=as_map(world.tags, 0.01))
+        result = run_slam(world.recording, prior_map=world.tags.as_prior(0.01))
         off = result.landmarks.position_m - world.tags.position_m[result.landmarks.landmark_id]
         # where the map was drawn: its own errors are zero here, so the estimate leans on it by what it says
         of_tags += [d @ np.linalg.solve(c, d) for d, c in zip(off, result.landmarks.covariance_m2, strict=True)]
