@@ -20,7 +20,7 @@ from benchmarks.overlap import overlap
 from evermap.config import TrackConfig
 from evermap.errors import InputError
 from evermap.runs.track.poses import read_input
-from evermap.runs.track.run import run_track, warm_up
+from evermap.tracking.run import run_track, warm_up
 from evermap.tracking.tracklets import TrackState
 from evermap.types import BoolArray, FloatArray, IntArray
 

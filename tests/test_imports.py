@@ -30,16 +30,18 @@ RULES = {
     "metrics": "errors show types geometry",
     "sensing": "errors compiled types config geometry",
     "existence": "errors compiled show types survival io sensing",
-    "slam": "errors interrupts compiled plugins types config geometry valid sensing",
-    "maps": "errors show types config geometry stamps survival sensing existence slam",
-    "tracking": "errors compiled show types config survival sensing existence",
+    "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry stamps survival metrics existence",
+    "slam": "errors interrupts compiled plugins types config geometry valid sensing tracking",
+    "maps": "errors show types config geometry stamps survival sensing existence slam",
     "pipeline": "errors types config valid slam maps",
     "runs": (
-        "errors interrupts show types config geometry stamps survival valid io metrics existence maps "
-        "tracking viz pipeline"
+        "errors interrupts types config geometry stamps survival valid io metrics existence tracking viz maps pipeline"
     ),
-    "cli": "errors interrupts plugins types config geometry stamps survival io existence slam maps viz pipeline runs",
+    "cli": (
+        "errors interrupts plugins types config geometry stamps survival io existence tracking viz slam maps "
+        "pipeline runs"
+    ),
 }
 
 # loaded by the functions that need them, never by starting up

@@ -21,7 +21,7 @@ import sys
 from typer.testing import CliRunner
 
 import evermap.runs.persist.run
-import evermap.runs.track.run
+import evermap.tracking.run
 import evermap.slam.localize_recording
 import evermap.cli.warmup
 from evermap.cli.main import app
@@ -58,7 +58,7 @@ def all_frames(*given, **settings):
     return answer
 
 
-for module in (evermap.cli.warmup, evermap.runs.persist.run, evermap.runs.track.run):
+for module in (evermap.cli.warmup, evermap.runs.persist.run, evermap.tracking.run):
     watched(module)
 fed, evermap.slam.localize_recording.fed = evermap.slam.localize_recording.fed, all_frames
 result = CliRunner().invoke(app, sys.argv[1:], catch_exceptions=False)

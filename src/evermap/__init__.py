@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from evermap.runs.persist.run import run_persist
     from evermap.runs.persist.table import read_looks
     from evermap.runs.sessions import Entered, enter_session
-    from evermap.runs.track.run import run_track
     from evermap.slam.check import check_recording
     from evermap.slam.localize import Localizer
     from evermap.survival.text import parse_prior
+    from evermap.tracking.run import run_track
     from evermap.tracking.tracker import Tracker
     from evermap.types import Detections, Frames, Landmarks, Odometry, Recording, Sensor, SlamResult, Trajectory
 
@@ -55,7 +55,7 @@ _HOME = {
     "evermap.runs.persist.run": ("run_persist",),
     "evermap.runs.persist.table": ("read_looks",),
     "evermap.runs.sessions": ("Entered", "enter_session"),
-    "evermap.runs.track.run": ("run_track",),
+    "evermap.tracking.run": ("run_track",),
     "evermap.slam.check": ("check_recording",),
     "evermap.slam.localize": ("Localizer",),
     "evermap.survival.text": ("parse_prior",),

@@ -73,9 +73,13 @@ def _run_in_space(
     from threadpoolctl import threadpool_limits
 
     from evermap.slam.space.intake import prepare_space
+    from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.result import concluded_in_space
     from evermap.slam.space.solve import solve_space
 
+    if has_traffic(recording):
+        with threadpool_limits(limits=1, user_api="blas"):
+            return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
         return concluded_in_space(recording, intake, solve_space(intake, prior_map, progress=progress))

@@ -766,6 +766,8 @@ class SlamResult(Shown):
         changes: how the world differs from the map that was given, or changed during the run.
         alternatives: other explanations nearly as probable as `changes`, the most probable first.
         gone: landmarks that the map knows but does not believe to be there.
+        followed: what moved while it was looked at, a `evermap.tracking.run.TrackResult`; None where nothing was
+            followed.
     """
 
     trajectory: Trajectory
@@ -781,6 +783,7 @@ class SlamResult(Shown):
     changes: tuple[MapChange, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     gone: Landmarks = field(default_factory=lambda: Landmarks.at([], np.zeros((0, 2))))
+    followed: Any = None
 
     def _facts(self) -> dict[str, Any]:
         return {

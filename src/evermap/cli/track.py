@@ -175,9 +175,9 @@ def _run(
     from evermap.runs.summary import RunInfo
     from evermap.runs.track.detections import read_confusion
     from evermap.runs.track.poses import read_input
-    from evermap.runs.track.run import check_choices, run_track
-    from evermap.runs.track.run import warm_up as compile_kernels
     from evermap.runs.track.write import write_track
+    from evermap.tracking.run import check_choices, run_track
+    from evermap.tracking.run import warm_up as compile_kernels
 
     check_replaceable(out, force=force, inputs=inputs)  # better now than after the run
     start = time.perf_counter()

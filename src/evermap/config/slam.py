@@ -130,6 +130,12 @@ class SpaceConfig(Section):
         le=10,
         description="how late the stamps of sensors may be [s]; 0: not at all",
     )
+    range_scale: float | None = Field(
+        default=None,
+        gt=0.5,
+        lt=2.0,
+        description="factor on the ranges of boxes without identity; unset: by what stands, the odometry's metre holds",
+    )
 
 
 class NoiseConfig(Section):

@@ -9,7 +9,7 @@ import pytest
 
 from evermap.errors import EvermapError
 from evermap.runs.track.detections import read_confusion, read_detections
-from evermap.runs.track.run import run_track
+from evermap.tracking.run import run_track
 
 CLASSES = ("bus", "car")
 

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from evermap.config import TrackConfig
 from evermap.errors import EvermapError
 from evermap.runs.track.poses import read_input, read_poses
-from evermap.runs.track.run import run_track
 from evermap.runs.track.write import write_track
+from evermap.tracking.run import run_track
 
 BOX = "length_m,width_m,height_m,yaw_rad"
 POSE = "stamp_s,x_m,y_m,z_m,qx,qy,qz,qw"

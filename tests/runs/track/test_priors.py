@@ -11,9 +11,9 @@ from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, InputError
 from evermap.existence.models import NamedModels, save_models
 from evermap.existence.one_stay import OneStay
-from evermap.runs.track.run import _priors
 from evermap.survival import Exponential, GeneralPurpose
 from evermap.survival.text import parse_prior
+from evermap.tracking.run import _priors
 
 NAMES = ("cart", "pallet")
 CART, PALLET = parse_prior("weibull:scale=1h,shape=1.5"), Exponential(1e-4)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from evermap.errors import ConfigError, InputError
 from evermap.io.columns import Columns, read_columns
-from evermap.io.text import counted, quote
+from evermap.io.text import quote
+from evermap.tracking.table import DetectionTable
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 from evermap.valid import STAMP_S, X_M, Quantity
 
@@ -39,53 +39,6 @@ _REQUIRED = (STAMP_S.name, *(quantity.name for quantity in POSITION))
 _OPTIONAL = (
     "class_id", *COVARIANCE, SIGMA.name, SCORE.name, *(quantity.name for quantity in (*BOX, *SENSOR)), *IMAGE_BOX,
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class DetectionTable:
-    """M detections in F frames, by time.
-
-    Attributes:
-        stamp_s: (F,) increasing.
-        first: (F + 1,) where each frame's detections start; an empty frame has none.
-        position_m: (M, 3) in the world.
-        class_names: classes in use, in natural order; one without a name where the table names none.
-        class_id: (M,) index into them, `UNKNOWN` where none is given.
-        covariance_m2: (M, 3, 3) of the positions, nan where none is given; None if nowhere.
-        appearance: (M, A) vectors, zeros where there is none; None if nowhere.
-        sensor_m: (F, 3) where the sensor was; None where the table does not say.
-        box: (M, 4) length, width, height [m] and heading in the world [rad]; None where detections are points.
-        score: (M,) the detector's, nan where none is given; None where the table has none.
-        sensor_yaw_rad: (F,) where the sensor looked; None where the table is in the world.
-        line: (M,) line of each detection in the file.
-        source: file it came from, '' if none.
-        n_weak: detections left out because of their score.
-        warnings: remarks of the reader.
-    """
-
-    stamp_s: FloatArray
-    first: IntArray
-    position_m: FloatArray
-    class_names: tuple[str, ...]
-    class_id: IntArray
-    covariance_m2: FloatArray | None
-    appearance: FloatArray | None
-    sensor_m: FloatArray | None
-    line: IntArray
-    source: str
-    box: FloatArray | None = None
-    score: FloatArray | None = None
-    sensor_yaw_rad: FloatArray | None = None
-    n_weak: int = 0
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def n_frames(self) -> int:
-        """F."""
-        return len(self.stamp_s)
-
-    def __len__(self) -> int:
-        return len(self.position_m)
 
 
 def read_detections(path: str | Path, *, min_score: float | None = None) -> DetectionTable:
@@ -233,12 +186,6 @@ def _sensor(table: Columns, frame: IntArray, n_frames: int) -> FloatArray | None
             "the sensor is in two places in one frame", row=int(elsewhere[0]), field=SENSOR[0].name, hint=hint
         )
     return sensor
-
-
-def said_of(table: DetectionTable) -> list[str]:
-    """Return remarks on what was read: its own, and what was left out."""
-    weak = [f"{counted(table.n_weak, 'detection')} of low score left out"] if table.n_weak else []
-    return [*table.warnings, *weak]
 
 
 def read_confusion(path: str | Path, class_names: Sequence[str]) -> FloatArray:

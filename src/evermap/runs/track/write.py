@@ -17,8 +17,8 @@ from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
 from evermap.runs.track.detections import COVARIANCE, ENTRIES
 from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
-from evermap.runs.track.run import TrackResult
 from evermap.tracking.record import BOX_COLUMNS
+from evermap.tracking.run import TrackResult
 from evermap.tracking.tracklets import EventKind, TrackState
 from evermap.types import UNKNOWN, FloatArray, IntArray
 from evermap.viz.plots import plot_track_run
@@ -50,14 +50,7 @@ def write_track(
         ConfigError: `out` must not or cannot be written.
     """
     start = perf_counter()
-    files: dict[str, Callable[[], bytes]] = {
-        "tracks.csv": lambda: csv_bytes(_with_names(_tracks(result))),
-        "tracks.parquet": lambda: parquet_bytes(_with_lists(_tracks(result))),
-        "detections.csv": lambda: csv_bytes(_detections(result)),
-        "events.jsonl": lambda: _events(result).encode(),
-        "spells.csv": lambda: csv_bytes(_with_names(_spells(result))),
-        "lifetimes.csv": lambda: _lifetimes_csv(result),
-    }
+    files = track_files(result)
     with RunFolder(out, force=force, inputs=(result.table.source, *inputs)) as folder:
         for k, (name, content) in enumerate(files.items()):
             folder.path(name).write_bytes(content())
@@ -74,6 +67,18 @@ def write_track(
         summary = track_summary(result, info=info or RunInfo(), timing=timing)
         summary["warnings"] += remarks
         return folder.finish(summary)
+
+
+def track_files(result: TrackResult) -> dict[str, Callable[[], bytes]]:
+    """Return the tables of a run by their names, made when they are asked for."""
+    return {
+        "tracks.csv": lambda: csv_bytes(_with_names(_tracks(result))),
+        "tracks.parquet": lambda: parquet_bytes(_with_lists(_tracks(result))),
+        "detections.csv": lambda: csv_bytes(_detections(result)),
+        "events.jsonl": lambda: _events(result).encode(),
+        "spells.csv": lambda: csv_bytes(_with_names(_spells(result))),
+        "lifetimes.csv": lambda: _lifetimes_csv(result),
+    }
 
 
 def track_summary(result: TrackResult, *, info: RunInfo, timing: Mapping[str, Any]) -> dict[str, Any]:

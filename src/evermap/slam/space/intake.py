@@ -54,16 +54,19 @@ class SpatialIntake:
     names: Mapping[int, str] = field(default_factory=dict)
 
 
-def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...] = ()) -> SpatialIntake:
+def prepare_space(
+    recording: SpatialRecording, settings: SpaceConfig, remarks: tuple[str, ...] = (), *, fewest: int = 2
+) -> SpatialIntake:
     """Sort out what can be used: detections of known identity, while there is odometry.
 
     Args:
         recording: as read.
         settings: what may be wrong with the mounts and stamps of the sensors.
         remarks: on the recording, before those on what was left out.
+        fewest: frames with a landmark that it takes.
 
     Raises:
-        DataError: fewer than two frames with a landmark of known identity.
+        DataError: fewer than `fewest` frames with a landmark of known identity.
     """
     detections, stamps = recording.detections, recording.frames.stamp_s
     usable, moving, warnings = _usable(recording, remarks)
@@ -72,11 +75,11 @@ def prepare_space(recording: SpatialRecording, settings: SpaceConfig, remarks: t
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
         usable &= ~broken
     seen_in = np.unique(detections.frame[usable])
-    if len(seen_in) < 2:
+    if len(seen_in) < fewest:
         boxes = np.isfinite(detections.size_m).any()
         raise DataError(
-            f"{recording.name}: landmarks of known identity were seen in {len(seen_in)} frames, at least 2 needed",
-            hint="evermap track follows boxes without identities"
+            f"{recording.name}: landmarks of known identity seen in {len(seen_in)} frames, at least {fewest} needed",
+            hint="boxes without identities need `odometry`"
             if boxes
             else "check landmark ids, and that detections and odometry share one clock",
         )

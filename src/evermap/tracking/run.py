@@ -14,13 +14,13 @@ from evermap.config.tables import DEFAULT_PRIOR
 from evermap.errors import ConfigError, DataError
 from evermap.existence.models import priors_of
 from evermap.io.text import counted, quote
-from evermap.runs.track.detections import DetectionTable, said_of
 from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
 from evermap.tracking.frame import p_real_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
+from evermap.tracking.table import DetectionTable, said_of
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View
@@ -95,6 +95,10 @@ class TrackResult(Shown):
         """Return the rows of `tracks` that are of objects that were confirmed, sooner or later."""
         t = self.tracks
         return t[np.isin(t.track_id, t.track_id[t.state != TrackState.BIRTH])]
+
+    def speeds_mps(self) -> FloatArray:
+        """Return (C,) the speed of each class above which it moves."""
+        return np.array(_speeds(self.config, self.table.class_names))
 
     def first_rows(self) -> IntArray:
         """Return (T,) row of `objects()` at which each object begins."""

@@ -1,0 +1,161 @@
+"""Which tracks stand and which move, by all of their detections: windows of time, one after the other.
+
+Over a window the velocity is a robust line through the detections, whose errors are alike for about a second: ten
+detections of it are hardly more than two. That it stands is a special case, velocity zero but for what a detector
+makes of a changing view; the ratio of the two densities is the Bayes factor (Dickey 1971).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
+
+STILL, MOVING = 0.3, 4.8
+"""Standard deviations of velocities of what stands and of what moves, each axis, over the speed that tells them apart:
+at that speed both are equally probable."""
+WINDOW_S = 2.0
+ALIKE_S = 0.5
+"""For how long the errors of a detector are alike."""
+NEAR_M, FAR_SHARE = 0.1, 0.01
+HEAVY = 2.0
+ROUNDS = 5
+LEAST_S, FEWEST = 0.4, 4
+"""What a track or a stay must last, and detections that it takes."""
+SAME_M, ELSEWHERE_M = 0.5, 2.0
+"""Stays this close are one; what left was farther away than that."""
+SURE = 0.8
+"""Probability to stand from which on a thing is believed to."""
+
+
+class Standing(NamedTuple):
+    """What stands.
+
+    Attributes:
+        stay: (M,) number of the stay that each detection is of, `UNKNOWN` where its thing moves or nothing is known.
+        p_static: (M,) probability that its thing stands at that time; nan where nothing is known.
+        p_still: by track, probability that it stood all the time.
+        track: (S,) of each stay.
+        p_stay: (S,) probability of each stay.
+        since_s, until_s: (S,) when it was seen to come to rest, and to leave; nan where it was not.
+    """
+
+    stay: IntArray
+    p_static: FloatArray
+    p_still: dict[int, float]
+    track: IntArray
+    p_stay: FloatArray
+    since_s: FloatArray
+    until_s: FloatArray
+
+
+def standing(
+    stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray
+) -> Standing:
+    """Return what stands, and when.
+
+    Args:
+        stamp_s: (M,) of detections, in order of time.
+        position_m: (M, 3) where they are in the world.
+        range_m: (M,) how far away they were.
+        track: (M,) what they are of, or `UNKNOWN`.
+        speed_mps: (M,) above which each moves.
+    """
+    stay, p_static = np.full(len(track), UNKNOWN), np.full(len(track), np.nan)
+    p_still: dict[int, float] = {}
+    rows: list[tuple[int, float, float, float]] = []
+    sigma_m = NEAR_M + FAR_SHARE * range_m
+    order = np.argsort(track, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(track[order])) + 1):
+        if track[mine[0]] == UNKNOWN or not _enough(stamp_s[mine]):
+            continue
+        name, limit = int(track[mine[0]]), float(np.median(speed_mps[mine]))
+        at, when, sigma = position_m[mine, :2], stamp_s[mine], sigma_m[mine]
+        p_still[name] = _p_static(when, at, sigma, limit)
+        p_static[mine] = _windows(when, at, sigma, limit)
+        parts = _stays(p_static[mine] > 0.5, when, at)
+        for part in parts:
+            p = _p_static(when[part], at[part], sigma[part], limit) if _enough(when[part]) else 0.0
+            if p > SURE:
+                stay[mine[part]] = len(rows)
+                rows.append((name, p, *_ends(part, when, at)))
+    columns = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    return Standing(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
+
+
+def long_enough(stamp_s: FloatArray, track: IntArray) -> IntArray:
+    """Return (M,) tracks of detections (M,) in order of time, `UNKNOWN` where one is too short to have a velocity."""
+    found = np.full(len(track), UNKNOWN)
+    for one in np.unique(track[track != UNKNOWN]):
+        mine = np.flatnonzero(track == one)
+        found[mine] = one if _enough(stamp_s[mine]) else UNKNOWN
+    return found
+
+
+def _enough(stamp_s: FloatArray) -> bool:
+    return len(stamp_s) >= FEWEST and float(stamp_s[-1] - stamp_s[0]) >= LEAST_S
+
+
+def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float) -> FloatArray:
+    """(K,) probability to stand, by what is seen around each detection."""
+    if stamp_s[-1] - stamp_s[0] <= WINDOW_S:
+        return np.full(len(stamp_s), _p_static(stamp_s, at, sigma, limit))
+    middle = np.clip(stamp_s, stamp_s[0] + 0.5 * WINDOW_S, stamp_s[-1] - 0.5 * WINDOW_S)
+    first = np.searchsorted(stamp_s, middle - 0.5 * WINDOW_S - 1e-6)
+    last = np.searchsorted(stamp_s, middle + 0.5 * WINDOW_S + 1e-6)
+    found: dict[tuple[int, int], float] = {}
+    for ends in zip(first.tolist(), last.tolist(), strict=True):
+        part = slice(*ends)
+        if ends not in found:
+            found[ends] = _p_static(stamp_s[part], at[part], sigma[part], limit) if _enough(stamp_s[part]) else 0.5
+    return np.array([found[ends] for ends in zip(first.tolist(), last.tolist(), strict=True)])
+
+
+def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float) -> float:
+    """Probability that what was seen at (K, 2) stood, as probable as not beforehand."""
+    velocity, spread = _line(stamp_s, at, sigma)
+    still, moving = (STILL * limit) ** 2 + spread, (MOVING * limit) ** 2 + spread
+    log_factor = np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving)
+    return float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0))))
+
+
+def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[FloatArray, float]:
+    """Velocity (2,) of detections (K, 2), and its variance on each axis."""
+    t = stamp_s - stamp_s[0]
+    rate = max((len(t) - 1) / max(float(t[-1]), 1e-6), 1e-6)
+    share = 1.0 / max(1.0, ALIKE_S * rate)
+    weight = 1.0 / sigma**2
+    velocity, curve = np.zeros(2), 1.0
+    for _ in range(ROUNDS):
+        mean_s, middle = weight @ t / weight.sum(), weight @ at / weight.sum()
+        curve = float(weight @ (t - mean_s) ** 2)
+        velocity = (weight * (t - mean_s)) @ (at - middle) / curve
+        off = np.linalg.norm(at - middle - (t - mean_s)[:, None] * velocity, axis=1) / (HEAVY * sigma)
+        weight = 1.0 / (sigma * np.hypot(1.0, off)) ** 2
+    return velocity, 1.0 / (share * curve)
+
+
+def _stays(still: BoolArray, stamp_s: FloatArray, at: FloatArray) -> list[IntArray]:
+    """Runs of detections (K, 2) that stand; those that follow each other in one place are one."""
+    rows = np.flatnonzero(still)
+    if not len(rows):
+        return []
+    found: list[IntArray] = []
+    for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        if found and np.linalg.norm(np.median(at[part], axis=0) - np.median(at[found[-1]], axis=0)) < SAME_M:
+            found[-1] = np.concatenate([found[-1], part])
+        elif _enough(stamp_s[part]):
+            found.append(part)
+    return found
+
+
+def _ends(part: IntArray, stamp_s: FloatArray, at: FloatArray) -> tuple[float, float]:
+    """When a stay began and ended, by a thing that was clearly elsewhere before and after; nan where it was not."""
+    here, found = np.median(at[part], axis=0), [np.nan, np.nan]
+    for k, (outside, beside) in enumerate(((slice(0, part[0]), part[0] - 1), (slice(part[-1] + 1, None), part[-1]))):
+        away = np.linalg.norm(at[outside] - here, axis=1)
+        if len(away) >= FEWEST and float(np.median(np.sort(away)[-FEWEST:])) > ELSEWHERE_M:
+            found[k] = 0.5 * float(stamp_s[beside] + stamp_s[beside + 1])
+    return found[0], found[1]
