@@ -173,8 +173,7 @@ def _run(
     """Read, run, write; return the summary."""
     from evermap.runs.folder import check_replaceable
     from evermap.runs.summary import RunInfo
-    from evermap.runs.track.detections import read_confusion
-    from evermap.runs.track.poses import read_input
+    from evermap.runs.track.detections import read_confusion, read_input
     from evermap.runs.track.write import write_track
     from evermap.tracking.run import check_choices, run_track
     from evermap.tracking.run import warm_up as compile_kernels

@@ -10,6 +10,7 @@ from evermap.config import Config
 from evermap.pipeline import run_session, run_slam
 from evermap.slam.localize_recording import warm_up as of_the_localizer
 from evermap.slam.warmup import warm_up as of_the_estimator
+from evermap.tracking.run import warm_up as of_the_tracker
 from evermap.types import (
     UNKNOWN,
     Detections,
@@ -37,6 +38,7 @@ def warm_up(
     sessions: bool = False,
     localize: bool = False,
     in_space: bool = False,
+    traffic: bool = False,
 ) -> None:
     """Compile what a job needs, or load it where that was done before; the job does it by itself, while it is timed.
 
@@ -46,8 +48,11 @@ def warm_up(
         sessions: what sessions of a living map need.
         localize: what the frames of localising in one need, and nothing else.
         in_space: what recordings in space need, and nothing else.
+        traffic: what boxes without identity in these need, too.
     """
     if in_space:
+        if traffic:
+            of_the_tracker()
         run_slam(_flight())
         return
     if localize:

@@ -469,7 +469,7 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     _write_innovations(result.innovations, folder.path("innovations.parquet"))
     folder.path("changes.jsonl").write_text(changes_text(map(change_dict, result.changes)), encoding="utf-8")
     if result.followed is not None:
-        from evermap.runs.track.write import track_files
+        from evermap.runs.track.tables import track_files
 
         for name, content in track_files(result.followed).items():
             folder.path(name).write_bytes(content())

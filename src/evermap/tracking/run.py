@@ -18,9 +18,8 @@ from evermap.show import Shown, draw
 from evermap.survival.base import LifetimePrior
 from evermap.survival.censored import CensoredLifetimes, lifetimes_of_sightings
 from evermap.survival.text import parse_prior
-from evermap.tracking.frame import p_real_of
+from evermap.tracking.frame import DetectionTable, p_real_of, said_of
 from evermap.tracking.record import Event, Recorder, StaticSpells, Tracks
-from evermap.tracking.table import DetectionTable, said_of
 from evermap.tracking.tracker import Tracker
 from evermap.tracking.tracklets import TrackState
 from evermap.tracking.views import View

@@ -30,7 +30,7 @@ SURE = 0.8
 """Probability to stand from which on a thing is believed to."""
 
 
-class Standing(NamedTuple):
+class Stood(NamedTuple):
     """What stands.
 
     Attributes:
@@ -53,7 +53,7 @@ class Standing(NamedTuple):
 
 def standing(
     stamp_s: FloatArray, position_m: FloatArray, range_m: FloatArray, track: IntArray, speed_mps: FloatArray
-) -> Standing:
+) -> Stood:
     """Return what stands, and when.
 
     Args:
@@ -82,7 +82,7 @@ def standing(
                 stay[mine[part]] = len(rows)
                 rows.append((name, p, *_ends(part, when, at)))
     columns = np.array(rows, dtype=np.float64).reshape(-1, 4)
-    return Standing(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
+    return Stood(stay, p_static, p_still, columns[:, 0].astype(np.int64), *columns[:, 1:].T)
 
 
 def long_enough(stamp_s: FloatArray, track: IntArray) -> IntArray:

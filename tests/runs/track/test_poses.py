@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from evermap.config import TrackConfig
 from evermap.errors import EvermapError
-from evermap.runs.track.poses import read_input, read_poses
+from evermap.runs.track.detections import read_input, read_poses
 from evermap.runs.track.write import write_track
 from evermap.tracking.run import run_track
 

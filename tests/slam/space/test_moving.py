@@ -14,7 +14,7 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.pipeline import run_slam
-from evermap.slam.space.gauge import bent, gauge_of
+from evermap.slam.space.drift import bent, gauge_of
 from evermap.types import ChangeKind, FloatArray, Landmarks, SlamResult
 
 BEND = np.radians(0.03)

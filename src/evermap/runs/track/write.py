@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from time import perf_counter
@@ -11,15 +10,11 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import MissingExtraError
-from evermap.io.columns import csv_bytes, named
-from evermap.io.table import parquet_bytes
 from evermap.runs.folder import RunFolder
 from evermap.runs.summary import RunInfo, summary_head
-from evermap.runs.track.detections import COVARIANCE, ENTRIES
-from evermap.runs.track.lifetimes import LIFETIME_COLUMNS, lifetimes_csv
-from evermap.tracking.record import BOX_COLUMNS
+from evermap.runs.track.tables import track_files
 from evermap.tracking.run import TrackResult
-from evermap.tracking.tracklets import EventKind, TrackState
+from evermap.tracking.tracklets import EventKind
 from evermap.types import UNKNOWN, FloatArray, IntArray
 from evermap.viz.plots import plot_track_run
 from evermap.viz.style import save_png
@@ -67,18 +62,6 @@ def write_track(
         summary = track_summary(result, info=info or RunInfo(), timing=timing)
         summary["warnings"] += remarks
         return folder.finish(summary)
-
-
-def track_files(result: TrackResult) -> dict[str, Callable[[], bytes]]:
-    """Return the tables of a run by their names, made when they are asked for."""
-    return {
-        "tracks.csv": lambda: csv_bytes(_with_names(_tracks(result))),
-        "tracks.parquet": lambda: parquet_bytes(_with_lists(_tracks(result))),
-        "detections.csv": lambda: csv_bytes(_detections(result)),
-        "events.jsonl": lambda: _events(result).encode(),
-        "spells.csv": lambda: csv_bytes(_with_names(_spells(result))),
-        "lifetimes.csv": lambda: _lifetimes_csv(result),
-    }
 
 
 def track_summary(result: TrackResult, *, info: RunInfo, timing: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,100 +114,6 @@ def _of_class(result: TrackResult, class_id: int, class_of_track: IntArray) -> d
         "spells_of_known_beginning": int((mine & bounded).sum()),
         "spells_with_lifetimes": int((spells.class_id[of_lifetime] == class_id).sum()),
         "seen_to_stay_s": {"median": float(np.median(stays_s)), "most": float(stays_s.max())} if len(stays_s) else None,
-    }
-
-
-def _tracks(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
-    """One row an object and frame; columns of names are the names and which of them each row has."""
-    tracks = result.tracks
-    return {
-        "stamp_s": tracks.stamp_s,
-        "track_id": tracks.track_id,
-        "class_id": (result.table.class_names, tracks.class_p.argmax(axis=1)),
-        "state": (tuple(state.name.lower() for state in TrackState), tracks.state),
-        **_axes("", "_m", tracks.position_m),
-        **_axes("v", "_mps", tracks.velocity_mps),
-        "p_exists": tracks.p_exists,
-        "static": tracks.static.astype(np.int64),
-        **_beliefs(result),
-    }
-
-
-def _beliefs(result: TrackResult) -> dict[str, FloatArray]:
-    """Boxes, covariances and scores, where detections have boxes or scores."""
-    tracks, found = result.tracks, {}
-    if result.table.score is not None:
-        p = np.clip(tracks.p_exists, 1e-12, 1.0 - 1e-12)
-        found["score"] = np.log(p / (1.0 - p))
-    if result.table.box is not None:
-        found |= {name: tracks.box[:, k] for k, name in enumerate(BOX_COLUMNS)}
-        sigma = np.sqrt(tracks.box_variance)
-        found |= {f"sigma_{name}": sigma[:, k] for k, name in enumerate(BOX_COLUMNS)}
-        entries = zip(COVARIANCE, ENTRIES, strict=True)
-        found |= {name: tracks.position_covariance_m2[:, i, j] for name, (i, j) in entries}
-    return found
-
-
-def _spells(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] | FloatArray | IntArray]:
-    """One row a spell; empty where it is not known when it began or that it ended."""
-    spells = result.spells
-    return {
-        "track_id": spells.track_id,
-        "class_id": (result.table.class_names, spells.class_id),
-        **_axes("", "_m", spells.position_m),
-        "elsewhere_s": np.where(np.isfinite(spells.elsewhere_s), spells.elsewhere_s, np.nan),
-        "first_s": spells.first_s,
-        "last_s": spells.last_s,
-        "gone_s": np.where(np.isfinite(spells.gone_s), spells.gone_s, np.nan),
-    }
-
-
-def _detections(result: TrackResult) -> dict[str, Any]:
-    """Which object each detection is of; empty for those of none."""
-    table = result.table
-    frame = np.repeat(np.arange(table.n_frames), np.diff(table.first))
-    found = result.track_of_detection
-    return {
-        "line": table.line,
-        "stamp_s": table.stamp_s[frame],
-        "track_id": np.where(found == UNKNOWN, np.nan, found) if (found == UNKNOWN).any() else found,
-    }
-
-
-def _events(result: TrackResult) -> str:
-    """One JSON object a line, of objects that were confirmed."""
-    known = set(np.unique(result.objects().track_id).tolist())
-    return "".join(
-        json.dumps({"stamp_s": event.stamp_s, "event": event.kind.name.lower(), "track_id": event.track_id}) + "\n"
-        for event in result.events
-        if event.track_id in known
-    )
-
-
-def _lifetimes_csv(result: TrackResult) -> bytes:
-    if result.lifetimes is None:
-        return (",".join(LIFETIME_COLUMNS) + "\n").encode()
-    spell = result.spell_of_lifetime
-    spells = result.spells
-    return lifetimes_csv(
-        result.lifetimes, result.table.class_names, spells.class_id[spell], spells.position_m[spell, :2]
-    )
-
-
-def _axes(prefix: str, unit: str, vectors: FloatArray) -> dict[str, FloatArray]:
-    return {f"{prefix}{axis}{unit}": vectors[:, k] for k, axis in enumerate("xyz")}
-
-
-def _with_names(columns: dict[str, Any]) -> dict[str, Any]:
-    """For `csv_bytes`."""
-    return {name: named(*cells) if isinstance(cells, tuple) else cells for name, cells in columns.items()}
-
-
-def _with_lists(columns: dict[str, Any]) -> dict[str, Any]:
-    """For `parquet_bytes`."""
-    return {
-        name: np.array(cells[0], dtype=object)[cells[1]].tolist() if isinstance(cells, tuple) else cells
-        for name, cells in columns.items()
     }
 
 

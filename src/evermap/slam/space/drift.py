@@ -1,9 +1,15 @@
-"""How far odometry drifts and for how long detection errors persist, before anything is estimated.
+"""What odometry and detector get wrong, before anything is estimated: what wanders, and what repeats itself.
 
 Each landmark is put where each of its sightings has it along the odometry alone. The squared distance between two of
 these places grows with the time between them: at once by white noise, to a limit by errors that persist (a view, a bias
 of the detector), and for ever by drift. The three are fitted to medians over pairs (a variogram, Matheron 1963), so
 that outliers do not matter.
+
+Things that stand still show what repeats itself: seen from two poses they must be in one place. A scale of the ranges
+looks like one of the odometry, so only their ratio is known, and the odometry's metre holds unless that of the ranges
+is stated; a bend, an angle by the metre driven, has no such twin. Errors of one thing are alike from frame to frame,
+so each thing is one witness, and so is each stretch of the drive: the spread of what they say is the uncertainty (a
+sandwich by clusters, Liang and Zeger 1986). A bend is taken only where it is clearly more probable than none by both.
 """
 
 from __future__ import annotations
@@ -15,7 +21,7 @@ from scipy.optimize import nnls
 
 from evermap.geometry import se3
 from evermap.slam.space.problem import SpatialProblem
-from evermap.types import FloatArray
+from evermap.types import FloatArray, IntArray
 
 PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """Correlation times of detection errors that are tried together; the last two only where the drift is known."""
@@ -97,3 +103,217 @@ def _rate(stamp_s: FloatArray) -> FloatArray:
     half_s = 0.5 * PERSIST_S[1]
     first, last = np.searchsorted(stamp_s, stamp_s - half_s), np.searchsorted(stamp_s, stamp_s + half_s, side="right")
     return np.asarray((last - first - 1) / PERSIST_S[1])
+
+
+SIGMA_SCALE, SIGMA_BEND = 0.1, 1e-3
+"""What is usual beforehand: a share, and radians by the metre."""
+ERROR_LOG_ODDS = -3.0
+"""That an odometry bends, or has another scale than a detector of known scale, beforehand."""
+NEAR_M, FAR_SHARE = 0.1, 0.01
+"""Deviation of where a box is detected: at no range, and by the range."""
+ROUNDS, HEAVY = 10, 2.0
+FEWEST = 3
+"""Things that it takes: one more than there are numbers."""
+STILL_MPS, MOVING_MPS = 0.1, 3.0
+"""Velocities of what stands, by what a detector makes of a changing view, and of what moves."""
+ALIKE_S = 0.5
+"""For how long the errors of a detector are alike."""
+STRETCHES, EVERYWHERE = 10, 3.36
+"""What is seen in one stretch of a drive may err for one cause: the odometry drifts at random, a queue creeps. So many
+standard deviations, which Student's t of ten stretches exceeds in one of 100 cases, are found everywhere."""
+MOST_SCALE, SCALE_STEP, EM_ROUNDS = 0.1, 0.01, 12
+
+
+class Gauge(NamedTuple):
+    """Errors that repeat themselves.
+
+    Attributes:
+        stated: factor on ranges that is known beforehand; None where it is not.
+        scale: by which ranges, with that factor, are too short against the odometry, as a share; 0.03 of a detector
+            that says 97 m where the odometry went 100.
+        scale_sigma: its standard deviation.
+        bend: angle about the vertical that the odometry turns too little by the metre [rad/m].
+        bend_sigma: its standard deviation.
+        things: how many said so.
+    """
+
+    stated: float | None = None
+    scale: float = 0.0
+    scale_sigma: float = SIGMA_SCALE
+    bend: float = 0.0
+    bend_sigma: float = SIGMA_BEND
+    things: int = 0
+
+    @property
+    def range_scale(self) -> float:
+        """Return the factor on ranges: what is stated, else the odometry's metre holds."""
+        return 1.0 + self.scale if self.stated is None else self.stated
+
+    @property
+    def odometry_scale(self) -> float:
+        """Return the factor on the odometry: 1, unless that of the ranges is stated."""
+        return 1.0 if self.stated is None else 1.0 / (1.0 + self.scale)
+
+    def applied(self, pose: FloatArray) -> FloatArray:
+        """Return poses (F, 7) without what the odometry repeats."""
+        scaled = pose.copy()
+        scaled[:, :3] = pose[:1, :3] + self.odometry_scale * (pose[:, :3] - pose[:1, :3])
+        return bent(scaled, self.bend / self.odometry_scale)
+
+
+def bent(pose: FloatArray, bend: float) -> FloatArray:
+    """Return poses (F, 7) that turn by `bend` [rad/m] more about their vertical, from the first one on."""
+    if bend == 0.0 or len(pose) < 2:
+        return pose
+    step = se3.between(pose[:-1], pose[1:])
+    twist = np.zeros((len(step), 6))
+    twist[:, 5] = bend * np.linalg.norm(step[:, :3], axis=1)
+    step = se3.retract(step, twist)
+    found = pose.copy()
+    for k in range(len(step)):
+        found[k + 1] = se3.compose(found[k], step[k])
+    return found
+
+
+def gauge_of(
+    pose: FloatArray, when_s: FloatArray, frame: IntArray, seen: FloatArray, mount_m: FloatArray, thing: IntArray,
+    stated: float | None = None,
+) -> Gauge:  # fmt: skip
+    """Return scale and bend by which as many things as possible stand still.
+
+    Args:
+        pose: (F, 7) of the robot by the odometry.
+        when_s: (K,) stamps of sightings.
+        frame: (K,) of each.
+        seen: (K, 3) where it is from the robot, in its frame.
+        mount_m: (K, 3) where the sensor is on the robot.
+        thing: (K,) what it is of.
+        stated: factor on ranges that is known; the scale that is left is the odometry's then, if it is there at all.
+    """
+    _, of = np.unique(thing, return_inverse=True)
+    count = int(of.max(initial=-1)) + 1
+    if count < FEWEST:
+        return Gauge(stated)
+    ray = seen - mount_m
+    at, by = _directions(pose, frame, mount_m + ray * (stated or 1.0), mount_m)
+    sigma = NEAR_M + FAR_SHARE * np.linalg.norm(ray, axis=1)
+    usual = np.array([SIGMA_SCALE, SIGMA_BEND])
+    still = _still(when_s, at, by, of, count, sigma)
+    prior, found, spread = usual.copy(), np.zeros(2), np.zeros((2, 2))
+    stretch = _stretches(when_s, of, count)
+    for asked in (1, 0, -1):  # the bend, then the scale
+        found, spread = _steady(at, by, of, still, sigma, prior, stretch)
+        if asked >= 0 and (asked == 1 or stated is not None):
+            odds = _log_odds(found[asked], float(spread[0, asked]), float(usual[asked]), float(still.sum()))
+            everywhere = abs(found[asked]) > EVERYWHERE * spread[1, asked]
+            probable = odds > 0.0 and everywhere and still.sum() >= FEWEST
+            prior[asked] = usual[asked] if probable else 1e-9 * usual[asked]
+    deviation = spread.max(axis=0) + 1e-9 * usual
+    return Gauge(
+        stated, float(found[0]), float(deviation[0]), float(found[1]), float(deviation[1]), round(float(still.sum()))
+    )
+
+
+def _directions(
+    pose: FloatArray, frame: IntArray, seen: FloatArray, mount_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where sightings (K, 2) are from above, and (K, 2, 2) how that changes by the scale and by the bend."""
+    at = se3.transform(pose[frame], seen)
+    step = np.linalg.norm(np.diff(pose[:, :3], axis=0), axis=1)
+    up = se3.rotation_of(pose)[1:, :, 2] * step[:, None]
+    turned = np.vstack([np.zeros(3), np.cumsum(up, axis=0)])
+    shifted = np.vstack([np.zeros(3), np.cumsum(np.cross(up, pose[1:, :3]), axis=0)])
+    by_scale = at - se3.transform(pose[frame], mount_m)
+    by_bend = np.cross(turned[frame], at) - shifted[frame]
+    return at[:, :2], np.stack([by_scale, by_bend], axis=2)[:, :2]
+
+
+def _still(
+    when_s: FloatArray, at: FloatArray, by: FloatArray, of: IntArray, count: int, sigma: FloatArray
+) -> FloatArray:
+    """(count,) probability that each thing stands, by its velocity: a mixture of what stands and what moves.
+
+    The scale and the bend are those of its highest optimum (expectation-maximisation from a grid of scales), so that
+    traffic which creeps along does not count for what stands.
+    """
+    weight = sigma**-2.0
+    t = _centred(when_s[:, None], of, count, weight)[:, 0]
+    curve = np.maximum(np.bincount(of, weight * t**2, minlength=count), 1e-9)
+    velocity = _summed((weight * t)[:, None] * at, of, count) / curve[:, None]
+    slope = (_summed((weight * t)[:, None] * by.reshape(-1, 4), of, count) / curve[:, None]).reshape(-1, 2, 2)
+    alike = np.maximum(1.0, ALIKE_S * np.bincount(of) / np.maximum(_spans(when_s, of, count), 1e-3))
+    variance = STILL_MPS**2 + alike / curve
+    best, found = -np.inf, np.ones(count)
+    for start in np.arange(-MOST_SCALE, MOST_SCALE + 1e-9, SCALE_STEP):
+        value, share, total = np.array([start, 0.0]), 0.5, -np.inf
+        for _ in range(EM_ROUNDS):
+            off = ((velocity + slope @ value) ** 2).sum(axis=1)
+            still = np.log(share / variance) - 0.5 * off / variance
+            moving = np.log((1.0 - share) / MOVING_MPS**2) - 0.5 * off / MOVING_MPS**2
+            total = float(np.logaddexp(still, moving).sum() - 0.5 * ((value / [SIGMA_SCALE, SIGMA_BEND]) ** 2).sum())
+            p = 1.0 / (1.0 + np.exp(np.clip(moving - still, -700.0, 700.0)))
+            share = float(np.clip(p.mean(), 0.05, 0.95))
+            square = np.einsum("k,kia,kib->ab", p / variance, slope, slope)
+            square += np.diag([SIGMA_SCALE**-2.0, SIGMA_BEND**-2.0])
+            value = -np.linalg.solve(square, np.einsum("k,kia,ki->a", p / variance, slope, velocity))
+        if total > best:
+            best, found = total, p
+    return found
+
+
+def _spans(when_s: FloatArray, of: IntArray, count: int) -> FloatArray:
+    """(count,) seconds from the first to the last sighting of each thing."""
+    first, last = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(first, of, when_s)
+    np.maximum.at(last, of, when_s)
+    return np.asarray(last - first)
+
+
+def _stretches(when_s: FloatArray, of: IntArray, count: int) -> IntArray:
+    """(count,) stretch of the drive in which each thing is seen: as many things in each."""
+    middle = _summed(when_s[:, None], of, count)[:, 0] / np.bincount(of)
+    return np.asarray(np.argsort(np.argsort(middle)) * STRETCHES // count)
+
+
+def _steady(
+    at: FloatArray, by: FloatArray, of: IntArray, still: FloatArray, sigma: FloatArray, prior: FloatArray,
+    stretch: IntArray,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """The two numbers, by reweighted least squares within each of the things that stand; and their deviations, with
+    things as witnesses, and with stretches of the drive.
+    """
+    trust, found, count = np.maximum(still, 1e-9)[of], np.zeros(2), len(still)
+    weight, total, told = trust / sigma**2, np.eye(2), np.zeros((count, 2))
+    for _ in range(ROUNDS):
+        off, slope = _centred(at, of, count, weight), _centred(by.reshape(len(at), 4), of, count, weight)
+        slope = slope.reshape(-1, 2, 2)
+        square = np.einsum("k,kia,kib->kab", weight, slope, slope)
+        right = -np.einsum("k,kia,ki->ka", weight, slope, off)
+        total = square.sum(axis=0) + np.diag(prior**-2.0)
+        found = np.linalg.solve(total, right.sum(axis=0))
+        told = _summed(right - square @ found, of, count)
+        residual = np.linalg.norm(off + slope @ found, axis=1) / (HEAVY * sigma)
+        weight = trust / (sigma * np.hypot(1.0, residual)) ** 2
+    inverse, deviation = np.linalg.inv(total), []
+    for part, witnesses in ((told, float(still.sum())), (_summed(told, stretch, STRETCHES), float(STRETCHES))):
+        spread = inverse @ part.T @ part @ inverse * witnesses / max(witnesses - 2.0, 1e-3)
+        deviation.append(np.sqrt(np.maximum(np.diag(spread), 0.0)))
+    return found, np.array(deviation)
+
+
+def _log_odds(value: float, sigma: float, usual: float, count: float) -> float:
+    """That there is an error: Student's density of what `count` things say, over that by chance."""
+    sigma = max(sigma, 1e-12)
+    fit = 0.5 * count * np.log1p((value / sigma) ** 2 / max(count - 2.0, 1e-3))
+    return float(fit - np.log(np.hypot(usual, sigma) / sigma) + ERROR_LOG_ODDS)
+
+
+def _centred(values: FloatArray, of: IntArray, count: int, weight: FloatArray) -> FloatArray:
+    """Values (K, C) less the mean of their thing."""
+    mean = _summed(weight[:, None] * values, of, count) / np.bincount(of, weight, minlength=count)[:, None]
+    return np.asarray(values - mean[of])
+
+
+def _summed(values: FloatArray, of: IntArray, count: int) -> FloatArray:
+    """(count, C) sums by thing."""
+    return np.stack([np.bincount(of, column, minlength=count) for column in values.T], axis=1)

@@ -76,13 +76,7 @@ def prepare_space(
         usable &= ~broken
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < fewest:
-        boxes = np.isfinite(detections.size_m).any()
-        raise DataError(
-            f"{recording.name}: landmarks of known identity seen in {len(seen_in)} frames, at least {fewest} needed",
-            hint="boxes without identities need `odometry`"
-            if boxes
-            else "check landmark ids, and that detections and odometry share one clock",
-        )
+        raise _too_little(recording, len(seen_in), fewest)
     pose_frame = seen_in if recording.odometry is None else np.flatnonzero(moving)
     used = np.flatnonzero(usable)
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
@@ -117,6 +111,16 @@ def prepare_space(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
         recording.landmark_names,
     )  # fmt: skip
+
+
+def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:
+    boxes = np.isfinite(recording.detections.size_m).any()
+    return DataError(
+        f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed",
+        hint="boxes without identities need `odometry`"
+        if boxes
+        else "check landmark ids, and that detections and odometry share one clock",
+    )
 
 
 def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:

@@ -72,7 +72,9 @@ def solve_space(
     identity = np.arange(len(intake.landmark_id))
     noise = DRIVEN if problem.driven else BY_HAND
     by_corners = problem.kind == CORNERS
-    if problem.driven and len(by_corners) and np.mean(by_corners) < 0.5:  # pixels err by themselves, detectors of objects by the view
+    if problem.driven and np.sum(~by_corners) > 0.5 * len(
+        by_corners
+    ):  # pixels err by themselves, detectors of objects by the view
         drift = drift_of(problem, intake.driven_pose)
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
         if drift.translation is not None and drift.rotation is not None:
