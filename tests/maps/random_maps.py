@@ -16,7 +16,9 @@ from evermap.types import UNKNOWN, ChangeKind, Clock, MapChange
 HOUR_S = 3600.0
 
 
-def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, format_1: bool = False) -> LivingMap:
+def random_map(
+    seed: int, *, cliques: int = 6, stamp_s: float | None = None, format_1: bool = False, dim: int = 2
+) -> LivingMap:
     """A consistent map: every clique has one to three landmarks and one or two sites, each with its stays.
 
     Args:
@@ -24,6 +26,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
         cliques: how many.
         stamp_s: of the map; None for any.
         format_1: as it is read where format 1 wrote it, which `data/schema_2.evermap` holds.
+        dim: 3 for one in space, in which about half of the places have an orientation.
     """
     random = np.random.default_rng(seed)
     now_s = float(random.uniform(50, 100) * HOUR_S) if stamp_s is None else stamp_s
@@ -36,7 +39,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
     since_s = random.uniform(0, 40, len(site_clique)) * HOUR_S
     pairs = [(s, n) for s, c in enumerate(site_clique) for n in landmark[clique == c]]
     place_site, place_landmark = np.array(pairs, dtype=np.int64).reshape(-1, 2).T.copy()
-    factor = random.normal(size=(2 * len(pairs), 2 * len(pairs))) * 0.02
+    factor = random.normal(size=(dim * len(pairs), dim * len(pairs))) * 0.02
     order = np.argsort(since_s, kind="stable")
     classes = random.integers(UNKNOWN, 2, cliques)
     lives = Lives(
@@ -74,7 +77,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
         places=Places(
             place_site,
             place_landmark,
-            random.uniform(-20, 20, (len(pairs), 2)),
+            random.uniform(-20, 20, (len(pairs), dim)),
             random.integers(0, 500, len(pairs)),
             random.integers(0, 50, len(pairs)),
         ),
@@ -82,7 +85,7 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
             site_clique[order].astype(np.int64),
             np.arange(len(site_clique))[order],
             classes[site_clique][order],
-            random.uniform(-20, 20, (len(site_clique), 2)),
+            random.uniform(-20, 20, (len(site_clique), dim)),
             np.where(random.random(len(order)) < 0.3, -np.inf, since_s[order] - HOUR_S),
             since_s[order],
             since_s[order] + HOUR_S,
@@ -99,7 +102,9 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
     ended = np.isfinite(living.stays.gone_s)
     if format_1:
         return replace(living, stays=replace(living.stays, p_gone=ended.astype(np.float64)))
-    random = np.random.default_rng([seed, 2])
+    random = np.random.default_rng([seed, dim])
+    if dim == 3:
+        living = replace(living, places=turned(random, living.places))
     return replace(
         living,
         session_start_s=now_s - 0.5 * HOUR_S,
@@ -115,11 +120,22 @@ def random_map(seed: int, *, cliques: int = 6, stamp_s: float | None = None, for
     )
 
 
+def turned(random: np.random.Generator, places: Places) -> Places:
+    """Places in space, with an orientation about every other."""
+    rotation = random.normal(size=(len(places), 4))
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)
+    spread = random.uniform(1e-4, 1e-2, (len(places), 1, 1)) * np.eye(3)
+    points = random.random(len(places)) < 0.5
+    rotation[points], spread[points] = np.nan, np.nan
+    return replace(places, rotation=rotation, rotation_covariance=spread)
+
+
 def random_lines(random: np.random.Generator, places: Places) -> SightLines:
     """Some lines of sight to each place."""
     place = np.repeat(np.arange(len(places)), 4)
-    sensor = places.position_m[place] + random.uniform(-8, 8, (len(place), 2))
-    cell = SightLines.empty().cells(sensor, places.position_m[place])
+    target = places.position_m[place, :2]
+    sensor = target + random.uniform(-8, 8, (len(place), 2))
+    cell = SightLines.empty().cells(sensor, target)
     hit = random.random(len(place)) < 0.5
     lines = SightLines.empty().learned(
         (places.site_id, places.landmark_id), place, cell, hit, random.random(len(place)) + 0.1
@@ -147,10 +163,10 @@ def random_changes(seed: int, living: LivingMap) -> tuple[MapChange, ...]:
     """Some changes, with everything in them that can be unknown."""
     random = np.random.default_rng(seed)
     names = living.members.landmark_id.tolist()
-    dx_m, dy_m = random.normal(size=2).tolist()
+    step_m, nowhere = tuple(random.normal(size=living.dim).tolist()), (np.nan,) * living.dim
     return (
-        MapChange(tuple(names[:2]), ChangeKind.MOVED, 1.5, living.stamp_s, (dx_m, dy_m), 0.0, 0.9, 5, 6),
-        MapChange(tuple(names[2:3]), ChangeKind.APPEARED, np.nan, living.stamp_s, (np.nan, np.nan), 0.0, 0.75, 9, 0),
+        MapChange(tuple(names[:2]), ChangeKind.MOVED, 1.5, living.stamp_s, step_m, 0.0, 0.9, 5, 6),
+        MapChange(tuple(names[2:3]), ChangeKind.APPEARED, np.nan, living.stamp_s, nowhere, 0.0, 0.75, 9, 0),
     )
 
 

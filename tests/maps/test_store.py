@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -50,8 +51,12 @@ def test_revision_zero_is_the_empty_map(store: MapStore) -> None:
     assert_same(store.load(0), LivingMap())
 
 
-def test_every_revision_reads_back_bit_by_bit(store: MapStore) -> None:
-    maps = [random_map(seed, cliques=1 + 2 * seed) for seed in range(8)]
+in_plane_and_space = pytest.mark.parametrize("dim", [2, 3])
+
+
+@in_plane_and_space
+def test_every_revision_reads_back_bit_by_bit(store: MapStore, dim: int) -> None:
+    maps = [random_map(seed, cliques=1 + 2 * seed, dim=dim) for seed in range(8)]
     for number, living in enumerate(maps):
         assert store.commit(living, SESSION, parent=number) == number + 1
     for number, living in enumerate(maps):
@@ -63,7 +68,8 @@ def test_every_revision_reads_back_bit_by_bit(store: MapStore) -> None:
 @given(data=st.data())
 def test_any_numbers_read_back_bit_by_bit(data: st.DataObject, store: MapStore) -> None:
     """Minus zero, subnormal numbers, and infinite stamps too; matrices that are not quite symmetric too."""
-    living = random_map(data.draw(st.integers(0, 5)), cliques=2)
+    dim = data.draw(st.sampled_from([2, 3]))
+    living = random_map(data.draw(st.integers(0, 5)), cliques=2, dim=dim)
     anything = st.floats(allow_nan=True, allow_infinity=True, allow_subnormal=True)
     count, size = len(living.places), len(living.covariance_m2)
     finite = st.floats(allow_nan=False, allow_infinity=False, allow_subnormal=True)
@@ -74,7 +80,7 @@ def test_any_numbers_read_back_bit_by_bit(data: st.DataObject, store: MapStore) 
         living,
         stamp_s=data.draw(anything.filter(lambda x: x == x)),
         covariance_m2=data.draw(st.sampled_from([matrix, symmetric])),
-        places=replace(living.places, position_m=data.draw(hnp.arrays(np.float64, (count, 2), elements=finite))),
+        places=replace(living.places, position_m=data.draw(hnp.arrays(np.float64, (count, dim), elements=finite))),
         members=replace(
             living.members,
             class_id=data.draw(hnp.arrays(np.int64, len(living.members), elements=st.integers(UNKNOWN, 2**63 - 1))),
@@ -104,8 +110,9 @@ def test_the_log_says_where_a_revision_comes_from(store: MapStore) -> None:
     assert first.created_at <= second.created_at
 
 
-def test_changes_read_back(store: MapStore) -> None:
-    living = random_map(4)
+@in_plane_and_space
+def test_changes_read_back(store: MapStore, dim: int) -> None:
+    living = random_map(4, dim=dim)
     changes = random_changes(4, living)
     store.commit(living, SESSION, changes, parent=0)
     store.commit(living, SESSION, parent=1)
@@ -354,6 +361,43 @@ def test_what_format_2_brought_is_checked(part: str, change: dict[str, float], l
     assert line in content.flaw(replace(living, **{part: replace(table, **{name: wrong})}))
 
 
+def test_a_map_in_space_has_columns_that_a_planar_one_does_not_have() -> None:
+    planar, spatial = (json.loads(chunks[name].raw) for name, chunks in map(content.pack, (random_map(2), SPATIAL)))
+    assert (planar["format"], spatial["format"]) == (2, 3)  # an older evermap reads planar maps
+    assert spatial["columns"].keys() - planar["columns"].keys() == {"places.rotation", "places.rotation_covariance"}
+    assert planar["values"].keys() == spatial["values"].keys()
+    assert_same(rewritten(LivingMap.in_space(), lambda manifest: None), LivingMap.in_space())
+    for change in (lambda m: m.update(format=2), lambda m: m["columns"].pop("stays.position_m")):
+        with pytest.raises(content.DamagedError):
+            rewritten(SPATIAL, change)
+
+
+SPATIAL = random_map(6, dim=3)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "change", "line"),
+    [
+        ("places", "rotation", lambda a: 1.1 * a, "a quaternion that is not of length 1"),
+        ("places", "rotation", lambda a: np.where([True, False, False, False], np.nan, a), "not of length 1"),
+        ("places", "rotation", lambda a: a[:, :3], r"'places.rotation' has rows of shape \(3,\), not \(4,\)"),
+        ("places", "rotation_covariance", lambda a: -a, "'places.rotation_covariance' is not a covariance"),
+        ("places", "rotation_covariance", lambda a: np.nan * a, "'places.rotation_covariance' is not a covariance"),
+        ("places", "rotation_covariance", lambda a: a[:-1], "columns of different lengths in 'places'"),
+        ("stays", "position_m", lambda a: a[:, :2], "'stays.position_m' has rows of shape"),
+    ],
+)
+def test_what_maps_in_space_brought_is_checked(
+    table: str, column: str, change: Callable[[np.ndarray], np.ndarray], line: str
+) -> None:
+    part = getattr(SPATIAL, table)
+    other = replace(SPATIAL, **{table: replace(part, **{column: change(getattr(part, column))})})
+    assert content.flaw(SPATIAL) == ""
+    assert re.search(line, content.flaw(other))
+    size = len(SPATIAL.covariance_m2)
+    assert "a covariance of shape" in content.flaw(replace(SPATIAL, covariance_m2=np.eye(size // 3 * 2)))
+
+
 @pytest.mark.parametrize("column", ["sightlines.cell", "views.heading", "stays.p_gone", "sightlines.hidden"])
 def test_columns_of_other_lengths_are_a_flaw(column: str) -> None:
     living = random_map(6)
@@ -371,7 +415,7 @@ def test_columns_of_other_lengths_are_a_flaw(column: str) -> None:
             lambda m: m["values"].update(colour="red"),
             "it holds 'colour', which this evermap does not know",
         ),
-        (lambda m: m.update(format=3), "columns of format 3, this evermap reads 1 and 2"),
+        (lambda m: m.update(format=4), "columns of format 4, this evermap reads 1 to 3"),
     ],
 )
 def test_what_this_evermap_does_not_know_is_not_dropped(change: Callable[[dict[str, Any]], None], line: str) -> None:

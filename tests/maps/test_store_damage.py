@@ -17,12 +17,12 @@ from evermap.maps.store import DamagedMapError, Provenance, content, open_store,
 
 
 @pytest.fixture
-def path(tmp_path: Path) -> Path:
-    """A map with three revisions."""
+def path(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """A map with three revisions, in the plane; in space with the parameter 3."""
     path = tmp_path / "m.evermap"
     with open_store(path, create=True) as store:
         for seed in range(3):
-            living = random_map(seed)
+            living = random_map(seed, dim=getattr(request, "param", 2))
             changes, evidence = random_changes(seed, living), random_evidence(seed, living)
             store.commit(living, Provenance(config="x = 1"), changes, evidence, parent=seed)
     return path
@@ -32,7 +32,8 @@ def use_all(path: Path) -> None:
     """Everything that reads. What it gives of maps is what was written."""
     with open_store(path) as store:
         for number in range(1, store.head() + 1):
-            assert_same(store.load(number), random_map(number - 1))
+            living = store.load(number)
+            assert_same(living, random_map(number - 1, dim=living.dim))
             store.changes(number)
         store.log()
         store.lineage()
@@ -49,7 +50,9 @@ def said_of(path: Path) -> str:
     return ""
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize(
+    ("path", "seed"), [*((2, k) for k in range(60)), *((3, k) for k in range(20))], indirect=["path"]
+)
 def test_flipped_bytes_give_the_truth_or_a_line(path: Path, seed: int) -> None:
     random = np.random.default_rng(seed)
     content = bytearray(path.read_bytes())
@@ -60,6 +63,7 @@ def test_flipped_bytes_give_the_truth_or_a_line(path: Path, seed: int) -> None:
     assert not line or (line.startswith(f"{path}: ") and "(try: " in line)
 
 
+@pytest.mark.parametrize("path", [2, 3], indirect=True)
 @pytest.mark.parametrize("share", [0.001, 0.03, 0.3, 0.7, 0.99])
 def test_a_file_that_was_cut_off_is_damaged(path: Path, share: float) -> None:
     content = path.read_bytes()

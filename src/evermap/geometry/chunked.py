@@ -39,7 +39,7 @@ FLOOR_M2 = 1e-10
 """Variance by which matrices that are inverted are kept definite: a hundredth of a millimetre."""
 
 Joint = Callable[[IntArray, IntArray], FloatArray]
-"""(2 A, 2 B) covariance of points of some rows with those of others."""
+"""(2 A, 2 B) covariance of points of some rows with those of others; in space 3 for 2, as everywhere here."""
 
 
 class Part:
@@ -71,7 +71,7 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class ChunkedCovariance:
-    """Joint covariance of P points in the plane, x and y interleaved.
+    """Joint covariance of P points in the plane, x and y interleaved; of points in space (x, y, z), and 3 for 2.
 
     Attributes:
         chunk: (P,) chunk of every point, 0 to C - 1; within a chunk points are in the order of their rows.
@@ -92,45 +92,53 @@ class ChunkedCovariance:
     def __len__(self) -> int:
         return len(self.chunk)
 
+    @property
+    def dim(self) -> int:
+        """Coordinates of a point: 2, or 3 in space."""
+        return int(self.each_m2.shape[-1])
+
     @classmethod
-    def empty(cls) -> Self:
+    def empty(cls, dim: int = 2) -> Self:
         """Return the covariance of no points."""
         none = np.zeros(0, dtype=np.int64)
-        return cls(none, none, np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64), np.zeros((0, 2, 2)), ())
+        return cls(none, none, np.zeros((0, dim)), np.zeros((0, 2), dtype=np.int64), np.zeros((0, dim, dim)), ())
 
     @classmethod
     def of_points(cls, position_m: FloatArray, joint: Joint) -> Self:
         """Cut points (P, 2) into chunks, and keep what `joint` says of neighbouring ones."""
+        dim = position_m.shape[1]
         chunk = _halved(position_m)
         centre = _centres(chunk, position_m, int(chunk.max(initial=-1)) + 1)
         parent = np.full(len(centre), -1, dtype=np.int64)
         for c in range(1, len(centre)):
             parent[c] = np.argmin(((centre[:c] - centre[c]) ** 2).sum(axis=1))
         pair = _pairs(centre, parent)
-        index = _Index.of(chunk, pair)
-        each, parts = np.zeros((len(chunk), 2, 2)), []
+        index = _Index.of(chunk, pair, dim)
+        each, parts = np.zeros((len(chunk), dim, dim)), []
         for g in range(len(index.group) - 1):
             found = []
             for a, b in pair[index.group[g] : index.group[g + 1]].tolist():
                 block = joint(index.points(a), index.points(b))
                 found.append(block.ravel())
                 if a == b:
-                    each[index.points(a)] = _of_each(block)
+                    each[index.points(a)] = _of_each(block, dim)
             parts.append(Part(np.concatenate(found)))
         return cls(chunk, parent, centre, pair, each, tuple(parts))
 
     @classmethod
     def of_dense(cls, position_m: FloatArray, covariance_m2: FloatArray) -> Self:
         """Cut points (P, 2) with a joint covariance (2 P, 2 P) into chunks."""
-        return cls.of_points(position_m, lambda a, b: covariance_m2[np.ix_(se2.xy_rows(a), se2.xy_rows(b))])
+        dim = position_m.shape[1]
+        return cls.of_points(position_m, lambda a, b: covariance_m2[np.ix_(se2.xy_rows(a, dim), se2.xy_rows(b, dim))])
 
-    def flaw(self, count: int) -> str:
+    def flaw(self, count: int, dim: int = 2) -> str:
         """Tell in what this contradicts itself, or is not of so many points; '' if it is consistent."""
         n = len(self.parent)
         own = self.pair[self.pair[:, 0] == self.pair[:, 1], 0]
         good = (
-            len(self.chunk) == len(self.each_m2) == count
-            and len(self.centre_m) == n
+            len(self.chunk) == count
+            and self.each_m2.shape == (count, dim, dim)
+            and self.centre_m.shape == (n, dim)
             and (self.chunk.min(initial=0) >= 0 and self.chunk.max(initial=-1) < n)
             and (self.parent < np.arange(n)).all()
             and (self.pair.min(initial=0) >= 0 and self.pair.max(initial=-1) < n)
@@ -148,7 +156,7 @@ class ChunkedCovariance:
 
     @functools.cached_property
     def _index(self) -> _Index:
-        return _Index.of(self.chunk, self.pair)
+        return _Index.of(self.chunk, self.pair, self.dim)
 
     def of(self, rows: IntArray) -> FloatArray:
         """Return (2 K, 2 K) joint covariance of points (K,), in their order."""
@@ -159,13 +167,13 @@ class ChunkedCovariance:
         points, joint = self._completed(self._connected(wanted))
         place = np.empty(len(self), dtype=np.int64)
         place[points] = np.arange(len(points))
-        at = se2.xy_rows(place[rows])
+        at = se2.xy_rows(place[rows], self.dim)
         return np.asarray(joint[np.ix_(at, at)])
 
     def taken(self, rows: IntArray) -> Self:
         """Return the covariance of points (K,), each at most once, in this order; chunks keep their numbers."""
         chunk = self.chunk[rows]
-        index, now = self._index, _Index.of(chunk, self.pair)
+        index, now = self._index, _Index.of(chunk, self.pair, self.dim)
         within = np.empty(len(self), dtype=np.int64)
         within[index.order] = np.arange(len(self)) - index.start[self.chunk[index.order]]
         size = np.diff(index.start)
@@ -173,7 +181,7 @@ class ChunkedCovariance:
         same = np.array([np.array_equal(mine, np.arange(n)) for mine, n in zip(kept, size.tolist(), strict=True)])
         fresh = {}
         for q in np.flatnonzero(~same[self.pair].all(axis=1)).tolist():
-            i, j = (se2.xy_rows(kept[c]) for c in self.pair[q].tolist())
+            i, j = (se2.xy_rows(kept[c], self.dim) for c in self.pair[q].tolist())
             fresh[q] = self._block(q)[np.ix_(i, j)].ravel()
         parts = self._parts(now, fresh, np.arange(len(self.pair)))
         return replace(self, chunk=chunk, each_m2=self.each_m2[rows], parts=parts)
@@ -224,23 +232,23 @@ class ChunkedCovariance:
         code, old_code = pair @ [n_chunks, 1], self.pair @ [n_chunks, 1]
         code = np.union1d(code[touched[pair].any(axis=1)], old_code[~touched[self.pair].any(axis=1)])
         pair = np.column_stack([code // n_chunks, code % n_chunks])
-        index = _Index.of(chunk, pair)
+        index = _Index.of(chunk, pair, self.dim)
         is_fresh = touched[pair].any(axis=1)
         fresh = self._told(index, np.flatnonzero(is_fresh), told, of_old, new)
         was = np.where(is_fresh, -1, np.searchsorted(old_code, code))
-        each = np.empty((len(chunk), 2, 2))
+        each = np.empty((len(chunk), self.dim, self.dim))
         each[kept] = self.each_m2[new.was[kept]]
         for q, block in fresh.items():
             a, b = pair[q].tolist()
             if a == b:
-                each[index.points(a)] = _of_each(block.reshape(2 * len(index.points(a)), -1))
+                each[index.points(a)] = _of_each(block.reshape(self.dim * len(index.points(a)), -1), self.dim)
         return type(self)(chunk, parent, centre, pair, each, self._parts(index, fresh, was))
 
     def _told(
         self, index: _Index, fresh: IntArray, told: BoolArray, of_old: IntArray, new: Update
     ) -> dict[int, FloatArray]:
         """Blocks of the pairs `fresh` of the new covariance."""
-        pair = index.pair
+        pair, dim = index.pair, self.dim
         points = np.flatnonzero(np.isin(index.chunk, pair[fresh].ravel()))
         rest = points[~told[points]]
         row = np.full(len(index.chunk), -1, dtype=np.int64)
@@ -249,15 +257,15 @@ class ChunkedCovariance:
         old = learned[of_old[learned] >= 0]  # those that were known before
         place_of_rest = np.full(len(index.chunk), -1, dtype=np.int64)
         place_of_rest[rest] = np.arange(len(rest))
-        across = np.zeros((2 * len(new.rows), 2 * len(rest)))
-        own = np.zeros((2 * len(rest), 2 * len(rest)))
+        across = np.zeros((dim * len(new.rows), dim * len(rest)))
+        own = np.zeros((dim * len(rest), dim * len(rest)))
         if len(rest):
             beside = old[np.isin(index.chunk[old], pair[np.isin(pair, index.chunk[rest]).any(axis=1)])]
             joint = self.of(of_old[np.concatenate([beside, rest])])
-            n = 2 * len(beside)
+            n = dim * len(beside)
             own = joint[n:, n:]
             if n:
-                s = se2.xy_rows(row[beside])
+                s = se2.xy_rows(row[beside], dim)
                 after = new.covariance_m2[np.ix_(s, s)] + FLOOR_M2 * np.eye(n)
                 carried = _transport(joint[:n, :n] + FLOOR_M2 * np.eye(n), after) @ joint[:n, n:]
                 across = new.covariance_m2[:, s] @ cho_solve(cho_factor(after), carried)
@@ -265,7 +273,7 @@ class ChunkedCovariance:
         found = {}
         for q in fresh.tolist():
             a, b = (index.points(int(c)) for c in pair[q])
-            block = np.empty((len(a), 2, len(b), 2))
+            block = np.empty((len(a), dim, len(b), dim))
             ta, tb = np.flatnonzero(told[a]), np.flatnonzero(told[b])
             ra, rb = np.flatnonzero(~told[a]), np.flatnonzero(~told[b])
             for i, j, source, rows, columns in (
@@ -274,7 +282,8 @@ class ChunkedCovariance:
                 (ra, tb, across.T, place_of_rest[a[ra]], row[b[tb]]),
                 (ra, rb, own, place_of_rest[a[ra]], place_of_rest[b[rb]]),
             ):
-                part = source[np.ix_(se2.xy_rows(rows), se2.xy_rows(columns))].reshape(len(i), 2, len(j), 2)
+                part = source[np.ix_(se2.xy_rows(rows, dim), se2.xy_rows(columns, dim))]
+                part = part.reshape(len(i), dim, len(j), dim)
                 block[i[:, None], :, j[None], :] = part.transpose(0, 2, 1, 3)
             found[q] = block.ravel()
         return found
@@ -282,13 +291,11 @@ class ChunkedCovariance:
     def _block(self, q: int) -> FloatArray:
         """The block of a pair."""
         index = self._index
-        a, b = self.pair[q].tolist()
-        g = a // CHUNKS_A_PART
+        g = int(self.pair[q, 0]) // CHUNKS_A_PART
         begin = index.first[index.group[g]]
         values = self.parts[g].values[index.first[q] - begin : index.first[q + 1] - begin]
-        return values.reshape(2 * int(index.start[a + 1] - index.start[a]), -1) if len(values) else np.zeros(
-            (2 * int(index.start[a + 1] - index.start[a]), 2 * int(index.start[b + 1] - index.start[b]))
-        )  # fmt: skip
+        rows, columns = (self.dim * int(index.start[c + 1] - index.start[c]) for c in self.pair[q].tolist())
+        return values.reshape(rows, columns)
 
     def _between(self, a: int, b: int) -> FloatArray:
         """The block of two neighbouring chunks in either order."""
@@ -321,7 +328,7 @@ class ChunkedCovariance:
         index, near = self._index, self._near(chunks)
         order = self._elimination(near)
         size = np.diff(index.start)
-        first = np.concatenate([[0], np.cumsum(2 * size[list(order)])]).astype(np.int64)
+        first = np.concatenate([[0], np.cumsum(self.dim * size[list(order)])]).astype(np.int64)
         at = {c: slice(int(first[k]), int(first[k + 1])) for k, c in enumerate(order)}
         joint = np.zeros((int(first[-1]), int(first[-1])))
         for c, given in order.items():
@@ -393,28 +400,33 @@ class ChunkedCovariance:
         return order
 
 
-def of_places(covariance_m2: JointCovariance, rows: IntArray) -> FloatArray:
-    """Return (2 K, 2 K) joint covariance of some points, in their order; of independent ones (P, 2, 2), (K, 2, 2)."""
+def of_places(covariance_m2: JointCovariance, rows: IntArray, dim: int = 2) -> FloatArray:
+    """Return (2 K, 2 K) joint covariance of some points, in their order; of independent ones (P, 2, 2), (K, 2, 2).
+
+    Of points in space with `dim=3`, which only a dense one has to be told.
+    """
     if isinstance(covariance_m2, ChunkedCovariance):
         return covariance_m2.of(rows)
     if covariance_m2.ndim == 3:
         return np.asarray(covariance_m2[rows])
-    at = se2.xy_rows(rows)
+    at = se2.xy_rows(rows, dim)
     return np.asarray(covariance_m2[np.ix_(at, at)])
 
 
-def taken(covariance_m2: JointCovariance, rows: IntArray) -> JointCovariance:
+def taken(covariance_m2: JointCovariance, rows: IntArray, dim: int = 2) -> JointCovariance:
     """Return the covariance of some points, in their order and in the form that it has."""
-    return covariance_m2.taken(rows) if isinstance(covariance_m2, ChunkedCovariance) else of_places(covariance_m2, rows)
+    if isinstance(covariance_m2, ChunkedCovariance):
+        return covariance_m2.taken(rows)
+    return of_places(covariance_m2, rows, dim)
 
 
-def blocks(covariance_m2: JointCovariance) -> FloatArray:
+def blocks(covariance_m2: JointCovariance, dim: int = 2) -> FloatArray:
     """Return (P, 2, 2) covariance of every point by itself."""
     if isinstance(covariance_m2, ChunkedCovariance):
         return covariance_m2.each_m2
     if covariance_m2.ndim == 3:
         return covariance_m2
-    return _of_each(covariance_m2)
+    return _of_each(covariance_m2, dim)
 
 
 class Update(NamedTuple):
@@ -457,12 +469,12 @@ class _Index:
     pair: IntArray
 
     @classmethod
-    def of(cls, chunk: IntArray, pair: IntArray) -> Self:
+    def of(cls, chunk: IntArray, pair: IntArray, dim: int) -> Self:
         n_chunks = int(pair.max(initial=-1)) + 1
         order = np.argsort(chunk, kind="stable")
         start = np.searchsorted(chunk[order], np.arange(n_chunks + 1))
         size = np.diff(start)
-        first = np.concatenate([[0], np.cumsum(4 * size[pair[:, 0]] * size[pair[:, 1]])]).astype(np.int64)
+        first = np.concatenate([[0], np.cumsum(dim**2 * size[pair[:, 0]] * size[pair[:, 1]])]).astype(np.int64)
         begins = np.arange(0, n_chunks + CHUNKS_A_PART, CHUNKS_A_PART) if n_chunks else np.zeros(1, dtype=np.int64)
         group = np.searchsorted(pair[:, 0], np.minimum(begins, n_chunks))
         return cls(chunk, order, start.astype(np.int64), first, group.astype(np.int64), pair)
@@ -487,11 +499,11 @@ class _Index:
         return csr_array((ones, (np.append(a, b), np.append(b, a))), shape=(n, n))
 
 
-def _of_each(block: FloatArray) -> FloatArray:
+def _of_each(block: FloatArray, dim: int) -> FloatArray:
     """(n, 2, 2) of every point by itself, of (2 n, 2 n)."""
-    n = len(block) // 2
+    n = len(block) // dim
     rows = np.arange(n)
-    return np.asarray(block.reshape(n, 2, n, 2)[rows, :, rows, :])
+    return np.asarray(block.reshape(n, dim, n, dim)[rows, :, rows, :])
 
 
 def _transport(before: FloatArray, after: FloatArray) -> FloatArray:
@@ -531,7 +543,7 @@ def _centres(chunk: IntArray, position_m: FloatArray, n_chunks: int) -> FloatArr
     """(C, 2) middles of chunks; nan of empty ones."""
     count = np.bincount(chunk, minlength=n_chunks)
     with np.errstate(invalid="ignore"):
-        sums = [np.bincount(chunk, position_m[:, k], minlength=n_chunks) / count for k in (0, 1)]
+        sums = [np.bincount(chunk, axis, minlength=n_chunks) / count for axis in position_m.T]
     return np.column_stack(sums)
 
 

@@ -156,9 +156,12 @@ def rotation(angle_rad: ArrayLike) -> FloatArray:
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
 
 
-def xy_rows(rows: ArrayLike) -> IntArray:
-    """Return (2 k,) rows of x and y, interleaved, of points (k,) in a vector or covariance of all points together."""
-    return np.asarray(2 * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(2)).ravel()
+def xy_rows(rows: ArrayLike, dim: int = 2) -> IntArray:
+    """Return (2 k,) rows of x and y, interleaved, of points (k,) in a vector or covariance of all points together.
+
+    Of x, y and z with `dim=3`, (3 k,).
+    """
+    return np.asarray(dim * np.asarray(rows, dtype=np.int64)[:, None] + np.arange(dim)).ravel()
 
 
 def rigid_directions(point: ArrayLike) -> FloatArray:

@@ -10,6 +10,7 @@ A landmark that the earlier map did not know, and that nobody saw appear, has no
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -18,13 +19,16 @@ from typing import Any
 import numpy as np
 
 from evermap.config import DecisionConfig
+from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
-from evermap.maps.living import LivingMap, Members
+from evermap.maps.living import TURNS, LivingMap, Members
 from evermap.maps.store.protocol import MapStore
 from evermap.show import Shown, data_frame
 from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Landmarks, MapChange
 
 USUAL = DecisionConfig()
+SAME_TURN_RAD = 0.3
+"""Bodies in space that are turned by less stand as they did."""
 ToldBySession = tuple[Sequence[MapChange], bool]
 """Changes that a session told, and whether they are undone."""
 _COMES = frozenset({ChangeKind.APPEARED, ChangeKind.RETURNED})
@@ -174,10 +178,27 @@ def edits(a: Members, b: Members) -> tuple[tuple[int, str], ...]:
     return tuple(sorted(words))
 
 
-def motion_of(was_m: FloatArray, now_m: FloatArray) -> tuple[FloatArray, float]:
-    """Return shift and rotation of a body by its landmarks (K, 2) before and after; 0 is the rotation of one."""
+def motion_of(
+    was_m: FloatArray, now_m: FloatArray, turns: tuple[FloatArray, FloatArray] | None = None
+) -> tuple[FloatArray, float]:
+    """Return shift and rotation of a body by its landmarks (K, 2) before and after; 0 is the rotation of one.
+
+    In space (K, 3), with quaternions `turns` (K, 4) before and after, the rotation is an angle without a sign: the
+    median one of the landmarks that have an orientation, else by the positions of three and more.
+    """
     shift = now_m.mean(axis=0) - was_m.mean(axis=0)
-    return shift, float(rigid(was_m, now_m)[2]) if len(was_m) > 1 else 0.0
+    if turns is None:
+        return shift, float(rigid(was_m, now_m)[2]) if len(was_m) > 1 else 0.0
+    known = np.isfinite(turns[0][:, 0]) & np.isfinite(turns[1][:, 0])
+    if known.any():
+        was, now = (np.hstack([at[known], turn[known]]) for at, turn in zip((was_m, now_m), turns, strict=True))
+        return shift, float(np.median(se3.angle_between(was, now)))
+    return shift, float(se3.angle_between(se3.identity(), rigid(was_m, now_m))) if len(was_m) > 2 else 0.0
+
+
+def elsewhere(shift: FloatArray, turn: float, same_spot_m: float) -> bool:
+    """Return whether a body is at another place after a motion, or in space turned at its own."""
+    return bool(math.hypot(*shift) >= same_spot_m or (len(shift) > 2 and abs(turn) >= SAME_TURN_RAD))
 
 
 def with_swaps(
@@ -188,7 +209,7 @@ def with_swaps(
 
     def at(records: Landmarks, names: tuple[int, ...]) -> FloatArray:
         rows = np.isin(records.landmark_id, names)
-        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(2, np.nan)
+        return np.asarray(records.position_m[rows].mean(axis=0)) if rows.any() else np.full(_dim(before, after), np.nan)
 
     moved = [k for k, change in enumerate(found) if change.kind is ChangeKind.MOVED]
     was = {k: at(then, found[k].landmark_ids) for k in moved}
@@ -226,7 +247,8 @@ def _composed(
     """The net effect of changes of the same landmarks; None for none."""
     first, last = path[0], path[-1]
     came, goes = [k for k, one in enumerate(path) if one.comes], last.goes
-    shift, turn = np.full(2, np.nan), 0.0
+    nowhere = np.full(_dim(*maps), np.nan)
+    shift, turn = nowhere, 0.0
     if first.comes and goes:
         return None
     if goes:
@@ -236,9 +258,9 @@ def _composed(
         if first.comes:
             new = first.change.kind is ChangeKind.APPEARED
             kind = ChangeKind.APPEARED if new else ChangeKind.RETURNED
-            shift, turn = (np.full(2, np.nan), 0.0) if new else (shift, turn)
+            shift, turn = (nowhere, 0.0) if new else (shift, turn)
             rests_on = path[came[-1] :]
-        elif np.hypot(*shift) < same_spot_m:
+        elif not elsewhere(shift, turn, same_spot_m):
             return None
         else:
             kind, rests_on = ChangeKind.MOVED, path
@@ -248,7 +270,7 @@ def _composed(
         kind=kind,
         stamp_from_s=float(np.min(from_s)),
         stamp_to_s=float(np.max(to_s)),
-        displacement_m=(float(shift[0]), float(shift[1])),
+        displacement_m=tuple(shift.tolist()),
         rotation_rad=turn,
         probability=float(np.prod([one.change.probability for one in rests_on])),
         n_hits=sum(one.change.n_hits for one in rests_on),
@@ -258,23 +280,33 @@ def _composed(
 
 def _shift(path: Sequence[Told], names: tuple[int, ...], a: LivingMap, b: LivingMap) -> tuple[FloatArray, float]:
     """Shift and rotation from the places in one map to those in the other; where these are unknown, as was told."""
-    ids = np.array(names)
-    was, now = _places_m(a, ids), _places_m(b, ids)
+    was, now = (_poses(living, np.array(names), _dim(a, b)) for living in (a, b))
     both = np.isfinite(was[:, 0]) & np.isfinite(now[:, 0])
     if both.any():
-        return motion_of(was[both], now[both])
+        (was_m, was_turned), (now_m, now_turned) = (np.split(at[both], [_dim(a, b)], axis=1) for at in (was, now))
+        return motion_of(was_m, now_m, (was_turned, now_turned) if was_turned.size else None)
     told = [np.multiply(one.change.displacement_m, -1.0 if one.undone else 1.0) for one in path if not one.goes]
     return np.asarray(np.sum(told, axis=0)), sum(one.change.rotation_rad for one in path)
 
 
-def _places_m(living: LivingMap, names: IntArray) -> FloatArray:
-    """(K, 2) where landmarks are said to stand, else where they were most probably; nan where the map does not know."""
-    position = np.full((len(names), 2), np.nan)
+def _poses(living: LivingMap, names: IntArray, dim: int) -> FloatArray:
+    """(K, 2) where landmarks are said to stand, else where they were most probably; in space (K, 7), with orientations.
+
+    What the map does not know is nan.
+    """
+    pose = np.full((len(names), dim + TURNS[dim]), np.nan)
     _, row, at = np.intersect1d(names, living.members.landmark_id, return_indices=True)
     told, best = living.told_site()[at], living.site_of()[at]
     place = living.place_row(names[row], np.where(told == UNKNOWN, best, told))
-    position[row[place >= 0]] = living.places.position_m[place[place >= 0]]
-    return position
+    row, place = row[place >= 0], place[place >= 0]
+    if len(row):
+        pose[row] = np.hstack([living.places.position_m[place], living.places.rotation[place]])
+    return pose
+
+
+def _dim(a: LivingMap, b: LivingMap) -> int:
+    """Coordinates of a position in two maps of one place; an empty one does not know."""
+    return max(a.dim, b.dim)
 
 
 def _standing(living: LivingMap) -> set[int]:

@@ -390,7 +390,7 @@ def _of_chunks(
 
     mine = np.flatnonzero(history.recent & (history.kind == row))
     chunks, which = np.unique(
-        np.floor(history.stays.position_m[mine] / chunk_m).astype(np.int64), axis=0, return_inverse=True
+        np.floor(history.stays.position_m[mine, :2] / chunk_m).astype(np.int64), axis=0, return_inverse=True
     )
     if len(chunks) < 2:
         return []

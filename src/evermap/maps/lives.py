@@ -76,10 +76,10 @@ class Lives:
 
         Args:
             class_id: of the class.
-            position_m: (2,) where; None for the whole floor.
+            position_m: (2,), in space (3,), where; None for the whole floor.
         """
         if position_m is not None:
-            here = np.floor(np.asarray(position_m) / self.chunk_m).astype(np.int64)
+            here = np.floor(np.asarray(position_m)[:2] / self.chunk_m).astype(np.int64)
             if (learned := self._learned(class_id, here)) is not None:
                 return learned
         if (learned := self._learned(class_id, _ANYWHERE)) is not None:

@@ -32,10 +32,14 @@ if TYPE_CHECKING:
 EXISTS = 0.5
 """What exists with at least this probability is in the map."""
 
+SURVEYED = 0.95
+"""Belief in landmarks of a survey, at most: some were moved since."""
 MOST_DIGITS = 18
 """Of ids of landmarks, which are 64 bits wide."""
 
 
+TURNS, AXES = {2: 0, 3: 4}, {2: 0, 3: 3}
+"""Numbers of an orientation, and of its covariance's rows, of places in the plane and in space."""
 _DTYPES: dict[str, type] = {"IntArray": np.int64, "FloatArray": np.float64, "BoolArray": np.bool_}
 
 
@@ -48,9 +52,10 @@ class _Rows(ShownTable):
         return len(getattr(self, fields(self)[0].name))
 
     @classmethod
-    def empty(cls) -> Self:
-        """Return a table of no rows."""
-        return cls(*(np.zeros((0, 2) if f.name == "position_m" else 0, _DTYPES[str(f.type)]) for f in fields(cls)))
+    def empty(cls, dim: int = 2) -> Self:
+        """Return a table of no rows, of the plane or, with `dim=3`, of space."""
+        shapes = {"position_m": (0, dim), "rotation": (0, TURNS[dim]), "rotation_covariance": (0, *2 * (AXES[dim],))}
+        return cls(*(np.zeros(shapes.get(f.name, (0,)), _DTYPES[str(f.type)]) for f in fields(cls)))
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
         """Some of the rows, by number or by a mask."""
@@ -108,8 +113,10 @@ class Places(_Rows):
 
     Attributes:
         site_id, landmark_id: where this landmark is while its clique stands at this site.
-        position_m: (P, 2) in the map's frame.
+        position_m: (P, 2) in the map's frame, in space (P, 3).
         n_hits, n_misses: (P,) detections there, and looks without one that expected it.
+        rotation: in space (P, 4) quaternion of landmarks that have an orientation, nan of points; (P, 0) in the plane.
+        rotation_covariance: (P, 3, 3) of it, in the landmark's own axes [rad^2]; (P, 0, 0) in the plane.
     """
 
     site_id: IntArray
@@ -117,6 +124,14 @@ class Places(_Rows):
     position_m: FloatArray
     n_hits: IntArray
     n_misses: IntArray
+    rotation: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    rotation_covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 0)))
+
+    def __post_init__(self) -> None:
+        count, dim = self.position_m.shape
+        if not self.rotation.size:  # nobody said
+            object.__setattr__(self, "rotation", np.full((count, TURNS[dim]), np.nan))
+            object.__setattr__(self, "rotation_covariance", np.full((count, AXES[dim], AXES[dim]), np.nan))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +140,7 @@ class Stays(_Rows):
 
     Attributes:
         clique_id, site_id, class_id: what and where.
-        position_m: (K, 2) middle of the clique there.
+        position_m: (K, 2) middle of the clique there, in space (K, 3).
         elsewhere_s: last look before `first_s` at which it was not there; -inf where its place was never looked at.
         first_s, last_s: first and last sighting.
         gone_s: first look after `last_s` at which it was not there; inf while it is said to stand there.
@@ -188,7 +203,8 @@ class LivingMap(Shown):
         session_start_s: begin of the newest session; one that begins earlier is late.
         members, sites, places, stays, dated: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y interleaved, as if the map's size were known;
-            or (P, 2, 2) blocks, while the places are independent; in chunks where there are many.
+            or (P, 2, 2) blocks, while the places are independent; in chunks where there are many; with 3 for 2 in
+            space.
         log_size_variance: variance of the log of the map's metre over the true one; 0 where a sensor knows the metre.
         log_size_information: sum of the inverse variances of that, of all sessions of which the metre is the mean.
         lives: how long things of a class stay, stay away, and where they turn up again.
@@ -220,6 +236,52 @@ class LivingMap(Shown):
     clock: Clock = Clock.RECORDING
     n_cliques_ever: int = 0
     n_sites_ever: int = 0
+
+    @classmethod
+    def in_space(cls, clock: Clock = Clock.RECORDING) -> Self:
+        """Return a map of three dimensions before its first session."""
+        return cls(places=Places.empty(3), stays=Stays.empty(3), clock=clock)
+
+    @classmethod
+    def begun(cls, landmarks: Landmarks) -> Self:
+        """Return a map of landmarks that somebody surveyed, each a body by itself, before its first session.
+
+        They are taken to have been seen when that begins.
+        """
+        order = np.argsort(landmarks.landmark_id, kind="stable")
+        names, count = landmarks.landmark_id[order], len(order)
+        number, none = np.arange(count), np.zeros(count, dtype=np.int64)
+        off, then = np.zeros(count, dtype=np.bool_), np.zeros(count)
+        p_here = np.clip(landmarks.p_exists[order], 0.0, SURVEYED)
+        position = landmarks.position_m[order]
+        dim = position.shape[1]
+        turns = [part[order] for part in (landmarks.rotation, landmarks.rotation_covariance) if part is not None]
+        covariance = np.zeros((count, dim, count, dim))
+        covariance[number, :, number] = landmarks.covariance_m2[order]
+        return cls(
+            members=Members(names, landmarks.class_id[order], number, off, off),
+            sites=Sites(number, number, p_here, p_here, then, then),
+            places=Places(number, names, position, none, none, *turns),
+            stays=Stays.empty(dim),
+            covariance_m2=covariance.reshape(dim * count, dim * count),
+            class_names=landmarks.class_names,
+            landmark_texts=tuple(sorted(landmarks.names.values())),
+            clock=landmarks.clock,
+            n_cliques_ever=count,
+            n_sites_ever=count,
+        )
+
+    def from_now_on(self, stamp_s: float) -> Self:
+        """Return the map at its first session, which begins at `stamp_s`: what was surveyed is seen until then."""
+        if np.isfinite(self.stamp_s) or not len(self.places):
+            return self
+        then = np.full(len(self.sites), stamp_s)
+        return replace(self, stamp_s=stamp_s, sites=replace(self.sites, since_s=then, seen_s=then))
+
+    @property
+    def dim(self) -> int:
+        """Coordinates of a position: 2, or 3 in space."""
+        return int(self.places.position_m.shape[1])
 
     def _facts(self) -> dict[str, Any]:
         exists = (self.p_exists() >= EXISTS) & ~self.members.deleted
@@ -350,7 +412,7 @@ class LivingMap(Shown):
                 raise InputError(
                     f"{within!r} is not a box", field="within", hint="(x_min, y_min, x_max, y_max) in metres"
                 )
-            position = self.places.position_m[row[kept]]
+            position = self.places.position_m[row[kept], :2]
             kept = kept[((position >= box[:2]) & (position <= box[2:])).all(axis=1)]
         row = row[kept]
         return self._records(row, self.place_covariance_m2(row), p_exists[kept])
@@ -359,6 +421,7 @@ class LivingMap(Shown):
         """Places (K,) as plain records."""
         site = np.searchsorted(self.sites.site_id, self.places.site_id[row])
         name = self.places.landmark_id[row]
+        oriented = self.dim == 3 and bool(np.isfinite(self.places.rotation).any())
         return Landmarks(
             landmark_id=name,
             position_m=self.places.position_m[row],
@@ -373,14 +436,16 @@ class LivingMap(Shown):
             frame="prior_map",
             clock=self.clock,
             names=self.landmark_names,
+            rotation=self.places.rotation[row] if oriented else None,
+            rotation_covariance=self.places.rotation_covariance[row] if oriented else None,
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
         """Return (K, 2, 2) covariance of places (K,), with what is not known of the map's size, about its middle."""
-        middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(2)
+        middle = self.places.position_m.mean(axis=0) if len(self.places) else np.zeros(self.dim)
         arm = self.places.position_m[row] - middle
         size = self.log_size_variance * arm[:, :, None] * arm[:, None, :]
-        return np.asarray(blocks(self.covariance_m2)[row] + size)
+        return np.asarray(blocks(self.covariance_m2, self.dim)[row] + size)
 
     def sighted_rows(self, p_site: FloatArray) -> Landmarks:
         """Return every place as a record of its own, in the order of `places`: what a robot may meet.
@@ -391,7 +456,7 @@ class LivingMap(Shown):
         site = np.searchsorted(self.sites.site_id, self.places.site_id)
         member = np.searchsorted(self.members.landmark_id, self.places.landmark_id)
         rows = np.arange(len(self.places))
-        own = blocks(self.covariance_m2)
+        own = blocks(self.covariance_m2, self.dim)
         return self._records(rows, own, np.where(self.members.deleted[member], 0.0, p_site[site]))
 
     def edited(self, landmark_id: int, *, pinned: bool | None = None, deleted: bool | None = None) -> LivingMap:
@@ -420,7 +485,7 @@ class LivingMap(Shown):
             dated=self.dated[np.isin(self.dated.site_id, places.site_id)],
             places=places,
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
-            covariance_m2=taken(self.covariance_m2, kept),
+            covariance_m2=taken(self.covariance_m2, kept, self.dim),
         )
 
 
@@ -444,8 +509,8 @@ def class_of(living: LivingMap, cliques: IntArray) -> IntArray:
 
 
 def site_middles(living: LivingMap) -> FloatArray:
-    """Return (S, 2) mean position of the places of every site."""
+    """Return (S, 2) mean position of the places of every site, in space (S, 3)."""
     row = np.searchsorted(living.sites.site_id, living.places.site_id)
     count = np.maximum(np.bincount(row, minlength=len(living.sites)), 1)
-    columns = [np.bincount(row, living.places.position_m[:, k], minlength=len(living.sites)) / count for k in (0, 1)]
+    columns = [np.bincount(row, axis, minlength=len(living.sites)) / count for axis in living.places.position_m.T]
     return np.column_stack(columns)

@@ -67,7 +67,9 @@ class Vicinity:
         )
         if len(part.dated):
             part = replace(part, sites=aged(part, config, living.stamp_s), dated=Dated.empty())
-        return cls(living, replace(part, covariance_m2=of_places(living.covariance_m2, place)), place, cells)
+        return cls(
+            living, replace(part, covariance_m2=of_places(living.covariance_m2, place, living.dim)), place, cells
+        )
 
     def put_back(self, part: LivingMap) -> LivingMap:
         """Return the whole map with what a session made of the part."""
@@ -97,13 +99,17 @@ class Vicinity:
         whole = self.whole
         row = LivingMap.place_row(replace(part, places=places), part.places.landmark_id, part.places.site_id)
         was = whole.place_row(places.landmark_id, places.site_id)
-        learned = of_places(part.covariance_m2, np.arange(len(part.places)))
+        learned = of_places(part.covariance_m2, np.arange(len(part.places)), part.dim)
         return _chunked(whole).updated(Update(places.position_m, was, row, learned))
 
 
 def near(living: LivingMap, path_m: FloatArray, reach_m: float) -> tuple[IntArray, FloatArray]:
-    """Return (C,) cliques with a place within reach of a path (N, 2), and the box of the path and what is in reach."""
-    away, _ = cKDTree(path_m).query(living.places.position_m, distance_upper_bound=reach_m)
+    """Return (C,) cliques with a place within reach of a path (N, 2), and the box of the path and what is in reach.
+
+    In space (N, 3), as seen from above: sessions see what is over and under them.
+    """
+    path_m = path_m[:, :2]
+    away, _ = cKDTree(path_m).query(living.places.position_m[:, :2], distance_upper_bound=reach_m)
     site = np.searchsorted(living.sites.site_id, living.places.site_id[np.isfinite(away)])
     box = np.concatenate([path_m.min(axis=0) - reach_m, path_m.max(axis=0) + reach_m])
     return np.unique(living.sites.clique_id[site]), box
@@ -154,7 +160,8 @@ def _chunked(living: LivingMap) -> ChunkedCovariance:
     covariance = living.covariance_m2
     if isinstance(covariance, ChunkedCovariance):
         return covariance
-    return ChunkedCovariance.of_dense(living.places.position_m, of_places(covariance, np.arange(len(living.places))))
+    every = np.arange(len(living.places))
+    return ChunkedCovariance.of_dense(living.places.position_m, of_places(covariance, every, living.dim))
 
 
 def _sight(living: LivingMap) -> Sight:

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import EvermapError, InputError
-from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, Part, blocks
+from evermap.geometry.chunked import ChunkedCovariance, Part, blocks
 from evermap.maps.lives import Life
-from evermap.maps.living import LivingMap, Members, Places, Sites, Stays
+from evermap.maps.living import AXES, TURNS, LivingMap, Members, Places, Sites, Stays
 from evermap.maps.shelves import Sight
 from evermap.sensing.sightlines import SightLines, Views
 from evermap.survival.base import LifetimePrior
@@ -35,6 +35,8 @@ from evermap.types import UNKNOWN, FloatArray
 
 FORMAT = 2
 """Of manifests; how columns are named and cut. Format 1 is read, see `_of_format_1`."""
+IN_SPACE = 3
+"""The same of maps in space, which an older evermap cannot read."""
 _CHUNK = 4096
 """Values a chunk, as a rule: some 30 kB, so that one changed row costs little, and a large map has some hundred."""
 _SHORTEST, _LONGEST = _CHUNK // 4, 4 * _CHUNK
@@ -49,7 +51,8 @@ NAME_BYTES = 32
 MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
 _LIFE = ("lives.life", "lives.prior")
-_NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s")
+_NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
+          "places.rotation_covariance")  # fmt: skip
 """Not written where there is none, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -161,7 +164,8 @@ def pack(living: LivingMap) -> tuple[bytes, dict[bytes, Chunk]]:
         kept = [_of_part(part) for part in parts]
         chunks.update((chunk.name, chunk) for chunk in kept)
         columns[column] = ["<f8", [len(kept)], False, [chunk.name.hex() for chunk in kept]]
-    manifest = text_chunk(json.dumps({"format": FORMAT, "values": values, "columns": columns}, default=_scalar))
+    form = FORMAT if living.dim == 2 else IN_SPACE
+    manifest = text_chunk(json.dumps({"format": form, "values": values, "columns": columns}, default=_scalar))
     return manifest.name, {**chunks, manifest.name: manifest}
 
 
@@ -252,7 +256,7 @@ def unpack(name: bytes, fetch: Fetch, *, lazily: bool = False) -> LivingMap:
         )
     if manifest["format"] == 1:
         _of_format_1(parts)
-    living: LivingMap = _build(LivingMap(), "", parts)
+    living: LivingMap = _build(LivingMap.in_space() if manifest["format"] == IN_SPACE else LivingMap(), "", parts)
     if parts:
         raise DamagedError(f"it holds '{min(parts)}', which this evermap does not know; a newer one wrote it")
     problem = flaw(living)
@@ -347,11 +351,16 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
     lines, places = living.sightlines, len(living.places)
     if len(lines.hidden) != len(lines.rules.p_hidden) or len(lines.shown) != len(lines.rules.p_hidden):
         yield "'sightlines.hidden' of another length"
-    covariance = living.covariance_m2
+    dim, covariance = living.dim, living.covariance_m2
+    of_row = {"position_m": (dim,), "rotation": (TURNS[dim],), "rotation_covariance": (AXES[dim], AXES[dim])}
+    for column in ("places.position_m", "stays.position_m", "places.rotation", "places.rotation_covariance"):
+        shape, wanted = attrgetter(column)(living).shape[1:], of_row[column.split(".")[1]]
+        if shape != wanted:
+            yield f"'{column}' has rows of shape {shape}, not {wanted}"
     if isinstance(covariance, ChunkedCovariance):
-        if problem := covariance.flaw(places):
+        if problem := covariance.flaw(places, dim):
             yield problem
-    elif covariance.shape != (2 * places, 2 * places):
+    elif covariance.shape != (dim * places, dim * places):
         yield f"a covariance of shape {covariance.shape} for {places} places"
 
 
@@ -398,8 +407,14 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
     if not all(np.isfinite(values).all() for values in (whole, *read)):
         yield "'covariance_m2' is not finite"
         return
-    if living.log_size_variance < 0.0 or np.any(_variances(living.covariance_m2) < -1e-9):
+    if living.log_size_variance < 0.0 or np.any(_variances(blocks(covariance, living.dim)) < -1e-9):
         yield "a negative variance"
+    known = ~np.isnan(living.places.rotation).all(axis=1)
+    rotation, spread = living.places.rotation[known], living.places.rotation_covariance[known]
+    if not np.all(np.abs(np.linalg.norm(rotation, axis=1) - 1.0) < 1e-6):
+        yield "'places.rotation' has a quaternion that is not of length 1"
+    if not (np.isfinite(spread).all() and np.all(_variances(spread) >= -1e-9)):
+        yield "'places.rotation_covariance' is not a covariance"
     for column in _PROBABILITIES:
         values = attrgetter(column)(living)
         if not np.all((values >= 0.0) & (values <= 1.0 + 1e-6)):
@@ -410,8 +425,8 @@ def _flaws_of_values(living: LivingMap) -> Iterator[str]:
         yield "a negative count in 'sightlines' or 'views'"
 
 
-def _variances(covariance_m2: JointCovariance) -> FloatArray:
-    return np.diagonal(blocks(covariance_m2), axis1=1, axis2=2)
+def _variances(each: FloatArray) -> FloatArray:
+    return np.diagonal(each, axis1=1, axis2=2)
 
 
 _NOT_STORED = {"sightlines.rules", "sight.lines.like.rules"}
@@ -422,7 +437,7 @@ def _collect(value: Any, prefix: str, arrays: dict[str, NDArray[Any]], values: d
     """Arrays and plain values of a dataclass and of those within it, by their dotted names."""
     for item in fields(value):
         name, part = prefix + item.name, getattr(value, item.name)
-        if name in {*_NOT_STORED, *_PARTS} or part is None or (name in _NEWER and not len(part)):
+        if name in {*_NOT_STORED, *_PARTS} or part is None or (name in _NEWER and not np.size(part)):
             continue
         if name in _LIFE:
             text = json.dumps([_life_to_dict(life) for life in part], default=_scalar)
@@ -447,7 +462,7 @@ def _build(default: Any, prefix: str, parts: dict[str, Any]) -> Any:
         if name in _NOT_STORED:
             content[item.name] = part
         elif name == "covariance_m2" and "covariance_m2.parts" in parts:
-            content[item.name] = _build(ChunkedCovariance.empty(), name + ".", parts)
+            content[item.name] = _build(ChunkedCovariance.empty(default.dim), name + ".", parts)
         elif name == "sight":
             large = "sight.lines.parts" in parts
             content[item.name] = _build(Sight.of(SightLines.empty(), Views.empty()), "sight.", parts) if large else None
@@ -528,8 +543,8 @@ def _unfolded(lower: FloatArray, size: int) -> FloatArray:
 def _manifest(name: bytes, fetch: Fetch) -> Any:
     """The values and the columns of a map, of the types that they have to have."""
     content = json_object(read_text(name, fetch([name])[name]))
-    if content.get("format") not in (1, FORMAT):
-        raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 and {FORMAT}")
+    if content.get("format") not in (1, FORMAT, IN_SPACE):
+        raise DamagedError(f"columns of format {content.get('format')!r}, this evermap reads 1 to {IN_SPACE}")
     columns = content.get("columns")
     if not isinstance(content.get("values"), dict) or not isinstance(columns, dict):
         raise DamagedError("a list of columns is missing")

@@ -18,8 +18,8 @@ from evermap.maps.store.content import Chunk, DamagedError, json_object, name_of
 from evermap.maps.store.protocol import Attachment, Provenance, Revision, RevisionKind
 from evermap.types import ChangeKind, MapChange
 
-FORMAT = 1
-"""Of records."""
+FORMAT, IN_SPACE = 1, 2
+"""Of records; those with changes in space an older evermap cannot read."""
 _TYPES: Mapping[str, type | tuple[type, ...]] = {
     "number": int,
     "parent": int,
@@ -110,7 +110,7 @@ class Record:
             json.dumps(
                 {
                     "evermap": "revision",
-                    "format": FORMAT,
+                    "format": IN_SPACE if any(len(one.displacement_m) > 2 for one in self.changes) else FORMAT,
                     **self.about,
                     "parent_record": _hex(self.parent),
                     "content": self.content.hex(),
@@ -131,8 +131,8 @@ class Record:
         row = json_object(text)
         if row.get("evermap") != "revision":
             raise DamagedError("a part is not the record of a revision")
-        if row.get("format") != FORMAT:
-            raise DamagedError(f"a record of format {row.get('format')!r}, this evermap reads {FORMAT}")
+        if row.get("format") not in (FORMAT, IN_SPACE):
+            raise DamagedError(f"a record of format {row.get('format')!r}, this evermap reads {FORMAT} and {IN_SPACE}")
         row.setdefault("n_grown", None)  # an older evermap did not count them
         for name, kind in _TYPES.items():
             if name not in row or not isinstance(row[name], kind) or isinstance(row[name], bool):
@@ -224,13 +224,15 @@ def _change_to_list(change: MapChange) -> list[Any]:
 
 def _change_from_list(values: Iterable[Any]) -> MapChange:
     kind, names, *numbers = values
-    from_s, to_s, dx_m, dy_m, rotation_rad, probability, n_hits, n_misses = map(_or_nan, numbers)
+    from_s, to_s, *step_m, rotation_rad, probability, n_hits, n_misses = map(_or_nan, numbers)
+    if len(step_m) not in (2, 3):
+        raise ValueError(f"a displacement of {len(step_m)} numbers")
     return MapChange(
         landmark_ids=tuple(int(name) for name in names),
         kind=ChangeKind(kind),
         stamp_from_s=from_s,
         stamp_to_s=to_s,
-        displacement_m=(dx_m, dy_m),
+        displacement_m=tuple(step_m),
         rotation_rad=rotation_rad,
         probability=probability,
         n_hits=int(n_hits),

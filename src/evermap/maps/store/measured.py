@@ -17,22 +17,42 @@ import numpy as np
 
 from evermap.maps.living import Evidence
 from evermap.maps.store.content import Chunk, DamagedError, name_of, text_chunk
-from evermap.types import Clock, Detections, Frames, Odometry, Recording, Sensor, landmark_id_of
+from evermap.types import (
+    AnyRecording,
+    Clock,
+    Detections,
+    Frames,
+    Odometry,
+    Recording,
+    Sensor,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
+    landmark_id_of,
+)
 
 RECORDING = "recording"
 """Name of the attachment."""
 _TABLES: dict[str, Any] = {"odometry": Odometry, "frames": Frames, "detections": Detections, "sensor": Sensor}
+_IN_SPACE: dict[str, Any] = {"odometry": SpatialOdometry, "frames": Frames, "detections": SpatialDetections}
 _PLAIN = ("name", "source", "class_names", "clock")
 
 
-def pack_recording(recording: Recording) -> bytes:
+def pack_recording(recording: AnyRecording) -> bytes:
     """Return the bytes of a recording; equal recordings have equal bytes."""
-    arrays: dict[str, Any] = {"objects": recording.objects}
+    arrays: dict[str, Any] = {}
     values: dict[str, Any] = {name: getattr(recording, name) for name in _PLAIN}
     values["landmark_texts"] = sorted(recording.landmark_names.values())
-    for table in _TABLES:
-        part = getattr(recording, table)
-        for item in fields(part):
+    if isinstance(recording, SpatialRecording):
+        values["sensors"] = len(recording.sensors)
+        tables = {table: getattr(recording, table) for table in _IN_SPACE}
+        tables |= {f"sensor {k}": sensor for k, sensor in enumerate(recording.sensors)}
+    else:
+        arrays["objects"] = recording.objects
+        tables = {table: getattr(recording, table) for table in _TABLES}
+    for table, part in tables.items():
+        for item in fields(part) if part is not None else ():
             value = getattr(part, item.name)
             (arrays if isinstance(value, np.ndarray) else values)[f"{table}.{item.name}"] = value
     arrays["values"] = np.frombuffer(json.dumps(values).encode(), np.uint8)
@@ -41,7 +61,7 @@ def pack_recording(recording: Recording) -> bytes:
     return buffer.getvalue()
 
 
-def unpack_recording(data: bytes) -> Recording:
+def unpack_recording(data: bytes) -> AnyRecording:
     """Return what `pack_recording` wrote.
 
     Raises:
@@ -51,23 +71,29 @@ def unpack_recording(data: bytes) -> Recording:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
         values = json.loads(arrays.pop("values").tobytes())
-        tables: dict[str, Any] = {
-            table: kind(
-                **{item.name: _part(f"{table}.{item.name}", item.name, arrays, values) for item in fields(kind)}
-            )
-            for table, kind in _TABLES.items()
+        about: dict[str, Any] = {
+            "name": values["name"],
+            "source": values["source"],
+            "class_names": tuple(values["class_names"]),
+            "clock": Clock(values["clock"]),
+            "landmark_names": {landmark_id_of(text): text for text in values["landmark_texts"]},
         }
-        return Recording(
-            name=values["name"],
-            source=values["source"],
-            objects=arrays["objects"],
-            class_names=tuple(values["class_names"]),
-            clock=Clock(values["clock"]),
-            landmark_names={landmark_id_of(text): text for text in values["landmark_texts"]},
-            **tables,
-        )
+        if "sensors" not in values:
+            tables = {table: _table(table, kind, arrays, values) for table, kind in _TABLES.items()}
+            return Recording(**about, **tables, objects=arrays["objects"])
+        carried = "odometry.clock" in values
+        tables = {
+            table: _table(table, kind, arrays, values) if carried or table != "odometry" else None
+            for table, kind in _IN_SPACE.items()
+        }
+        sensors = (_table(f"sensor {k}", SpatialSensor, arrays, values) for k in range(values["sensors"]))
+        return SpatialRecording(**about, **tables, sensors=tuple(sensors))
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
+
+
+def _table(table: str, kind: Any, arrays: dict[str, Any], values: dict[str, Any]) -> Any:
+    return kind(**{item.name: _part(f"{table}.{item.name}", item.name, arrays, values) for item in fields(kind)})
 
 
 def _part(column: str, name: str, arrays: dict[str, Any], values: dict[str, Any]) -> Any:
