@@ -24,12 +24,17 @@ from typing import NamedTuple
 import numpy as np
 
 from evermap.config import GroupingConfig
-from evermap.geometry import se2
 from evermap.geometry.chunked import taken
+from evermap.geometry.group import PLANE, SPACE
+from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap, Sites
 from evermap.types import BoolArray, FloatArray, IntArray
 
 USUAL = GroupingConfig()
+TURN_INFORMATION = 1e-6
+"""Of rotations, since landmarks may be at one point, or in space on one line."""
+ALL_TURNS = {2: 2.0 * math.pi, 3: 8.0 * math.pi**2}
+"""Volume of all rotations of the plane and of space."""
 
 
 class Fate(IntEnum):
@@ -183,34 +188,38 @@ def log_evidence_of_motion(
     Of one landmark exact, of more by Laplace's method about the most probable motion.
 
     Args:
-        before_m: (n, 2) old places.
+        before_m: (n, 2) old places; with 3 for 2 in space, here and below.
         after_m: (n, 2) new places.
         covariance_m2: (n, 2, 2) of each difference.
         sigma_m: standard deviation of displacements, each axis.
     """
     count = len(before_m)
     if count == 1:
-        spread = covariance_m2[0] + sigma_m**2 * np.eye(2)
+        spread = covariance_m2[0] + sigma_m**2 * np.eye(before_m.shape[1])
         return -0.5 * float(_square(after_m - before_m, spread[None])[0] + _log_det(2.0 * math.pi * spread))
     middle, new_middle = before_m.mean(axis=0), after_m.mean(axis=0)
-    arm, new_arm = before_m - middle, after_m - new_middle
-    turn = math.atan2(float(np.sum(_perpendicular(arm) * new_arm)), float(np.sum(arm * new_arm)))
-    shift = new_middle - middle
+    group = PLANE if before_m.shape[1] == PLANE.point_dim else SPACE
+    axes, turns = group.point_dim, group.dim - group.point_dim
+    arm = before_m - middle
+    motion = rigid(arm, after_m - new_middle)  # Gauss-Newton from the rotation that suits equal variances best
+    turn, shift = group.rotation_of(motion), new_middle - middle
     precision = np.linalg.inv(covariance_m2)
-    prior = np.diag([sigma_m**-2, sigma_m**-2, 1e-6])  # landmarks may be at one point
-    for _ in range(5):  # Gauss-Newton from the rotation that suits equal variances best
-        turned = arm @ se2.rotation(turn).T
-        jacobian = np.concatenate([np.tile(np.eye(2), (count, 1, 1)), _perpendicular(turned)[:, :, None]], axis=2)
+    prior = np.diag(np.repeat([sigma_m**-2, TURN_INFORMATION], [axes, turns]))
+    for _ in range(5):
+        turned = arm @ turn.T
+        jacobian = group.rigid_directions(turned).reshape(count, axes, group.dim)
         residual = after_m - middle - shift - turned
         information = np.einsum("nia,nij,njb->ab", jacobian, precision, jacobian) + prior
-        slope = np.einsum("nia,nij,nj->a", jacobian, precision, residual) - prior @ np.append(shift, turn)
+        slope = np.einsum("nia,nij,nj->a", jacobian, precision, residual)
+        slope[:axes] -= shift / sigma_m**2
         step = np.linalg.solve(information, slope)
-        shift, turn = shift + step[:2], turn + float(step[2])
-    residual = after_m - middle - shift - arm @ se2.rotation(turn).T
+        shift = shift + step[:axes]
+        turn = group.rotation_of(group.exp(np.append(np.zeros(axes), step[axes:]))) @ turn
+    residual = after_m - middle - shift - arm @ turn.T
     log_likelihood = -0.5 * float(np.sum(_square(residual, covariance_m2) + _log_det(2.0 * math.pi * covariance_m2)))
-    log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - math.log(2.0 * math.pi * sigma_m**2)
-    log_width = 1.5 * math.log(2.0 * math.pi) - 0.5 * float(_log_det(information))
-    return log_likelihood + log_prior - math.log(2.0 * math.pi) + log_width
+    log_prior = -0.5 * float(shift @ shift) / sigma_m**2 - 0.5 * axes * math.log(2.0 * math.pi * sigma_m**2)
+    log_width = 0.5 * group.dim * math.log(2.0 * math.pi) - 0.5 * float(_log_det(information))
+    return log_likelihood + log_prior - math.log(ALL_TURNS[axes]) + log_width
 
 
 def _square(residual: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -220,11 +229,6 @@ def _square(residual: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def _log_det(matrix: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.slogdet(matrix)[1])
-
-
-def _perpendicular(vector: FloatArray) -> FloatArray:
-    """(n, 2) turned left by a right angle."""
-    return np.stack([-vector[:, 1], vector[:, 0]], axis=1)
 
 
 def _extent(position: FloatArray) -> float:
@@ -286,7 +290,7 @@ def relabelled(living: LivingMap, clique_id: IntArray) -> tuple[LivingMap, IntAr
         members=replace(members, clique_id=clique_id),
         sites=parted,
         places=moved[order],
-        covariance_m2=taken(living.covariance_m2, order),
+        covariance_m2=taken(living.covariance_m2, order, living.dim),
         stays=stays[~(np.isin(stays.clique_id, no_more) & (stays.gone_s == np.inf))],
         n_cliques_ever=max(living.n_cliques_ever, int(clique_id.max(initial=-1)) + 1),
         n_sites_ever=living.n_sites_ever + int(np.count_nonzero(~keeps)),
@@ -339,12 +343,12 @@ def without_missed(before: LivingMap, after: LivingMap, settings: GroupingConfig
     fate = np.select([known & (hits > 0), known & (p_missed < 0.5)], [Fate.STAYED, Fate.GONE], Fate.UNSEEN)
     if not (fate == Fate.GONE).any():
         return after
-    nowhere = np.zeros((len(members), 2))
+    nowhere, dim = np.zeros((len(members), after.dim)), after.dim
     clique_id = regrouped(
         members.clique_id,
         members.class_id,
         fate,
-        Displacements(nowhere, nowhere, np.zeros((len(members), 2, 2))),
+        Displacements(nowhere, nowhere, np.zeros((len(members), dim, dim))),
         reach_m=0.0,
         next_id=after.n_cliques_ever,
         p_wrong=np.where(fate == Fate.GONE, p_missed, settings.p_wrong),

@@ -305,3 +305,22 @@ def _frame(profile: Profile, place: FloatArray, turn: FloatArray) -> SensorFrame
         float(assumed.sigma_attitude_rad),
     )
     return SensorFrame(tuple(place.tolist()), tuple(turn.ravel().tolist()), limits)
+
+
+def watched(
+    model: LearnedDetection, stamp_s: FloatArray, pose: FloatArray, detected: BoolArray, there: BoolArray
+) -> LearnedDetection:
+    """Return the model after a session of which it is known when what was there.
+
+    Args:
+        model: before it; every landmark is a clique by itself.
+        stamp_s: (F,) of the looks, in order.
+        pose: (F, 4, 4) from the sensor's frame to the world's.
+        detected: (F, K) which landmarks were detected.
+        there: (F, K) which of them were there; of the others nothing is learned.
+    """
+    for stamp, one, hit, active in zip(stamp_s.tolist(), pose, detected, there, strict=True):
+        if active.any():
+            model, seen = look(model, stamp, one[:3, 3], one[:3, :3], hit, active=active)
+            model = confirm(model, seen, np.ones(len(model)))
+    return model

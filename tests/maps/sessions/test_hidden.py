@@ -11,7 +11,7 @@ from evermap.config import LivingConfig
 from evermap.existence.sites import SiteLooks
 from evermap.maps.living import LivingMap, clique_rows
 from evermap.maps.sessions.believe import believed, said
-from evermap.maps.sessions.looks import PlaceLooks, Sighting, looked_at
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, looked_at
 from evermap.sensing.sightlines import SightLines
 from evermap.types import FloatArray, Sensor
 
@@ -44,7 +44,7 @@ def looks_of(living: LivingMap, seen: tuple[int, ...], frames: int = 12) -> Plac
     place = np.flatnonzero(np.isin(living.places.landmark_id, seen))
     frame = np.repeat(np.arange(frames), len(place))
     sighting = Sighting(1000.0 + np.arange(frames), np.tile(EYE, (frames, 1)), frame, np.tile(place, frames))
-    return looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig())
+    return looked_at(living, living.sites.p_here, Watch.of(sighting, living.places.position_m, SENSOR), LivingConfig())
 
 
 def evidence(living: LivingMap, looks: PlaceLooks) -> dict[int, float]:
@@ -142,7 +142,7 @@ def test_things_in_different_rooms_are_not_behind_one_door() -> None:
     none = np.zeros(0, dtype=np.int64)
     pose = np.column_stack([np.repeat(eyes, 12, axis=0), np.zeros(36)])
     sighting = Sighting(1000.0 + np.arange(36), pose, none, none)
-    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig())
+    looks = looked_at(living, living.sites.p_here, Watch.of(sighting, living.places.position_m, SENSOR), LivingConfig())
     np.testing.assert_allclose(p_hidden_of(living, looks), hidden_alone(3, 0.05, seen=0), rtol=1e-6)
 
 
@@ -160,7 +160,12 @@ def test_sight_that_is_not_learned_takes_the_field_of_view_for_the_truth() -> No
     living = a_map({1: (6.0, 0.25), 2: (6.0, 4.0)}, clear=(1,))
     none = np.zeros(0, dtype=np.int64)
     sighting = Sighting(1000.0 + np.arange(5), np.tile(EYE, (5, 1)), none, none)
-    looks = looked_at(living, living.sites.p_here, sighting, SENSOR, LivingConfig(learn_sight=False))
+    looks = looked_at(
+        living,
+        living.sites.p_here,
+        Watch.of(sighting, living.places.position_m, SENSOR),
+        LivingConfig(learn_sight=False),
+    )
     assert isinstance(looks.rows, SiteLooks)
     assert looks.counts.all()
     assert len(looks.rows) == 10

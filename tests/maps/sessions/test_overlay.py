@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.geometry.rigid import consensus
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Overlay, Sighted, lay_over
 
@@ -47,6 +47,36 @@ def test_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
         return
     np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), best)
     assert found.drift_m == best_drift_m
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_in_space_the_most_probable_of_all_assignments_is_found(seed: int) -> None:
+    """Where it lies about is known there, and orientations say something of each site."""
+    random = np.random.default_rng(300 + seed)
+    cliques = int(random.integers(4, 7))
+    n_sites = random.integers(1, 3, cliques).tolist()
+    site = [ELSEWHERE if c > 2 and random.random() < 0.6 else int(random.integers(k)) for c, k in enumerate(n_sites)]
+    drift_m = float(random.choice([0.0, 0.05]))
+    one = world(random, random.integers(1, 4, cliques).tolist(), n_sites, site, drift_m=drift_m, dim=3)
+    off = np.array([*random.normal(0.0, 0.02, 3), *random.normal(0.0, 0.002, 3)])
+    about = se3.retract(one.pose_map_session, off)
+    dense = Densely(one.sighted, one.known, about)
+    best, best_drift_m, _ = dense.best()
+    found = lay_over(one.sighted, one.known, motion=about)
+    assert (found is not None) == dense.is_this_place(best, best_drift_m)
+    if found is None:
+        return
+    np.testing.assert_array_equal(sites_of(found, one.known, one.sighted), best)
+    assert found.drift_m == best_drift_m
+    for clique, sites in enumerate(dense.sites):
+        each = []
+        for option in [*sites, ELSEWHERE]:
+            other = best.copy()
+            other[clique] = option
+            each.append(dense.log_probability(other, best_drift_m))
+        share = np.exp(np.array(each) - max(each))
+        want = share[[*sites, ELSEWHERE].index(int(best[clique]))] / share.sum()
+        np.testing.assert_allclose(found.probability[one.sighted.clique == clique], want, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -121,7 +151,7 @@ def test_a_landmark_that_is_back_at_an_old_site_is_there() -> None:
     p_site[of_last] = [0.9, 0.02, 0.02]  # believed to be at its first site, but found at its second
     known = Known(
         one.known.position_m, one.known.covariance_m2, one.known.landmark, one.known.site, np.log(p_site),
-        one.known.log_p_elsewhere,
+        one.known.log_p_elsewhere, one.known.log_turned,
     )  # fmt: skip
     for search in ("joint", "gate"):
         found = lay_over(one.sighted, known, search)

@@ -8,11 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from evermap.geometry import se2
+from evermap.geometry.group import PLANE, SPACE
 from evermap.maps.sessions.overlay import (
     ELSEWHERE,
-    FREE_MOTION,
+    FREE_M,
+    FREE_RAD,
     USUAL,
     Known,
     Overlay,
@@ -27,7 +29,7 @@ class World:
 
     Attributes:
         sighted, known: what `lay_over` is given.
-        pose_map_session: (3,) the motion.
+        pose_map_session: (3,) the motion, in space (7,).
         site: (C,) at which site every clique stands, `ELSEWHERE` for a new place.
     """
 
@@ -48,6 +50,7 @@ def world(
     p_site: list[float] | None = None,
     shift_m: FloatArray | None = None,
     room_m: float = 12.0,
+    dim: int = 2,
 ) -> World:
     """Cliques at random places.
 
@@ -61,16 +64,19 @@ def world(
         p_site: (S,) beliefs; None for even ones, with 0.1 for elsewhere.
         shift_m: (2,) by which those elsewhere stand beside their first site; None for anywhere.
         room_m: sides of the room.
+        dim: of the plane or of space; there orientations say something of each site, too.
     """
+    group = PLANE if dim == 2 else SPACE
     clique = np.repeat(np.arange(len(sizes)), sizes)
-    shape = random.uniform(-0.6, 0.6, (len(clique), 2))
+    shape = random.uniform(-0.6, 0.6, (len(clique), dim))
 
-    def pose() -> FloatArray:
-        return np.array([*random.uniform(0, room_m, 2), random.uniform(-np.pi, np.pi)])
+    def pose(low: float = 0.0, high: float = room_m) -> FloatArray:
+        turn = [random.uniform(-np.pi, np.pi)] if dim == 2 else Rotation.random(random_state=random).as_quat()
+        return np.array([*random.uniform(low, high, dim), *turn])
 
     rows: list[tuple[int, int]] = []
     at: list[FloatArray] = []
-    truth = np.zeros((len(clique), 2))
+    truth = np.zeros((len(clique), dim))
     names = np.full(len(sizes), ELSEWHERE)
     for c, count in enumerate(n_sites):
         mine = np.flatnonzero(clique == c)
@@ -78,31 +84,33 @@ def world(
         number = rows[-1][1] + 1 if rows else 0
         for k, stands in enumerate(poses):
             rows += [(int(n), number + k) for n in mine]
-            at += list(se2.transform(stands, shape[mine]))
+            at += list(group.transform(stands, shape[mine]))
         if site[c] == ELSEWHERE:
             new = pose() if shift_m is None else poses[0] + [*shift_m, 0.0]
-            truth[mine] = se2.transform(new, shape[mine])
+            truth[mine] = group.transform(new, shape[mine])
         else:
             names[c] = number + site[c]
-            truth[mine] = se2.transform(poses[site[c]], shape[mine]) + drift_m * random.normal(size=(len(mine), 2))
+            off = drift_m * random.normal(size=(len(mine), dim))
+            truth[mine] = group.transform(poses[site[c]], shape[mine]) + off
     landmark, of_site = (np.array(column) for column in zip(*rows, strict=True))
     position = np.array(at)
-    map_covariance = _covariance(random, len(position), sigma_m)
-    session_covariance = _covariance(random, len(truth), sigma_m)
-    motion = np.array([*random.uniform(-30, 30, 2), random.uniform(-np.pi, np.pi)])
-    seen = se2.transform(se2.inverse(motion), truth)
-    seen = seen + random.multivariate_normal(np.zeros(seen.size), session_covariance).reshape(-1, 2)
-    position = position + random.multivariate_normal(np.zeros(position.size), map_covariance).reshape(-1, 2)
+    map_covariance = _covariance(random, len(position), sigma_m, dim)
+    session_covariance = _covariance(random, len(truth), sigma_m, dim)
+    motion = pose(-30.0, 30.0)
+    seen = group.transform(group.inverse(motion), truth)
+    seen = seen + random.multivariate_normal(np.zeros(seen.size), session_covariance).reshape(-1, dim)
+    position = position + random.multivariate_normal(np.zeros(position.size), map_covariance).reshape(-1, dim)
     of = np.concatenate([[c] * count for c, count in enumerate(n_sites)]).astype(np.int64)
     p = np.array([0.9 / n_sites[c] for c in of]) if p_site is None else np.array(p_site)
     away = np.array([max(1.0 - p[of == c].sum(), 1e-6) for c in range(len(sizes))])
-    known = Known(position, map_covariance, landmark, of_site, np.log(p), np.log(away))
+    turned = random.uniform(-1.0, 1.0, len(p)) if dim == 3 else np.zeros(len(p))
+    known = Known(position, map_covariance, landmark, of_site, np.log(p), np.log(away), turned)
     return World(Sighted(seen, session_covariance, clique), known, motion, names)
 
 
-def _covariance(random: np.random.Generator, points: int, sigma_m: float) -> FloatArray:
-    factor = random.normal(size=(2 * points, points)) / math.sqrt(points)
-    return np.asarray(sigma_m**2 * (0.7 * factor @ factor.T + 0.3 * np.eye(2 * points)))
+def _covariance(random: np.random.Generator, points: int, sigma_m: float, dim: int) -> FloatArray:
+    factor = random.normal(size=(dim * points, points)) / math.sqrt(points)
+    return np.asarray(sigma_m**2 * (0.7 * factor @ factor.T + 0.3 * np.eye(dim * points)))
 
 
 class Densely:
@@ -114,17 +122,22 @@ class Densely:
 
     def __init__(self, sighted: Sighted, known: Known, motion: FloatArray) -> None:
         self.sighted, self.known = sighted, known
-        self.at = se2.transform(motion, sighted.position_m)
-        turn = np.kron(np.eye(len(self.at)), se2.rotation(motion[2]))
+        self.dim = dim = sighted.position_m.shape[1]
+        self.at = sighted.position_m @ _turn(motion[dim:]).T + motion[:dim]
+        turn = np.kron(np.eye(len(self.at)), _turn(motion[dim:]))
         middle = self.at.mean(axis=0)
 
         def moved(step: FloatArray) -> FloatArray:
-            return np.asarray((middle + step[:2] + (self.at - middle) @ se2.rotation(step[2]).T).ravel())
+            return np.asarray((middle + step[:dim] + (self.at - middle) @ _turn(step[dim:]).T).ravel())
 
-        slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(3)])
-        self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(np.square(FREE_MOTION)) @ slope.T
+        free = np.array([FREE_M] * dim + [FREE_RAD] * (3 if dim == 3 else 1))
+        slope = np.column_stack([(moved(h) - moved(-h)) / 2e-6 for h in 1e-6 * np.eye(len(free))])
+        self.spread = turn @ sighted.covariance_m2 @ turn.T + slope @ np.diag(free**2) @ slope.T
         both = np.vstack([self.at, known.position_m])
-        self.room_m2 = max(float(np.prod(both.max(axis=0) - both.min(axis=0))), USUAL.smallest_room_m2)
+        extent = both.max(axis=0) - both.min(axis=0)
+        self.room_m2 = max(float(np.prod(extent[:2])), USUAL.smallest_room_m2)
+        if dim == 3:
+            self.room_m2 *= max(float(extent[2]), 1.0)
         clique = sighted.clique[known.landmark]
         self.sites = [sorted({int(s) for s in known.site[clique == c]}) for c in range(len(known.log_p_elsewhere))]
 
@@ -133,21 +146,21 @@ class Densely:
             yield np.array(chosen)
 
     def log_probability(self, chosen: IntArray, drift_m: float) -> float:
-        known = self.known
+        known, dim = self.known, self.dim
         rows = np.flatnonzero(np.isin(known.site, chosen[chosen >= 0]))
         total = 0.0
         if len(rows):
-            pick = np.zeros((2 * len(rows), 2 * len(self.at)))
+            pick = np.zeros((dim * len(rows), dim * len(self.at)))
             for k, landmark in enumerate(known.landmark[rows]):
-                pick[2 * k : 2 * k + 2, 2 * landmark : 2 * landmark + 2] = np.eye(2)
-            xy = np.column_stack([2 * rows, 2 * rows + 1]).ravel()
+                pick[dim * k : dim * k + dim, dim * landmark : dim * landmark + dim] = np.eye(dim)
+            xy = np.column_stack([dim * rows + axis for axis in range(dim)]).ravel()
             spread = pick @ self.spread @ pick.T + known.covariance_m2[np.ix_(xy, xy)] + drift_m**2 * np.eye(len(xy))
             error = (self.at[known.landmark[rows]] - known.position_m[rows]).ravel()
             _, log_volume = np.linalg.slogdet(2.0 * np.pi * spread)
             total -= 0.5 * float(log_volume + error @ np.linalg.solve(spread, error))
         for clique, site in enumerate(chosen):
             if site >= 0:
-                total += float(known.log_p_site[site])
+                total += float(known.log_p_site[site] + known.log_turned[site])
             elif self.sites[clique]:
                 total += float(known.log_p_elsewhere[clique]) + max(self._moved(s) for s in self.sites[clique])
         return total
@@ -177,15 +190,24 @@ class Densely:
         rows = np.flatnonzero(self.known.site == site)
         step = self.at[self.known.landmark[rows]] - self.known.position_m[rows]
         middle = step.mean(axis=0)
-        nudged = math.exp(-0.5 * float(middle @ middle) / USUAL.nudge_m**2) / (2.0 * math.pi * USUAL.nudge_m**2)
+        scale = (2.0 * math.pi * USUAL.nudge_m**2) ** (0.5 * self.dim)
+        nudged = math.exp(-0.5 * float(middle @ middle) / USUAL.nudge_m**2) / scale
         whole = math.log(USUAL.share_nudged * nudged + (1.0 - USUAL.share_nudged) / self.room_m2)
         rest = step - middle
-        free = 2 * (len(rows) - 1)
+        free = self.dim * (len(rows) - 1)
         return (
             whole
             - 0.5 * float((rest**2).sum()) / USUAL.turn_m**2
             - 0.5 * free * math.log(2.0 * math.pi * USUAL.turn_m**2)
         )
+
+
+def _turn(angles: FloatArray) -> FloatArray:
+    """Rotation matrix of an angle, of a rotation vector or of a quaternion."""
+    if len(angles) == 1:
+        return Rotation.from_rotvec([0.0, 0.0, float(angles[0])]).as_matrix()[:2, :2]
+    turn = Rotation.from_quat(angles) if len(angles) == 4 else Rotation.from_rotvec(angles)
+    return np.asarray(turn.as_matrix())
 
 
 def sites_of(overlay: Overlay, known: Known, sighted: Sighted) -> IntArray:

@@ -154,7 +154,7 @@ def _pinned(living: LivingMap, cliques: IntArray) -> BoolArray:
 
 def _lives(living: LivingMap, config: LivingConfig, class_id: IntArray, position_m: FloatArray) -> list[Life]:
     """(S,) lives at sites (S, 2) of classes (S,): what holds for one is the same object for all that it holds for."""
-    chunk = np.floor(position_m / living.lives.chunk_m).astype(np.int64)
+    chunk = np.floor(position_m[:, :2] / living.lives.chunk_m).astype(np.int64)
     _, first, which = np.unique(np.column_stack([class_id, chunk]), axis=0, return_index=True, return_inverse=True)
     found = []
     for kind, middle in zip(class_id[first].tolist(), position_m[first], strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 
 from evermap.config import DecisionConfig
 from evermap.geometry.chunked import taken
-from evermap.maps.diff import motion_of, with_swaps
+from evermap.maps.diff import elsewhere, motion_of, with_swaps
 from evermap.maps.learning import ClassLives
 from evermap.maps.living import EXISTS, LivingMap, Stays, class_of, clique_rows, site_middles
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks
@@ -280,7 +280,7 @@ class _Session:
         left_s = self._ends(old, stay, 1.0)
         since = self._begins(int(self.cliques[row]), site, left_s)
         self.p_kept[site] = p_moved = float(self.after.sites.p_here[site])
-        if np.hypot(*_motion(self.after, old, site)[0]) >= self.same_spot_m:
+        if elsewhere(*_motion(self.after, old, site), self.same_spot_m):
             n_hits, n_misses = int(self.hits[site]), int(self.misses[old])
             self._tell(ChangeKind.MOVED, old, site, left_s, since, p_moved, n_hits, n_misses)
 
@@ -329,13 +329,14 @@ class _Session:
         n_misses: int,
     ) -> None:
         """A change of the clique that left one site (row, -1 for none), and stands at another."""
-        step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else (np.full(2, np.nan), 0.0)
+        away = np.full(self.after.dim, np.nan), 0.0
+        step, turn = _motion(self.after, left, site) if site >= 0 and left >= 0 else away
         change = MapChange(
             landmark_ids=_members_at(self.after, site if site >= 0 else left),
             kind=kind,
             stamp_from_s=from_s if np.isfinite(from_s) else float("nan"),
             stamp_to_s=to_s,
-            displacement_m=(float(step[0]), float(step[1])),
+            displacement_m=tuple(step.tolist()),
             rotation_rad=turn,
             probability=float(min(max(probability, 0.0), 1.0)),
             n_hits=n_hits,
@@ -387,7 +388,7 @@ def without_forgotten(living: LivingMap, most_sites: int, settings: DecisionConf
         members=members[~np.isin(members.clique_id, gone)],
         sites=sites[kept],
         places=living.places[rows],
-        covariance_m2=taken(living.covariance_m2, rows),
+        covariance_m2=taken(living.covariance_m2, rows, living.dim),
         stays=stays,
     )
 
@@ -426,7 +427,10 @@ def _motion(living: LivingMap, old: int, new: int) -> tuple[FloatArray, float]:
     if len(i):
         a, b = a[i], b[j]
     was, now = living.places.position_m[a], living.places.position_m[b]
-    return motion_of(was, now) if len(i) else (now.mean(axis=0) - was.mean(axis=0), 0.0)
+    if not len(i):
+        return now.mean(axis=0) - was.mean(axis=0), 0.0
+    turns = (living.places.rotation[a], living.places.rotation[b]) if living.dim > 2 else None
+    return motion_of(was, now, turns)
 
 
 def _first_miss(looks: PlaceLooks, site: int, last_s: float, start_s: float) -> float:

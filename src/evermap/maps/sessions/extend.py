@@ -22,11 +22,12 @@ class Found:
         landmark_id, class_id: (K,).
         place: (K,) row of the old map's places, -1 where it stands at none of its own.
         probability: (K,) of that.
-        position_m: (K, 2) posterior.
+        position_m: (K, 2) posterior, in space (K, 3).
         covariance_m2: joint covariance of it.
         object_id: (K,) object that it is on, as an object detector says; -1 for none.
         first_s: (K,) first sighting.
         last_s: (K,) last sighting.
+        rotation, rotation_covariance: in space (K, 4) and (K, 3, 3), as of `living.Places`; None in the plane.
     """
 
     landmark_id: IntArray
@@ -38,6 +39,8 @@ class Found:
     object_id: IntArray
     first_s: FloatArray
     last_s: FloatArray
+    rotation: FloatArray | None = None
+    rotation_covariance: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +87,19 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
 
     order = np.concatenate([np.flatnonzero(found.place >= 0), new])
     seen = found.place[found.place >= 0]
-    position, covariance = found.position_m[order], taken(found.covariance_m2, order)
+    position, covariance = found.position_m[order], taken(found.covariance_m2, order, living.dim)
     if len(living.places):
         position, covariance = with_session(
             living.places.position_m,
-            of_places(living.covariance_m2, np.arange(len(living.places))),
+            of_places(living.covariance_m2, np.arange(len(living.places)), living.dim),
             seen,
             position,
-            of_places(covariance, np.arange(len(order))),
+            of_places(covariance, np.arange(len(order)), living.dim),
             drift_m,
         )
     nothing = np.zeros(len(new), dtype=np.int64)
     places = living.places.joined(Places(site, found.landmark_id[new], found.position_m[new], nothing, nothing))
-    places = replace(places, position_m=position)
+    places = _turned(replace(places, position_m=position), found, seen, new)
     sites, p_start, is_new = _with_sites(living, p_site, found, clique, (fresh, new_ids), config.decisions.new_clique_p)
     sorted_rows = np.lexsort((places.landmark_id, places.site_id))
     rank = np.empty(len(sorted_rows), dtype=np.int64)
@@ -110,7 +113,7 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
             members=members,
             sites=sites,
             places=places[sorted_rows],
-            covariance_m2=taken(covariance, sorted_rows),
+            covariance_m2=taken(covariance, sorted_rows, living.dim),
             n_cliques_ever=cliques_ever,
             n_sites_ever=living.n_sites_ever + len(fresh),
         ),
@@ -119,6 +122,22 @@ def extended(living: LivingMap, p_site: FloatArray, found: Found, config: Living
         p_start,
         is_new,
     )
+
+
+def _turned(places: Places, found: Found, seen: IntArray, new: IntArray) -> Places:
+    """Places with the orientations of the session: of those that it saw (rows `seen`), and of the new ones at the end.
+
+    An orientation that the session did not see stays.
+    """
+    if found.rotation is None or found.rotation_covariance is None:
+        return places
+    at = np.concatenate([seen, len(places) - len(new) + np.arange(len(new))])
+    of = np.concatenate([np.flatnonzero(found.place >= 0), new])
+    known = np.isfinite(found.rotation[of, 0])
+    rotation, covariance = places.rotation.copy(), places.rotation_covariance.copy()
+    rotation[at[known]] = found.rotation[of[known]]
+    covariance[at[known]] = found.rotation_covariance[of[known]]
+    return replace(places, rotation=rotation, rotation_covariance=covariance)
 
 
 def _with_bodies(
@@ -200,10 +219,11 @@ def _bodies(living: LivingMap, found: Found, config: LivingConfig, drift_m: floa
     if not (fate == Fate.MOVED).any():
         return _torn(living, members.clique_id, found, config.clique_reach_m)
     before = places.position_m[np.maximum(stood, 0)]
-    after, spread = before.copy(), np.zeros((len(members), 2, 2))
+    after, spread = before.copy(), np.zeros((len(members), living.dim, living.dim))
     after[member] = found.position_m[row]
-    spread[member] = blocks(found.covariance_m2)[row] + blocks(living.covariance_m2)[stood[member]]
-    spread += drift_m**2 * np.eye(2)
+    now, then = (blocks(covariance, living.dim) for covariance in (found.covariance_m2, living.covariance_m2))
+    spread[member] = now[row] + then[stood[member]]
+    spread += drift_m**2 * np.eye(living.dim)
     clique_id = regrouped(
         members.clique_id,
         members.class_id,

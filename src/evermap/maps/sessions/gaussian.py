@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from evermap.config import FitConfig
 from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, of_places
+from evermap.geometry.group import PLANE, SPACE
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
 from evermap.slam.problem import Marginals
@@ -39,7 +40,7 @@ def with_session(
     What the session says of the places it saw moves those that it did not see, by their correlation.
 
     Args:
-        position_m: (P, 2) as the map had them.
+        position_m: (P, 2) as the map had them; with 3 for 2 in space, here and below.
         covariance_m2: (2 P, 2 P).
         seen: (K,) rows of those that the session saw.
         session_m: (K + N, 2) posterior of these, then of N new ones.
@@ -52,23 +53,24 @@ def with_session(
     count, new = len(position_m), len(session_m) - len(seen)
     if count == 0:  # a map begins
         return session_m, session_covariance_m2
-    s = se2.xy_rows(seen)
+    dim = position_m.shape[1]
+    s = se2.xy_rows(seen, dim)
     k = len(s)
-    u = np.setdiff1d(np.arange(2 * count), s)
+    u = np.setdiff1d(np.arange(dim * count), s)
     before = drifted(covariance_m2[np.ix_(s, s)], drift_m)
     gain = np.linalg.solve(before, covariance_m2[np.ix_(s, u)]).T if k else np.zeros((len(u), 0))
-    mean = np.zeros(2 * (count + new))
+    mean = np.zeros(dim * (count + new))
     mean[s] = session_m[: len(seen)].ravel()
     mean[u] = position_m.ravel()[u] + gain @ (session_m[: len(seen)] - position_m[seen]).ravel()
-    mean[2 * count :] = session_m[len(seen) :].ravel()
+    mean[dim * count :] = session_m[len(seen) :].ravel()
     joint = np.zeros((len(mean), len(mean)))
-    place = np.concatenate([s, np.arange(2 * count, 2 * (count + new))])
+    place = np.concatenate([s, np.arange(dim * count, dim * (count + new))])
     joint[np.ix_(place, place)] = session_covariance_m2
     joint[np.ix_(u, u)] = covariance_m2[np.ix_(u, u)] + gain @ (session_covariance_m2[:k, :k] - before) @ gain.T
     across = gain @ session_covariance_m2[:k]
     joint[np.ix_(u, place)] = across
     joint[np.ix_(place, u)] = across.T
-    return mean.reshape(-1, 2), 0.5 * (joint + joint.T)
+    return mean.reshape(-1, dim), 0.5 * (joint + joint.T)
 
 
 def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
@@ -90,8 +92,10 @@ def anchored(position_m: FloatArray, covariance_m2: FloatArray) -> FloatArray:
 
 
 def _motions(position_m: FloatArray) -> FloatArray:
-    """(2 K, 3) orthonormal directions in which places move when all of them shift and turn."""
-    direction, size, _ = np.linalg.svd(se2.rigid_directions(position_m - position_m.mean(axis=0)), full_matrices=False)
+    """(2 K, 3) orthonormal directions in which places move when all of them shift and turn; in space (3 K, 6)."""
+    group = PLANE if position_m.shape[1] == PLANE.point_dim else SPACE
+    middle = position_m.mean(axis=0)
+    direction, size, _ = np.linalg.svd(group.rigid_directions(position_m - middle), full_matrices=False)
     return np.asarray(direction[:, size > 1e-12 * size[0]])  # places that are one have no heading
 
 

@@ -25,7 +25,7 @@ from evermap.existence.sites import SiteLooks
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap, class_of, clique_rows, site_middles
 from evermap.sensing.sightlines import HEADINGS, Lines, SightLines, Views, nominal_lines, offsets
-from evermap.sensing.visibility import NominalField, looks_at
+from evermap.sensing.visibility import LooksAt, NominalField, looks_at
 from evermap.types import BoolArray, FloatArray, IntArray, Sensor
 
 USUAL = LooksConfig()
@@ -46,6 +46,26 @@ class Sighting:
     pose_map_robot: FloatArray
     frame: IntArray
     place: IntArray
+
+
+class Watch(NamedTuple):
+    """What was looked at, where a sensor was.
+
+    Attributes:
+        stamp_s: (F,) of the looks of a sensor.
+        listed: which places it looked at then, whatever is in the way, and which of them it saw.
+        eye: (F, 3) pose of the sensor on the floor: x, y, and the heading in which it looks.
+    """
+
+    stamp_s: FloatArray
+    listed: LooksAt
+    eye: FloatArray
+
+    @classmethod
+    def of(cls, sighting: Sighting, position_m: FloatArray, sensor: Sensor) -> Watch:
+        """Return what a sensor in the plane looked at, by its nominal field of view, of places (P, 2)."""
+        listed = looks_at(sensor, sighting.pose_map_robot, position_m, (sighting.frame, sighting.place))
+        return cls(sighting.stamp_s, listed, sensor_poses(sighting, sensor))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,23 +95,20 @@ class PlaceLooks:
     unwitnessed: FloatArray
 
 
-def looked_at(
-    living: LivingMap, p_start: FloatArray, sighting: Sighting, sensor: Sensor, config: LivingConfig
-) -> PlaceLooks:
+def looked_at(living: LivingMap, p_start: FloatArray, watch: Watch, config: LivingConfig) -> PlaceLooks:
     """Return which places of a map were looked at, frame by frame, and which of them were seen.
 
     Args:
         living: the map, with the sites that the session found.
         p_start: (S,) beliefs in these when it began.
-        sighting: what the session saw of it.
-        sensor: its nominal field of view.
-        config: `looks`; without `learn_sight` that is taken for the truth, whatever is in the way.
+        watch: at which of its places the session looked, and which it saw.
+        config: `looks`; without `learn_sight` nothing is ever in the way.
     """
     from evermap.sensing.kernels import close_to_hits, grouped, witnessed
 
-    places = living.places
+    places, (stamp_s, listed, eye) = living.places, watch
+    floor_m = np.ascontiguousarray(places.position_m[:, :2])  # lines of sight are told apart on the floor
     used = ~np.isin(places.landmark_id, living.members.landmark_id[living.members.deleted])  # those nobody looks for
-    listed = looks_at(sensor, sighting.pose_map_robot, places.position_m, (sighting.frame, sighting.place))
     if not used.all():
         listed = listed.rows(used[listed.landmark])
     cliques, clique_of_site = clique_rows(living.sites)
@@ -99,10 +116,9 @@ def looked_at(
     clique_of_place = clique_of_site[site_of_place]
     order = grouped(clique_of_place[listed.landmark], len(cliques))  # places are sorted by site: so are those of a pose
     frame, place, nominal, hit = listed.rows(order)
-    eye = sensor_poses(sighting, sensor)
-    cell = living.sightlines.cells(eye[:, :2], places.position_m, (frame, place))
+    cell = living.sightlines.cells(eye[:, :2], floor_m, (frame, place))
     line, key, p_nominal = _different(place, cell, nominal)
-    rows = SiteLooks(sighting.stamp_s[frame], clique_of_place[place], site_of_place[place], key, hit)
+    rows = SiteLooks(stamp_s[frame], clique_of_place[place], site_of_place[place], key, hit)
     settings, rules = config.looks, living.sightlines.rules
     settled = close_to_hits(rows.stamp_s, rows.site, hit, len(living.sites), settings.settled_s)
     if not config.learn_sight:
@@ -119,7 +135,7 @@ def looked_at(
     clear = line_is_clear[key]
     beside, behind = (some[order] for some in witnessed(
         listed.pose, listed.landmark, listed.hit, clique_of_place, np.ascontiguousarray(eye[:, :2]),
-        np.ascontiguousarray(places.position_m), (settings.beside_m, settings.beside_rad, settings.along_m),
+        floor_m, (settings.beside_m, settings.beside_rad, settings.along_m),
     ))  # fmt: skip
     unknown = behind & (~line_is_clear & (p_clear > rules.blocked))[key]
     was_unknown = behind & (~was_clear & (p_before > rules.blocked))[key]
@@ -129,7 +145,7 @@ def looked_at(
         p_start,
         rows,
         _Seen(clear, beside & clear, unknown),
-        lambda some: (eye[frame[some], :2], places.position_m[place[some]]),
+        lambda some: (eye[frame[some], :2], floor_m[place[some]]),
         settings,
     )
     lines = lines._replace(p_free=1.0 - p_hidden[clique_of_place[line[:, 0]]])
@@ -282,7 +298,7 @@ def arrivals(
         log_missed: dict[float, float] = {}
         for place in np.flatnonzero(site_of_place == site).tolist():
             mine = looks.rows.hit & (looks.place == place)
-            place_m = after.places.position_m[place]
+            place_m = after.places.position_m[place, :2]
             seen_from = place_m + offsets(np.unique(looks.cell[mine]), cells)
             frames, rate, stamps = _empty_looks(before.views, rays, seen_from, place_m, at_eye, settings)
             for stamp in np.unique(stamps):
@@ -313,7 +329,7 @@ class _Rays:
         lines = living.sightlines
         row = living.place_row(lines.landmark_id, lines.site_id)
         used = (row >= 0) & (lines.hits >= 0.5)
-        to_m = living.places.position_m[row[used]]
+        to_m = living.places.position_m[row[used], :2]
         return cls(to_m + offsets(lines.cell[used], lines.cell_m), to_m)
 
     def pass_by(self, eye_m: FloatArray, place_m: FloatArray, settings: LooksConfig) -> BoolArray:

@@ -18,13 +18,16 @@ from scipy.linalg import cho_factor, cho_solve
 
 from evermap.config import OverlayConfig
 from evermap.geometry import se2
+from evermap.geometry.group import PLANE, SPACE
 from evermap.geometry.rigid import AGREE_M, consensus, rigid
 from evermap.types import FloatArray, IntArray
 
 ELSEWHERE = -1
 """Option of a clique that stands at no known site."""
-FREE_MOTION = (20.0, 20.0, 3.0)
-"""Standard deviations (m, m, rad) of the motion between session and map, around the one that was agreed on."""
+FREE_M, FREE_RAD = 20.0, 3.0
+"""Standard deviations of the motion between session and map, around the one that was agreed on."""
+LOWEST_ROOM_M = 1.0
+"""Of a room in space, at least."""
 FAR_M = 2.0
 HOPELESS = -200.0
 """Who lies farther than this from a site, where most agree, with less than this log density, is not asked again."""
@@ -37,8 +40,8 @@ class Sighted:
     """Landmarks of a session that was solved alone.
 
     Attributes:
-        position_m: (L, 2) in the session's frame.
-        covariance_m2: (2 L, 2 L).
+        position_m: (L, 2) in the session's frame, in space (L, 3).
+        covariance_m2: (2 L, 2 L), in space (3 L, 3 L).
         clique: (L,) row of the clique of each.
     """
 
@@ -57,6 +60,7 @@ class Known:
         site: (P,) row of its site.
         log_p_site: (S,) log probability that the clique of each site stands there, before this session.
         log_p_elsewhere: (C,) log probability that a clique stands at none of its sites.
+        log_turned: (S,) what the orientations of its landmarks say for standing there against having been moved.
     """
 
     position_m: FloatArray
@@ -65,6 +69,7 @@ class Known:
     site: IntArray
     log_p_site: FloatArray
     log_p_elsewhere: FloatArray
+    log_turned: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ class Overlay:
     """How a session lies over the map.
 
     Attributes:
-        pose_map_session: (3,) the rigid motion.
+        pose_map_session: (3,) the rigid motion, in space (7,).
         place: (L,) row of the place at which each landmark stands, `ELSEWHERE` where it stands at none.
         probability: (L,) of that, given what is decided of the others.
         drift_m: standard deviation by which landmarks that nobody moved are not quite where they were.
@@ -84,7 +89,13 @@ class Overlay:
     drift_m: float
 
 
-def lay_over(sighted: Sighted, known: Known, search: str = "joint", settings: OverlayConfig = USUAL) -> Overlay | None:
+def lay_over(
+    sighted: Sighted,
+    known: Known,
+    search: str = "joint",
+    settings: OverlayConfig = USUAL,
+    motion: FloatArray | None = None,
+) -> Overlay | None:
     """Return the most probable assignment of sites to cliques, and the motion that goes with it.
 
     Args:
@@ -94,19 +105,24 @@ def lay_over(sighted: Sighted, known: Known, search: str = "joint", settings: Ov
             itself, at the motion that most landmarks agree on; 'none' leaves each at its most probable site.
         settings: priors of what moved. Landmarks that nobody moved may be off by one of `drifts_m`: another robot with
             errors of its own, warmth, a sensor that sees another corner.
+        motion: where the session lies about; None for where most landmarks agree, in the plane.
 
     Returns:
         None where no two landmarks stand to each other as in the map, or where another place explains all better.
     """
     if len(known.landmark) < 2:
         return None
-    weight = np.exp(known.log_p_site[known.site])
-    motion, _ = consensus(
-        sighted.position_m[known.landmark], known.position_m, landmark=known.landmark, weight=np.maximum(weight, 1e-3)
-    )
-    gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
-    if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
-        return None
+    if motion is None:
+        weight = np.exp(known.log_p_site[known.site])
+        motion, _ = consensus(
+            sighted.position_m[known.landmark],
+            known.position_m,
+            landmark=known.landmark,
+            weight=np.maximum(weight, 1e-3),
+        )
+        gap = np.linalg.norm(se2.transform(motion, sighted.position_m[known.landmark]) - known.position_m, axis=1)
+        if len(np.unique(known.landmark[gap < AGREE_M])) < 2:
+            return None
     options = _Options(sighted, known, motion, settings)
     if search == "none":
         chosen = options.likeliest_sites()
@@ -145,16 +161,21 @@ class _Options:
     def __init__(self, sighted: Sighted, known: Known, motion: FloatArray, settings: OverlayConfig) -> None:
         self.settings = settings
         self.sighted, self.known, self.motion = sighted, known, motion
-        self.landmark_m = se2.transform(motion, sighted.position_m)
-        turn = np.kron(np.eye(len(self.landmark_m)), se2.rotation(motion[2]))
+        self.dim = known.position_m.shape[1]
+        group = PLANE if self.dim == PLANE.point_dim else SPACE
+        self.landmark_m = group.transform(motion, sighted.position_m)
+        turn = np.kron(np.eye(len(self.landmark_m)), group.rotation_of(motion))
         # the session turned with the map, and the motion's own freedom
         middle = self.landmark_m - self.landmark_m.mean(axis=0)
-        freedom = se2.rigid_directions(middle) * FREE_MOTION
+        free = np.repeat([FREE_M, FREE_RAD], [group.point_dim, group.dim - group.point_dim])
+        freedom = group.rigid_directions(middle) * free
         self._session = turn @ sighted.covariance_m2 @ turn.T
         self._freedom = freedom @ freedom.T
         self.drift_m = settings.drifts_m[0]
         spread = np.ptp(np.vstack([self.landmark_m, known.position_m]), axis=0)
-        self._log_room = -math.log(max(float(np.prod(spread)), settings.smallest_room_m2))
+        height_m = float(np.prod(np.maximum(spread[2:], LOWEST_ROOM_M)))
+        self._log_room = -math.log(max(float(np.prod(spread[:2])), settings.smallest_room_m2) * height_m)
+        self._log_site = known.log_p_site + known.log_turned
         self.sites: list[list[int]] = [[] for _ in known.log_p_elsewhere]
         order = np.argsort(known.site, kind="stable")
         parts = np.split(order, np.flatnonzero(np.diff(known.site[order])) + 1)
@@ -248,11 +269,11 @@ class _Options:
         """Log probability of the options, with the density of all that stands at its site; and how many places do."""
         error, inverse, rows = self._field(chosen)
         log_volume = float(np.linalg.slogdet(inverse)[1]) if len(rows) else 0.0
-        total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - len(rows) * math.log(2.0 * math.pi)
+        total = 0.5 * log_volume - 0.5 * float(error @ inverse @ error) - 0.5 * len(error) * math.log(2.0 * math.pi)
         for clique, sites in enumerate(self.sites):
             if sites:
                 site = int(chosen[clique])
-                total += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self.known.log_p_site[site])
+                total += float(self.known.log_p_elsewhere[clique] if site == ELSEWHERE else self._log_site[site])
         return total, len(rows)
 
     def n_standing(self, chosen: IntArray) -> int:
@@ -279,7 +300,7 @@ class _Options:
         rows = self._chosen_rows(chosen)
         matched = self.known.landmark[rows]
         motion = self.motion
-        if len(rows) >= 2:
+        if len(rows) >= 2 and self.dim == PLANE.point_dim:  # in space it is where it was said to be
             motion = rigid(self.sighted.position_m[matched], self.known.position_m[rows])
         return Overlay(motion, place, probability, self.drift_m)
 
@@ -323,9 +344,9 @@ class _Options:
             mine = int(chosen[clique])
             others: tuple[IntArray, FloatArray, FloatArray] | None = None
             for site in sites:
-                prior = float(self.known.log_p_site[site])
+                prior = float(self._log_site[site])
                 if site == mine:  # leave-one-out by the inverse alone
-                    block = slice(2 * start[site], 2 * (start[site] + len(self._rows[site])))
+                    block = slice(self.dim * start[site], self.dim * (start[site] + len(self._rows[site])))
                     precision = inverse[block, block]
                     squared = float(pull[block] @ np.linalg.solve(precision, pull[block]))
                     scores[site] = prior + 0.5 * float(np.linalg.slogdet(precision)[1]) - 0.5 * squared
@@ -357,7 +378,7 @@ class _Options:
             return rows, error, inverse
         kept = np.ones(len(rows), dtype=np.bool_)
         kept[start[site] : start[site] + len(self._rows[site])] = False
-        both = np.repeat(kept, 2)
+        both = np.repeat(kept, self.dim)
         ties = inverse[np.ix_(both, ~both)]
         rest = inverse[np.ix_(both, both)] - ties @ np.linalg.solve(inverse[np.ix_(~both, ~both)], ties.T)
         return rows[kept], error[both], rest
@@ -380,11 +401,13 @@ class _Options:
         step = self.landmark_m[self.known.landmark[of]] - self.known.position_m[of]
         middle = step.mean(axis=0)
         share, nudge_m, turn_m = float(self.settings.share_nudged), self.settings.nudge_m, self.settings.turn_m
-        near = math.log(share) - math.log(2.0 * math.pi * nudge_m**2) - 0.5 * float(middle @ middle) / nudge_m**2
+        log_volume = 0.5 * self.dim * math.log(2.0 * math.pi * nudge_m**2)
+        near = math.log(share) - log_volume - 0.5 * float(middle @ middle) / nudge_m**2
         log_density = float(np.logaddexp(near, math.log(1.0 - share) + self._log_room))
         rest = step - middle
-        count = 2 * (len(of) - 1)
-        return log_density - 0.5 * float((rest**2).sum()) / turn_m**2 - 0.5 * count * math.log(2 * math.pi * turn_m**2)
+        count = self.dim * (len(of) - 1)
+        still = 0.5 * float((rest**2).sum()) / turn_m**2 + 0.5 * count * math.log(2 * math.pi * turn_m**2)
+        return float(log_density - still)
 
     def _field(self, chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Differences, inverse of their covariance, and rows of all places that are chosen."""
@@ -400,8 +423,8 @@ class _Options:
 
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places."""
-        la, lb = se2.xy_rows(self.known.landmark[a]), se2.xy_rows(self.known.landmark[b])
-        pa, pb = se2.xy_rows(a), se2.xy_rows(b)
+        la, lb = (se2.xy_rows(self.known.landmark[rows], self.dim) for rows in (a, b))
+        pa, pb = se2.xy_rows(a, self.dim), se2.xy_rows(b, self.dim)
         both: FloatArray = (
             self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)] + self._freedom[np.ix_(la, lb)]
         )

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import sparse
 
 from evermap.config import FitConfig, LivingConfig
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
-from evermap.maps.living import LivingMap
+from evermap.maps.living import LivingMap, Places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
@@ -22,6 +22,8 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 USUAL = FitConfig()
 SMALLEST_P = 1e-6
+STOOD_RAD, MOVED_RAD = (0.02, 0.06, 0.15), (0.2, 1.0)
+"""How far landmarks in space seem turned from session to session: standard deviations, of a group all alike."""
 BENT_ROUNDS = 5
 """Refits of that motion to the bodies that agree with it."""
 
@@ -52,6 +54,43 @@ class Laid:
         return replace(self, place=place, assumed=np.zeros(len(place), dtype=np.bool_))
 
 
+class Turned(NamedTuple):
+    """How the landmarks of a session in space are turned, of which it is known about where it lies.
+
+    Attributes:
+        pose_map_session: (7,) where.
+        rotation: (K, 4) quaternions in its frame, nan of points.
+        covariance: (K, 3, 3) of them, in the landmarks' own axes [rad^2].
+    """
+
+    pose_map_session: FloatArray
+    rotation: FloatArray
+    covariance: FloatArray
+
+    def log_odds(self, landmark: IntArray, places: Places) -> FloatArray:
+        """Return (P,) log likelihood ratio of landmarks (P,) being turned as at places, for 'stands' over 'moved'."""
+        turn = se3.compose(self.pose_map_session, _turns(self.rotation[landmark]))
+        off = se3.local(_turns(places.rotation), turn)[:, 3:]
+        known = np.isfinite(places.rotation[:, 0]) & np.isfinite(self.rotation[landmark, 0])
+        spread = np.where(known[:, None, None], self.covariance[landmark] + places.rotation_covariance, np.eye(3))
+
+        def log_density(sigmas_rad: tuple[float, ...]) -> FloatArray:
+            each = []
+            for sigma in sigmas_rad:
+                wide = spread + sigma**2 * np.eye(3)
+                squared = np.einsum("ki,ki->k", off, np.linalg.solve(wide, off[..., None])[..., 0])
+                each.append(-0.5 * squared - 0.5 * np.linalg.slogdet(wide)[1])
+            return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
+
+        return np.where(known, log_density(STOOD_RAD) - log_density(MOVED_RAD), 0.0)
+
+
+def _turns(rotation: FloatArray) -> FloatArray:
+    """Poses (K, 7) at the origin with orientations (K, 4); of nan with none."""
+    known = np.isfinite(rotation[:, :1])
+    return np.hstack([np.zeros((len(rotation), 3)), np.where(known, rotation, [0.0, 0.0, 0.0, 1.0])])
+
+
 def laid_over(
     living: LivingMap,
     p_site: FloatArray,
@@ -59,8 +98,9 @@ def laid_over(
     position_m: FloatArray,
     covariance_m2: FloatArray,
     config: LivingConfig,
+    turned: Turned | None = None,
 ) -> Laid | None:
-    """Find a session in the map.
+    """Find a session in the map; None where it shows nothing that stands as there.
 
     Args:
         living: the map.
@@ -69,37 +109,39 @@ def laid_over(
         position_m: (K, 2) in its own frame.
         covariance_m2: (2 K, 2 K).
         config: `search` and `overlay`, see `overlay.lay_over`.
-
-    Returns:
-        None where the session shows nothing that stands as in the map.
+        turned: of a session in space, where it lies about; its positions have three coordinates.
     """
     members, places, sites = living.members, living.places, living.sites
     at = np.minimum(np.searchsorted(members.landmark_id, landmark_id), max(len(members) - 1, 0))
     known = members.landmark_id[at] == landmark_id if len(members) else np.zeros(len(landmark_id), np.bool_)
     seen = np.flatnonzero(known)
-    row_of = {int(landmark_id[k]): n for n, k in enumerate(seen)}
-    landmark = np.array([row_of.get(int(name), -1) for name in places.landmark_id], dtype=np.int64)
-    used = np.flatnonzero(landmark >= 0)
+    used = np.flatnonzero(np.isin(places.landmark_id, landmark_id[seen]))
+    landmark = np.searchsorted(landmark_id[seen], places.landmark_id[used])
     if len(used) < 2:
         return None
     clique_ids, clique = np.unique(members.clique_id[at[seen]], return_inverse=True)
     used_sites, site = np.unique(places.site_id[used], return_inverse=True)
     site_rows = np.searchsorted(sites.site_id, used_sites)
+    log_turned = np.zeros(len(used_sites))
+    if turned is not None:
+        np.add.at(log_turned, site.ravel(), turned.log_odds(seen[landmark], places[used]))
     total = np.zeros(len(clique_ids))
     of_known = np.isin(sites.clique_id, clique_ids)
     np.add.at(total, np.searchsorted(clique_ids, sites.clique_id[of_known]), p_site[of_known])
     found = lay_over(
-        Sighted(position_m[seen], of_places(covariance_m2, seen), clique.ravel().astype(np.int64)),
+        Sighted(position_m[seen], of_places(covariance_m2, seen, living.dim), clique.ravel().astype(np.int64)),
         Known(
             position_m=places.position_m[used],
-            covariance_m2=of_places(living.covariance_m2, used),
-            landmark=landmark[used],
+            covariance_m2=of_places(living.covariance_m2, used, living.dim),
+            landmark=landmark,
             site=site.ravel().astype(np.int64),
             log_p_site=np.log(np.maximum(p_site[site_rows], SMALLEST_P)),
             log_p_elsewhere=np.log(np.maximum(1.0 - total, SMALLEST_P)),
+            log_turned=log_turned,
         ),
         config.search,
         config.overlay,
+        None if turned is None else turned.pose_map_session,
     )
     if found is None:
         return None

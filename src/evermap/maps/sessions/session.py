@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy import sparse
@@ -25,14 +26,32 @@ from evermap.maps.sessions.gaussian import (
     resized,
     settled,
 )
-from evermap.maps.sessions.looks import PlaceLooks, Sighting, arrivals, looked_at, sensor_poses
+from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
+from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
+from evermap.slam.space.result import concluded_in_space
 from evermap.slam.streaming import Outcome
-from evermap.types import UNKNOWN, FloatArray, IntArray, MapChange, Misses, Recording, SlamResult, rows_of
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    FloatArray,
+    IntArray,
+    MapChange,
+    Misses,
+    Recording,
+    Sensor,
+    SlamResult,
+    SpatialRecording,
+    rows_of,
+)
 
+RecordingT = TypeVar("RecordingT", Recording, SpatialRecording)
+
+Visit = Solved | SpatialVisit
+"""A session that is solved, in the plane or in space."""
 NOT_FOUND = "too few of its landmarks were seen standing to each other as it says"
 CONTRADICTED = "most sightings contradict it; the session is bent, or of another place"
 """Why a session cannot be localised in a map."""
@@ -54,7 +73,7 @@ class Session:
 
     living: LivingMap
     found: bool
-    recording: Recording
+    recording: AnyRecording
     slam: SlamResult
     changes: tuple[MapChange, ...]
     evidence: Evidence
@@ -76,12 +95,19 @@ class Believed:
     evidence: Evidence
 
 
-def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, LivingMap]:
+def admitted(recording: RecordingT, living: LivingMap) -> tuple[RecordingT, LivingMap]:
     """Return the recording without landmarks that an operator deleted, and with the map's class numbers.
 
     Raises:
-        DataError: another clock than the map's.
+        DataError: another clock than the map's, or of the plane where that is of space.
     """
+    if (living.dim == 3) != isinstance(recording, SpatialRecording):
+        of = {2: "the plane", 3: "space"}
+        raise DataError(
+            f"{recording.name}: a recording in {of[5 - living.dim]}, the map is of {of[living.dim]}",
+            field="living",
+            hint="one map file each",
+        )
     if len(living.places) and recording.clock != living.clock:
         raise DataError(
             f"{recording.name}: its stamps count '{recording.clock}', the map's '{living.clock}'",
@@ -101,7 +127,7 @@ def admitted(recording: Recording, living: LivingMap) -> tuple[Recording, Living
     )
 
 
-def check_in_order(recording: Recording, living: LivingMap) -> None:
+def check_in_order(recording: AnyRecording, living: LivingMap) -> None:
     """Raise `DataError` for a session that begins before the newest one of the map."""
     stamps = recording.frames.stamp_s
     if len(stamps) and stamps[0] < living.session_start_s:
@@ -253,7 +279,7 @@ class Judged:
 
 
 def judged(
-    living: LivingMap, where: Laid | None, visit: Solved, config: LivingConfig, known: Judged | None = None
+    living: LivingMap, where: Laid | None, visit: Visit, config: LivingConfig, known: Judged | None = None
 ) -> Judged:
     """Return the map after the session, what changed, and what was seen and missed.
 
@@ -271,7 +297,7 @@ def judged(
     living = replace(living, sightlines=replace(living.sightlines, rules=config.sight))
     aged = believe.aged(living, config, visit.start_s)
     living = replace(living, sites=replace(living.sites, p_kept=aged.p_kept))
-    found = found_in(where, visit, config) if known is None else known.found
+    found = found_in(living, where, visit, config) if known is None else known.found
     entry = entered(living, aged.p_here, where, found, visit, config)
     seen, eye = looks(entry, visit, config)
     now = believed(entry, seen, visit, config)
@@ -281,18 +307,20 @@ def judged(
 
 
 def entered(
-    living: LivingMap, p_site: FloatArray, where: Laid | None, found: Found, visit: Solved, config: LivingConfig
+    living: LivingMap, p_site: FloatArray, where: Laid | None, found: Found, visit: Visit, config: LivingConfig
 ) -> Extended:
     """Return the map with the places and sites that the session found."""
-    if where is None:
+    if where is None and isinstance(visit, Solved):
         variance = visit.outcome.log_scale_sigma**2
         information = 1.0 / variance if variance > 0.0 else np.inf
         living = replace(living, log_size_variance=variance, log_size_information=information)
     return extended(living, p_site, found, config, 0.0 if where is None else where.drift_m)
 
 
-def found_in(where: Laid | None, visit: Solved, config: LivingConfig) -> Found:
+def found_in(living: LivingMap, where: Laid | None, visit: Visit, config: LivingConfig) -> Found:
     """Return the landmarks of a session, in the frame of the map; None for `where` begins one."""
+    if isinstance(visit, SpatialVisit):
+        return visit.found(where, living, config.fit)
     begins, in_place = where is None, None
     if where is not None:
         in_place = np.searchsorted(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
@@ -319,10 +347,13 @@ def found_in(where: Laid | None, visit: Solved, config: LivingConfig) -> Found:
     return Found(names, kind[row], place, probability, own.position_m[seen], covariance, body, first[row], last[row])
 
 
-def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:
+def looks(entry: Extended, visit: Visit, config: LivingConfig) -> tuple[PlaceLooks, FloatArray]:
     """Return which places of the map were looked at in the session, and which of them were seen; and (F, 3) sensor
     poses.
     """
+    if isinstance(visit, SpatialVisit):
+        watch = visit.watched(entry, config)
+        return looked_at(entry.living, entry.p_start, watch, config), watch.eye
     recording, prepared, outcome = visit.recording, visit.prepared, visit.outcome
     trajectory = of_slam.trajectory(prepared, outcome, recording, "")
     stamps = recording.frames.stamp_s
@@ -336,8 +367,8 @@ def looks(entry: Extended, visit: Solved, config: LivingConfig) -> tuple[PlaceLo
     hit = place_of[landmark]
     frame = np.searchsorted(frames, recording.detections.frame[detection])
     sighting = Sighting(stamps[frames], pose, frame[hit >= 0], hit[hit >= 0])
-    seen = looked_at(entry.living, entry.p_start, sighting, recording.sensor, config)
-    return seen, sensor_poses(sighting, recording.sensor)
+    watch = Watch.of(sighting, entry.living.places.position_m, recording.sensor)
+    return looked_at(entry.living, entry.p_start, watch, config), watch.eye
 
 
 def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: float) -> None:
@@ -353,7 +384,7 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: 
     place_of[row[near]] = place[near]
 
 
-def believed(entry: Extended, seen: PlaceLooks, visit: Solved, config: LivingConfig) -> Believed:
+def believed(entry: Extended, seen: PlaceLooks, visit: Visit, config: LivingConfig) -> Believed:
     """Return the map with the beliefs and the counts of the session."""
     living, rows = entry.living, seen.rows
     hit, missed = rows.hit, seen.counts & ~rows.hit
@@ -368,9 +399,7 @@ def believed(entry: Extended, seen: PlaceLooks, visit: Solved, config: LivingCon
     np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
     sites = living.sites
     if config.existence:
-        beliefs = believe.believed(
-            living, entry.p_start, seen, visit.recording.sensor, config, visit.start_s, visit.end_s
-        )
+        beliefs = believe.believed(living, entry.p_start, seen, _sensor(visit), config, visit.start_s, visit.end_s)
         sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), believe.said(living, beliefs)
         evidence = believe.evidence(living, beliefs)
     else:
@@ -388,7 +417,11 @@ def believed(entry: Extended, seen: PlaceLooks, visit: Solved, config: LivingCon
     return Believed(living, log_evidence, evidence)
 
 
-def missed(living: LivingMap, seen: PlaceLooks, visit: Solved) -> Misses:
+def _sensor(visit: Visit) -> Sensor:
+    return visit.floor_sensor if isinstance(visit, SpatialVisit) else visit.recording.sensor
+
+
+def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
     """Return the looks that the map counts as misses of landmarks where they most probably stand after the session.
 
     These are looks in the field of view, without a detection, along lines of sight that are known to be clear.
@@ -404,7 +437,7 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Solved) -> Misses:
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: PlaceLooks, visit: Solved, config: LivingConfig, classes: ClassLives | None
+    before: LivingMap, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """Return the map with its stays up to date and without what is forgotten, and what changed since the session
     before.
@@ -417,7 +450,7 @@ def decided(
         config: which parts of the engine are on.
         classes: how long things stay, as the session teaches; None for nothing.
     """
-    came = arrivals(before, now.living, seen, visit.recording.sensor, config.looks)
+    came = arrivals(before, now.living, seen, _sensor(visit), config.looks)
     after, changes = decide.decided(
         before, now.living, seen, now.log_evidence, came, visit.start_s, classes, settings=config.decisions
     )
@@ -445,26 +478,35 @@ def learned(
     return replace(after, lives=classes.lives), classes
 
 
-def told(found: Judged, where: Laid | None, visit: Solved) -> Session:
+def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     """Return the session that made a map of another; its landmarks have hits and misses of all sessions of the map."""
-    frame, names = "first_pose" if where is None else "prior_map", visit.recording.landmark_names
+    frame = "first_pose" if where is None else "prior_map"
+    names = {**visit.recording.landmark_names, **found.living.landmark_names}
     known = replace(found.living.landmarks(), frame=frame, names=names)
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in found.changes)
-    slam = replace(of_slam.result(visit, frame, landmarks, found.misses), changes=changes, gone=gone)
+    if isinstance(visit, SpatialVisit):
+        result = concluded_in_space(visit.recording, visit.intake, visit.solved)
+        slam = replace(result, landmarks=landmarks, misses=found.misses)
+    else:
+        slam = of_slam.result(visit, frame, landmarks, found.misses)
+    slam = replace(slam, changes=changes, gone=gone)
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 
-def lost(alone: Solved, living: LivingMap, config: LivingConfig, reason: str) -> Session:
+def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: str) -> Session:
     """Return a session that cannot be found in the map: it stands by itself, and the map as it was."""
-    frame = "first_pose"
-    landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, frame)
-    slam = existing(alone, of_slam.result(alone, frame, landmarks), config)
+    if isinstance(alone, SpatialVisit):
+        result = concluded_in_space(alone.recording, alone.intake, alone.solved)
+    else:
+        landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, "first_pose")
+        result = of_slam.result(alone, "first_pose", landmarks)
+    slam = existing(alone, result, config)
     slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason}"))
     return Session(living, False, alone.recording, slam, (), Evidence.empty())
 
 
-def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResult:
+def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
     """Return the result of a recording by itself with its misses, and with the belief that each landmark still exists.
 
     Both are those of a living map whose first session the recording is.
@@ -482,8 +524,11 @@ def existing(visit: Solved, slam: SlamResult, config: LivingConfig) -> SlamResul
         object_id=nowhere,
         first_s=mapped.first_seen_s,
         last_s=mapped.last_seen_s,
+        rotation=mapped.rotation,
+        rotation_covariance=mapped.rotation_covariance,
     )
-    empty = LivingMap(clock=visit.recording.clock, class_names=visit.recording.class_names)
+    begun = LivingMap.in_space() if isinstance(visit, SpatialVisit) else LivingMap()
+    empty = replace(begun, clock=visit.recording.clock, class_names=visit.recording.class_names)
     empty = replace(empty, sightlines=replace(empty.sightlines, rules=config.sight))
     entry = extended(empty, np.zeros(0), found, config, 0.0)
     seen, _ = looks(entry, visit, config)

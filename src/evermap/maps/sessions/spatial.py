@@ -1,0 +1,341 @@
+"""A session in space: what it found and what it looked at, for the same map and the same steps as in the plane.
+
+A camera that is carried by hand knows nothing of how it came from one group of tags to the next, so that a session by
+itself may be loose. Therefore it is solved within the map from the beginning, every landmark weighted by the
+probability that it stands (`slam.space.against_map`); what the session says by itself is that optimum without what the
+map said. It is laid over the map as any other session, and solved once more with what stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from evermap.config import FitConfig, LivingConfig
+from evermap.geometry import se2, se3
+from evermap.geometry.chunked import blocks, of_places
+from evermap.maps.living import EXISTS, Dated, LivingMap
+from evermap.maps.sessions.extend import Extended, Found
+from evermap.maps.sessions.gaussian import anchored, drifted
+from evermap.maps.sessions.looks import Watch
+from evermap.maps.sessions.placing import Laid, Turned, laid_over
+from evermap.sensing import learned
+from evermap.sensing.profile import Assumed, Field, Projection
+from evermap.sensing.visibility import WORTH_A_LOOK, LooksAt
+from evermap.slam.space.against_map import by_itself
+from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.problem import PlacePrior
+from evermap.slam.space.result import identities_of, located, most_of
+from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Sensor, SpatialRecording, landmark_id_of
+
+AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+"""Columns are ahead, left and up of a sensor that looks along its z, with y down."""
+FIELD_MARGIN_RAD = 0.02
+RANGE_MARGIN = 1.1
+"""Nothing is expected farther than the farthest sighting times this."""
+USUAL_RANGE = 0.9
+"""Share of sightings that were nearer than what an earlier look at an empty place reaches."""
+FACED = 0.2
+"""Median cosine of incidence from which on landmarks are taken to have a face."""
+WIDEST_RAD = np.radians(85.0)
+"""Angle of incidence from which landmarks with a face are detected hardly at all."""
+MOST_OF_ONE_IDENTITY = 4
+"""Landmarks that a map tells apart."""
+MOST_VIEWS = 2000
+"""Looks that detection is learned from."""
+DRIFT_RAD = 0.02
+"""By which orientations of landmarks that nobody moved are off from session to session."""
+
+
+@dataclass(frozen=True)
+class SpatialVisit:
+    """A session in space, in a frame of its own or in that of a map.
+
+    Attributes:
+        recording: as it was used.
+        intake: as the estimator wants it.
+        solved: its values.
+    """
+
+    recording: SpatialRecording
+    intake: SpatialIntake
+    solved: SpatialSolved
+
+    @property
+    def start_s(self) -> float:
+        """Stamp of the first frame that has a pose."""
+        return self.intake.start_s
+
+    @property
+    def end_s(self) -> float:
+        """Stamp of the last frame that has a pose."""
+        return self.intake.start_s + float(self.solved.optimum.smoother.problem.stamp_s[-1])
+
+    @property
+    def optimum(self) -> SpatialOptimum:
+        """The last values."""
+        return self.solved.optimum
+
+    @property
+    def inlier(self) -> FloatArray:
+        """(M,) probability of each detection that is used to be no outlier."""
+        return self.optimum.now.weight
+
+    @property
+    def landmark_id(self) -> IntArray:
+        """(P,) ids of the places of the problem."""
+        return identities_of(self.intake, self.solved)[0]
+
+    def named(self, living: LivingMap) -> LivingMap:
+        """Return the map with the names of landmarks that carry the identity of others."""
+        texts = identities_of(self.intake, self.solved)[1].values()
+        return replace(living, landmark_texts=tuple(sorted({*living.landmark_texts, *texts})))
+
+    @property
+    def floor_sensor(self) -> Sensor:
+        """How far and how widely the sensors saw, as one on the floor: what earlier looks are asked by."""
+        direction, range_m = self._directions(np.flatnonzero(self.inlier >= EXISTS))
+        half = float(np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.0)) + FIELD_MARGIN_RAD
+        told = self.recording.sensors[0]
+        return Sensor(
+            range_min_m=told.range_min_m,
+            range_max_m=float(np.quantile(range_m, USUAL_RANGE)) if len(range_m) else told.range_max_m,
+            bearing_min_rad=max(-half, -np.pi),
+            bearing_max_rad=min(half, np.pi),
+            p_detect=told.p_detect,
+            p_false=told.p_false,
+        )
+
+    def _axes(self) -> FloatArray:
+        """(S, 3, 3) ahead, left and up of each sensor, by where it saw most."""
+        problem = self.optimum.smoother.problem
+        axes = np.tile(np.eye(3), (len(problem.mount), 1, 1))
+        for row, sensor in enumerate(self.recording.sensors):
+            seen = problem.measured[problem.sensor == row, :3]
+            if sensor.intrinsics is not None or (len(seen) and np.median(seen[:, 2]) > abs(np.median(seen[:, 0]))):
+                axes[row] = AXES_OF_CAMERA
+        return axes
+
+    def _directions(self, some: IntArray) -> tuple[FloatArray, FloatArray]:
+        """(N, 3) unit vectors of detections by the axes of their sensors, and (N,) ranges."""
+        problem = self.optimum.smoother.problem
+        along = np.einsum("nji,nj->ni", self._axes()[problem.sensor[some]], problem.measured[some, :3])
+        range_m = np.linalg.norm(along, axis=1)
+        return along / np.maximum(range_m, 1e-9)[:, None], range_m
+
+    def found(self, where: Laid | None, living: LivingMap | None, settings: FitConfig) -> Found:
+        """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
+        problem, place = self.optimum.smoother.problem, self.optimum.estimate.place
+        names, count = self.landmark_id, len(place)
+        good = np.flatnonzero(self.inlier >= settings.inlier)
+        n_fit = np.bincount(problem.place, self.inlier, minlength=count)
+        laid = np.full(count, -1, dtype=np.int64)
+        probability, alone = np.ones(count), by_itself(self.optimum)
+        if where is not None:
+            _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
+            laid[here], probability[here] = where.place[there], where.probability[there]
+        least = np.where(laid >= 0, settings.sightings_in_place, settings.sightings)
+        tied = located(problem, self.optimum.now)[1]
+        row = np.flatnonzero((n_fit >= least) & (np.bincount(problem.place[good], minlength=count) > 0) & tied)
+        row = row[np.argsort(names[row], kind="stable")]
+        stamps = self.recording.frames.stamp_s[self.recording.detections.frame[self.intake.used[good]]]
+        first, last = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(first, problem.place[good], stamps)
+        np.maximum.at(last, problem.place[good], stamps)
+        at = se2.xy_rows(row, 3)
+        position, covariance = place[row, :3] + alone.shift_m[row], alone.covariance_m2[np.ix_(at, at)]
+        if living is None or where is None:
+            covariance = anchored(position, covariance)
+        else:
+            position, covariance = _fused(position, covariance, laid[row], living, where.drift_m)
+        kind = most_of(problem.place, self.recording.detections.class_id[self.intake.used], count)
+        rotation = np.where(problem.oriented[row, None], place[row, 3:], np.nan)
+        return Found(
+            names[row], kind[row], laid[row], probability[row], position, covariance,
+            np.full(len(row), UNKNOWN, dtype=np.int64), first[row], last[row], rotation, alone.rotation[row],
+        )  # fmt: skip
+
+    def watched(self, entry: Extended, config: LivingConfig) -> Watch:
+        """Return at which places of the map the session looked: where its own sightings show that it would have seen
+        them.
+
+        The detection by range, incidence and direction is learned from what stood (`sensing.learned`).
+        """
+        eye, stamp_s, hits = self._views(entry, config)
+        places, axes = entry.living.places, self._axes()
+        pose, p = np.tile(np.eye(4), (len(stamp_s), 1, 1)), np.zeros((len(stamp_s), len(places)))
+        pose[:, :3, 3] = eye.pose[:, :3]
+        pose[:, :3, :3] = se3.rotation_of(eye.pose) @ axes[eye.sensor]
+        detected = np.zeros(p.shape, dtype=np.bool_)
+        detected[hits] = True
+        for sensor in np.unique(eye.sensor):
+            mine = np.flatnonzero(eye.sensor == sensor)
+            model = self._model(int(sensor), places.position_m, places.rotation, pose[mine], detected[mine])
+            there = _near_hits(stamp_s[mine], detected[mine], config.looks.settled_s)
+            some = mine[:: max(1, len(mine) // MOST_VIEWS)]
+            chosen = np.isin(mine, some)
+            model = learned.watched(model, stamp_s[some], pose[some], detected[some], there[chosen])
+            p[mine] = model.p_detect(pose[mine], places.position_m)
+        looked = detected | (p >= WORTH_A_LOOK * p.max(initial=0.0))
+        view, place = np.nonzero(looked)
+        listed = LooksAt(view, place, p[view, place], detected[view, place])
+        heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
+        return Watch(stamp_s, listed, np.column_stack([pose[:, 0, 3], pose[:, 1, 3], heading]))
+
+    def _views(self, entry: Extended, config: LivingConfig) -> tuple[_Eyes, FloatArray, tuple[IntArray, IntArray]]:
+        """Looks of sensors, their stamps, and the rows of looks and of places of what was seen where the map has it."""
+        problem, optimum = self.optimum.smoother.problem, self.optimum
+        n_sensors = len(problem.mount)
+        view = problem.pose_row * n_sensors + problem.sensor
+        views = np.unique(view)
+        if n_sensors == 1 and problem.driven:  # it looked in every frame
+            views = np.arange(len(problem.stamp_s))
+        views = views[located(problem, optimum.now)[0][views // n_sensors]]
+        row, sensor = views // n_sensors, views % n_sensors
+        eye = se3.compose(optimum.estimate.pose[row], optimum.estimate.mount(problem)[sensor])
+        place_of = np.full(len(problem.oriented), -1, dtype=np.int64)
+        _, here, there = np.intersect1d(self.landmark_id, entry.landmark_id, return_indices=True)
+        place_of[here] = entry.place[there]
+        hit = np.flatnonzero((self.inlier >= config.fit.inlier) & (place_of[problem.place] >= 0) & np.isin(view, views))
+        at = np.searchsorted(views, view[hit]), place_of[problem.place[hit]]
+        return _Eyes(eye, sensor), self.intake.start_s + problem.stamp_s[row], at
+
+    def _model(
+        self, sensor: int, position_m: FloatArray, rotation: FloatArray, pose: FloatArray, detected: BoolArray
+    ) -> learned.LearnedDetection:
+        """The detection model of a sensor before the session: its field is where it has seen anything."""
+        problem, told = self.optimum.smoother.problem, self.recording.sensors[sensor]
+        direction, range_m = self._directions(np.flatnonzero((problem.sensor == sensor) & (self.inlier >= EXISTS)))
+        camera = told.intrinsics is not None or not np.array_equal(self._axes()[sensor], np.eye(3))
+        across = direction[:, 0] if camera else np.hypot(direction[:, 0], direction[:, 1])
+        azimuth = np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.1) + FIELD_MARGIN_RAD
+        elevation = np.abs(np.arctan2(direction[:, 2], across)).max(initial=0.1) + FIELD_MARGIN_RAD
+        widest = np.pi / 2 if camera else np.pi
+        view, place = np.nonzero(detected)
+        outward = np.zeros_like(position_m)
+        turned = np.isfinite(rotation[:, 0])
+        outward[turned] = se3.rotation_of(np.hstack([position_m, rotation])[turned])[:, :, 2]
+        to_eye = pose[view, :3, 3] - position_m[place]
+        cosine = (to_eye * outward[place]).sum(axis=1) / np.maximum(np.linalg.norm(to_eye, axis=1), 1e-9)
+        middle = float(np.median(cosine[turned[place]])) if turned[place].any() else 0.0
+        faced = abs(middle) > FACED
+        assumed = Assumed(
+            Field(
+                min(told.range_max_m, RANGE_MARGIN * float(range_m.max(initial=1.0))),
+                float(min(azimuth, widest)),
+                float(min(elevation, np.pi / 2)),
+                Projection.PINHOLE if camera else Projection.SPHERICAL,
+            ),
+            fading_m=np.inf,
+            viewing_angle_rad=WIDEST_RAD if faced else np.pi,
+        )
+        model = learned.init(position_m, np.arange(len(position_m)), assumed)
+        return replace(model, outward=np.sign(middle) * outward if faced else 0.0 * outward)
+
+
+@dataclass(frozen=True, slots=True)
+class _Eyes:
+    """(V, 7) poses of sensors in the map, and (V,) which."""
+
+    pose: FloatArray
+    sensor: IntArray
+
+
+def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> BoolArray:
+    """(V, K) looks with a detection of the same landmark so shortly before or after."""
+    before = np.maximum.accumulate(np.where(detected, stamp_s[:, None], -np.inf), axis=0)
+    after = np.minimum.accumulate(np.where(detected, stamp_s[:, None], np.inf)[::-1], axis=0)[::-1]
+    return np.asarray((stamp_s[:, None] - before <= within_s) | (after - stamp_s[:, None] <= within_s))
+
+
+def visited(
+    intake: SpatialIntake,
+    recording: SpatialRecording,
+    living: LivingMap,
+    p_site: FloatArray,
+    config: LivingConfig,
+    progress: Progress | None = None,
+) -> tuple[SpatialVisit, Laid | None]:
+    """Return a session solved within a map, and where it lies there; None where it shows nothing that stands."""
+    if not len(living.places):
+        return SpatialVisit(recording, intake, solve_space(intake, None, progress=progress)), None
+    believed = replace(living, sites=replace(living.sites, p_here=p_site), dated=Dated.empty(), stamp_s=-np.inf)
+    prior = believed.landmarks(p_least=EXISTS)
+    solved = solve_space(intake, prior, progress=progress)
+    visit = SpatialVisit(recording, intake, _numbered(intake, solved, living))
+    where = _laid(visit, living, p_site, config)
+    if where is None or np.count_nonzero(where.place >= 0) < 2:
+        return visit, None
+    return replace(visit, solved=replace(visit.solved, optimum=_held(visit, living, where), from_map=None)), where
+
+
+def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
+    """The session with landmarks of one identity named as the map names those that are nearest."""
+    number, place = solved.number.copy(), solved.optimum.estimate.place
+    for row, own in enumerate(intake.landmark_id.tolist()):
+        name = intake.names.get(own, own)
+        names = np.array([own, *(landmark_id_of(f"{name}#{k}") for k in range(2, MOST_OF_ONE_IDENTITY + 1))])
+        known = np.flatnonzero(np.isin(names, living.members.landmark_id))
+        mine = np.flatnonzero(solved.identity == row)
+        if len(mine) == 1 and not (known > 0).any():
+            continue
+        site = living.site_of()[np.searchsorted(living.members.landmark_id, names[known])]
+        at = living.places.position_m[living.place_row(names[known], site)]
+        nearest = linear_sum_assignment(np.linalg.norm(place[mine, None, :3] - at, axis=2))
+        called = dict(zip(nearest[0].tolist(), known[nearest[1]].tolist(), strict=True))
+        rest = iter(np.setdiff1d(np.arange(len(names) + len(mine)), known).tolist())
+        number[mine] = [1 + (called[k] if k in called else next(rest)) for k in range(len(mine))]
+    return replace(solved, number=number)
+
+
+def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: LivingConfig) -> Laid | None:
+    """Where the session lies in the map, by what it says without the map."""
+    alone, names = by_itself(visit.optimum), visit.landmark_id
+    place, n_fit = visit.optimum.estimate.place, np.bincount(
+        visit.optimum.smoother.problem.place, visit.inlier, minlength=len(names)
+    )  # fmt: skip
+    tied = located(visit.optimum.smoother.problem, visit.optimum.now)[1]
+    row = np.flatnonzero((n_fit >= config.fit.sightings_in_place) & tied)
+    row = row[np.argsort(names[row], kind="stable")]
+    at = se2.xy_rows(row, 3)
+    rotation = np.where(visit.optimum.smoother.problem.oriented[row, None], place[row, 3:], np.nan)
+    turned = Turned(se3.identity(), rotation, alone.rotation[row])
+    position = place[row, :3] + alone.shift_m[row]
+    return laid_over(living, p_site, names[row], position, alone.covariance_m2[np.ix_(at, at)], config, turned)
+
+
+def _fused(
+    position_m: FloatArray, covariance_m2: FloatArray, place: IntArray, living: LivingMap, drift_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Positions (K, 3) and their joint covariance by a session and the map, of which those with a `place` stand."""
+    stand = np.flatnonzero(place >= 0)
+    s = se2.xy_rows(stand, 3)
+    known = drifted(of_places(living.covariance_m2, place[stand], 3), drift_m)
+    gain = np.linalg.solve(covariance_m2[np.ix_(s, s)] + known, covariance_m2[s]).T
+    off = (living.places.position_m[place[stand]] - position_m[stand]).ravel()
+    covariance = covariance_m2 - gain @ covariance_m2[s]
+    return position_m + (gain @ off).reshape(-1, 3), 0.5 * (covariance + covariance.T)
+
+
+def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum:
+    """The session solved once more, its landmarks held where they stand in the map."""
+    optimum = visit.optimum
+    problem, places = optimum.smoother.problem, living.places
+    _, row, at = np.intersect1d(visit.landmark_id, where.landmark_id[where.place >= 0], return_indices=True)
+    place = where.place[where.place >= 0][at]
+    pose = se3.identity(len(row))
+    pose[:, :3] = places.position_m[place]
+    turned = np.isfinite(places.rotation[place, 0]) & problem.oriented[row]
+    pose[turned, 3:] = places.rotation[place[turned]]
+    sigma = np.full((len(row), 6), np.pi)
+    own = blocks(living.covariance_m2, 3)[place]
+    sigma[:, :3] = np.sqrt(np.trace(own, axis1=1, axis2=2) / 3.0 + where.drift_m**2)[:, None]
+    spread = np.trace(places.rotation_covariance[place], axis1=1, axis2=2) / 3.0
+    sigma[turned, 3:] = np.sqrt(spread[turned] + DRIFT_RAD**2)[:, None]
+    prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
+    problem = replace(problem, prior=prior, start_sigma=np.full(6, FREE))
+    return converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
