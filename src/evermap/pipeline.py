@@ -72,6 +72,8 @@ def _run_in_space(
     """The same in space: all frames are read, then solved together."""
     from threadpoolctl import threadpool_limits
 
+    from evermap.maps.sessions.session import existing
+    from evermap.maps.sessions.spatial import SpatialVisit
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.result import concluded_in_space
@@ -82,11 +84,12 @@ def _run_in_space(
             return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
     intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
-        return concluded_in_space(recording, intake, solve_space(intake, prior_map, progress=progress))
+        visit = SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
+        return existing(visit, concluded_in_space(recording, intake, visit.solved), config.living)
 
 
 def run_session(
-    recording: Recording,
+    recording: AnyRecording,
     living: LivingMap | None = None,
     config: Config | None = None,
     *,
@@ -112,9 +115,39 @@ def run_session(
 
     config = config or Config()
     check_type(recording)
-    living = LivingMap(clock=recording.clock) if living is None else living
+    in_space = isinstance(recording, SpatialRecording)
+    if living is None or (in_space and not len(living.places)):
+        begun = LivingMap.in_space() if in_space else LivingMap()
+        living = replace(living, places=begun.places, stays=begun.stays) if living is not None else begun
+        living = replace(living, clock=recording.clock)
+    if len(recording.frames):
+        living = living.from_now_on(float(recording.frames.stamp_s[0]))
     check_in_order(recording, living)
+    if isinstance(recording, SpatialRecording):
+        return _bring_in_space(recording, living, config, progress)
     return bring_in(solve_alone(recording, living, config, progress=progress), living, config)
+
+
+def _bring_in_space(
+    recording: SpatialRecording, living: LivingMap, config: Config, progress: Progress | None
+) -> Session:
+    """The same in space, where a session is solved within the map from the beginning."""
+    from threadpoolctl import threadpool_limits
+
+    from evermap.maps.sessions import believe, spatial
+    from evermap.maps.sessions import session as steps
+    from evermap.slam.space.intake import prepare_space
+
+    recording, living = steps.admitted(recording, living)
+    intake = prepare_space(recording, config.slam.space)
+    with threadpool_limits(limits=1, user_api="blas"):
+        p_site = believe.aged(living, config.living, intake.start_s).p_here
+        visit, where = spatial.visited(intake, recording, living, p_site, config.living, progress)
+        if where is None and len(living.places):
+            return steps.lost(visit, living, config.living, steps.NOT_FOUND)
+        living = visit.named(living)
+        known = steps.judged(living, where, visit, config.living)
+        return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
 
 
 def solve_alone(recording: Recording, living: LivingMap, config: Config, *, progress: Progress | None = None) -> Solved:

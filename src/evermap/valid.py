@@ -118,7 +118,7 @@ def validate(recording: Any) -> None:
         InputError: not a `Recording`, or a value that cannot be; the message names the array and the row.
         DataError: fewer than two rows of odometry, or no detection.
     """
-    check_type(recording)
+    check_type(recording, (Recording,))
     odometry, frames, detections = recording.odometry, recording.frames, recording.detections
     if len(odometry) < 2:
         raise DataError("the odometry needs at least two rows", path=recording.source or None, field="odometry")
@@ -251,9 +251,9 @@ def _check_poses(pose: FloatArray, field: str) -> None:
     _require(_is_unit(pose[:, 3:]), pose, field, "does not end in a unit quaternion", "x, y, z, qx, qy, qz, qw")
 
 
-def check_type(recording: Any) -> None:
-    """Raise InputError for anything but a `Recording`, with the way to get one."""
-    if not isinstance(recording, Recording):
+def check_type(recording: Any, kinds: tuple[type, ...] = (Recording, SpatialRecording)) -> None:
+    """Raise InputError for anything but a recording of some kinds, with the way to get one."""
+    if not isinstance(recording, kinds):
         hint = f"evermap.read_recording({str(recording)!r})" if isinstance(recording, str | Path) else "a Recording"
         raise InputError(f"a Recording is needed, not {type(recording).__name__}", field="recording", hint=hint)
 

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from evermap.maps.why import Answer
 
 
+_AXES = ("x_m", "y_m", "z_m")
+
+
 def revision_dict(item: Revision) -> dict[str, Any]:
     """Return one line of the history."""
     origin = asdict(item.provenance) | {"kind": item.provenance.kind.value}
@@ -82,12 +85,13 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
     place = living.place_row(members.landmark_id, site)
     p_exists = living.p_exists()
     at = np.searchsorted(living.sites.site_id, site)
-    own = blocks(living.covariance_m2)
+    own = blocks(living.covariance_m2, living.dim)
     cliques, row_of_site = clique_rows(living.sites)
     n_sites = np.append(np.bincount(row_of_site), 0)[np.searchsorted(cliques, members.clique_id)]
     content = []
     for row in range(len(members)):
         placed = place[row] >= 0
+        at_m = living.places.position_m[place[row]].tolist() if placed else [None] * living.dim
         content.append(
             {
                 "landmark": int(members.landmark_id[row]),
@@ -96,9 +100,9 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
                 "clique": int(members.clique_id[row]),
                 "p_exists": float(p_exists[row]),
                 "p_ahead": json_number(float(p_ahead[row])),
-                "x_m": float(living.places.position_m[place[row], 0]) if placed else None,
-                "y_m": float(living.places.position_m[place[row], 1]) if placed else None,
-                "sigma_m": float(np.sqrt(np.trace(own[place[row]]) / 2)) if placed else None,
+                **dict(zip(_AXES, at_m, strict=False)),
+                **({"rotation": _rotation(living, int(place[row]))} if living.dim == 3 else {}),
+                "sigma_m": float(np.sqrt(np.trace(own[place[row]]) / living.dim)) if placed else None,
                 "since_s": json_number(float(living.sites.since_s[at[row]])) if placed else None,
                 "seen_s": json_number(float(living.sites.seen_s[at[row]])) if placed else None,
                 "sites": int(n_sites[row]) if placed else 0,
@@ -109,6 +113,12 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
             }
         )
     return content
+
+
+def _rotation(living: LivingMap, place: int) -> list[float] | None:
+    """Quaternion of a place in space; None of a point, and where `place` is -1."""
+    rotation: list[float] = living.places.rotation[place].tolist() if place >= 0 else [math.nan]
+    return None if math.isnan(rotation[0]) else rotation
 
 
 def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
@@ -123,7 +133,7 @@ def landmark_row(content: dict[str, Any], clock: Clock) -> list[str]:
         content["class"] or "-",
         probability_text(content["p_exists"]),
         "-" if ahead is None else probability_text(ahead),
-        f"({content['x_m']:.2f}, {content['y_m']:.2f})" if placed else "-",
+        f"({', '.join(f'{content[axis]:.2f}' for axis in _AXES if axis in content)})" if placed else "-",
         f"{100 * content['sigma_m']:.1f} cm" if placed else "-",
         stamp_text(_or_nan(content["since_s"]), clock),
         stamp_text(_or_nan(content["seen_s"]), clock),

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from evermap.maps.store import MapStore
     from evermap.runs.sessions import Entered
     from evermap.runs.summary import RunInfo
-    from evermap.types import AnyRecording, Landmarks, Recording, SlamResult
+    from evermap.types import AnyRecording, Landmarks, SlamResult
 
 # (section, key, label, format); a number that the run does not have is left out
 _ROWS = (
@@ -181,10 +181,10 @@ def slam(
         out = default_out(recording.name)
         check_replaceable(out, force=force, inputs=inputs)
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
-    if map_file is not None:
-        run_in_map(_planar(recording), chosen, MapOptions(map_file, prior or [], localize, realtime), out, **how)
-        return
     known = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
+    if map_file is not None:
+        run_in_map(recording, chosen, MapOptions(map_file, prior or [], localize, realtime, known), out, **how)
+        return
     run_and_write(recording, chosen, out, prior=known, realtime=realtime, **how)
 
 
@@ -270,22 +270,12 @@ def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str 
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
         return
-    if prior_map is not None:
+    if prior_map is not None and localize:
         raise ConfigError("a living map takes no other one", field="prior_map", hint="either --map or --prior-map")
     if method is not None:
         raise ConfigError(
             "a living map finds changes by itself", field="method", hint="--set living.search=gate, for example"
         )
-
-
-def _planar(recording: AnyRecording) -> Recording:
-    """Return a recording in the plane: living maps are planar so far."""
-    from evermap.types import Recording
-
-    if not isinstance(recording, Recording):
-        problem = "the recording is in space, living maps are in the plane so far"
-        raise ConfigError(problem, field="map", hint="--prior-map FILE reports what of a map in space has moved")
-    return recording
 
 
 def _write_template(folder: Path, *, in_space: bool) -> None:
@@ -325,40 +315,49 @@ class MapOptions(NamedTuple):
         priors: how long things stay, `[CLASS=]PRIOR`.
         localize: only localise; the map stays.
         realtime: at the recording's pace.
+        survey: landmarks that a new map begins with.
     """
 
     map_file: Path
     priors: Sequence[str]
     localize: bool
     realtime: bool
+    survey: Landmarks | None = None
 
 
-def run_in_map(recording: Recording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
+def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
     """Run, write the folder, then commit the map: what is in the map has its folder, whatever happens in between."""
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.existence.models import priors_of
     from evermap.maps.store import open_store
     from evermap.pipeline import run_localization
-    from evermap.runs.sessions import at_time, enter_session
+    from evermap.runs.sessions import at_time, begin_map, enter_session
+    from evermap.types import SpatialRecording
 
-    map_file, priors, localize, realtime = options
+    map_file, priors, localize, realtime, _ = options
     if realtime and not localize:
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
+    planar = None if isinstance(recording, SpatialRecording) else recording
+    if localize and planar is None:
+        hint = f"evermap map export {map_file} --out map.parquet, then --prior-map map.parquet"
+        raise ConfigError("is for recordings in the plane so far", field="localize", hint=hint)
     said = priors_of(*priors_by_class(priors))
-    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize))
+    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize, in_space=planar is None))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} stays as it was")
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
+        if options.survey is not None:
+            begin_map(store, options.survey, recording, command_line())
         with progress_bar(recording.name) as progress:
-            if localize:
+            if planar is not None and localize:
                 stamps = recording.frames.stamp_s
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
-                result = run_localization(recording, living, config, realtime=realtime, progress=progress)
+                result = run_localization(planar, living, config, realtime=realtime, progress=progress)
             else:
                 entered = enter_session(store, recording, config, priors=said, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording

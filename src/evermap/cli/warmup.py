@@ -47,13 +47,16 @@ def warm_up(
         unknown_ids: what landmarks without identities need.
         sessions: what sessions of a living map need.
         localize: what the frames of localising in one need, and nothing else.
-        in_space: what recordings in space need, and nothing else.
+        in_space: what recordings in space need, or sessions of them, and nothing else.
         traffic: what boxes without identity in these need, too.
     """
+    if in_space and sessions:
+        run_session(_flight(1e5), run_session(_flight(0.0)).living)
+        return
     if in_space:
         if traffic:
             of_the_tracker()
-        run_slam(_flight())
+        run_slam(_flight(0.0))
         return
     if localize:
         of_the_localizer()
@@ -91,9 +94,9 @@ def _drive(start_s: float) -> Recording:
     )
 
 
-def _flight() -> SpatialRecording:
+def _flight(start_s: float) -> SpatialRecording:
     """The same in space, with objects that have an orientation."""
-    planar = _drive(0.0)
+    planar = _drive(start_s)
     seen, count = planar.detections, len(planar.detections)
     pose = np.zeros((FRAMES, 7))
     pose[:, 0], pose[:, 6] = 0.1 * np.arange(FRAMES), 1.0

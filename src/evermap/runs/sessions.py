@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from evermap.existence.lifetimes import Lifetimes
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
-    from evermap.types import IntArray, MapChange, Recording
+    from evermap.types import AnyRecording, IntArray, Landmarks, MapChange
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ class _Step:
 
 def enter_session(
     store: MapStore,
-    recording: Recording,
+    recording: AnyRecording,
     config: Config | None = None,
     *,
     priors: Mapping[str, Lifetimes] | None = None,
@@ -114,7 +114,7 @@ def enter_session(
 
     Args:
         store: the map.
-        recording: the session.
+        recording: the session, in space where those of the map are.
         config: settings of this session; the others are brought in again with their own.
         priors: how long things of a class stay, and stay away, as `maps.learning.with_priors` takes them; they stay in
             the map.
@@ -148,9 +148,36 @@ def enter_session(
     return _enter_late(store, recording, said, config, _history(store, kept), data, progress)
 
 
+def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, source: str) -> int:
+    """Commit surveyed landmarks as the first revision of an empty map; returns its number.
+
+    Args:
+        store: the map.
+        landmarks: with covariances; what is not stated must have a value.
+        recording: the first session, whose clock the map has, and whose classes.
+        source: where they come from.
+
+    Raises:
+        ConfigError: the map has landmarks already.
+    """
+    from evermap.errors import ConfigError
+    from evermap.maps.living import LivingMap
+
+    if len(store.load().places):
+        raise ConfigError(
+            "this map has landmarks already",
+            field="prior_map",
+            path=store.where,
+            hint="only a new map begins with some",
+        )
+    living = replace(LivingMap.begun(landmarks), clock=recording.clock)
+    said = Provenance(kind=RevisionKind.EDIT, source=source, note=f"{len(landmarks)} surveyed landmarks")
+    return store.commit(living, said, parent=store.head())
+
+
 def _enter_late(
     store: MapStore,
-    recording: Recording,
+    recording: AnyRecording,
     newest: LivingMap,
     config: Config | None,
     steps: list[_Step],
@@ -220,7 +247,7 @@ def at_time(store: MapStore, stamp_s: float) -> LivingMap:
     return living
 
 
-def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: Recording) -> None:
+def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording) -> None:
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
             raise InputError(

@@ -129,6 +129,20 @@ def test_a_wrong_map_is_told_where_it_is_wrong(odometry):
         assert told[tag].probability > 0.95
 
 
+@pytest.mark.parametrize("seed", [11, 12, 14])
+def test_what_was_moved_by_metres_draws_no_others_along(seed):
+    """Nor is it another landmark of its identity. The others are moved by less, or not."""
+    world = tagged_corridor(seed, drift=0.04, p_wrong=0.03, odometry=seed != 11)
+    shift = {5: (1.6, 0.0, 0.9), 2: (0.2, 0.0, 0.0), 9: (0.0, 0.0, -0.6)}
+    result = run_slam(world.recording, prior_map=moved(world.tags, shift))
+    told = {change.landmark_ids[0]: change for change in result.changes}
+    assert told.keys() == shift.keys()
+    for tag, by in shift.items():
+        assert told[tag].displacement_m == pytest.approx(by, abs=0.03)
+        assert told[tag].probability > 0.95
+    assert not any("#2" in warning for warning in result.warnings)
+
+
 @pytest.mark.slow
 def test_probabilities_of_moves_are_calibrated():
     """Moves are reported right, and as surely as they should be, of maps with stated errors and wrong identities."""

@@ -7,9 +7,11 @@ places and the session fixed, its position is Gaussian in both cases, so the odd
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from evermap.geometry import se2, se3
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.problem import SpatialProblem
 from evermap.types import FloatArray
@@ -18,12 +20,18 @@ P_MOVED = 0.03
 """Probability that a landmark moved since the map was made."""
 MOVED_M, MOVED_RAD = (0.15, 0.5, 2.0), (0.05, 0.5)
 """How far things are moved and turned: standard deviations, all combinations alike."""
-ROUNDS = 8
+ROUNDS = 12
+FARTHEST = 0.25
+"""Squared distances, as a share of the largest one, of places that are let go together."""
 SETTLED = 0.01
 """Change of all probabilities that ends it."""
 PRIOR_COUNT = 6.0
 """Numbers that the stated accuracy of the map is worth where it is estimated."""
 LEAST_WEIGHT = 1e-6
+LEAST_SEEN = 0.5
+"""Sum of inlier probabilities of detections from which on a session says something of a place."""
+LOOSE = 1.0 / 20.0**2
+"""Information of a session by itself in directions of which it says nothing [1/m^2, 1/rad^2]."""
 LEAST_INFORMATION = 1.0 / 25.0
 """Of a place by the others alone: it is somewhere within 5 m, or 5 rad."""
 
@@ -56,13 +64,25 @@ def compared(optimum: SpatialOptimum, stated: FloatArray) -> tuple[SpatialOptimu
     found = _asked(optimum, stated)
     for _ in range(ROUNDS):
         factor = _accuracy(found, stated, problem)
-        prior = replace(problem.prior, sigma=factor * stated, weight=np.maximum(found.p_stands, LEAST_WEIGHT))
-        problem = replace(problem, prior=prior)
+        weight = _believed(found, factor * stated, problem.prior.weight)
+        held = bool(np.any((found.p_stands < 0.5) & (weight >= 0.5)))
+        problem = replace(problem, prior=replace(problem.prior, sigma=factor * stated, weight=weight))
         optimum = converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)
         before, found = found, replace(_asked(optimum, factor * stated), factor=factor)
-        if np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
+        if not held and np.abs(found.p_stands - before.p_stands).max(initial=0.0) < SETTLED:
             break
     return optimum, found
+
+
+def _believed(found: MapComparison, sigma: FloatArray, before: FloatArray) -> FloatArray:
+    """(K,) weights of the map's places: of those that do not stand the farthest are let go first, which may have
+    drawn the others after them.
+    """
+    spread = found.covariance + sigma[:, :, None] ** 2 * np.eye(6)
+    far = np.einsum("ki,kij,kj->k", found.off, np.linalg.inv(spread), found.off)
+    moved = (found.p_stands < 0.5) & (before >= 0.5)
+    waits = moved & (far < FARTHEST * far[moved].max(initial=0.0))
+    return np.where(waits, before, np.maximum(found.p_stands, LEAST_WEIGHT))
 
 
 def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
@@ -87,6 +107,57 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
         p_stands[k] = 1.0 / (1.0 + np.exp(np.clip(odds, -500.0, 500.0)))
         off[k, :dim], covariance[k, :dim, :dim] = mean, alone
     return MapComparison(p_stands, off, covariance, 1.0)
+
+
+class Alone(NamedTuple):
+    """What a session says of its P places without the map, in the frame in which the map has put it.
+
+    Attributes:
+        shift_m: (P, 3) from where they are with the map.
+        covariance_m2: (3 P, 3 P) joint covariance of the positions, wide in what only the map knows.
+        rotation: (P, 3, 3) covariance of their orientations with the map, in their own axes [rad^2].
+    """
+
+    shift_m: FloatArray
+    covariance_m2: FloatArray
+    rotation: FloatArray
+
+
+def by_itself(optimum: SpatialOptimum) -> Alone:
+    """Return what a session says of its places, linearised where the map holds it, which is taken back."""
+    problem, place = optimum.smoother.problem, optimum.estimate.place
+    count, n = len(place), len(problem.stamp_s)
+    seen = np.flatnonzero(np.bincount(problem.place, optimum.now.weight, minlength=count) > LEAST_SEEN)
+    first = np.full(count + 1, -1, dtype=np.int64)
+    first[seen] = np.append(0, np.cumsum(np.where(problem.oriented[seen], 6, 3)))[:-1]
+    joint = optimum.smoother.factorised(optimum.now).joint(n + seen)
+    rotation = np.full((count, 3, 3), np.nan)
+    onto = np.zeros((3 * len(seen), len(joint)))  # positions in the axes of the map
+    for k, (row, at) in enumerate(zip(seen.tolist(), first[seen].tolist(), strict=True)):
+        turned = problem.oriented[row]
+        onto[3 * k : 3 * k + 3, at : at + 3] = se3.rotation_of(place[row]) if turned else np.eye(3)
+        if turned:
+            rotation[row] = joint[at + 3 : at + 6, at + 3 : at + 6]
+    rows, shift = se2.xy_rows(seen, 3), np.zeros((count, 3))
+    covariance = np.eye(3 * count) / LOOSE
+    if not len(problem.prior.place):
+        covariance[np.ix_(rows, rows)] = onto @ joint @ onto.T
+        return Alone(shift, covariance, rotation)
+    information, pull = np.linalg.inv(joint), np.zeros(len(joint))
+    for k in np.flatnonzero(np.isin(problem.prior.place, seen)).tolist():
+        row = int(problem.prior.place[k])
+        off = problem.prior.off(k, place[row], oriented=bool(problem.oriented[row]))
+        jacobian = se3.right_jacobian_inverse(off) if len(off) == 6 else np.eye(3)
+        said = jacobian.T * (problem.prior.weight[k] / problem.prior.sigma[k, : len(off)] ** 2)
+        own = slice(int(first[row]), int(first[row]) + len(off))
+        information[own, own] -= said @ jacobian
+        pull[own] = said @ off
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    told = values > LOOSE
+    shift[seen] = (onto @ vectors[:, told] @ ((vectors[:, told].T @ pull) / values[told])).reshape(-1, 3)
+    root = onto @ (vectors / np.sqrt(np.maximum(values, LOOSE)))
+    covariance[np.ix_(rows, rows)] = root @ root.T
+    return Alone(shift, covariance, rotation)
 
 
 def _log_density(off: FloatArray, covariance: FloatArray) -> float:

@@ -27,6 +27,10 @@ TOGETHER_M = 0.5
 """Outliers of one identity that are this close are another landmark which carries it."""
 FEWEST, FEWEST_FRAMES = 5, 3
 """Detections, and frames, that it takes."""
+LEAST_SEEN = 1.0
+"""Sum of inlier probabilities below which a landmark was not seen at its place."""
+LEAST_WEIGHT = 1e-6
+"""Of a map's word on a landmark that is elsewhere."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -99,8 +103,30 @@ def _cost_of_frames(problem: SpatialProblem, estimate: SpatialEstimate, noise: S
     return np.bincount(problem.pose_row, problem.share * loss, minlength=len(estimate.pose)).astype(np.float64)
 
 
+def rejoined(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, SpatialEstimate] | None:
+    """Return the problem with landmarks of one identity put together that came to be at one place; None without any.
+
+    The same where the first of them is not seen any more, or this one hardly ever.
+    """
+    problem, estimate = optimum.smoother.problem, optimum.estimate
+    place, at = problem.place.copy(), estimate.place.copy()
+    hits = np.bincount(place, optimum.now.weight, minlength=len(at))
+    held = np.isin(np.arange(len(at)), problem.prior.place)
+    for row in range(int(identity.max(initial=-1)) + 1, len(identity)):
+        own = int(identity[row])
+        near = np.linalg.norm(at[row, :3] - at[own, :3]) < TOGETHER_M
+        if near or hits[row] < FEWEST or (hits[own] < LEAST_SEEN and not held[own]):
+            at[own] = at[row] if hits[row] > hits[own] else at[own]
+            place[place == row] = own
+    if np.array_equal(place, problem.place):
+        return None
+    return replace(problem, place=place), replace(estimate, place=at)
+
+
 def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, SpatialEstimate, IntArray] | None:
     """Return the problem with places of their own for landmarks that carry the identity of others; None without any.
+
+    Of a landmark that was never seen where a map has it the first of them is its own: it was moved there.
 
     Args:
         optimum: with outliers.
@@ -114,6 +140,8 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
     asked = outlier & located[problem.pose_row]
     at = as_seen(problem, estimate, problem.measured)
     place, places, oriented_too, whose = problem.place.copy(), list[FloatArray](), [], []
+    at_places, prior = estimate.place.copy(), problem.prior
+    unseen = np.bincount(problem.place, optimum.now.weight, minlength=len(at_places)) < LEAST_SEEN
     for known in np.unique(problem.place[asked]):
         mine = np.flatnonzero(asked & (problem.place == known))
         while len(mine) >= FEWEST:
@@ -123,13 +151,19 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
             away = np.linalg.norm(np.median(at[near, :3], axis=0) - estimate.place[known, :3])
             if len(near) < FEWEST or len(np.unique(problem.pose_row[near])) < FEWEST_FRAMES or away < TOGETHER_M:
                 break
-            place[near] = len(estimate.place) + len(places)
-            places.append(at[mine[centre]])
-            oriented_too.append(problem.oriented[known])
-            whose.append(identity[known])
+            if unseen[known]:
+                at_places[known], unseen[known] = at[mine[centre]], False
+                prior = replace(prior, weight=np.where(prior.place == known, LEAST_WEIGHT, prior.weight))
+            else:
+                place[near] = len(estimate.place) + len(places)
+                places.append(at[mine[centre]])
+                oriented_too.append(problem.oriented[known])
+                whose.append(identity[known])
             mine = mine[gap[centre] >= TOGETHER_M]
-    if not places:
+    if not places and prior is problem.prior:
         return None
-    larger = replace(problem, place=place, oriented=np.append(problem.oriented, oriented_too))
-    added = replace(estimate, place=np.vstack([estimate.place, places]))
-    return larger, added, np.append(identity, whose)
+    larger = replace(
+        problem, place=place, oriented=np.append(problem.oriented, oriented_too).astype(np.bool_), prior=prior
+    )
+    added = replace(estimate, place=np.vstack([at_places, *places]))
+    return larger, added, np.append(identity, whose).astype(np.int64)

@@ -6,10 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSE, POSITION, ROTATION, ROWS, TRANSLATION
+from evermap.slam.space.problem import SpatialProblem
+from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
 from evermap.slam.sparse.elimination import Spread
 from evermap.types import (
@@ -29,6 +33,8 @@ from evermap.types import (
     landmark_id_of,
 )
 
+TIED_S = 0.25
+"""Frames this close are tied by how far a robot may go between them, if nothing else says where they are."""
 SEEN = 0.5
 """A pose without odometry is told where its detections' inlier probabilities sum to this."""
 TOLD = 0.5
@@ -53,30 +59,40 @@ class _Told:
     spread: Spread
     frame: str
     stamp_s: FloatArray
+    placed: BoolArray
 
 
 def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solved: SpatialSolved) -> SlamResult:
     """Return trajectory and map, and what stands elsewhere than a given map says."""
-    frame = "first_pose" if solved.from_map is None else "prior_map"
+    frame = "prior_map" if len(solved.optimum.smoother.problem.prior.place) else "first_pose"
     optimum = solved.optimum
+    found, placed = located(optimum.smoother.problem, optimum.now)
     told = _Told(
         recording, intake, solved, optimum.smoother.spread(optimum.now), frame,
-        intake.start_s + optimum.smoother.problem.stamp_s,
+        intake.start_s + optimum.smoother.problem.stamp_s, placed,
     )  # fmt: skip
-    identities, names = _identities(told)
-    located = _located(told)
+    identities, names = identities_of(intake, solved)
     warnings = list(intake.warnings)
-    if not located.all():
-        warnings.append(f"{int((~located).sum())} frames in which the robot could not be located left out")
-    twice = [_called(names, int(identity)) for identity in identities[len(intake.landmark_id) :]]
+    left_out = [
+        names.get(int(identities[k]), str(identities[k]))
+        for k in np.setdiff1d(optimum.smoother.problem.place[optimum.now.weight > SEEN], np.flatnonzero(placed))
+    ]
+    if left_out:
+        warnings.append(
+            f"landmarks left out, since nothing tells where they are beside the others: {', '.join(left_out)}"
+        )
+    if not found.all():
+        warnings.append(f"{int((~found).sum())} frames in which the robot could not be located left out")
+    seen = np.bincount(optimum.smoother.problem.place, optimum.now.weight, minlength=len(identities)) > SEEN
+    twice = [_called(names, int(identities[k])) for k in np.flatnonzero((solved.number > 1) & seen & placed)]
     if twice:
         warnings.append(f"identities that several landmarks carry, told apart by their places: {', '.join(twice)}")
     rough = np.repeat(solved.online_spread**2, 3, axis=1)[:, :, None] * np.eye(6)
     return SlamResult(
         trajectory=Trajectory(
-            told.stamp_s[located],
-            optimum.estimate.pose[located],
-            optimum.smoother.covariance_of_poses(told.spread)[located],
+            told.stamp_s[found],
+            optimum.estimate.pose[found],
+            optimum.smoother.covariance_of_poses(told.spread)[found],
             frame=frame,
             clock=recording.clock,
         ),
@@ -93,14 +109,12 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
     )
 
 
-def _identities(told: _Told) -> tuple[IntArray, dict[int, str]]:
-    """Ids (P,) of the places, and names: a second landmark with the identity 7 is called '7#2'."""
-    intake, whose = told.intake, told.solved.identity
-    names, identities = dict(intake.names), intake.landmark_id[whose].copy()
-    for row in range(len(intake.landmark_id), len(whose)):
-        number = 1 + int(np.count_nonzero(whose[:row] == whose[row]))
-        own = int(intake.landmark_id[whose[row]])
-        name = f"{names.get(own, own)}#{number}"
+def identities_of(intake: SpatialIntake, solved: SpatialSolved) -> tuple[IntArray, dict[int, str]]:
+    """Return ids (P,) of places, and names: a second landmark with the identity 7 is called '7#2'."""
+    names, identities = dict(intake.names), intake.landmark_id[solved.identity].copy()
+    for row in np.flatnonzero(solved.number > 1).tolist():
+        own = int(identities[row])
+        name = f"{names.get(own, own)}#{solved.number[row]}"
         identities[row] = landmark_id_of(name)
         names[int(identities[row])] = name
     return identities, names
@@ -110,13 +124,26 @@ def _called(names: Mapping[int, str], identity: int) -> str:
     return names.get(identity, str(identity))
 
 
-def _located(told: _Told) -> BoolArray:
-    """(N,) poses of which something is known: by odometry, or by detections that are no outliers."""
-    problem, now = told.solved.optimum.smoother.problem, told.solved.optimum.now
+def located(problem: SpatialProblem, now: SpatialLinear) -> tuple[BoolArray, BoolArray]:
+    """Return (N,) poses and (P,) places of which it is known where they are, beside the map or beside each other.
+
+    That is by odometry, or by detections that are no outliers. Without odometry these tie frames to landmarks, and
+    what is tied to neither the map nor to most that was seen may be anywhere.
+    """
+    n, count = len(problem.stamp_s), len(problem.oriented)
     if problem.driven:
-        return np.ones(len(problem.stamp_s), dtype=np.bool_)
-    seen = np.bincount(problem.pose_row, now.weight, minlength=len(problem.stamp_s))
-    return np.asarray(seen > SEEN)
+        return np.ones(n, dtype=np.bool_), np.ones(count, dtype=np.bool_)
+    good = now.weight > SEEN
+    soon = np.flatnonzero(np.diff(problem.stamp_s) <= TIED_S)
+    one = np.concatenate([problem.pose_row[good], soon])
+    other = np.concatenate([n + problem.place[good], soon + 1])
+    graph = csr_array((np.ones(len(one)), (one, other)), shape=(n + count, n + count))
+    part = connected_components(graph, directed=False)[1]
+    stands = problem.prior.place[problem.prior.weight > SEEN]
+    known = part[n + stands] if len(stands) else np.bincount(part[problem.pose_row[good]], minlength=1).argmax()
+    tied = np.isin(part, known)
+    seen = np.bincount(problem.pose_row, now.weight, minlength=n) > SEEN
+    return seen & tied[:n], tied[n:]
 
 
 def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> Landmarks:
@@ -139,14 +166,14 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     np.fmin.at(first, problem.place[used], stamp_s[used])
     np.fmax.at(last, problem.place[used], stamp_s[used])
     order = np.argsort(identities, kind="stable")
-    order = order[hits[order] > 0]
+    order = order[(hits[order] > 0) & told.placed[order]]
     oriented = bool(problem.oriented.any())
     rotation = np.where(problem.oriented[:, None], place[:, 3:], np.nan)
     return Landmarks(
         landmark_id=identities[order],
         position_m=place[order, :3],
         covariance_m2=covariance[order],
-        class_id=_most(problem.place, recording.detections.class_id[told.intake.used], count)[order],
+        class_id=most_of(problem.place, recording.detections.class_id[told.intake.used], count)[order],
         p_exists=np.ones(len(order)),
         n_hits=hits[order],
         n_misses=np.zeros(len(order), dtype=np.int64),
@@ -162,8 +189,8 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     )
 
 
-def _most(place: IntArray, class_id: IntArray, count: int) -> IntArray:
-    """(P,) the class that most detections of each place say."""
+def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
+    """Return (P,) the class that most detections of each place say."""
     found = np.full(count, UNKNOWN)
     for row in range(count):
         own = class_id[(place == row) & (class_id != UNKNOWN)]

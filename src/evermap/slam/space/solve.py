@@ -13,7 +13,7 @@ from evermap.slam.space.estimate import SpatialOptimum, converged, first_places,
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.slam.space.repair import repaired, split
+from evermap.slam.space.repair import rejoined, repaired, split
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.start import incremental
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
@@ -38,6 +38,7 @@ class SpatialSolved:
     Attributes:
         optimum: values, noise and covariances of the last problem.
         identity: (P,) rows of `SpatialIntake.landmark_id` that the places are of.
+        number: (P,) which of the landmarks with that identity each is, from 1.
         from_map: what of the given map stands; None without a map.
         map_rows: (K,) rows of the given map behind its comparison.
         online_pose: (N, 7) poses as each frame had them.
@@ -47,6 +48,7 @@ class SpatialSolved:
 
     optimum: SpatialOptimum
     identity: IntArray
+    number: IntArray
     from_map: MapComparison | None
     map_rows: IntArray
     online_pose: FloatArray
@@ -96,10 +98,13 @@ def solve_space(
             break
         problem, estimate, identity = found
         optimum = repaired(converged(problem, estimate, optimum.noise, heavy_rounds=0))
+    if (together := rejoined(optimum, identity)) is not None:
+        optimum = converged(*together, optimum.noise, heavy_rounds=0)
+    number = np.array([np.count_nonzero(identity[: k + 1] == one) for k, one in enumerate(identity)], dtype=np.int64)
     from_map = None
     if len(stated):
         optimum, from_map = compared(optimum, stated)
-    return SpatialSolved(optimum, identity, from_map, rows, stepwise.pose, spread, step_s)
+    return SpatialSolved(optimum, identity, number, from_map, rows, stepwise.pose, spread, step_s)
 
 
 def _with_map(
