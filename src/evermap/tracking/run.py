@@ -50,6 +50,8 @@ class TrackResult(Shown):
         n_gaps: times without any look, between two frames.
         seconds: wall time of the tracker.
         warnings: remarks.
+        p_static: (R,) of each row of `tracks` the probability that its object stood from first to last, nan where it
+            was too short; None where nobody asked (`tracking.standing`).
     """
 
     table: DetectionTable
@@ -63,6 +65,7 @@ class TrackResult(Shown):
     n_gaps: int
     seconds: float
     warnings: tuple[str, ...]
+    p_static: FloatArray | None = None
 
     def to_pandas(self) -> Any:
         """Return a data frame with a row an object and frame.

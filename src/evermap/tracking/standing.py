@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
-STILL, MOVING = 0.3, 4.8
+STILL, MOVING = 0.25, 4.8
 """Standard deviations of velocities of what stands and of what moves, each axis, over the speed that tells them apart:
 at that speed both are equally probable."""
 WINDOW_S = 2.0
@@ -36,7 +36,7 @@ class Stood(NamedTuple):
     Attributes:
         stay: (M,) number of the stay that each detection is of, `UNKNOWN` where its thing moves or nothing is known.
         p_static: (M,) probability that its thing stands at that time; nan where nothing is known.
-        p_still: by track, probability that it stood all the time.
+        p_still: by track, probability that it stood, from its first detections to its last ones.
         track: (S,) of each stay.
         p_stay: (S,) probability of each stay.
         since_s, until_s: (S,) when it was seen to come to rest, and to leave; nan where it was not.
@@ -73,7 +73,7 @@ def standing(
             continue
         name, limit = int(track[mine[0]]), float(np.median(speed_mps[mine]))
         at, when, sigma = position_m[mine, :2], stamp_s[mine], sigma_m[mine]
-        p_still[name] = _p_static(when, at, sigma, limit)
+        p_still[name] = _p_of(*_way(when, at, sigma), limit)
         p_static[mine] = _windows(when, at, sigma, limit)
         parts = _stays(p_static[mine] > 0.5, when, at)
         for part in parts:
@@ -114,11 +114,29 @@ def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: floa
 
 
 def _p_static(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: float) -> float:
-    """Probability that what was seen at (K, 2) stood, as probable as not beforehand."""
-    velocity, spread = _line(stamp_s, at, sigma)
+    """Probability that what was seen at (K, 2) stood."""
+    return _p_of(*_line(stamp_s, at, sigma), limit)
+
+
+def _p_of(velocity: FloatArray, spread: float, limit: float) -> float:
+    """Probability that a thing of a velocity (2,), known to a variance on each axis, stands; as probable as not
+    beforehand.
+    """
     still, moving = (STILL * limit) ** 2 + spread, (MOVING * limit) ** 2 + spread
     log_factor = np.log(moving / still) - 0.5 * float(velocity @ velocity) * (1.0 / still - 1.0 / moving)
     return float(1.0 / (1.0 + np.exp(-np.clip(log_factor, -700.0, 700.0))))
+
+
+def _way(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[FloatArray, float]:
+    """Velocity (2,) from the beginning of a track to its end, and its variance: what stands in between counts, too."""
+    part = max(3, len(at) // 8)
+    ends = slice(0, part), slice(-part, None)
+    lasted_s = float(np.median(stamp_s[ends[1]]) - np.median(stamp_s[ends[0]]))
+    if lasted_s <= 0.0:
+        return _line(stamp_s, at, sigma)
+    velocity = (np.median(at[ends[1]], axis=0) - np.median(at[ends[0]], axis=0)) / lasted_s
+    variance = sum(float(np.median(sigma[end])) ** 2 for end in ends)
+    return velocity, variance / lasted_s**2
 
 
 def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[FloatArray, float]:

@@ -51,6 +51,9 @@ def test_what_stands_is_a_landmark_and_what_moves_is_followed() -> None:
     track, stands = followed.track_of_detection, made.of < len(made.parked)
     assert np.mean(np.isin(track[stands], result.landmarks.landmark_id)) > 0.95
     assert not np.isin(track[~stands], result.landmarks.landmark_id).any()
+    p_static = {int(one): p for one, p in zip(followed.tracks.track_id, followed.p_static, strict=True)}
+    assert min(p_static[one] for one in result.landmarks.landmark_id.tolist()) > 0.9
+    assert max(p_static[one] for one in np.unique(track[~stands]).tolist() if one >= 0) < 0.1
     used = result.innovations
     assert (made.of[used.detection] < len(made.parked)).all()
     assert np.mean(track[used.detection] == used.landmark_id) > 0.95

@@ -47,8 +47,9 @@ def _tracks(result: TrackResult) -> dict[str, tuple[tuple[str, ...], IntArray] |
 
 
 def _beliefs(result: TrackResult) -> dict[str, FloatArray]:
-    """Boxes, covariances and scores, where detections have boxes or scores."""
-    tracks, found = result.tracks, {}
+    """P(static) where it was asked; boxes, covariances and scores, where detections have boxes or scores."""
+    tracks = result.tracks
+    found = {} if result.p_static is None else {"p_static": result.p_static}
     if result.table.score is not None:
         p = np.clip(tracks.p_exists, 1e-12, 1.0 - 1e-12)
         found["score"] = np.log(p / (1.0 - p))

@@ -201,7 +201,9 @@ def gauge_of(
     still = _still(when_s, at, by, of, count, sigma)
     prior, found, spread = usual.copy(), np.zeros(2), np.zeros((2, 2))
     stretch = _stretches(when_s, of, count)
-    for asked in (1, 0, -1):  # the bend, then the scale
+    for asked in (1, 0, 1, -1):  # the bend, the scale, and the bend again beside that scale
+        if asked >= 0:
+            prior[asked] = usual[asked]
         found, spread = _steady(at, by, of, still, sigma, prior, stretch)
         if asked >= 0 and (asked == 1 or stated is not None):
             odds = _log_odds(found[asked], float(spread[0, asked]), float(usual[asked]), float(still.sum()))

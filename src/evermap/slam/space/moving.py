@@ -80,6 +80,10 @@ def run_in_traffic(
     intake = prepare_space(standing_only, space, fewest=0)
     result = concluded_in_space(standing_only, intake, solve_space(intake, None, progress=progress))
     followed = _followed(recording, result.trajectory.pose_world_robot, traffic.gauge, track)
+    if followed is not None:
+        p_still = _stands(recording, followed).p_still
+        of_row = [p_still.get(one, np.nan) for one in followed.tracks.track_id.tolist()]
+        followed = replace(followed, p_static=np.array(of_row, dtype=np.float64))
     rows = rows[identity != UNKNOWN]
     return with_stays(_beside(result, driven), traffic, followed, _known(recording), rows)
 
