@@ -105,7 +105,7 @@ def _rate(stamp_s: FloatArray) -> FloatArray:
     return np.asarray((last - first - 1) / PERSIST_S[1])
 
 
-SIGMA_SCALE, SIGMA_BEND = 0.1, 1e-3
+SIGMA_SCALE, SIGMA_BEND = 0.05, 1e-3
 """What is usual beforehand: a share, and radians by the metre."""
 ERROR_LOG_ODDS = -3.0
 """That an odometry bends, or has another scale than a detector of known scale, beforehand."""

@@ -17,9 +17,10 @@ from evermap.config import SpaceConfig, TrackConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import SIGMA_BEND, SIGMA_SCALE, Gauge, gauge_of
+from evermap.slam.space.estimate import converged
 from evermap.slam.space.intake import prepare_space
 from evermap.slam.space.result import concluded_in_space
-from evermap.slam.space.solve import solve_space
+from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
 from evermap.tracking.standing import Stood, long_enough, standing
@@ -78,7 +79,9 @@ def run_in_traffic(
     identity = _identity(recording, traffic.standing)
     standing_only = _standing_only(recording, driven, traffic, identity)
     intake = prepare_space(standing_only, space, fewest=0)
-    result = concluded_in_space(standing_only, intake, solve_space(intake, None, progress=progress))
+    intake = replace(intake, problem=replace(intake.problem, steady=True))
+    solved = _wandering(solve_space(intake, None, progress=progress))
+    result = concluded_in_space(standing_only, intake, solved)
     followed = _followed(recording, result.trajectory.pose_world_robot, traffic.gauge, track)
     if followed is not None:
         p_still = _stands(recording, followed).p_still
@@ -217,12 +220,32 @@ def _standing_only(
     return replace(recording, odometry=path, detections=rows_of(told, identity != UNKNOWN), warnings=())
 
 
+def _wandering(solved: SpatialSolved) -> SpatialSolved:
+    """The solution with odometry that wanders, where that explains far better what is seen; else as it is.
+
+    The errors of boxes are alike for seconds, and things that creep are taken for such that stand: both look like an
+    odometry that wanders a little. So good odometry is believed, until things agree that it is not.
+    """
+    optimum = solved.optimum
+    problem, begun = optimum.smoother.problem, optimum.noise
+    if len(np.unique(problem.place)) < FEWEST_WITNESSES:
+        return solved
+    noise = replace(begun, translation=WANDERS[0], rotation=WANDERS[1])
+    other = converged(replace(problem, steady=False), optimum.estimate, noise, heavy_rounds=0)
+    better = begun.position > FAR_BETTER * other.noise.position
+    return replace(solved, optimum=other) if better else solved
+
+
 def _beside(result: SlamResult, driven: FloatArray) -> SlamResult:
     """The result beside the odometry as it was given."""
     alone = replace(result.dead_reckoning, pose_world_robot=se3.compose(result.trajectory.pose_world_robot[0], driven))
     return replace(result, dead_reckoning=alone)
 
 
+WANDERS = 0.03, 0.003
+"""From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
+FEWEST_WITNESSES, FAR_BETTER = 10, 2.0
+"""Things that must say so, and the factor by which their deviations become smaller."""
 TILT = 0.05
 """Boxes are upright to within this [rad]."""
 WHEN_S = 0.5

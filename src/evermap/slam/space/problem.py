@@ -78,6 +78,7 @@ class SpatialProblem:
         lasted_s: (N - 1,) what its variance grows with: the time; without odometry the time squared, at a speed of
             which nothing is known but its size.
         driven: True if there is odometry.
+        steady: True where the noise of that is not learned, but held where it starts.
         pose_row, place, sensor, kind: (M,) which pose saw which place how; sorted by pose.
         measured: (M, 7) the place in the sensor's frame.
         measured_root: (M, 3, 3) upper triangular, whitens the position but for its noise level.
@@ -114,6 +115,7 @@ class SpatialProblem:
     mount: FloatArray
     mount_sigma: FloatArray
     prior: PlacePrior = field(default_factory=PlacePrior.none)
+    steady: bool = False
     start_sigma: FloatArray = field(default_factory=lambda: np.full(6, 1e-4))
 
     @property

@@ -22,6 +22,8 @@ BY_HAND = SpatialNoise(translation=1.0, rotation=0.7, pixel=2.0)
 """Without odometry: metres and radians that a robot may go a second."""
 DRIVEN = SpatialNoise(pixel=2.0)
 """With odometry: metres and radians of drift for the square root of a second."""
+STEADY = 3e-4, 1e-5
+"""The same of odometry that is believed."""
 FREE = 1e3
 """Deviation by which the first pose is held where a map says where it is [m, rad]."""
 LOOSE_M = 0.05
@@ -79,7 +81,9 @@ def solve_space(
     ):  # pixels err by themselves, detectors of objects by the view
         drift = drift_of(problem, intake.driven_pose)
         problem = replace(problem, share=np.where(by_corners, 1.0, drift.share))
-        if drift.translation is not None and drift.rotation is not None:
+        if problem.steady:
+            noise = replace(noise, translation=STEADY[0], rotation=STEADY[1])
+        elif drift.translation is not None and drift.rotation is not None:
             noise = replace(noise, translation=drift.translation, rotation=drift.rotation)
     known, place = np.zeros(len(problem.oriented), dtype=np.bool_), se3.identity(len(problem.oriented))
     known[problem.prior.place], place[problem.prior.place] = True, problem.prior.pose
