@@ -114,12 +114,11 @@ def prepare_space(
 
 
 def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:
-    boxes = np.isfinite(recording.detections.size_m).any()
+    hint = "check landmark ids, and that detections and odometry share one clock"
+    if np.isfinite(recording.detections.size_m).any():
+        hint = "boxes without identities need `odometry`, and are solved without a map"
     return DataError(
-        f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed",
-        hint="boxes without identities need `odometry`"
-        if boxes
-        else "check landmark ids, and that detections and odometry share one clock",
+        f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed", hint=hint
     )
 
 
