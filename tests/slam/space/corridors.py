@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -23,6 +23,7 @@ SQUARE = 0.5 * SIZE_M * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0
 # the camera looks along the robot's left: z ahead is the robot's y, x right its x, y down its -z
 MOUNT = Rotation.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]))
 MOUNT_AT = np.array([0.1, 0.05, 0.3])
+CAMERA = SpatialSensor("left", tuple(np.hstack([MOUNT_AT, MOUNT.as_quat()]).tolist()), INTRINSICS)
 
 
 @dataclass
@@ -79,8 +80,78 @@ def tagged_corridor(
     said = identity[tag]
     wrong = random.random(len(tag)) < p_wrong
     said = np.where(wrong, identity[random.integers(0, n_tags, len(tag))], said)
+    detections = _detections(frame, said, corner)
+    pose = poses(at, turn)
+    driven = _drifting(pose, stamp_s, drift, random) if odometry else None
+    truth = Trajectory(stamp_s, pose, np.zeros((n_frames, 6, 6)), frame="truth")
+    tags = Landmarks.in_space(np.arange(n_tags), place, rotation=facing.as_quat())
+    return World(SpatialRecording("corridor", driven, Frames(stamp_s), detections, (CAMERA,), truth, tags), pose, tags)
+
+
+@dataclass
+class Site:
+    """A corridor that changes from day to day.
+
+    Attributes:
+        place, facing: where each tag is now.
+        present: which of them are there.
+    """
+
+    place: np.ndarray
+    facing: Rotation
+    present: np.ndarray
+
+    @classmethod
+    def of(cls, seed: int, n_tags: int = 24) -> Site:
+        random = np.random.default_rng(seed)
+        place = np.column_stack([np.linspace(0.0, 15.0, n_tags), np.full(n_tags, 2.0), random.uniform(0, 0.8, n_tags)])
+        facing = MOUNT * Rotation.from_rotvec(random.normal(0.0, 0.25, (n_tags, 3)))
+        return cls(place, facing, np.ones(n_tags, dtype=np.bool_))
+
+    def turn(self, tag: int, angle: float) -> None:
+        turned = [one * Rotation.from_rotvec([0.0, 0.0, angle * (k == tag)]) for k, one in enumerate(self.facing)]
+        self.facing = Rotation.concatenate(turned)
+
+    def patrol(
+        self,
+        seed: int,
+        day: int,
+        low_m: float,
+        high_m: float,
+        *,
+        odometry: bool = True,
+        p_wrong: float = 0.0,
+        rename: dict[int, int] | None = None,
+    ) -> SpatialRecording:
+        """A drive there and back along a part of the wall; nine of ten tags in view are detected."""
+        random, n_frames = np.random.default_rng([seed, day]), 160
+        stamp_s = np.linspace(0.0, 40.0, n_frames)
+        along = 0.5 * (low_m + high_m) - 0.5 * (high_m - low_m) * np.cos(2.0 * np.pi * stamp_s / 40.0)
+        at = np.column_stack([along, 0.3 * np.sin(stamp_s), 0.1 * np.sin(0.7 * stamp_s)])
+        sway = np.column_stack([0.05 * np.sin(stamp_s), 0.05 * np.cos(stamp_s), 0.2 * np.sin(0.5 * stamp_s)])
+        turn = Rotation.from_euler("xyz", sway)
+        there = np.flatnonzero(self.present)
+        frame, tag, corner = _seen(at, turn, self.place[there], self.facing[there])
+        kept = random.random(len(frame)) < 0.9
+        frame, tag, corner = frame[kept], there[tag[kept]], corner[kept] + random.normal(0, 0.3, corner[kept].shape)
+        wrong = random.random(len(tag)) < p_wrong
+        said = np.where(wrong, random.integers(0, len(self.place), len(tag)), tag)
+        said = np.array([(rename or {}).get(one, one) for one in said.tolist()])
+        pose, then = poses(at, turn), stamp_s + 86_400.0 * day
+        driven = _drifting(pose, stamp_s, 0.01, random) if odometry else None
+        return SpatialRecording(
+            f"day {day}",
+            None if driven is None else replace(driven, stamp_s=then),
+            Frames(then),
+            _detections(frame, said, corner),
+            (CAMERA,),
+            Trajectory(then, pose, np.zeros((n_frames, 6, 6)), frame="truth"),
+        )
+
+
+def _detections(frame: np.ndarray, said: np.ndarray, corner: np.ndarray) -> SpatialDetections:
     count = len(frame)
-    detections = SpatialDetections(
+    return SpatialDetections(
         frame=frame,
         sensor=np.zeros(count, dtype=np.int64),
         landmark_id=said,
@@ -95,12 +166,6 @@ def tagged_corridor(
         score=np.full(count, np.nan),
         source_line=np.zeros(count, dtype=np.int64),
     )
-    camera = SpatialSensor("left", tuple(np.hstack([MOUNT_AT, MOUNT.as_quat()]).tolist()), INTRINSICS)
-    pose = poses(at, turn)
-    driven = _drifting(pose, stamp_s, drift, random) if odometry else None
-    truth = Trajectory(stamp_s, pose, np.zeros((n_frames, 6, 6)), frame="truth")
-    tags = Landmarks.in_space(np.arange(n_tags), place, rotation=facing.as_quat())
-    return World(SpatialRecording("corridor", driven, Frames(stamp_s), detections, (camera,), truth, tags), pose, tags)
 
 
 def _seen(
