@@ -7,6 +7,7 @@ no orientations. The references of the recordings are used for scores only.
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from evermap.errors import InputError
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.io import read_recording
+from evermap.maps.living import LivingMap
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import FloatArray, Landmarks, SlamResult, SpatialRecording, Trajectory
 
@@ -40,7 +42,7 @@ def run(folder: Path = FOLDER) -> tuple[dict[str, float], dict[str, Any]]:
     """
     if not (folder / "tagslam").is_dir():
         raise InputError("has no recordings of tags", path=folder, hint="tagslam/test_11 and others")
-    shown: dict[str, Any] = {"tags": [], "changes": {}, "objects": []}
+    shown: dict[str, Any] = {"tags": [], "changes": {}, "days": _days(folder), "objects": []}
     shown["tags"].append(_tags(folder, "test_11", mapped=False))
     for name in TAGS:
         shown["tags"].append(_tags(folder, name, mapped=True, changes=shown["changes"]))
@@ -82,6 +84,44 @@ def _tags(folder: Path, name: str, *, mapped: bool, changes: dict[str, Any] | No
         "cpu_s": cpu_s,
         "lasted_s": float(np.ptp(recording.frames.stamp_s)),
     }
+
+
+def _days(folder: Path) -> list[dict[str, Any]]:
+    """The three days as sessions of one living map, which begins with the survey of the first."""
+    living, surveys, rows = None, [], []
+    for name in TAGS:
+        recording = read_recording(folder / "tagslam" / name)
+        assert isinstance(recording, SpatialRecording)
+        assert recording.true_landmarks is not None
+        surveys.append(recording.true_landmarks)
+        if living is None:
+            living = replace(LivingMap.begun(surveys[0].as_prior(SIGMA_SURVEY)), clock=recording.clock)
+        began = time.process_time()
+        session = em.run_session(recording, living)
+        cpu_s = time.process_time() - began
+        found = compare_with_truth(recording, session.slam, rate_hz=RATE_HZ)
+        assert found.poses is not None
+        told = []
+        for change in session.changes:
+            tag = change.landmark_ids[0]
+            at = [
+                survey.position_m[survey.landmark_id == tag] for survey in (surveys[max(len(rows) - 1, 0)], surveys[-1])
+            ]
+            by = float(np.linalg.norm(at[1][0] - at[0][0])) if all(map(len, at)) else None
+            told.append([living.label(tag), float(np.linalg.norm(change.displacement_m)), change.probability, by])
+        rows.append(
+            {
+                "name": name,
+                "found": session.found,
+                "rmse_m": _rms(found.poses.position_error_m),
+                "median_m": float(np.median(found.poses.position_error_m)),
+                "tags": [len(living.members), len(session.living.members)],
+                "changes": told,
+                "cpu_s": cpu_s,
+            }
+        )
+        living = session.living
+    return rows
 
 
 def _rms(error: FloatArray) -> float:
@@ -224,6 +264,16 @@ def as_markdown(shown: dict[str, Any]) -> str:
     for name, changes in shown["changes"].items():
         told = "; ".join(f"{tag} by {np.linalg.norm(by):.2f} m ({100.0 * p:.0f} %)" for tag, by, p in changes)
         lines.append(f"| {name} | {told or 'none'} |")
+    lines += ["", "| day of one living map | error, RMSE | median | tags before, after | told to have moved | CPU |"]
+    lines += ["|---|---:|---:|---:|---|---:|"]
+    for row in shown["days"]:
+        told = "; ".join(
+            f"{tag} by {by:.2f} m ({100.0 * p:.0f} %" + (f", by the surveys {was:.2f} m)" if was else ")")
+            for tag, by, p, was in row["changes"]
+        )
+        sizes = "{}, {}".format(*row["tags"])
+        error = f"{row['rmse_m']:.3f} m | {row['median_m']:.3f} m" if row["found"] else "**not located** | –"
+        lines.append(f"| {row['name']} | {error} | {sizes} | {told or 'none'} | {row['cpu_s']:.0f} s |")
     lines += [
         "",
         "| objects | camera, RMSE | odometry alone | worst object, median | single detection, median | CPU |",

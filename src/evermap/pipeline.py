@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.config import Config
+from evermap.errors import DataError
 from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
@@ -137,7 +138,11 @@ def _bring_in_space(
     from evermap.maps.sessions import believe, spatial
     from evermap.maps.sessions import session as steps
     from evermap.slam.space.intake import prepare_space
+    from evermap.slam.space.moving import has_traffic
 
+    if has_traffic(recording):
+        problem = f"{recording.name}: boxes without identity are not found again from session to session"
+        raise DataError(problem, field="landmark_id", hint="evermap slam without --map follows them")
     recording, living = steps.admitted(recording, living)
     intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
@@ -231,7 +236,6 @@ def run_localization(
     Raises:
         DataError: the map is empty, or the robot's place in it could not be found.
     """
-    from evermap.errors import DataError
     from evermap.maps.sessions.session import admitted
     from evermap.maps.vicinity import predicted_of
     from evermap.slam.check import odd, valid

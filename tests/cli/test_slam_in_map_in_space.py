@@ -124,3 +124,15 @@ def test_what_does_not_fit_is_one_line(days: list[Path], tmp_path: Path) -> None
     run("map", "export", site, "--out", tmp_path / "map.parquet")  # what the line says to do instead
     found = slam(days[2], "--prior-map", tmp_path / "map.parquet", "--out", tmp_path / "where")
     assert [change["landmarks"] for change in found["changes"]] == [[3]]
+
+
+@pytest.mark.parametrize("in_space", [False, True])
+def test_a_new_map_may_begin_with_a_survey(in_space: bool, tmp_path: Path) -> None:
+    folder, file = tmp_path / "mine", tmp_path / "site.evermap"
+    assert run("slam", "--init", folder, *(["--3d"] if in_space else [])).exit_code == 0
+    given = [folder, "--map", file, "--prior-map", "truth"]
+    assert run("slam", *given, "--out", tmp_path / "first", *QUICK).exit_code == 0
+    told = json.loads(run("map", "log", file, "--json").stdout)
+    assert [row["kind"] for row in told["revisions"]] == ["edit", "session"]
+    assert told["revisions"][0]["note"].endswith("surveyed landmarks")
+    assert "has landmarks already" in refused(*given, "--out", tmp_path / "second")

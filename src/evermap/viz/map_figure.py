@@ -83,7 +83,8 @@ def draw_map(recording: AnyRecording, result: SlamResult, evaluation: Evaluation
     figure = new_figure(7.2, height_in)
     panels = lay_out(figure, low, high)
     (moved, *_) = [_draw_panel(axes, view, scene, low, high) for axes, view in panels]
-    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+    columns = 4 if len(panels) == 1 else 3
+    figure.legend(*panels[0][0].get_legend_handles_labels(), loc="outside upper center", ncols=columns)
     if moved:
         figure.legend(
             handles=moved, loc="outside lower left", ncols=1 if len(changed) <= _MOST_LINES else 3, handlelength=3.2
