@@ -499,6 +499,10 @@ class SpatialOdometry(_Columns):
         return {"rows": len(self), **span(self.stamp_s), "clock": self.clock.value}
 
 
+ANY_RANGE_M2 = 1e6
+"""Variance beyond which the range of a detection is not known."""
+
+
 @dataclass(frozen=True, slots=True)
 class SpatialDetections(_Columns):
     """Hits in space: one row a detection, sorted by frame; what a detector does not give is nan.
@@ -509,7 +513,8 @@ class SpatialDetections(_Columns):
         landmark_id: (M,) identity given by the front end, or `UNKNOWN`.
         position_sensor_m: (M, 3) in the sensor's frame; of a camera x is right, y down, z ahead.
         rotation: (M, 4) quaternion of the landmark in the sensor's frame.
-        covariance_sensor_m2: (M, 3, 3) of the position.
+        covariance_sensor_m2: (M, 3, 3) of the position; a variance of more than `ANY_RANGE_M2` along it says that only
+            the direction was seen.
         sigma_rad: (M,) standard deviation of the orientation about every axis.
         corner_px: (M, 4, 2) corners of a square tag in the image (u right, v down), in the order (-1, -1), (1, -1),
             (1, 1), (-1, 1) times half of the tag's size in the tag's own x and y.

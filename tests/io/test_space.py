@@ -27,7 +27,7 @@ from evermap.io import (
     write_tum,
 )
 from evermap.io.landmarks import write_map_csv
-from evermap.types import UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
+from evermap.types import ANY_RANGE_M2, UNKNOWN, Landmarks, Recording, SpatialRecording, landmark_id_of
 from evermap.valid import validate_spatial
 
 Files = dict[str, str]
@@ -225,6 +225,21 @@ def test_full_covariances(lay_out: Callable, space: Files) -> None:
     assert np.isnan(covariance[1]).all()
 
 
+def test_a_pixel_alone_is_a_direction(lay_out: Callable, space: Files) -> None:
+    table = "stamp_s,landmark_id,sensor,u_px,v_px\n0.5,7,left,620,240\n"
+    recording = read_recording(lay_out({**space, "detections.csv": table, "camera.toml": CAMERA}))
+    assert isinstance(recording, SpatialRecording)
+    ray, covariance = recording.detections.position_sensor_m[0], recording.detections.covariance_sensor_m2[0]
+    focal, _, centre_u, centre_v = recording.sensors[0].intrinsics or (1.0, 1.0, 0.0, 0.0)
+    plane = np.array([(620.0 - centre_u) / focal, (240.0 - centre_v) / focal, 1.0])
+    np.testing.assert_allclose(ray, plane / np.linalg.norm(plane), atol=1e-9)
+    assert ray @ covariance @ ray > ANY_RANGE_M2
+    across = np.cross(ray, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    sigma_px = recording.sensors[0].sigma_px or 1.0
+    np.testing.assert_allclose(np.sqrt(across @ covariance @ across), sigma_px / focal, rtol=0.02)
+
+
 def test_gzipped_tables_are_read_as_they_are(lay_out: Callable, space: Files, native: Files, tmp_path: Path) -> None:
     for files in (space, native):
         packed = {
@@ -309,10 +324,6 @@ BAD: dict[str, tuple[Files, str]] = {
     "sensor and camera": (
         {"detections.csv": f"{DETECTIONS},sensor,camera\n0.5,7,1,1,1,a,b\n", "camera.toml": CAMERA},
         r"sensor and camera are both given",
-    ),
-    "a pixel alone": (
-        {"detections.csv": "stamp_s,landmark_id,camera,u_px,v_px\n0.5,7,left,1,1\n", "camera.toml": CAMERA},
-        r"detections\.csv:1: field 'u_px': a pixel alone has no depth.*u_right_px",
     ),
     "pixels of a lidar": (
         {

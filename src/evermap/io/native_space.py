@@ -32,6 +32,7 @@ from evermap.io.spatial import (
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
+    ANY_RANGE_M2,
     BoolArray,
     Clock,
     FloatArray,
@@ -328,21 +329,21 @@ def _cornered(table: Table, detections: SpatialDetections, rig: Rig) -> SpatialD
 
 
 def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
-    """Positions (M, 3) and covariances of points that a stereo camera saw; nan where the point is not ahead.
+    """Positions (M, 3) and covariances of points that a camera saw; nan where the point is not ahead.
 
-    The depth follows from the disparity of the undistorted pixels, its covariance from a pixel's to first order.
+    In a stereo pair the depth follows from the disparity of the undistorted pixels, its covariance from a pixel's to
+    first order. Of one camera it is the direction, at a range of 1 m of which nothing is known.
     """
     camera = np.array([one.intrinsics is not None for one in rig.sensors])[sensor]
     baseline = np.array(rig.baseline_m)[sensor]
     _need_camera(table, ~camera, POINT[0], rig)
+    left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
     if RIGHT[0] not in table:
-        hint = "u_right_px of a rectified stereo pair, x_m, y_m, z_m, or a tag's corners u0_px .. v3_px"
-        raise table.error("a pixel alone has no depth", row=None, field=POINT[0], hint=hint)
+        return _directions(left, sensor, rig)
     lone = np.flatnonzero(np.isnan(baseline))
     if len(lone):
         hint = f"baseline_m of the left camera in {CAMERA_FILE}"
         raise table.error("the baseline is not known", row=int(lone[0]), field=RIGHT[0], hint=hint)
-    left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
     right = left.copy()
     right[:, 0] = table.numbers(replace(_pixel(RIGHT[0]), optional=False))
     if RIGHT[1] in table:
@@ -356,6 +357,20 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
                 plane = rays[..., :2] / rays[..., 2:]
             noise = (one.sigma_px or 1.0) / np.array(one.intrinsics[:2])
             position[rows], covariance[rows] = _triangulated(plane, baseline[rows], noise)
+    return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
+
+
+def _directions(pixel: FloatArray, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
+    """Unit vectors to points that one camera saw, with the covariance of a pixel across, and any range."""
+    position, covariance = np.full((len(pixel), 3), np.nan), np.full((len(pixel), 3, 3), np.nan)
+    for number, one in enumerate(rig.sensors):
+        rows = np.flatnonzero(sensor == number)
+        if len(rows) and one.intrinsics is not None:
+            ray = unproject(pixel[rows], one)
+            along = ray[:, :, None] * ray[:, None, :]
+            sigma = (one.sigma_px or 1.0) / float(np.mean(one.intrinsics[:2]))
+            position[rows] = ray
+            covariance[rows] = sigma**2 * (np.eye(3) - along) + 1e3 * ANY_RANGE_M2 * along
     return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
 
 

@@ -168,6 +168,27 @@ def _detections(frame: np.ndarray, said: np.ndarray, corner: np.ndarray) -> Spat
     )
 
 
+def as_directions(world: World, seed: int, sigma_px: float = 0.5) -> SpatialRecording:
+    """The same drive, of every tag only the direction of its centre."""
+    recording, random = world.recording, np.random.default_rng(seed)
+    seen = recording.detections
+    robot = Rotation.from_quat(world.true_pose[seen.frame, 3:])
+    eye = world.true_pose[seen.frame, :3] + robot.apply(MOUNT_AT)
+    ahead = (robot * MOUNT).inv().apply(world.tags.position_m[seen.landmark_id] - eye)
+    plane = ahead[:, :2] / ahead[:, 2:] + random.normal(0.0, sigma_px / FOCAL, (len(ahead), 2))
+    ray = np.column_stack([plane, np.ones(len(plane))])
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    along = ray[:, :, None] * ray[:, None, :]
+    directions = replace(
+        seen,
+        position_sensor_m=ray,
+        covariance_sensor_m2=(sigma_px / FOCAL) ** 2 * (np.eye(3) - along) + 1e9 * along,
+        corner_px=np.full((len(seen), 4, 2), np.nan),
+        tag_size_m=np.full(len(seen), np.nan),
+    )
+    return replace(recording, detections=directions)
+
+
 def _seen(
     at: np.ndarray, turn: Rotation, place: np.ndarray, facing: Rotation
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

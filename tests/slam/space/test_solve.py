@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from corridors import World, tagged_corridor
+from corridors import World, as_directions, tagged_corridor
 from scipy.spatial.transform import Rotation
 
 from evermap import run_slam
+from evermap.errors import DataError
 from evermap.metrics.summary import compare_with_truth
 from evermap.types import Landmarks, SlamResult, SpatialSensor
 
@@ -178,3 +179,23 @@ def test_places_and_poses_are_as_sure_as_they_say():
         of_poses += [float(g @ np.linalg.solve(c, g)) for g, c in zip(gap[::10], cov[::10], strict=True)]
     assert np.mean(of_tags) < 3.0
     assert 1.0 < np.mean(of_poses) < 3.6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_of_which_only_the_direction_is_seen_are_triangulated_along_the_odometry(seed):
+    world = tagged_corridor(seed, n_frames=320)
+    recording = as_directions(world, seed)
+    result = run_slam(recording)
+    robot, tags = errors(result, replace(world, recording=recording))
+    found = compare_with_truth(recording, result, rate_hz=10.0)
+    assert found.dead_reckoning is not None
+    assert robot < 0.7 * np.sqrt(np.mean(found.dead_reckoning.position_error_m**2))
+    assert tags < 0.05
+    assert len(result.landmarks) == 12
+    assert 0.8 < np.nanmean(result.innovations.nis / result.innovations.dof) < 1.2
+
+
+def test_directions_without_odometry_are_left_out():
+    recording = as_directions(tagged_corridor(0, odometry=False), 0)
+    with pytest.raises(DataError, match="seen in 0 frames"):
+        run_slam(recording)

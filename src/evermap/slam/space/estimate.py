@@ -95,6 +95,8 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             squares = (now.residual[some, rows] ** 2).sum(axis=1)
             total = float(w @ squares + of_detection[some, rows].sum())
             count = float(w.sum()) * (rows.stop - rows.start)
+            if level == POSITION:
+                count -= float(w @ problem.ray[some])  # ranges that nobody measured fit
             levels[level] = _level(before[level], start[level], total, count)
     return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
 

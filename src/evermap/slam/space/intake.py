@@ -14,7 +14,7 @@ from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.problem import SpatialProblem
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
+from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
 
 NEAREST_M = 0.02
 NOMINAL_ALONG, NOMINAL_ACROSS, NOMINAL_RAD = 0.02, 0.01, 0.05
@@ -26,6 +26,12 @@ ONE_PX_M = 1e-3
 """A tag's position from its corners is no better than this."""
 WIDEST = 3.0
 """Corners beyond this much off the axis (at depth 1) are not used: pixels say little there."""
+SHORTLY_S = 15.0
+"""What is seen within this time of a detection without a range gives it one."""
+LEAST_PARALLAX = 0.25
+"""Standard deviation of a range that makes a first value, as a share of it."""
+HARDLY = 1.0
+"""Standard deviation with which it counts, as a share of the range: as good as nothing."""
 NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -74,6 +80,10 @@ def prepare_space(
     if broken.any():
         warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
         usable &= ~broken
+    blind = _with_ranges(recording, where, usable)
+    if blind.any():
+        warnings.append(f"{int(blind.sum())} detections without a range, seen from too few directions, not used")
+        usable &= ~blind
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < fewest:
         raise _too_little(recording, len(seen_in), fewest)
@@ -103,6 +113,7 @@ def prepare_space(
         other=some.other,
         other_log_odds=some.other_log_odds,
         share=np.ones(len(used)),
+        ray=_without_range(recording)[used],
         oriented=oriented,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
@@ -187,6 +198,55 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
     broken = usable & ~(np.isfinite(found.measured).all(axis=1) & np.isfinite(found.covariance).all(axis=(1, 2)))
     near = np.linalg.norm(np.nan_to_num(found.measured[:, :3]), axis=1) < NEAREST_M
     return found, broken | (usable & near)
+
+
+def _without_range(recording: SpatialRecording) -> BoolArray:
+    """(M,) detections of which only the direction was seen."""
+    at, covariance = recording.detections.position_sensor_m, recording.detections.covariance_sensor_m2
+    along = np.einsum("mi,mij,mj->m", at, covariance, at)  # nan where nothing is stated
+    return np.asarray(along > ANY_RANGE_M2 * (at**2).sum(axis=1))
+
+
+def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) -> BoolArray:
+    """Give detections without a range one, from where else the same landmark was seen shortly before and after.
+
+    The covariance keeps what was seen across; the range itself is hardly believed. Returns (M,) those that could not.
+    """
+    given, blind = recording.detections, np.zeros(len(usable), dtype=np.bool_)
+    rays = np.flatnonzero(usable & _without_range(recording))
+    if not len(rays):
+        return blind
+    if recording.odometry is None:
+        blind[rays] = True
+        return blind
+    mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
+    pose, _ = _driven(recording, recording.frames.stamp_s)
+    eye = se3.compose(pose[given.frame[rays]], mount[given.sensor[rays]])
+    ahead = given.position_sensor_m[rays] / np.linalg.norm(given.position_sensor_m[rays], axis=1, keepdims=True)
+    along = np.einsum("mij,mj->mi", se3.rotation_of(eye), ahead)
+    across = np.eye(3) - along[:, :, None] * along[:, None, :]
+    stamp_s, landmark = recording.frames.stamp_s[given.frame[rays]], given.landmark_id[rays]
+    range_m, spread = np.full(len(rays), np.nan), np.full(len(rays), np.inf)
+    for name in np.unique(landmark):
+        mine = np.flatnonzero(landmark == name)
+        total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(across[mine], axis=0)])
+        pull = np.einsum("mij,mj->mi", across[mine], eye[mine, :3])
+        pull = np.concatenate([np.zeros((1, 3)), np.cumsum(pull, axis=0)])
+        first, last = (np.searchsorted(stamp_s[mine], stamp_s[mine] + by) for by in (-SHORTLY_S, SHORTLY_S))
+        seen = total[last] - total[first] + 1e-9 * np.eye(3)
+        at = np.linalg.solve(seen, (pull[last] - pull[first])[..., None])[..., 0]
+        range_m[mine] = ((at - eye[mine, :3]) * along[mine]).sum(axis=1)
+        spread[mine] = np.einsum("mi,mi->m", along[mine], np.linalg.solve(seen, along[mine][..., None])[..., 0])
+    out = np.einsum("mi,mij,mj->m", ahead, given.covariance_sensor_m2[rays], ahead)
+    own = given.covariance_sensor_m2[rays] - out[:, None, None] * ahead[:, :, None] * ahead[:, None, :]
+    sigma2 = np.trace(own, axis1=1, axis2=2) / 2.0 / (given.position_sensor_m[rays] ** 2).sum(axis=1)
+    good = (range_m > NEAREST_M) & (sigma2 * spread < LEAST_PARALLAX**2)
+    blind[rays[~good]] = True
+    r2, n = range_m[good, None, None] ** 2, ahead[good]
+    outer = n[:, :, None] * n[:, None, :]
+    where.measured[rays[good], :3] = range_m[good, None] * n
+    where.covariance[rays[good]] = r2 * (sigma2[good, None, None] * (np.eye(3) - outer) + HARDLY**2 * outer)
+    return blind
 
 
 def _put(found: _Where, rows: IntArray, plane: FloatArray, slope: FloatArray, poses: SquarePoses) -> None:

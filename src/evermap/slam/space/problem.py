@@ -87,6 +87,7 @@ class SpatialProblem:
         other: (M, 7) the other orientation that explains the corners, with its position; nan where there is none.
         other_log_odds: (M,) of the first against the other.
         share: (M,) of the information of each detection that is new.
+        ray: (M,) detections of which only the direction was seen; their ranges are triangulated first values.
         oriented: (P,) places with an orientation; the others are points.
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
@@ -111,6 +112,7 @@ class SpatialProblem:
     other: FloatArray
     other_log_odds: FloatArray
     share: FloatArray
+    ray: BoolArray
     oriented: BoolArray
     mount: FloatArray
     mount_sigma: FloatArray

@@ -262,7 +262,7 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
         landmark_id=identities[problem.place],
         nis=np.maximum(nis, 0.0),
         p_inlier=np.clip(now.weight, 0.0, 1.0),
-        dof=ROWS[problem.kind].astype(np.int64),
+        dof=(ROWS[problem.kind] - problem.ray).astype(np.int64),
     )
 
 

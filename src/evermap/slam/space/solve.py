@@ -75,7 +75,7 @@ def solve_space(
     problem, stated, rows = _with_map(intake, prior_map, sigma)
     identity = np.arange(len(intake.landmark_id))
     noise = DRIVEN if problem.driven else BY_HAND
-    by_corners = problem.kind == CORNERS
+    by_corners = (problem.kind == CORNERS) | problem.ray
     if problem.driven and np.sum(~by_corners) > 0.5 * len(
         by_corners
     ):  # pixels err by themselves, detectors of objects by the view
