@@ -217,7 +217,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
 
 
 def run_localization(
-    recording: Recording,
+    recording: AnyRecording,
     living: LivingMap,
     config: Config | None = None,
     *,
@@ -225,6 +225,9 @@ def run_localization(
     progress: Progress | None = None,
 ) -> SlamResult:
     """Localise in a living map that stays as it is: causal, from an unknown pose, at a fixed cost per frame.
+
+    In space all frames are solved together, beside what the map says and what of it has moved, as `run_slam` with a
+    prior map does.
 
     Args:
         recording: what a reader returned; its truth is not looked at.
@@ -236,7 +239,9 @@ def run_localization(
     Raises:
         DataError: the map is empty, or the robot's place in it could not be found.
     """
+    from evermap.maps.sessions.believe import aged
     from evermap.maps.sessions.session import admitted
+    from evermap.maps.sessions.spatial import standing
     from evermap.maps.vicinity import predicted_of
     from evermap.slam.check import odd, valid
     from evermap.slam.intake import beliefs
@@ -245,6 +250,10 @@ def run_localization(
     config = config or Config()
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
+    if isinstance(recording, SpatialRecording):
+        recording, living = admitted(recording, living)
+        p_site = aged(living, config.living, float(recording.frames.stamp_s[0])).p_here
+        return _run_in_space(recording, config, standing(living, p_site), progress)
     recording = valid(recording, config.sensor)
     remarks = odd(recording, settings=config.slam.check)
     recording, living = admitted(recording, living)

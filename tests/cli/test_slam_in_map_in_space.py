@@ -115,15 +115,15 @@ def test_what_does_not_fit_is_one_line(days: list[Path], tmp_path: Path) -> None
     before = site.read_bytes()
     line = refused(days[0], "--map", site, "--out", tmp_path / "again")
     assert "is in the map already, as revision 1" in line
-    line = refused(days[1], "--map", site, "--localize", "--out", tmp_path / "where")
-    assert "map export" in line
+    line = refused(days[1], "--map", site, "--localize", "--realtime", "--out", tmp_path / "where")
+    assert "solved when it ends" in line
     assert run("slam", "--init", tmp_path / "planar").exit_code == 0
     line = refused(tmp_path / "planar", "--map", site, "--out", tmp_path / "mixed")
     assert "a recording in the plane, the map is of space" in line
     assert site.read_bytes() == before
-    run("map", "export", site, "--out", tmp_path / "map.parquet")  # what the line says to do instead
-    found = slam(days[2], "--prior-map", tmp_path / "map.parquet", "--out", tmp_path / "where")
+    found = slam(days[2], "--map", site, "--localize", "--out", tmp_path / "where")
     assert [change["landmarks"] for change in found["changes"]] == [[3]]
+    assert site.read_bytes() == before
 
 
 @pytest.mark.parametrize("in_space", [False, True])

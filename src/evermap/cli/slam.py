@@ -335,16 +335,13 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     from evermap.types import SpatialRecording
 
     map_file, priors, localize, realtime, _ = options
-    if realtime and not localize:
+    in_space = isinstance(recording, SpatialRecording)
+    if realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     if config.slam.unknown_ids:
         raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
-    planar = None if isinstance(recording, SpatialRecording) else recording
-    if localize and planar is None:
-        hint = f"evermap map export {map_file} --out map.parquet, then --prior-map map.parquet"
-        raise ConfigError("is for recordings in the plane so far", field="localize", hint=hint)
     said = priors_of(*priors_by_class(priors))
-    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize, in_space=planar is None))
+    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} stays as it was")
@@ -354,10 +351,10 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
         if options.survey is not None:
             begin_map(store, options.survey, recording, command_line())
         with progress_bar(recording.name) as progress:
-            if planar is not None and localize:
+            if localize:
                 stamps = recording.frames.stamp_s
                 living = at_time(store, float(stamps[0]) if len(stamps) else 0.0)
-                result = run_localization(planar, living, config, realtime=realtime, progress=progress)
+                result = run_localization(recording, living, config, realtime=realtime, progress=progress)
             else:
                 entered = enter_session(store, recording, config, priors=said, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording

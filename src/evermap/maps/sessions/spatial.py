@@ -30,7 +30,17 @@ from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of, located, most_of
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
-from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Progress, Sensor, SpatialRecording, landmark_id_of
+from evermap.types import (
+    UNKNOWN,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Landmarks,
+    Progress,
+    Sensor,
+    SpatialRecording,
+    landmark_id_of,
+)
 
 AXES_OF_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns are ahead, left and up of a sensor that looks along its z, with y down."""
@@ -263,14 +273,18 @@ def visited(
     """Return a session solved within a map, and where it lies there; None where it shows nothing that stands."""
     if not len(living.places):
         return SpatialVisit(recording, intake, solve_space(intake, None, progress=progress)), None
-    believed = replace(living, sites=replace(living.sites, p_here=p_site), dated=Dated.empty(), stamp_s=-np.inf)
-    prior = believed.landmarks(p_least=EXISTS)
-    solved = solve_space(intake, prior, progress=progress)
+    solved = solve_space(intake, standing(living, p_site), progress=progress)
     visit = SpatialVisit(recording, intake, _numbered(intake, solved, living))
     where = _laid(visit, living, p_site, config)
     if where is None or np.count_nonzero(where.place >= 0) < 2:
         return visit, None
     return replace(visit, solved=replace(visit.solved, optimum=_held(visit, living, where), from_map=None)), where
+
+
+def standing(living: LivingMap, p_site: FloatArray) -> Landmarks:
+    """Return what more probably stands than not, where it most probably does, by beliefs (S,) in the sites."""
+    believed = replace(living, sites=replace(living.sites, p_here=p_site), dated=Dated.empty(), stamp_s=-np.inf)
+    return believed.landmarks(p_least=EXISTS)
 
 
 def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
