@@ -75,15 +75,7 @@ def prepare_space(
         DataError: fewer than `fewest` frames with a landmark of known identity.
     """
     detections, stamps = recording.detections, recording.frames.stamp_s
-    usable, moving, warnings = _usable(recording, remarks)
-    where, broken = _where(recording, usable)
-    if broken.any():
-        warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
-        usable &= ~broken
-    blind = _with_ranges(recording, where, usable)
-    if blind.any():
-        warnings.append(f"{int(blind.sum())} detections without a range, seen from too few directions, not used")
-        usable &= ~blind
+    where, usable, moving, warnings = _said(recording, remarks)
     seen_in = np.unique(detections.frame[usable])
     if len(seen_in) < fewest:
         raise _too_little(recording, len(seen_in), fewest)
@@ -131,6 +123,20 @@ def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataErro
     return DataError(
         f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed", hint=hint
     )
+
+
+def _said(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[_Where, BoolArray, BoolArray, list[str]]:
+    """What detections say, which (M,) can be used, frames (F,) while there is odometry, and what is left out."""
+    usable, moving, warnings = _usable(recording, remarks)
+    where, broken = _where(recording, usable)
+    if broken.any():
+        warnings.append(f"{int(broken.sum())} detections from which no position follows not used")
+        usable &= ~broken
+    blind = _with_ranges(recording, where, usable)
+    if blind.any():
+        warnings.append(f"{int(blind.sum())} detections without a range, seen from too few directions, not used")
+        usable &= ~blind
+    return where, usable, moving, warnings
 
 
 def _usable(recording: SpatialRecording, remarks: tuple[str, ...]) -> tuple[BoolArray, BoolArray, list[str]]:
