@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from benchmarks import kitti_score
+from benchmarks import kitti_score, kitti_slam
 from benchmarks.ab3dmot import CLASSES, Ab3dmot
 from benchmarks.kitti_score import LEAST_PX, MOST_OCCLUDED, MOST_TRUNCATED, Judged
 from benchmarks.overlap import overlap
@@ -302,6 +302,7 @@ def run(folder: Path = FOLDER, only: Sequence[str] | None = None) -> tuple[dict[
             ratios[f"kitti_{name.lower()}_{what}"] = 100.0 * (1.0 - rows["evermap"][when][key])
     n_frames = sum(len(one.stamp_s) for one in drives)
     shown["ms_a_frame"] = {who: 1e3 * spent / n_frames for who, spent in cpu_s.items()}
+    shown["slam"] = kitti_slam.run(folder, read, only)
     ratios["kitti_speed_ratio"] = cpu_s["AB3DMOT"] / cpu_s["evermap"]
     return ratios, shown
 
@@ -322,6 +323,10 @@ def claims(shown: dict[str, Any]) -> list[str]:
         f"| least lead over AB3DMOT in MOTA, IDF1 and HOTA | ≥ 0 | {min(leads):.4f} | {_met(min(leads) >= 0.0)} |",
         f"| identity switches of cars, pedestrians, cyclists | ≤ 0 | {switches} | {_met(switches == 0)} |",
         f"| CPU time of a frame [ms] | ≤ 5 | {spent:.2f} | {_met(spent <= 5.0)} |",
+        *(
+            f"| {name} | {expected} | {measured} | {_met(fine)} |"
+            for name, expected, measured, fine in kitti_slam.claims(shown["slam"])
+        ),
     ]
 
 
@@ -368,4 +373,5 @@ def as_markdown(shown: dict[str, Any]) -> str:
             text = " | ".join(f"{v:.0f}" if isinstance(v, int) else f"{v:.4f}" for v in cells)
             lines.append(f"| {name} | {who} | {text} |")
     took = ", ".join(f"{who} {ms:.2f} ms" for who, ms in shown["ms_a_frame"].items())
-    return "\n".join([*lines, "", f"CPU time of a frame, all classes: {took}."])
+    lines += ["", f"CPU time of a frame, all classes: {took}."]
+    return "\n".join([*lines, "", kitti_slam.as_markdown(shown["slam"])])

@@ -169,10 +169,23 @@ def test_a_folder_without_sequences_is_named(tmp_path: Path) -> None:
 def test_tables_and_figure_of_a_run_are_written(tmp_path: Path) -> None:
     row = swept([SWITCHED], [{7: 5.0, 8: 1.0}]) | identities([SWITCHED])
     both = {"swept": row, "at_once": row}
-    shown = {"classes": {"Car": {"evermap": both, "AB3DMOT": both}}, "ms_a_frame": {"evermap": 9.0, "AB3DMOT": 1.0}}
+    drive = {
+        "sequence": "0000", "odometry_m": 2.0, "ours_m": 1.2, "calibrated_m": 0.9, "all_stand_m": 3.0, "as_is_m": 0.1,
+        "range_scale": 1.03, "range_scale_sigma": 0.002, "factor": 1.03, "landmarks": 9, "cpu_ms": 4.0,
+        "parked_or_moving": {"ranges": [19, 20, 1], "reference": [18, 20, 1]},
+    }  # fmt: skip
+    shown = {
+        "classes": {"Car": {"evermap": both, "AB3DMOT": both}},
+        "ms_a_frame": {"evermap": 9.0, "AB3DMOT": 1.0},
+        "slam": [drive],
+    }
     kitti.write(shown, tmp_path / "out")
     text = (tmp_path / "out" / "table.md").read_text()
     assert "| least lead over AB3DMOT in MOTA, IDF1 and HOTA | ≥ 0 | 0.0000 | yes |" in text
     assert "| CPU time of a frame [ms] | ≤ 5 | 9.00 | **no** |" in text
     assert "| Car | evermap |" in text
     assert (tmp_path / "out" / "kitti.png").stat().st_size > 1000
+    assert "| sequences where a worse odometry's error is halved | ≥ 1 | 0 | **no** |" in text
+    assert "| the same, with the factor on ranges known | ≥ 1 | 1 | yes |" in text
+    assert "| 0000 \\* | 2.00 | 1.20 | 0.90 | 3.00 | 0.10 | 1.0300 ± 0.0020 | 9 | 4.0 |" in text
+    assert "95.0 % (19 of 20)" in text
