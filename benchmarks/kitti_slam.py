@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from evermap.cli.warmup import warm_up
 from evermap.config import Config, TrackConfig
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
@@ -122,6 +123,7 @@ def run(folder: Path, read_labels: Any, only: Sequence[str] | None = None) -> li
     """
     places = [place for place in sorted(folder.glob("[0-9]*")) if only is None or place.name in only]
     rows: list[dict[str, Any]] = []
+    warm_up(in_space=True, traffic=True)
     recordings = {place.name: read_recording(place) for place in places}
     recordings = {name: one for name, one in recordings.items() if has_traffic(one)}
     for name, one in recordings.items():

@@ -16,7 +16,7 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 STILL, MOVING = 0.25, 4.8
 """Standard deviations of velocities of what stands and of what moves, each axis, over the speed that tells them apart:
 at that speed both are equally probable."""
-WINDOW_S = 2.0
+WINDOW_S, STRIDE_S = 2.0, 0.3
 ALIKE_S = 0.5
 """For how long the errors of a detector are alike."""
 NEAR_M, FAR_SHARE = 0.1, 0.01
@@ -102,7 +102,7 @@ def _windows(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray, limit: floa
     """(K,) probability to stand, by what is seen around each detection."""
     if stamp_s[-1] - stamp_s[0] <= WINDOW_S:
         return np.full(len(stamp_s), _p_static(stamp_s, at, sigma, limit))
-    middle = np.clip(stamp_s, stamp_s[0] + 0.5 * WINDOW_S, stamp_s[-1] - 0.5 * WINDOW_S)
+    middle = np.clip(STRIDE_S * np.round(stamp_s / STRIDE_S), stamp_s[0] + 0.5 * WINDOW_S, stamp_s[-1] - 0.5 * WINDOW_S)
     first = np.searchsorted(stamp_s, middle - 0.5 * WINDOW_S - 1e-6)
     last = np.searchsorted(stamp_s, middle + 0.5 * WINDOW_S + 1e-6)
     found: dict[tuple[int, int], float] = {}
@@ -150,8 +150,8 @@ def _line(stamp_s: FloatArray, at: FloatArray, sigma: FloatArray) -> tuple[Float
         mean_s, middle = weight @ t / weight.sum(), weight @ at / weight.sum()
         curve = float(weight @ (t - mean_s) ** 2)
         velocity = (weight * (t - mean_s)) @ (at - middle) / curve
-        off = np.linalg.norm(at - middle - (t - mean_s)[:, None] * velocity, axis=1) / (HEAVY * sigma)
-        weight = 1.0 / (sigma * np.hypot(1.0, off)) ** 2
+        off = at - middle - (t - mean_s)[:, None] * velocity
+        weight = 1.0 / (sigma**2 + (off**2).sum(axis=1) / HEAVY**2)
     return velocity, 1.0 / (share * curve)
 
 
