@@ -323,10 +323,6 @@ def claims(shown: dict[str, Any]) -> list[str]:
         f"| least lead over AB3DMOT in MOTA, IDF1 and HOTA | ≥ 0 | {min(leads):.4f} | {_met(min(leads) >= 0.0)} |",
         f"| identity switches of cars, pedestrians, cyclists | ≤ 0 | {switches} | {_met(switches == 0)} |",
         f"| CPU time of a frame [ms] | ≤ 5 | {spent:.2f} | {_met(spent <= 5.0)} |",
-        *(
-            f"| {name} | {expected} | {measured} | {_met(fine)} |"
-            for name, expected, measured, fine in kitti_slam.claims(shown["slam"])
-        ),
     ]
 
 
@@ -374,4 +370,9 @@ def as_markdown(shown: dict[str, Any]) -> str:
             lines.append(f"| {name} | {who} | {text} |")
     took = ", ".join(f"{who} {ms:.2f} ms" for who, ms in shown["ms_a_frame"].items())
     lines += ["", f"CPU time of a frame, all classes: {took}."]
+    lines += ["", "| SLAM among traffic | asked for | reached | met |", "| --- | ---: | ---: | ---: |"]
+    lines += [
+        f"| {name} | {asked} | {reached} | {_met(fine)} |"
+        for name, asked, reached, fine in kitti_slam.claims(shown["slam"])
+    ]
     return "\n".join([*lines, "", kitti_slam.as_markdown(shown["slam"])])
