@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "bateman2020",
+    "building",
     "demo",
     "lifelong",
     "lifetimes",
@@ -282,6 +283,31 @@ def partial_views(
         return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
 
     _run("partial-views", compute, out, as_json=as_json, force=force, in_seconds=False)
+
+
+def building(
+    out: Out = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Buildings.", show_default="2")] = None,
+    seed: Seed = 0,
+    quick: Quick = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Keep a map of a building in space for four weeks of partial patrols, against the truth.
+
+    \b
+    Example:
+      evermap reproduce building --quick
+    """
+
+    def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
+        from evermap_studies.building import study
+
+        first = study.QUICK if quick else study.Settings()
+        settings = replace(first, seed=seed, **_given(worlds=runs))
+        return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
+
+    _run("building", compute, out, as_json=as_json, force=force, in_seconds=False)
 
 
 def _run(

@@ -13,7 +13,8 @@ from evermap.types import BoolArray, FloatArray, IntArray
 OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
 """Half of the squared residual of which a detection with 3, 6 or 8 numbers is as likely an outlier: which one of
 10,000 right detections exceeds."""
-JUMP_LOG_ODDS = 14.0
+JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS = 14.0, 1e3
+"""The same of odometry, which may slip; without, nothing takes a camera to somewhere else between two frames."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +62,11 @@ class PlacePrior:
         """Return a map that says nothing."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
 
-    def off(self, row: int, place: FloatArray, *, oriented: bool) -> FloatArray:
-        """Return the twist (6,) from where the map has a place to `place` (7,); the shift (3,) of a point."""
+    def off(self, row: int | IntArray, place: FloatArray, *, oriented: bool) -> FloatArray:
+        """Return twists (..., 6) from where the map has places to `place` (..., 7); shifts (..., 3) of points."""
         if oriented:
             return se3.local(self.pose[row], place)
-        return np.asarray(place[:3] - self.pose[row, :3])
+        return np.asarray(place[..., :3] - self.pose[row, :3])
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ import numpy as np
 from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.slam.space.linearise import ODOMETRY, ROWS, STATES, linearise_odometry, linearise_sightings
-from evermap.slam.space.problem import JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.sparse.elimination import Spread, curvature
 from evermap.slam.sparse.system import Factorised, System, exhausted
 from evermap.slam.sparse.tree import Factors
@@ -101,8 +101,9 @@ class SpatialSmoother:
         sigma = _odometry_sigma(problem, noise)
         odometry = ODOMETRY * (n - 1)
         cost = linearise_odometry(
-            estimate.pose, problem.increment, sigma, JUMP_LOG_ODDS, heavy, values[:odometry], odometry_weight
-        )
+            estimate.pose, problem.increment, sigma, JUMP_LOG_ODDS if problem.driven else NO_JUMP_LOG_ODDS, heavy,
+            values[:odometry], odometry_weight,
+        )  # fmt: skip
         end = odometry + int(self._seen.first[-1])
         cost += linearise_sightings(
             estimate.pose, estimate.place, estimate.mount(problem), self._velocity, noise.levels, self._seen, heavy,
@@ -142,14 +143,16 @@ class SpatialSmoother:
 
     def _priors(self, estimate: SpatialEstimate, values: FloatArray, at: int) -> float:
         """Fill in what the given map says; returns its cost."""
-        prior, cost = self.problem.prior, 0.0
-        for k, place in enumerate(prior.place):
-            off = prior.off(k, estimate.place[place], oriented=bool(self.problem.oriented[place]))
-            root = (np.sqrt(prior.weight[k]) / prior.sigma[k])[: len(off)]
-            jacobian = se3.right_jacobian_inverse(off) if len(off) == 6 else np.eye(3)
-            block = np.column_stack([root[:, None] * jacobian, -root * off])
-            values[at : at + block.size] = block.ravel()
-            at += block.size
+        prior, problem = self.problem.prior, self.problem
+        turned = problem.oriented[prior.place]
+        first = at + np.append(0, np.cumsum(np.where(turned, 42, 12)))
+        cost = 0.0
+        for some, dim in ((np.flatnonzero(turned), 6), (np.flatnonzero(~turned), 3)):
+            off = prior.off(some, estimate.place[prior.place[some]], oriented=dim == 6)
+            root = (np.sqrt(prior.weight[some])[:, None] / prior.sigma[some])[:, :dim]
+            jacobian = se3.right_jacobian_inverse(off) if dim == 6 else np.eye(3)
+            block = np.concatenate([root[..., None] * jacobian, -(root * off)[..., None]], axis=2)
+            values[first[some][:, None] + np.arange(dim * (dim + 1))] = block.reshape(len(some), dim * (dim + 1))
             cost += 0.5 * float(np.sum((root * off) ** 2))
         return cost
 

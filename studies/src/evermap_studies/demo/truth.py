@@ -66,7 +66,7 @@ def truth_of(building: BuildingSimulation) -> Truth:
         away = np.isnan(position_m[k, :, 0])
         stays = np.all(position_m[k] == position_m[k - 1], axis=-1) | (away & np.isnan(position_m[k - 1, :, 0]))
         changed[k] = ~stays
-    known, knowable = _observed(looked_at(building), building.n_landmarks)
+    known, knowable = observed(looked_at(building), building.n_landmarks)
     return Truth(position_m, seen_m, detected, changed, known, knowable)
 
 
@@ -77,7 +77,7 @@ def _hits(building: BuildingSimulation, session: int) -> IntArray:
     return np.bincount(named[(really == named) & (named >= 0)], minlength=building.n_landmarks)
 
 
-def _observed(looks: LookedAt, n_landmarks: int) -> tuple[BoolArray, IntArray]:
+def observed(looks: LookedAt, n_landmarks: int) -> tuple[BoolArray, IntArray]:
     """What an observer knows who sees whatever is really looked at, and nothing else.
 
     Returns:

@@ -1,0 +1,1 @@
+"""A building in space over four weeks: partial patrols by camera, things that come, move and go."""
