@@ -40,7 +40,9 @@ def draw_map(story: Story, living: LivingMap, run: Mapping[str, Any]) -> Figure:
         for (a, b), top in zip(ends, height, strict=True):
             above.plot(*zip(a, b, strict=True), color=MUTED, lw=1.1 if top > 2.5 else 0.7, zorder=1)
         if truth is not None:
-            above.plot(*truth.pose_world_robot[:, :2].T, color=ESTIMATE, lw=0.9, alpha=0.7, label="last patrol", zorder=2)
+            above.plot(
+                *truth.pose_world_robot[:, :2].T, color=ESTIMATE, lw=0.9, alpha=0.7, label="last patrol", zorder=2
+            )
         for row, what in enumerate(KINDS):
             some = kind == row
             style = {"marker": MARKERS[row], "s": 20, "color": COLOURS[row], "lw": 0.0, "zorder": 3}
@@ -68,7 +70,9 @@ def draw_existence(content: Mapping[str, Any]) -> Figure:
     with house_style():
         figure = new_figure(7.2, 3.6)
         panels = figure.subplots(1, 2, sharey=True)
-        for axes, key, title in zip(panels, ("statements", "forecasts"), ("after a session", "a day ahead"), strict=True):
+        for axes, key, title in zip(
+            panels, ("statements", "forecasts"), ("after a session", "a day ahead"), strict=True
+        ):
             axes.plot([0.0, 1.0], [0.0, 1.0], color=MUTED, lw=0.9, ls="--")
             for row, method in enumerate(methods):
                 pairs = [pair for run in of_method(content, method) if run["seed"] in first for pair in run[key]]

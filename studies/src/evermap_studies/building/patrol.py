@@ -68,13 +68,14 @@ def patrolled(world: World, day: int, seed: int, place: IntArray, at_day: IntArr
         world: what stands where.
         day: row of the session.
         seed: of everything random in it.
-        place, at_day: (P,) landmarks, and days on which they stood at the places that are asked for.
+        place: (P,) landmarks of the places that are asked for.
+        at_day: (P,) days on which they stood there.
         by_hand: the cameras are carried, nothing is known of how they moved.
     """
     random = np.random.default_rng([seed, 2, day])
     rooms = _visited(world.door_open[day], random, first=day == 0)
     at, turn = _driven(rooms, random, by_hand)
-    stamp_s = np.arange(len(at)) * STEP_S
+    stamp_s = np.arange(len(at), dtype=np.float64) * STEP_S
     position, rotation = world.landmarks(day)
     present = np.flatnonzero(np.isfinite(position[:, 0]))
     people = _people(at, random)
@@ -156,7 +157,7 @@ def _people(at: FloatArray, random: np.random.Generator) -> FloatArray:
     near = at[random.integers(0, len(at), N_PEOPLE), :2] + random.normal(0.0, 1.0, (N_PEOPLE, 2))
     walk = random.normal(0.0, 0.15, (N_PEOPLE, 2)) * (random.random((N_PEOPLE, 1)) < 0.5)
     swing = np.sin(np.arange(len(at))[:, None] * STEP_S / 3.0 + random.uniform(0.0, 6.0, N_PEOPLE))
-    return near + 10.0 * walk * swing[..., None]
+    return np.asarray(near + 10.0 * walk * swing[..., None])
 
 
 @dataclass(frozen=True, slots=True)

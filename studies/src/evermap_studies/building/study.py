@@ -38,11 +38,11 @@ BY_HAND = 3
 AGREE_M = 0.5
 """Landmarks that never move and are farther off than this do not take part in the alignment."""
 SCORING = (
-    f"every reported change by landmark: right where it came, left or moved within the reported interval; a true change "
-    f"can be known where its old state was seen and its new one looked at (5 detections to expect); existence: 'it stands "
-    f"within {NEAR_M} m of where the map has it', for every landmark that the map knows, after each session; forecasts: "
-    f"the same a day later; poses in the frame of what never moves, root mean square; lifetimes: median by the map over "
-    f"the median that was drawn from"
+    "every reported change by landmark: right where it came, left or moved within the reported interval; a true change "
+    "can be known where its old state was seen and its new one looked at (5 detections to expect); existence: 'it "
+    f"stands within {NEAR_M} m of where the map has it', for every landmark that the map knows, after each session; "
+    "forecasts: the same a day later; poses in the frame of what never moves, root mean square; lifetimes: median by "
+    "the map over the median that was drawn from"
 )
 
 
@@ -95,7 +95,9 @@ def reproduce(
 
     settings = settings or Settings()
     todo = [
-        (settings.seed + k, method) for k in range(settings.worlds) for method in (settings.methods if not k else COMPARED[:1])
+        (settings.seed + k, method)
+        for k in range(settings.worlds)
+        for method in (settings.methods if not k else COMPARED[:1])
     ]
     with RunFolder(out, force=force) as folder:
         stopwatch, runs, shown = Stopwatch(), [], None
@@ -168,7 +170,12 @@ def story_of(seed: int, days: int) -> Story:
     """Make a building and record it."""
     world = made(seed, days)
     position_m = world.positions()
-    place = {(name, tuple(at)): (name, day) for day in range(days) for name, at in enumerate(position_m[day].tolist()) if at[0] == at[0]}
+    place = {
+        (name, tuple(at)): (name, day)
+        for day in range(days)
+        for name, at in enumerate(position_m[day].tolist())
+        if at[0] == at[0]
+    }
     names, first = (np.array(column) for column in zip(*sorted(place.values()), strict=True))
     at = position_m[first, names]
     patrols = tuple(patrolled(world, day, seed, names, first, day % 7 == BY_HAND) for day in range(days))
@@ -193,13 +200,20 @@ def live(story: Story, method: str, tell: Any = None) -> tuple[Row, LivingMap]:
         session = run_session(patrol.recording, living, config)
         living = session.living
         pose = story.alignment(living, k)
-        row = {"session": k, "found": session.found, "by_hand": patrol.recording.odometry is None, "known": len(living.members)}
+        row: Row = {
+            "session": k,
+            "found": session.found,
+            "by_hand": patrol.recording.odometry is None,
+            "known": len(living.members),
+        }
         if session.found:
             row |= _pose_errors(session.slam, patrol.recording, pose)
         if method == COMPARED[0]:
             truth = run_slam(patrol.recording, prior_map=patrol.recording.true_landmarks)
-            row |= {f"oracle_{key}": value for key, value in _pose_errors(truth, patrol.recording, se3.identity()).items()}
-        found["sessions"].append(row)
+            row |= {
+                f"oracle_{key}": value for key, value in _pose_errors(truth, patrol.recording, se3.identity()).items()
+            }
+        found["sessions"].append(row | _consistency(story, living, k, pose))
         if k:
             found["told"] += [row for change in session.changes for row in _scored(story, change, k, pose)]
         found["statements"] += _statements(story, living, k, k, pose)
@@ -208,8 +222,8 @@ def live(story: Story, method: str, tell: Any = None) -> tuple[Row, LivingMap]:
         if tell is not None:
             tell(float(k + 1))
     assert living is not None
-    row = {"seed": story.seed, "method": method, **found, "changes": _knowable(story, found["told"])}
-    return row | {"lifetimes": _lifetimes(living)}, living
+    run: Row = {"seed": story.seed, "method": method, **found, "changes": _knowable(story, found["told"])}
+    return run | {"lifetimes": _lifetimes(living)}, living
 
 
 def _pose_errors(slam: SlamResult, recording: SpatialRecording, pose: FloatArray) -> Row:
@@ -220,7 +234,25 @@ def _pose_errors(slam: SlamResult, recording: SpatialRecording, pose: FloatArray
     error = np.linalg.norm(se3.transform(pose, mine) - true, axis=1)
     alone = np.linalg.norm(se3.transform(rigid(mine, true), mine) - true, axis=1)
     root = [float(np.sqrt(np.mean(e**2))) for e in (error, alone)]
-    return {"pose_m": root[0], "aligned_m": root[1], "median_m": float(np.median(error)), "largest_m": float(error.max()), "located": len(row) / len(recording.frames)}
+    return {
+        "pose_m": root[0],
+        "aligned_m": root[1],
+        "median_m": float(np.median(error)),
+        "largest_m": float(error.max()),
+        "located": len(row) / len(recording.frames),
+    }
+
+
+def _consistency(story: Story, living: LivingMap, session: int, pose: FloatArray) -> Row:
+    """Errors of the landmarks that stand about where the map has them: squared, and by the map's covariances."""
+    records = living.landmarks(p_least=0.5)
+    own = np.flatnonzero(records.landmark_id < len(story.world.of))
+    error = se3.transform(pose, records.position_m[own]) - story.position_m[session, records.landmark_id[own]]
+    right = np.linalg.norm(error, axis=1) < NEAR_M
+    turn = se3.rotation_of(pose)
+    covariance = turn @ records.covariance_m2[own[right]] @ turn.T
+    nees = np.einsum("ni,ni->n", error[right], np.linalg.solve(covariance, error[right][..., None])[..., 0])
+    return {"n_errors": int(right.sum()), "squared_m2": float((error[right] ** 2).sum()), "nees": float(nees.sum())}
 
 
 def _scored(story: Story, change: MapChange, session: int, pose: FloatArray) -> list[Row]:
@@ -248,7 +280,9 @@ def _scored(story: Story, change: MapChange, session: int, pose: FloatArray) -> 
     ]
 
 
-def _statements(story: Story, living: LivingMap, session: int, asked: int, pose: FloatArray) -> list[tuple[float, bool]]:
+def _statements(
+    story: Story, living: LivingMap, session: int, asked: int, pose: FloatArray
+) -> list[tuple[float, bool]]:
     """P(it stands at its place in a session) of every landmark that the map knows, and whether it does."""
     at_s = float(story.world.stamp_days[asked]) * DAY_S if asked > session else None
     records = living.landmarks(at=at_s)
@@ -266,19 +300,21 @@ def _knowable(story: Story, told: list[Row]) -> list[Row]:
         when = [row["session"] for row in told if row["landmark"] == name and first <= row["session"] < until]
         here, before = story.seen[at, name], story.seen[:at, name].any()
         kind = "is elsewhere or again" if here and before else "is new" if here else "is gone"
-        found.append({"landmark": name, "kind": kind, "session": at, "told": bool(when), "at_once": any(k <= at for k in when)})
+        found.append(
+            {"landmark": name, "kind": kind, "session": at, "told": bool(when), "at_once": any(k <= at for k in when)}
+        )
     return found
 
 
 def _lifetimes(living: LivingMap) -> dict[str, Row]:
     """Median stay by class, by the map and as drawn."""
     found = {}
-    for row, kind in enumerate(KINDS):
+    for kind in KINDS:
         name = list(living.class_names).index(kind.name)
         life, mine = living.lives.of(name), living.stays.class_id == name
         found[kind.name] = {
             "median_days": float(np.ravel(life.stay.quantile([0.5]))[0] / DAY_S),
-            "true_days": float(np.log(2.0) * KINDS[row].stay_days) if np.isfinite(KINDS[row].stay_days) else None,
+            "true_days": float(np.log(2.0) * kind.stay_days) if np.isfinite(kind.stay_days) else None,
             "n_stays": int(mine.sum()),
             "n_ended": int(np.isfinite(living.stays.gone_s[mine]).sum()),
         }

@@ -28,6 +28,7 @@ def summary(runs: Sequence[Row]) -> dict[str, Any]:
     sure = [right for p, right in stated if p >= 0.9]
     located = [row for row in sessions if row["found"]]
     errors = [row["error_m"] for row in told if row["error_m"] is not None and row["true"]]
+    n_errors = max(sum(row["n_errors"] for row in sessions), 1)
     happened = _mean([right for _, right in forecast])
     ratio = [row["pose_m"] / row["oracle_pose_m"] for row in located if "oracle_pose_m" in row]
     return {
@@ -49,6 +50,8 @@ def summary(runs: Sequence[Row]) -> dict[str, Any]:
         "forecast_brier": _mean([(p - right) ** 2 for p, right in forecast]),
         "constant_brier": None if happened is None else happened * (1.0 - happened),
         "displacement_m": float(np.median(errors)) if errors else None,
+        "landmark_m": float(np.sqrt(sum(row["squared_m2"] for row in sessions) / n_errors)),
+        "nees": sum(row["nees"] for row in sessions) / (3.0 * n_errors),
         "pose_m": _root([row["pose_m"] for row in located]),
         "oracle_m": _root([row["oracle_pose_m"] for row in located if "oracle_pose_m" in row]),
         "pose_ratio": float(np.median(ratio)) if ratio else None,
@@ -59,7 +62,9 @@ def reliability(pairs: Iterable[tuple[float, bool]]) -> list[tuple[float, float,
     """Mean probability, share of what is so, and number, in ten bins of probability."""
     table = np.array(list(pairs), dtype=np.float64).reshape(-1, 2)
     which = np.clip(np.digitize(table[:, 0], EDGES) - 1, 0, 9)
-    return [(*table[which == k].mean(axis=0).tolist(), int(np.sum(which == k))) for k in range(10) if np.any(which == k)]
+    return [
+        (*table[which == k].mean(axis=0).tolist(), int(np.sum(which == k))) for k in range(10) if np.any(which == k)
+    ]
 
 
 def as_markdown(content: Mapping[str, Any]) -> str:
@@ -94,20 +99,33 @@ def _changes(groups: list[tuple[str, list[Row]]]) -> str:
     for name, runs in groups:
         s = summary(runs)
         counts = [f"{s['told']}", f"{s['false']}", f"{s['false'] / max(s['sessions'], 1):.2f}"]
-        counts += [f"{s['never']}", f"{s['never_sure']}", f"{s['unseen']}", number("{:.3f}", s["told_brier"]), f"{s['n_changes']}"]
+        counts += [
+            f"{s['never']}",
+            f"{s['never_sure']}",
+            f"{s['unseen']}",
+            number("{:.3f}", s["told_brier"]),
+            f"{s['n_changes']}",
+        ]
         keys = ("recall", "at_once", "displacement_m")
         lines.append([name, *counts, *(number("{:.3f}", s[key]) for key in keys)])
     return markdown_table(head, lines)
 
 
 def _poses(groups: list[tuple[str, list[Row]]]) -> str:
-    head = ("poses", "sessions", "not found", "rms [m]", "oracle [m]", "median ratio", "by hand, rms [m]", "oracle [m]", "median ratio")
+    head = (
+        "poses", "sessions", "not found", "rms [m]", "oracle [m]", "median ratio", "by hand, rms [m]", "oracle [m]",
+        "median ratio", "landmarks, rms [m]", "NEES / 3",
+    )  # fmt: skip
     lines = []
     for name, runs in groups:
-        parts = [summary([{**run, "sessions": [row for row in run["sessions"] if row["by_hand"] == hand]} for run in runs]) for hand in (False, True)]
+        parts = [
+            summary([{**run, "sessions": [row for row in run["sessions"] if row["by_hand"] == hand]} for run in runs])
+            for hand in (False, True)
+        ]
         counts = [f"{sum(p['sessions'] for p in parts)}", f"{sum(p['lost'] for p in parts)}"]
         keys = ("pose_m", "oracle_m", "pose_ratio")
-        lines.append([name, *counts, *(number("{:.3f}", p[key]) for p in parts for key in keys)])
+        s, errors = summary(runs), (number("{:.3f}", p[key]) for p in parts for key in keys)
+        lines.append([name, *counts, *errors, f"{s['landmark_m']:.3f}", f"{s['nees']:.2f}"])
     return markdown_table(head, lines)
 
 

@@ -55,10 +55,10 @@ _QUARTER = np.pi / 2.0
 KINDS = (
     Kind("wall", 26, tags=((0.0, 0.0, 0.0, 0.0),)),
     Kind("sign", 6),
-    Kind("shelf", 10, 0, (1.4, 0.4, 2.0), ((-0.5, -0.2, 0.9, -_QUARTER), (0.5, -0.2, 1.4, -_QUARTER)), 40.0, p_leave=0.3),
+    Kind("shelf", 10, 0, (1.4, 0.4, 2.0), ((-0.5, -0.2, 0.9, -_QUARTER), (0.5, -0.2, 1.4, -_QUARTER)), 40.0, 2.0, 0.3),
     Kind(
         "pallet", 8, 4, (1.2, 0.8, 1.0),
-        ((0.6, 0.0, 0.5, 0.0), (0.0, 0.4, 0.5, _QUARTER), (-0.6, 0.0, 0.5, 2.0 * _QUARTER), (0.0, -0.4, 0.5, -_QUARTER)),
+        ((0.6, 0.0, 0.5, 0.0), (0.0, 0.4, 0.5, _QUARTER), (-0.6, 0.0, 0.5, np.pi), (0.0, -0.4, 0.5, -_QUARTER)),
         6.0,
     ),
     Kind("forklift", 5, 0, (1.2, 0.8, 2.0), (), 2.0, 1.0, p_leave=0.5, p_return=0.95),
@@ -113,7 +113,7 @@ class World:
         return np.stack([self.landmarks(day)[0] for day in range(len(self.stamp_days))])
 
     def blocking(self, day: int) -> tuple[FloatArray, FloatArray, IntArray]:
-        """(S, 2, 2) ends of walls, shut doors and sides of things, (S,) their heights, and whose they are (-1: none)."""
+        """(S, 2, 2) ends of walls, shut doors and sides of things, (S,) heights, and whose they are (-1: none)."""
         walls = _walls(self.door_open[day])
         ends, height, whose = [walls], [np.full(len(walls), 3.0)], [np.full(len(walls), -1)]
         for row in np.flatnonzero(np.isfinite(self.thing[day, :, 0])).tolist():
@@ -210,7 +210,12 @@ def _walls(door_open: BoolArray) -> FloatArray:
     """(S, 2, 2) of the floor, with the doors that are shut."""
     low, high = CORRIDOR_M
     depth = high + ROOM_M[1]
-    ends = [((0, 0), (LENGTH_M, 0)), ((0, depth), (LENGTH_M, depth)), ((0, 0), (0, depth)), ((LENGTH_M, 0), (LENGTH_M, depth))]
+    ends = [
+        ((0, 0), (LENGTH_M, 0)),
+        ((0, depth), (LENGTH_M, depth)),
+        ((0, 0), (0, depth)),
+        ((LENGTH_M, 0), (LENGTH_M, depth)),
+    ]
     ends += [((x, y), (x, y + ROOM_M[1])) for x in (8.0, 16.0) for y in (0.0, high)]
     for room, (x, _) in enumerate(ROOM_CENTRES.tolist()):
         y, half = low if room < 3 else high, 0.5 * DOOR_M
