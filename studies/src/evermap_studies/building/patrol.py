@@ -184,7 +184,7 @@ class _Sight:
         p = MOST_P * np.clip(1.0 - (range_m / RANGE_M) ** 4, 0.0, 1.0) * faced * inside
         frame, row = np.nonzero(p)
         p[frame, row] *= ~self._blocked(frame, at[row], self.world.of[landmark[row]])
-        return p
+        return np.asarray(p)
 
     def _blocked(self, frame: IntArray, at: FloatArray, thing: IntArray) -> BoolArray:
         """(R,) rays from the camera that meet a wall, a thing other than what they go to, or a person."""

@@ -12,6 +12,7 @@ from typing import Any
 from evermap.runs.folder import RunFolder, write_run
 from evermap.runs.summary import RunInfo
 from evermap.types import Progress
+from evermap.viz.style import NamedFigure
 from evermap_studies.demo.methods import method_named
 from evermap_studies.demo.scenario import Scenario
 from evermap_studies.demo.study import run_study
@@ -34,7 +35,8 @@ def run_demo(
     """Live in a changing building for four weeks, with every method. Returns `summary.json`'s content.
 
     The folder is that of evermap's last session (see `runfolder.write_run`), with a section `demo` in the summary, the
-    story at the top of the report, its figures, the map with all its revisions and the simulator's true events.
+    story at the top of the report, its figures, the map with all its revisions and the simulator's true events; and a
+    week in a building in space, from eight days on.
 
     Args:
         out: folder to write.
@@ -51,6 +53,7 @@ def run_demo(
     from evermap.viz.style import save_png, save_svg
     from evermap_studies.demo.claims_figure import draw_claims
     from evermap_studies.demo.hero import draw_hero
+    from evermap_studies.demo.in_space import live_in_space, section_of
     from evermap_studies.demo.lifetime_figure import draw_lifetimes
     from evermap_studies.demo.lifetimes import learned_lives
     from evermap_studies.demo.numbers import cost, demo_dict, lines_of
@@ -65,19 +68,24 @@ def run_demo(
         study = run_study(scenario, seed, store=folder.path(MAP), processes=processes, progress=progress)
         lines, lives = lines_of(study), learned_lives(study)
         numbers, costs = demo_dict(study, lines, lives, seed), cost(study)
-        figures = (
+        figures: tuple[NamedFigure, ...] = (
             draw_weeks(study, lines),
             draw_hero(study, lines),
             draw_claims(study, lines),
             draw_scores(study, lines),
             draw_lifetimes(lives),
         )
+        in_space = live_in_space(scenario.days, seed)
         info = RunInfo(
             command=command, seeds={"simulation": seed, "slam": config.slam.seed}, total_s=time.perf_counter() - start
         )
         # the run in a folder of its own first: what is added must not be half there either
         run = folder.path("run")
         sections = demo_sections(numbers, costs, figures)
+        if in_space is not None:
+            numbers["space"] = in_space[0]
+            sections += (section_of(*in_space),)
+            figures += (in_space[1],)
         summary = write_run(run, study.building.sessions[-1], study.result, config, info=info, sections=sections)
         for item in run.iterdir():
             item.rename(folder.path(item.name))
