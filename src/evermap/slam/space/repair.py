@@ -31,6 +31,10 @@ LEAST_SEEN = 1.0
 """Sum of inlier probabilities below which a landmark was not seen at its place."""
 LEAST_WEIGHT = 1e-6
 """Of a map's word on a landmark that is elsewhere."""
+MOVED_NATS = 5.0
+"""What it costs that a landmark of the map was moved, instead of the robot."""
+ONLY_THERE = 0.9
+"""Share of a landmark's sightings in a stretch of frames with which it can have moved without a trace elsewhere."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -47,6 +51,53 @@ def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
             break
         optimum = found
     return optimum
+
+
+def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
+    """Return the optimum, or a better one in which not the robot jumped, but landmarks of the map were moved.
+
+    A robot that sees only things that were carried away together finds itself where these had been, and jumps back
+    with the next view. So each stretch of frames between jumps of the odometry is asked once more without them.
+    """
+    for _ in range(ROUNDS):
+        jumps = np.flatnonzero(optimum.now.odometry_weight < 0.5)
+        bounds = np.unique(np.concatenate([[0], jumps + 1, [len(optimum.estimate.pose)]]))
+        stretches = zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)
+        better = next((found for a, b in stretches if (found := _as_driven(optimum, a, b)) is not None), None)
+        if not len(jumps) or better is None:
+            break
+        optimum = better
+    return optimum
+
+
+def _as_driven(optimum: SpatialOptimum, first: int, end: int) -> SpatialOptimum | None:
+    """The optimum with a stretch of frames where the odometry has it, and what was seen only there moved with it; None
+    if that is no better.
+    """
+    problem, pose = optimum.smoother.problem, optimum.estimate.pose
+    if 2 * (end - first) > len(pose):
+        return None
+    inside = (problem.pose_row >= first) & (problem.pose_row < end)
+    seen, there = (
+        np.bincount(problem.place, optimum.now.weight * some, minlength=len(problem.oriented))
+        for some in (np.ones(len(inside)), inside)
+    )
+    only = np.flatnonzero((there >= LEAST_SEEN) & (there >= ONLY_THERE * seen))
+    held = np.isin(problem.prior.place, only)
+    if not held.any():
+        return None
+    if first:
+        at, to = first, se3.compose(pose[first - 1], problem.increment[first - 1])
+    else:
+        at, to = end - 1, se3.compose(pose[end], se3.inverse(problem.increment[end - 1]))
+    motion = se3.compose(to, se3.inverse(pose[at]))
+    start = replace(optimum.estimate, pose=pose.copy(), place=optimum.estimate.place.copy())
+    start.pose[first:end] = se3.compose(motion, pose[first:end])
+    start.place[only] = se3.compose(motion, start.place[only])
+    prior = replace(problem.prior, weight=np.where(held, LEAST_WEIGHT, problem.prior.weight))
+    found = converged(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=0)
+    cost = found.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
+    return found if cost + MOVED_NATS * held.sum() < optimum.now.cost - GAIN else None
 
 
 def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tuple[SpatialEstimate, bool]:

@@ -13,7 +13,7 @@ from evermap.slam.space.estimate import SpatialOptimum, converged, first_places,
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import CORNERS, POINT
 from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.slam.space.repair import rejoined, repaired, split
+from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.start import incremental
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
@@ -96,6 +96,9 @@ def solve_space(
         voted = oriented(problem, estimate, points.now.weight)
         estimate = replace(estimate, place=voted)
     optimum = repaired(converged(problem, estimate, noise))
+    if problem.driven and len(problem.prior.place):
+        optimum = unjumped(optimum)
+        problem = optimum.smoother.problem
     for _ in range(SPLITS):
         found = split(optimum, identity)
         if found is None:
