@@ -27,7 +27,7 @@ from evermap.tracking.run import run_track
 from evermap.types import UNKNOWN, FloatArray, SlamResult, SpatialOdometry, SpatialRecording
 
 CALIBRATED_ON = ("0000", "0003", "0005", "0009", "0017")
-"""Sequences that choices were made on, and the factor on ranges."""
+"""Sequences that the factor on ranges is taken from, with the odometry as it is."""
 SCALE, BEND_RADPM, WHITE_M, WHITE_RAD = 1.02, np.radians(0.02), 0.01, 0.001
 """By which the odometry is made worse: its way, its turn by the metre, and noise of every step."""
 MOVES_MPS, LEAST_S, NEAR_M = 0.5, 2.0, 1.5
