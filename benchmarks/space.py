@@ -20,7 +20,7 @@ from evermap.geometry.rigid import rigid
 from evermap.io import read_recording
 from evermap.maps.living import LivingMap
 from evermap.metrics.summary import compare_with_truth
-from evermap.types import FloatArray, Landmarks, SlamResult, SpatialRecording, Trajectory
+from evermap.types import ChangeKind, FloatArray, Landmarks, SlamResult, SpatialRecording, Trajectory
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 TAGS = ("test_9", "test_10", "test_11")
@@ -108,7 +108,8 @@ def _days(folder: Path) -> list[dict[str, Any]]:
                 survey.position_m[survey.landmark_id == tag] for survey in (surveys[max(len(rows) - 1, 0)], surveys[-1])
             ]
             by = float(np.linalg.norm(at[1][0] - at[0][0])) if all(map(len, at)) else None
-            told.append([living.label(tag), float(np.linalg.norm(change.displacement_m)), change.probability, by])
+            away = float(np.linalg.norm(change.displacement_m)) if change.kind is ChangeKind.MOVED else None
+            told.append([session.living.label(tag), change.kind.value, away, change.probability, by])
         rows.append(
             {
                 "name": name,
@@ -264,12 +265,13 @@ def as_markdown(shown: dict[str, Any]) -> str:
     for name, changes in shown["changes"].items():
         told = "; ".join(f"{tag} by {np.linalg.norm(by):.2f} m ({100.0 * p:.0f} %)" for tag, by, p in changes)
         lines.append(f"| {name} | {told or 'none'} |")
-    lines += ["", "| day of one living map | error, RMSE | median | tags before, after | told to have moved | CPU |"]
+    lines += ["", "| day of one living map | error, RMSE | median | tags before, after | told | CPU |"]
     lines += ["|---|---:|---:|---:|---|---:|"]
     for row in shown["days"]:
         told = "; ".join(
-            f"{tag} by {by:.2f} m ({100.0 * p:.0f} %" + (f", by the surveys {was:.2f} m)" if was else ")")
-            for tag, by, p, was in row["changes"]
+            f"{tag} {kind}{'' if by is None else f' by {by:.2f} m'} ({100.0 * p:.0f} %"
+            + (f", by the surveys {was:.2f} m)" if was else ")")
+            for tag, kind, by, p, was in row["changes"]
         )
         sizes = "{}, {}".format(*row["tags"])
         error = f"{row['rmse_m']:.3f} m | {row['median_m']:.3f} m" if row["found"] else "**not located** | –"
