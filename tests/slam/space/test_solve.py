@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from evermap import run_slam
 from evermap.errors import DataError
 from evermap.metrics.summary import compare_with_truth
-from evermap.types import Landmarks, SlamResult, SpatialSensor
+from evermap.types import Landmarks, SlamResult, SpatialSensor, rows_of
 
 
 def errors(result: SlamResult, world: World) -> tuple[float, float]:
@@ -142,6 +142,23 @@ def test_what_was_moved_by_metres_draws_no_others_along(seed):
         assert told[tag].displacement_m == pytest.approx(by, abs=0.03)
         assert told[tag].probability > 0.95
     assert not any("#2" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_two_tags_that_were_carried_away_together_do_not_carry_the_robot_away(seed):
+    """For some frames the robot sees nothing else, so that the two agree that it is where they had been."""
+    world = tagged_corridor(seed)
+    seen = world.recording.detections
+    recording = replace(world.recording, detections=rows_of(seen, ~np.isin(seen.landmark_id, [4, 7])))
+    result = run_slam(recording, prior_map=moved(world.tags, {5: (0.0, 9.0, 0.0), 6: (0.0, 9.0, 0.0)}))
+    gap = np.linalg.norm(result.trajectory.pose_world_robot[:, :3] - _true_at(world, result), axis=1)
+    assert np.max(gap) < 0.1
+    assert {tag for change in result.changes for tag in change.landmark_ids} <= {5, 6}
+
+
+def _true_at(world: World, result: SlamResult) -> np.ndarray:
+    row = np.searchsorted(world.recording.frames.stamp_s, result.trajectory.stamp_s - 1e-6)
+    return world.true_pose[row, :3]
 
 
 @pytest.mark.slow

@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, oriented
 from evermap.slam.space.linearise import linearise_sightings
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
 BETTER = 6.0
@@ -33,8 +34,6 @@ LEAST_WEIGHT = 1e-6
 """Of a map's word on a landmark that is elsewhere."""
 MOVED_NATS = 5.0
 """What it costs that a landmark of the map was moved, instead of the robot."""
-ONLY_THERE = 0.9
-"""Share of a landmark's sightings in a stretch of frames with which it can have moved without a trace elsewhere."""
 
 
 def repaired(optimum: SpatialOptimum) -> SpatialOptimum:
@@ -57,47 +56,59 @@ def unjumped(optimum: SpatialOptimum) -> SpatialOptimum:
     """Return the optimum, or a better one in which not the robot jumped, but landmarks of the map were moved.
 
     A robot that sees only things that were carried away together finds itself where these had been, and jumps back
-    with the next view. So each stretch of frames between jumps of the odometry is asked once more without them.
+    with the next view. So the stretches of frames between jumps of the odometry are asked once more without them,
+    those together that see the same landmarks of the map.
     """
     for _ in range(ROUNDS):
-        jumps = np.flatnonzero(optimum.now.odometry_weight < 0.5)
-        bounds = np.unique(np.concatenate([[0], jumps + 1, [len(optimum.estimate.pose)]]))
-        stretches = zip(bounds[:-1].tolist(), bounds[1:].tolist(), strict=True)
-        better = next((found for a, b in stretches if (found := _as_driven(optimum, a, b)) is not None), None)
-        if not len(jumps) or better is None:
+        problem = optimum.smoother.problem
+        bounds = np.flatnonzero(optimum.now.odometry_weight < 0.5) + 1
+        if not len(bounds):
             break
-        optimum = better
+        stretch = np.searchsorted(bounds, np.arange(len(optimum.estimate.pose)), side="right")
+        seen = np.zeros((len(bounds) + 1, len(problem.oriented)))
+        np.add.at(seen, (stretch[problem.pose_row], problem.place), optimum.now.weight)
+        known = (seen >= LEAST_SEEN) & np.isin(np.arange(seen.shape[1]), problem.prior.place)
+        group = connected_components(known.astype(np.int64) @ known.T, directed=False)[1]
+        nowhere = ~known.any(axis=1)  # follows what is before it
+        asked = [
+            _as_driven(optimum, stretch, (group == one) | nowhere, known[group == one].any(axis=0))
+            for one in np.unique(group)
+        ]
+        cost, best = min((found for found in asked if found is not None), key=lambda one: one[0], default=(0.0, None))
+        if best is None or cost > optimum.now.cost - GAIN:
+            break
+        optimum = best
     return optimum
 
 
-def _as_driven(optimum: SpatialOptimum, first: int, end: int) -> SpatialOptimum | None:
-    """The optimum with a stretch of frames where the odometry has it, and what was seen only there moved with it; None
-    if that is no better.
+def _as_driven(
+    optimum: SpatialOptimum, stretch: IntArray, some: BoolArray, moved: BoolArray
+) -> tuple[float, SpatialOptimum] | None:
+    """The optimum with some stretches where the odometry has them, and places moved with the first; and its cost.
+
+    None for stretches without such places, or for more than half of the frames.
     """
-    problem, pose = optimum.smoother.problem, optimum.estimate.pose
-    if 2 * (end - first) > len(pose):
+    problem, inside = optimum.smoother.problem, some[stretch]
+    if not moved.any() or 2 * inside.sum() > len(inside):
         return None
-    inside = (problem.pose_row >= first) & (problem.pose_row < end)
-    seen, there = (
-        np.bincount(problem.place, optimum.now.weight * some, minlength=len(problem.oriented))
-        for some in (np.ones(len(inside)), inside)
-    )
-    only = np.flatnonzero((there >= LEAST_SEEN) & (there >= ONLY_THERE * seen))
-    held = np.isin(problem.prior.place, only)
-    if not held.any():
-        return None
-    if first:
-        at, to = first, se3.compose(pose[first - 1], problem.increment[first - 1])
-    else:
-        at, to = end - 1, se3.compose(pose[end], se3.inverse(problem.increment[end - 1]))
-    motion = se3.compose(to, se3.inverse(pose[at]))
-    start = replace(optimum.estimate, pose=pose.copy(), place=optimum.estimate.place.copy())
-    start.pose[first:end] = se3.compose(motion, pose[first:end])
-    start.place[only] = se3.compose(motion, start.place[only])
+    start = replace(optimum.estimate, pose=optimum.estimate.pose.copy(), place=optimum.estimate.place.copy())
+    pose, places_go = start.pose, moved
+    for one in np.flatnonzero(some).tolist():
+        mine = np.flatnonzero(stretch == one)
+        first, last = int(mine[0]), int(mine[-1])
+        if first:
+            at, to = first, se3.compose(pose[first - 1], problem.increment[first - 1])
+        else:
+            at, to = last, se3.compose(pose[last + 1], se3.inverse(problem.increment[last]))
+        motion = se3.compose(to, se3.inverse(pose[at]))
+        pose[mine] = se3.compose(motion, pose[mine])
+        start.place[places_go] = se3.compose(motion, start.place[places_go])
+        places_go = np.zeros_like(moved)
+    held = moved[problem.prior.place]
     prior = replace(problem.prior, weight=np.where(held, LEAST_WEIGHT, problem.prior.weight))
-    found = converged(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=0)
+    found = converged(replace(problem, prior=prior), start, optimum.noise, heavy_rounds=1)
     cost = found.smoother.linearised(found.estimate, optimum.noise, heavy=False).cost
-    return found if cost + MOVED_NATS * held.sum() < optimum.now.cost - GAIN else None
+    return cost + MOVED_NATS * float(held.sum()), found
 
 
 def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tuple[SpatialEstimate, bool]:
