@@ -30,6 +30,7 @@ STUDIES = (
     "tracking",
     "kitti",
     "space",
+    "building",
     "persistence-speed",
     "soak",
     "scale",

@@ -82,6 +82,6 @@ def draw_existence(content: Mapping[str, Any]) -> Figure:
                 axes.scatter(p, share, s=10.0 + 60.0 * np.sqrt(count / count.max()), color=colour, label=method)
             axes.set(title=title, xlabel="P(it stands there) by the map [1]", xlim=(-0.03, 1.03), ylim=(-0.03, 1.05))
         panels[0].set_ylabel("share that does [1]")
-        panels[0].legend(loc="upper left", markerscale=0.6)
+        panels[1].legend(loc="lower right", markerscale=0.6)
         settle(figure)
     return figure
