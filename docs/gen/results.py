@@ -107,18 +107,16 @@ def _with(text: str, unit: str) -> str:
 
 def claims_page() -> str:
     """Return the page of all claims as Markdown."""
-    lines = [HEAD, "| study | computed by | commit |", "| --- | --- | --- |"]
-    rows = ["", "| study | number | expected | measured | met |", "| --- | --- | ---: | ---: | ---: |"]
+    rows = [HEAD, "| study, tables of | number | expected | measured | met |", "| --- | --- | ---: | ---: | ---: |"]
     for study in STUDIES:
         text = page_of(study).read_text(encoding="utf-8")
         made = PROVENANCE.search(text)
         if made is None:
             raise ValueError(f"{page_of(study)}: no line 'Computed by `command`. Tables of commit `hash`, date.'")
-        lines.append(f"| [{study}](results/{study}.md) | `{made['command']}` | `{made['commit']}`, {made['date']} |")
         for index, claim in enumerate(claims(text)):
-            label = "" if index else f"**{study}**"
+            label = "" if index else f"**[{study}](results/{study}.md)** `{made['commit']}`, {made['date']}"
             rows.append(f"| {label} | {claim.name} | {claim.expected} | {claim.measured} | {claim.met} |")
-    return "\n".join(lines + rows) + "\n"
+    return "\n".join(rows) + "\n"
 
 
 def renew(study: str, folder: Path) -> None:
