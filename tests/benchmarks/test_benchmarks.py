@@ -284,10 +284,14 @@ def test_a_small_run_writes_compares_and_reports(
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     monkeypatch.setattr(run, "read_baseline", lambda: _read(tmp_path / "baseline.json"))
     monkeypatch.setattr(run.scale, "SIZES", (20, 40))
-    boxes = dict.fromkeys(run.kitti.METRICS, 1.0), {"classes": {}, "ms_a_frame": {"evermap": 0.3}}
+    errors = dict.fromkeys(("odometry_m", "ours_m", "calibrated_m", "all_stand_m", "as_is_m", "cpu_ms", "factor"), 1.0)
+    traffic = {"sequence": "0000", "range_scale": None, "landmarks": 2, **errors}
+    traffic["parked_or_moving"] = {"ranges": (9, 10, 1), "reference": (8, 10, 1)}
+    shown = {"classes": {}, "ms_a_frame": {"evermap": 0.3}, "slam": [traffic]}
+    boxes = dict.fromkeys(run.kitti.METRICS, 1.0), shown
     monkeypatch.setattr(run.kitti, "FOLDER", tmp_path)
     monkeypatch.setattr(run.kitti, "run", lambda: boxes)
-    tags = dict.fromkeys(run.space.METRICS, 1.0), {"tags": [], "changes": {}, "objects": []}
+    tags = dict.fromkeys(run.space.METRICS, 1.0), {"tags": [], "changes": {}, "days": [], "objects": []}
     (tmp_path / "tagslam").mkdir()
     monkeypatch.setattr(run.space, "FOLDER", tmp_path)
     monkeypatch.setattr(run.space, "run", lambda: tags)
