@@ -286,7 +286,7 @@ def test_a_small_run_writes_compares_and_reports(
     monkeypatch.setattr(run.scale, "SIZES", (20, 40))
     errors = dict.fromkeys(("odometry_m", "ours_m", "calibrated_m", "all_stand_m", "as_is_m", "cpu_ms", "factor"), 1.0)
     traffic = {"sequence": "0000", "range_scale": None, "landmarks": 2, **errors}
-    traffic["parked_or_moving"] = {"ranges": (9, 10, 1), "reference": (8, 10, 1)}
+    traffic["parked_or_moving"] = {"ranges": [9, 10, 1], "reference": [8, 10, 1]}
     shown = {"classes": {}, "ms_a_frame": {"evermap": 0.3}, "slam": [traffic]}
     boxes = dict.fromkeys(run.kitti.METRICS, 1.0), shown
     monkeypatch.setattr(run.kitti, "FOLDER", tmp_path)
