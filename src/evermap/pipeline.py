@@ -137,6 +137,7 @@ def _bring_in_space(
 
     from evermap.maps.sessions import believe, spatial
     from evermap.maps.sessions import session as steps
+    from evermap.maps.vicinity import Vicinity, cliques_of, in_chunks
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic
 
@@ -146,13 +147,22 @@ def _bring_in_space(
     recording, living = steps.admitted(recording, living)
     intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
+        whole, vicinity = living, None
+        if len(whole.places) > config.living.whole_places:
+            vicinity = Vicinity.of(whole, cliques_of(whole, spatial.names_of(intake).ravel()), config.living)
+            living = vicinity.part
         p_site = believe.aged(living, config.living, intake.start_s).p_here
         visit, where = spatial.visited(intake, recording, living, p_site, config.living, progress)
-        if where is None and len(living.places):
-            return steps.lost(visit, living, config.living, steps.NOT_FOUND)
+        if where is None and len(whole.places):
+            return steps.lost(visit, whole, config.living, steps.NOT_FOUND)
+        if vicinity is not None and where is not None:
+            vicinity, where = steps.widened(vicinity, where, visit.path_m, visit.floor_sensor, config.living)
+            living = vicinity.part
         living = visit.named(living)
         known = steps.judged(living, where, visit, config.living)
-        return steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
+        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
+        after = session.living if vicinity is None else vicinity.put_back(session.living)
+        return replace(session, living=in_chunks(after, config.living))
 
 
 def solve_alone(recording: Recording, living: LivingMap, config: Config, *, progress: Progress | None = None) -> Solved:

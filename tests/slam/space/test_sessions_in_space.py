@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evermap.config import Config, LivingConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
@@ -62,6 +63,26 @@ def test_what_was_moved_turned_taken_and_brought_back_is_told_when_it_is_seen(se
     assert changes(fifth) == [(ChangeKind.RETURNED, (14,))]
     p = dict(zip(fifth.living.members.landmark_id.tolist(), fifth.living.p_exists().tolist(), strict=True))
     assert min(p.values()) > 0.9
+
+
+def test_of_a_large_map_a_session_touches_what_is_near() -> None:
+    """The same changes and beliefs, whether a map is updated as one or in parts."""
+    found = []
+    for most in (600, 10):
+        config = Config(living=LivingConfig(whole_places=most))
+        site, living, told = Site.of(8), None, list[tuple[ChangeKind, tuple[int, ...]]]()
+        for day, part in enumerate((ALL, WEST, EAST, WEST)):
+            if day == 2:
+                site.place[3] += [0.5, 0.0, 0.0]
+                site.present[16] = False
+            session = run_session(site.patrol(8, day, *part, rename={20: 2}), living, config)
+            living = session.living
+            told += changes(session)
+        assert living is not None
+        found.append((told, living.members.landmark_id.tolist(), living.p_exists()))
+    assert sorted(found[0][0]) == [(ChangeKind.MOVED, (3,)), (ChangeKind.VANISHED, (16,))]
+    assert found[1][:2] == found[0][:2]
+    np.testing.assert_allclose(found[1][2], found[0][2], atol=0.05)
 
 
 def test_beliefs_are_those_of_misses_from_where_tags_can_be_seen() -> None:

@@ -178,12 +178,21 @@ def near_session(living: LivingMap, alone: Solved, config: LivingConfig) -> tupl
     where = laid(seen.part, believe.aged(seen.part, config, alone.start_s).p_here, alone, config)
     if where is None:
         return seen, None
-    reach_m = alone.recording.sensor.range_max_m + config.near_m
+    path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
+    return widened(seen, where, path, alone.recording.sensor, config)
+
+
+def widened(
+    seen: Vicinity, where: Laid, path_m: FloatArray, sensor: Sensor, config: LivingConfig
+) -> tuple[Vicinity, Laid]:
+    """Return the part of a large map with all that a sensor may have seen on a path (N, 2 or 3), and where a session
+    lies in it.
+    """
+    living, reach_m = seen.whole, sensor.range_max_m + config.near_m
     cliques, box = living.sites.clique_id, np.array([-np.inf, -np.inf, np.inf, np.inf])
     if np.isfinite(reach_m):  # else all there is may be in view
-        path = se2.transform(where.pose_map_session, alone.outcome.estimate.pose[:, :2])
-        cliques, box = near(living, path, reach_m)
-    vicinity = Vicinity.of(living, np.union1d(named, cliques), config, box)
+        cliques, box = near(living, path_m, reach_m)
+    vicinity = Vicinity.of(living, np.union1d(np.unique(seen.part.sites.clique_id), cliques), config, box)
     at = where.place >= 0
     place = where.place.copy()
     places = seen.part.places[place[at]]

@@ -91,6 +91,12 @@ class SpatialVisit:
         return self.solved.optimum
 
     @property
+    def path_m(self) -> FloatArray:
+        """(N, 3) of the poses of which it is known where they are."""
+        found, _ = located(self.optimum.smoother.problem, self.optimum.now)
+        return self.optimum.estimate.pose[found, :3]
+
+    @property
     def inlier(self) -> FloatArray:
         """(M,) probability of each detection that is used to be no outlier."""
         return self.optimum.now.weight
@@ -287,12 +293,18 @@ def standing(living: LivingMap, p_site: FloatArray) -> Landmarks:
     return believed.landmarks(p_least=EXISTS)
 
 
+def names_of(intake: SpatialIntake) -> IntArray:
+    """Return (K, `MOST_OF_ONE_IDENTITY`) ids that a map may have for landmarks with each identity of a session."""
+    called = [intake.names.get(own, own) for own in intake.landmark_id.tolist()]
+    others = [[landmark_id_of(f"{name}#{k}") for k in range(2, MOST_OF_ONE_IDENTITY + 1)] for name in called]
+    others_of = np.array(others, dtype=np.int64).reshape(-1, MOST_OF_ONE_IDENTITY - 1)
+    return np.column_stack([intake.landmark_id, others_of])
+
+
 def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
     """The session with landmarks of one identity named as the map names those that are nearest."""
     number, place = solved.number.copy(), solved.optimum.estimate.place
-    for row, own in enumerate(intake.landmark_id.tolist()):
-        name = intake.names.get(own, own)
-        names = np.array([own, *(landmark_id_of(f"{name}#{k}") for k in range(2, MOST_OF_ONE_IDENTITY + 1))])
+    for row, names in enumerate(names_of(intake)):
         known = np.flatnonzero(np.isin(names, living.members.landmark_id))
         mine = np.flatnonzero(solved.identity == row)
         if len(mine) == 1 and not (known > 0).any():

@@ -33,7 +33,7 @@ def live_in_space(days: int, seed: int) -> tuple[dict[str, Any], NamedFigure] | 
         "Tags, signs, shelves, pallets and forklifts after the last patrol, faint where they may be gone, with arrows"
         " for what was reported as moved; from above and from the side."
     )
-    figure = NamedFigure("space", draw_map(story, living, run), "A building seen by cameras", caption)
+    figure = NamedFigure("demo_space", draw_map(story, living, run), "A building seen by cameras", caption)
     return summary([run]) | {"landmarks": len(living.members), "by_hand": by_hand}, figure
 
 
