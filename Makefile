@@ -3,7 +3,7 @@
 #   make lint    style, formatting and types            make docs-check    run the commands of the documents
 #   make docs    set up and build the documentation as a site, into out/site
 #   make bench   compare with the committed baseline    make clean   remove what make made
-#   make experiments    whole experiments on the recordings in ../shared/data, minutes long
+#   make experiments    whole experiments, most on the recordings in ../shared/data, minutes long
 # Use another interpreter or folder with `make PYTHON=python3.12 VENV=/somewhere/venv test`.
 PYTHON ?= python3
 VENV ?= .venv

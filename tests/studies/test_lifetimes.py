@@ -125,6 +125,7 @@ def test_coverage_is_counted_as_it_should_be() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.experiment
 def test_bands_hold_the_truth_and_naive_ones_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """The median of 120 groups: a Weibull truth, 95 % bands, gaps between visits of an eighth of a lifetime."""
     judged = {name: ESTIMATORS[name] for name in ("chosen family", *NAIVE)}

@@ -313,7 +313,8 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.experiment)])
+@pytest.mark.experiment
+@pytest.mark.parametrize("seed", [0, 1])
 def test_four_weeks_show_what_they_were_built_to_show(tmp_path: Path, seed: int) -> None:
     """What follows from what the methods do, but for times: those are no property of the code."""
     numbers = run_demo(tmp_path / "out", seed=seed, processes=2)["demo"]
