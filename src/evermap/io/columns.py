@@ -246,7 +246,7 @@ def _fast_csv(data: bytes, path: Path) -> Columns | None:
     try:
         table = csv.read_csv(
             pa.BufferReader(pa.py_buffer(data).slice(head.end())),
-            read_options=csv.ReadOptions(column_names=names),
+            read_options=csv.ReadOptions(column_names=names, use_threads=False),
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.string()), strings_can_be_null=False
             ),

@@ -226,7 +226,8 @@ def read_parquet(data: bytes, path: Path) -> Any:
     import pyarrow.parquet as pq
 
     try:
-        table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read()
+        # without threads: one that still runs while the process ends aborts it
+        table = pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True).read(use_threads=False)
         table.validate(full=True)
     except (pa.ArrowException, OSError, ValueError, MemoryError, OverflowError) as error:
         raise InputError(f"not a readable Parquet file: {reason(error)}", path=path, hint="write it again") from error
