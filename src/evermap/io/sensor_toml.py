@@ -74,7 +74,7 @@ def sensor_toml(settings: Settings) -> str:
 
 
 def toml_text(sections: dict[str, dict[str, Any]]) -> str:
-    """Return sections of a TOML file; values that are None and empty sections are left out."""
+    """Return the sections of a TOML file without values of None and without empty sections."""
     blocks = []
     for name, content in sections.items():
         lines = [f"{key} = {_toml_value(value)}" for key, value in content.items() if value is not None]

@@ -55,14 +55,13 @@ def concluded(solved: Solved) -> SlamResult:
     )
 
 
-def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None = None) -> SlamResult:
+def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
     """Bridge the blind stretches, and put all of an estimate into plain arrays.
 
     Args:
         solved: the recording and its estimate.
         frame: in which the estimate is: 'first_pose' or 'prior_map'.
         in_map: landmarks that are told.
-        misses: of these landmarks in this recording; None where they are not known yet.
     """
     recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
     path = trajectory(prepared, outcome, recording, frame)
@@ -77,7 +76,7 @@ def result(solved: Solved, frame: str, in_map: Landmarks, misses: Misses | None 
         landmarks=in_map,
         parameters=states,
         innovations=innovations(prepared, solved.slam, outcome, recording),
-        misses=Misses.empty() if misses is None else misses,
+        misses=Misses.empty(),  # the map says what they are
         step_s=solved.step_s,
         dead_reckoning=dead_reckoning(prepared, path),
         warnings=tuple(warnings),

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evermap import __version__
+from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -19,6 +20,13 @@ if TYPE_CHECKING:
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables that must be 1 before numpy is loaded for timings on one core; the command sets them."""
+
+
+def check_least(settings: DataclassInstance, **least: int) -> None:
+    """Raise `ConfigError` for the first setting that is smaller than it must be."""
+    for name, value in least.items():
+        if getattr(settings, name) < value:
+            raise ConfigError(f"must be {value} at least, not {getattr(settings, name)}", field=name)
 
 
 class Stopwatch:

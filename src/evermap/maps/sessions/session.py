@@ -495,11 +495,10 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in found.changes)
     if isinstance(visit, SpatialVisit):
-        result = concluded_in_space(visit.recording, visit.intake, visit.solved)
-        slam = replace(result, landmarks=landmarks, misses=found.misses)
+        slam = concluded_in_space(visit.recording, visit.intake, visit.solved)
     else:
-        slam = of_slam.result(visit, frame, landmarks, found.misses)
-    slam = replace(slam, changes=changes, gone=gone)
+        slam = of_slam.result(visit, frame, landmarks)
+    slam = replace(slam, landmarks=landmarks, misses=found.misses, changes=changes, gone=gone)
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 

@@ -8,6 +8,7 @@ map said. It is laid over the map as any other session, and solved once more wit
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,7 +29,7 @@ from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.problem import PlacePrior
-from evermap.slam.space.result import identities_of, located, most_of
+from evermap.slam.space.result import identities_of, located, most_of, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
 from evermap.types import (
     UNKNOWN,
@@ -90,18 +91,22 @@ class SpatialVisit:
         """The last values."""
         return self.solved.optimum
 
+    @functools.cached_property
+    def located(self) -> tuple[BoolArray, BoolArray]:
+        """(N,) poses and (P,) places of which it is known where they are."""
+        return located(self.optimum.smoother.problem, self.optimum.now)
+
     @property
     def path_m(self) -> FloatArray:
         """(N, 3) of the poses of which it is known where they are."""
-        found, _ = located(self.optimum.smoother.problem, self.optimum.now)
-        return self.optimum.estimate.pose[found, :3]
+        return self.optimum.estimate.pose[self.located[0], :3]
 
     @property
     def inlier(self) -> FloatArray:
         """(M,) probability of each detection that is used to be no outlier."""
         return self.optimum.now.weight
 
-    @property
+    @functools.cached_property
     def landmark_id(self) -> IntArray:
         """(P,) ids of the places of the problem."""
         return identities_of(self.intake, self.solved)[0]
@@ -111,7 +116,7 @@ class SpatialVisit:
         texts = identities_of(self.intake, self.solved)[1].values()
         return replace(living, landmark_texts=tuple(sorted({*living.landmark_texts, *texts})))
 
-    @property
+    @functools.cached_property
     def floor_sensor(self) -> Sensor:
         """How far and how widely the sensors saw, as one on the floor: what earlier looks are asked by."""
         direction, range_m = self._directions(np.flatnonzero(self.inlier >= EXISTS))
@@ -126,6 +131,7 @@ class SpatialVisit:
             p_false=told.p_false,
         )
 
+    @functools.cached_property
     def _axes(self) -> FloatArray:
         """(S, 3, 3) ahead, left and up of each sensor, by where it saw most."""
         problem = self.optimum.smoother.problem
@@ -139,37 +145,47 @@ class SpatialVisit:
     def _directions(self, some: IntArray) -> tuple[FloatArray, FloatArray]:
         """(N, 3) unit vectors of detections by the axes of their sensors, and (N,) ranges."""
         problem = self.optimum.smoother.problem
-        along = np.einsum("nji,nj->ni", self._axes()[problem.sensor[some]], problem.measured[some, :3])
+        along = np.einsum("nji,nj->ni", self._axes[problem.sensor[some]], problem.measured[some, :3])
         range_m = np.linalg.norm(along, axis=1)
         return along / np.maximum(range_m, 1e-9)[:, None], range_m
 
-    def found(self, where: Laid | None, living: LivingMap | None, settings: FitConfig) -> Found:
+    @functools.cached_property
+    def n_fit(self) -> FloatArray:
+        """(P,) sums of the inlier probabilities of each place's detections."""
+        problem = self.optimum.smoother.problem
+        return np.bincount(problem.place, self.inlier, minlength=len(problem.oriented)).astype(np.float64)
+
+    def told(self, some: BoolArray) -> tuple[IntArray, FloatArray]:
+        """Return rows (K,) of some places (P,), if located, by their ids; and orientations (K, 4), nan of points."""
+        row = np.flatnonzero(some & self.located[1])
+        row = row[np.argsort(self.landmark_id[row], kind="stable")]
+        oriented = self.optimum.smoother.problem.oriented[row, None]
+        return row, np.where(oriented, self.optimum.estimate.place[row, 3:], np.nan)
+
+    def found(self, where: Laid | None, living: LivingMap, settings: FitConfig) -> Found:
         """Return the landmarks of the session in the frame of a map; None for `where` begins one."""
         problem, place = self.optimum.smoother.problem, self.optimum.estimate.place
         names, count = self.landmark_id, len(place)
         good = np.flatnonzero(self.inlier >= settings.inlier)
-        n_fit = np.bincount(problem.place, self.inlier, minlength=count)
         laid = np.full(count, -1, dtype=np.int64)
         probability, alone = np.ones(count), by_itself(self.optimum)
         if where is not None:
             _, here, there = np.intersect1d(names, where.landmark_id, return_indices=True)
             laid[here], probability[here] = where.place[there], where.probability[there]
         least = np.where(laid >= 0, settings.sightings_in_place, settings.sightings)
-        tied = located(problem, self.optimum.now)[1]
-        row = np.flatnonzero((n_fit >= least) & (np.bincount(problem.place[good], minlength=count) > 0) & tied)
-        row = row[np.argsort(names[row], kind="stable")]
+        seen = np.bincount(problem.place[good], minlength=count) > 0
+        row, rotation = self.told((self.n_fit >= least) & seen)
         stamps = self.recording.frames.stamp_s[self.recording.detections.frame[self.intake.used[good]]]
         first, last = np.full(count, np.inf), np.full(count, -np.inf)
         np.minimum.at(first, problem.place[good], stamps)
         np.maximum.at(last, problem.place[good], stamps)
         at = se2.xy_rows(row, 3)
         position, covariance = place[row, :3] + alone.shift_m[row], alone.covariance_m2[np.ix_(at, at)]
-        if living is None or where is None:
+        if where is None:
             covariance = anchored(position, covariance)
         else:
             position, covariance = _fused(position, covariance, laid[row], living, where.drift_m)
         kind = most_of(problem.place, self.recording.detections.class_id[self.intake.used], count)
-        rotation = np.where(problem.oriented[row, None], place[row, 3:], np.nan)
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
             np.full(len(row), UNKNOWN, dtype=np.int64), first[row], last[row], rotation, alone.rotation[row],
@@ -181,15 +197,15 @@ class SpatialVisit:
 
         The detection by range, incidence and direction is learned from what stood (`sensing.learned`).
         """
-        eye, stamp_s, hits = self._views(entry, config)
-        places, axes = entry.living.places, self._axes()
+        eye, which, stamp_s, hits = self._views(entry, config)
+        places, axes = entry.living.places, self._axes
         pose, p = np.tile(np.eye(4), (len(stamp_s), 1, 1)), np.zeros((len(stamp_s), len(places)))
-        pose[:, :3, 3] = eye.pose[:, :3]
-        pose[:, :3, :3] = se3.rotation_of(eye.pose) @ axes[eye.sensor]
+        pose[:, :3, 3] = eye[:, :3]
+        pose[:, :3, :3] = se3.rotation_of(eye) @ axes[which]
         detected = np.zeros(p.shape, dtype=np.bool_)
         detected[hits] = True
-        for sensor in np.unique(eye.sensor):
-            mine = np.flatnonzero(eye.sensor == sensor)
+        for sensor in np.unique(which):
+            mine = np.flatnonzero(which == sensor)
             model = self._model(int(sensor), places.position_m, places.rotation, pose[mine], detected[mine])
             there = _near_hits(stamp_s[mine], detected[mine], config.looks.settled_s)
             some = mine[:: max(1, len(mine) // MOST_VIEWS)]
@@ -202,15 +218,17 @@ class SpatialVisit:
         heading = np.arctan2(pose[:, 1, 0], pose[:, 0, 0])
         return Watch(stamp_s, listed, np.column_stack([pose[:, 0, 3], pose[:, 1, 3], heading]))
 
-    def _views(self, entry: Extended, config: LivingConfig) -> tuple[_Eyes, FloatArray, tuple[IntArray, IntArray]]:
-        """Looks of sensors, their stamps, and the rows of looks and of places of what was seen where the map has it."""
+    def _views(
+        self, entry: Extended, config: LivingConfig
+    ) -> tuple[FloatArray, IntArray, FloatArray, tuple[IntArray, IntArray]]:
+        """(V, 7) poses of sensors in the map, (V,) which, (V,) stamps; rows of looks and of places of hits."""
         problem, optimum = self.optimum.smoother.problem, self.optimum
         n_sensors = len(problem.mount)
         view = problem.pose_row * n_sensors + problem.sensor
         views = np.unique(view)
         if n_sensors == 1 and problem.driven:  # it looked in every frame
             views = np.arange(len(problem.stamp_s))
-        views = views[located(problem, optimum.now)[0][views // n_sensors]]
+        views = views[self.located[0][views // n_sensors]]
         row, sensor = views // n_sensors, views % n_sensors
         eye = se3.compose(optimum.estimate.pose[row], optimum.estimate.mount(problem)[sensor])
         place_of = np.full(len(problem.oriented), -1, dtype=np.int64)
@@ -218,7 +236,7 @@ class SpatialVisit:
         place_of[here] = entry.place[there]
         hit = np.flatnonzero((self.inlier >= config.fit.inlier) & (place_of[problem.place] >= 0) & np.isin(view, views))
         at = np.searchsorted(views, view[hit]), place_of[problem.place[hit]]
-        return _Eyes(eye, sensor), self.intake.start_s + problem.stamp_s[row], at
+        return eye, sensor, self.intake.start_s + problem.stamp_s[row], at
 
     def _model(
         self, sensor: int, position_m: FloatArray, rotation: FloatArray, pose: FloatArray, detected: BoolArray
@@ -226,7 +244,7 @@ class SpatialVisit:
         """The detection model of a sensor before the session: its field is where it has seen anything."""
         problem, told = self.optimum.smoother.problem, self.recording.sensors[sensor]
         direction, range_m = self._directions(np.flatnonzero((problem.sensor == sensor) & (self.inlier >= EXISTS)))
-        camera = told.intrinsics is not None or not np.array_equal(self._axes()[sensor], np.eye(3))
+        camera = told.intrinsics is not None or not np.array_equal(self._axes[sensor], np.eye(3))
         across = direction[:, 0] if camera else np.hypot(direction[:, 0], direction[:, 1])
         azimuth = np.abs(np.arctan2(direction[:, 1], direction[:, 0])).max(initial=0.1) + FIELD_MARGIN_RAD
         elevation = np.abs(np.arctan2(direction[:, 2], across)).max(initial=0.1) + FIELD_MARGIN_RAD
@@ -251,14 +269,6 @@ class SpatialVisit:
         )
         model = learned.init(position_m, np.arange(len(position_m)), assumed)
         return replace(model, outward=np.sign(middle) * outward if faced else 0.0 * outward)
-
-
-@dataclass(frozen=True, slots=True)
-class _Eyes:
-    """(V, 7) poses of sensors in the map, and (V,) which."""
-
-    pose: FloatArray
-    sensor: IntArray
 
 
 def _near_hits(stamp_s: FloatArray, detected: BoolArray, within_s: float) -> BoolArray:
@@ -296,7 +306,7 @@ def standing(living: LivingMap, p_site: FloatArray) -> Landmarks:
 def names_of(intake: SpatialIntake) -> IntArray:
     """Return (K, `MOST_OF_ONE_IDENTITY`) ids that a map may have for landmarks with each identity of a session."""
     called = [intake.names.get(own, own) for own in intake.landmark_id.tolist()]
-    others = [[landmark_id_of(f"{name}#{k}") for k in range(2, MOST_OF_ONE_IDENTITY + 1)] for name in called]
+    others = [[landmark_id_of(numbered(name, k)) for k in range(2, MOST_OF_ONE_IDENTITY + 1)] for name in called]
     others_of = np.array(others, dtype=np.int64).reshape(-1, MOST_OF_ONE_IDENTITY - 1)
     return np.column_stack([intake.landmark_id, others_of])
 
@@ -320,15 +330,9 @@ def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -
 
 def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: LivingConfig) -> Laid | None:
     """Where the session lies in the map, by what it says without the map."""
-    alone, names = by_itself(visit.optimum), visit.landmark_id
-    place, n_fit = visit.optimum.estimate.place, np.bincount(
-        visit.optimum.smoother.problem.place, visit.inlier, minlength=len(names)
-    )  # fmt: skip
-    tied = located(visit.optimum.smoother.problem, visit.optimum.now)[1]
-    row = np.flatnonzero((n_fit >= config.fit.sightings_in_place) & tied)
-    row = row[np.argsort(names[row], kind="stable")]
+    alone, names, place = by_itself(visit.optimum), visit.landmark_id, visit.optimum.estimate.place
+    row, rotation = visit.told(visit.n_fit >= config.fit.sightings_in_place)
     at = se2.xy_rows(row, 3)
-    rotation = np.where(visit.optimum.smoother.problem.oriented[row, None], place[row, 3:], np.nan)
     turned = Turned(se3.identity(), rotation, alone.rotation[row])
     position = place[row, :3] + alone.shift_m[row]
     return laid_over(living, p_site, names[row], position, alone.covariance_m2[np.ix_(at, at)], config, turned)

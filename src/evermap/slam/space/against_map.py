@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.problem import SpatialProblem
+from evermap.slam.space.problem import LEAST_WEIGHT, SpatialProblem
 from evermap.types import FloatArray
 
 P_MOVED = 0.03
@@ -27,7 +27,6 @@ SETTLED = 0.01
 """Change of all probabilities that ends it."""
 PRIOR_COUNT = 6.0
 """Numbers that the stated accuracy of the map is worth where it is estimated."""
-LEAST_WEIGHT = 1e-6
 LEAST_SEEN = 0.5
 """Sum of inlier probabilities of detections from which on a session says something of a place."""
 LOOSE = 1.0 / 20.0**2

@@ -18,8 +18,8 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import SIGMA_BEND, SIGMA_SCALE, Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import prepare_space
-from evermap.slam.space.result import concluded_in_space
+from evermap.slam.space.intake import NO_TURN, prepare_space
+from evermap.slam.space.result import concluded_in_space, numbered
 from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
@@ -43,6 +43,29 @@ from evermap.types import (
 ROUNDS = 4
 SETTLED = 0.2
 """Standard deviations by which the gauge changes in the last round, at most."""
+WANDERS = 0.03, 0.003
+"""From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
+FEWEST_WITNESSES, FAR_BETTER = 10, 2.0
+"""Things that must say so, and the factor by which their deviations become smaller."""
+TILT = 0.05
+"""Boxes are upright to within this [rad]."""
+WHEN_S = 0.5
+"""When a thing came to rest, or left, is known to within this to both sides [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """What is around the robot.
+
+    Attributes:
+        followed: the tracker's answer; None where nothing was seen often enough.
+        standing: what of it stands, a row a box.
+        gauge: errors that repeat themselves.
+    """
+
+    followed: TrackResult | None
+    standing: Stood
+    gauge: Gauge
 
 
 def has_traffic(recording: SpatialRecording) -> bool:
@@ -156,7 +179,7 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
     given, rows, stamps = recording.detections, _boxes(recording), recording.frames.stamp_s
     mount = _mounts(recording)[rows]
     local = np.column_stack([gauge.range_scale * given.position_sensor_m[rows], given.rotation[rows]])
-    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], [0.0, 0.0, 0.0, 1.0])
+    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], NO_TURN)
     local = se3.compose(mount, local)
     names = recording.class_names or ("",)
     turn = se3.rotation_of(mount)
@@ -242,31 +265,6 @@ def _beside(result: SlamResult, driven: FloatArray) -> SlamResult:
     return replace(result, dead_reckoning=alone)
 
 
-WANDERS = 0.03, 0.003
-"""From where the noise of an odometry that wanders is sought [m/sqrt(s), rad/sqrt(s)]."""
-FEWEST_WITNESSES, FAR_BETTER = 10, 2.0
-"""Things that must say so, and the factor by which their deviations become smaller."""
-TILT = 0.05
-"""Boxes are upright to within this [rad]."""
-WHEN_S = 0.5
-"""When a thing came to rest, or left, is known to within this to both sides [s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Traffic:
-    """What is around the robot.
-
-    Attributes:
-        followed: the tracker's answer; None where nothing was seen often enough.
-        standing: what of it stands, a row a box.
-        gauge: errors that repeat themselves.
-    """
-
-    followed: TrackResult | None
-    standing: Stood
-    gauge: Gauge
-
-
 def with_stays(
     result: SlamResult, traffic: Traffic, followed: TrackResult | None, known: int, rows: IntArray
 ) -> SlamResult:
@@ -320,7 +318,7 @@ def _identities(track: IntArray, known: int) -> tuple[IntArray, dict[int, str]]:
     for stay, one in enumerate(track.tolist()):
         times[one] = times.get(one, 0) + 1
         if times[one] > 1:
-            name = f"{known + one}#{times[one]}"
+            name = numbered(known + one, times[one])
             found[stay] = landmark_id_of(name)
             names[int(found[stay])] = name
     return found, names

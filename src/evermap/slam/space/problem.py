@@ -17,6 +17,10 @@ JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS = 14.0, 1e3
 """The same of odometry, which may slip; without, nothing takes a camera to somewhere else between two frames."""
 
 
+LEAST_WEIGHT = 1e-6
+"""Of a map's word on a landmark that is elsewhere."""
+
+
 @dataclass(frozen=True, slots=True)
 class SpatialNoise:
     """Standard deviations.

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from evermap.geometry import se3
 from evermap.slam.space.estimate import SpatialOptimum, as_seen, converged, oriented
 from evermap.slam.space.linearise import linearise_sightings
-from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import LEAST_WEIGHT, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, IntArray
 
 ROUNDS = 3
@@ -30,8 +30,6 @@ FEWEST, FEWEST_FRAMES = 5, 3
 """Detections, and frames, that it takes."""
 LEAST_SEEN = 1.0
 """Sum of inlier probabilities below which a landmark was not seen at its place."""
-LEAST_WEIGHT = 1e-6
-"""Of a map's word on a landmark that is elsewhere."""
 MOVED_NATS = 5.0
 """What it costs that a landmark of the map was moved, instead of the robot."""
 

@@ -109,12 +109,17 @@ def concluded_in_space(recording: SpatialRecording, intake: SpatialIntake, solve
     )
 
 
+def numbered(name: str | int, number: int) -> str:
+    """Return what the landmark with this number is called, of those that carry one identity: '7#2'."""
+    return f"{name}#{number}"
+
+
 def identities_of(intake: SpatialIntake, solved: SpatialSolved) -> tuple[IntArray, dict[int, str]]:
     """Return ids (P,) of places, and names: a second landmark with the identity 7 is called '7#2'."""
     names, identities = dict(intake.names), intake.landmark_id[solved.identity].copy()
     for row in np.flatnonzero(solved.number > 1).tolist():
         own = int(identities[row])
-        name = f"{names.get(own, own)}#{solved.number[row]}"
+        name = numbered(names.get(own, own), int(solved.number[row]))
         identities[row] = landmark_id_of(name)
         names[int(identities[row])] = name
     return identities, names

@@ -10,6 +10,7 @@ from typing import Any
 
 from evermap.errors import ConfigError
 from evermap.sensing.profile import Field
+from evermap_studies.frame import check_least
 from evermap_studies.worlds.cliques import CliqueWorld, named_world
 from evermap_studies.worlds.sensors import CAMERA, LIDAR
 
@@ -108,16 +109,7 @@ class Settings:
             unknown = [item for item in given if item not in known]
             if unknown:
                 raise ConfigError(f"there is no {unknown[0]!r}", field=name, hint=", ".join(known))
-        for name, least in (
-            ("runs", 2),
-            ("tuning_runs", 1),
-            ("known_runs", 1),
-            ("sweep_runs", 2),
-            ("bootstrap_draws", 2),
-            ("seed", 0),
-        ):
-            if getattr(self, name) < least:
-                raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
+        check_least(self, runs=2, tuning_runs=1, known_runs=1, sweep_runs=2, bootstrap_draws=2, seed=0)
 
     def filters_in(self, world: str) -> tuple[str, ...]:
         """What is run in a world, in the order of the tables."""

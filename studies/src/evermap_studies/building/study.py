@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from evermap.errors import ConfigError
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
@@ -23,7 +22,7 @@ from evermap_studies.building.table import as_markdown
 from evermap_studies.building.world import FIXED, KINDS, World, made
 from evermap_studies.demo.methods import METHODS
 from evermap_studies.demo.truth import observed
-from evermap_studies.frame import Stopwatch
+from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.sim.looked import LookedAt
 from evermap_studies.worlds.scores import NEAR_M
 
@@ -63,9 +62,7 @@ class Settings:
     methods: tuple[str, ...] = COMPARED
 
     def __post_init__(self) -> None:
-        for name, least in (("worlds", 1), ("days", 2), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
+        check_least(self, worlds=1, days=2, seed=0)
 
 
 QUICK = Settings(worlds=1, days=8)

@@ -15,7 +15,7 @@ from typing import Any
 
 from evermap.errors import ConfigError
 from evermap.types import Progress
-from evermap_studies.frame import Stopwatch
+from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.lifelong.runs import ABLATIONS, CONTENDERS, SIMULATED, WHOLE, Contender, live
 from evermap_studies.lifelong.scores import NOTHING
 from evermap_studies.lifelong.table import as_markdown, verdicts
@@ -62,9 +62,7 @@ class Settings:
         unknown = [part for part in self.parts if part not in PARTS]
         if unknown:
             raise ConfigError(f"no part {unknown[0]}", field="part", hint=" | ".join(PARTS))
-        for name, least in (("seeds", 1), ("short", 2), ("long", 5), ("buildings", 1), ("days", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
+        check_least(self, seeds=1, short=2, long=5, buildings=1, days=1, seed=0)
 
 
 QUICK = Settings(seeds=1, long=10, buildings=1, days=3)

@@ -14,6 +14,7 @@ from evermap.errors import ConfigError
 from evermap.io.shifts import Shift
 from evermap.metrics.landmarks import MIN_SIGHTINGS
 from evermap.types import Recording
+from evermap_studies.frame import check_least
 from evermap_studies.mrclam.study import find_dataset
 from evermap_studies.nielsen2024.runs import BUILDING, SENSORS, Job, recording_of
 from evermap_studies.worlds.moved import ModeConfig
@@ -80,9 +81,7 @@ class Settings:
             unknown = [item for item in given if item not in known]
             if unknown:
                 raise ConfigError(f"no {name} {unknown[0]}", field=name, hint=" | ".join(map(str, known)))
-        for name, value, least in (("runs", self.runs, 2), ("processes", self.processes, 1), ("seed", self.seed, 0)):
-            if value < least:
-                raise ConfigError(f"must be {least} at least, not {value}", field=name)
+        check_least(self, runs=2, processes=1, seed=0)
 
 
 QUICK = Settings(

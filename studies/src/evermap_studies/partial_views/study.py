@@ -20,7 +20,7 @@ from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.types import BoolArray, FloatArray, IntArray, Landmarks, Progress
-from evermap_studies.frame import Stopwatch
+from evermap_studies.frame import Stopwatch, check_least
 from evermap_studies.partial_views.table import as_markdown
 from evermap_studies.sim import (
     CLUTTER,
@@ -83,9 +83,7 @@ class Settings:
         for part in self.parts:
             if part not in PARTS:
                 raise ConfigError(f"no such part: {part!r}", field="--part", hint=", ".join(PARTS))
-        for name, least in (("buildings", 1), ("sessions", 2), ("seed", 0), ("processes", 1)):
-            if getattr(self, name) < least:
-                raise ConfigError(f"must be {least} at least, not {getattr(self, name)}", field=name)
+        check_least(self, buildings=1, sessions=2, seed=0, processes=1)
 
 
 QUICK = Settings(buildings=2, sessions=6)
