@@ -596,6 +596,8 @@ class SpatialRecording(Shown):
         warnings: counted, human-readable remarks of the reader.
         source: where it was read from.
         landmark_names: texts behind the ids of landmarks that were given as such (`landmark_id_of`).
+        symmetries: turns after which objects look the same, by the names of their classes; as
+            `geometry.symmetry.Symmetry.generated` reads them.
     """
 
     name: str
@@ -610,6 +612,7 @@ class SpatialRecording(Shown):
     source: str = ""
     clock: Clock = Clock.RECORDING
     landmark_names: Mapping[int, str] = field(default_factory=dict)
+    symmetries: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def robot_sightings(self) -> None:

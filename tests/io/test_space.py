@@ -400,6 +400,19 @@ BAD: dict[str, tuple[Files, str]] = {
         {"sensor.toml": "[limits]\nbearing_max_rad = 1.0\n"},
         r"sensor\.toml:2: field 'limits\.bearing_max_rad': unknown key",
     ),
+    "symmetry": (
+        {"sensor.toml": '[symmetries]\ncan = "axis:z"\nbox = ["180:z", "50:x"]\n'},
+        r"sensor\.toml:3: field 'symmetries\.box': '50:x': 50 degrees are no whole part .*\(try: axis:z",
+    ),
+    "kind of symmetry": (
+        {"sensor.toml": "[symmetries]\ncan = 180\n"},
+        r"sensor\.toml:2: field 'symmetries\.can': must be a text, or a list of texts \(try: axis:z",
+    ),
+    "symmetry of no class": (
+        {"sensor.toml": '[recording]\nclass_names = ["can", "box"]\n\n[symmetries]\ncna = "axis:z"\n'},
+        r"sensor\.toml:5: field 'symmetries\.cna': not one of class_names \(try: can\)",
+    ),
+    "symmetries": ({"sensor.toml": "symmetries = 3\n"}, r"field 'symmetries': must be a section"),
     "not toml": ({"camera.toml": "[camera.left\n"}, r"camera\.toml: not valid TOML"),
 }
 
@@ -427,6 +440,18 @@ def test_written_and_read_again(
         first = read_recording(lay_out(request.getfixturevalue(made)))
     again = read_recording(write_native(first, tmp_path / "again", kind))
     assert_equal(first, again)
+
+
+def test_symmetries_of_classes(lay_out: Callable, space: Files, tmp_path: Path) -> None:
+    table = f"{DETECTIONS},class_id\n0.5,7,1,1,1,can\n1,8,1,1,1,the box\n"
+    said = '[symmetries]\ncan = "axis:z"\n"the box" = ["180:z", "180:x"]\nspoon = "any"\n'
+    recording = read(lay_out, space, detections__csv=table, sensor__toml=said)
+    expected = {"can": ("axis:z",), "the box": ("180:z", "180:x"), "spoon": ("any",)}
+    assert recording.symmetries == expected
+    assert any("symmetries of classes that nothing has: spoon" in warning for warning in recording.warnings)
+    write_native(recording, tmp_path / "again")
+    del expected["spoon"]
+    assert read_recording(tmp_path / "again").symmetries == expected
 
 
 def test_sensors_with_odd_names_and_mounts(lay_out: Callable, space: Files, tmp_path: Path) -> None:

@@ -201,6 +201,25 @@ def test_landmarks_are_compared_by_place_and_orientation(spatial):
     assert evaluate_landmarks(points, truth, None).orientation_rmse_deg is None
 
 
+def test_what_looks_the_same_is_no_error(spatial):
+    truth = spatial[0].true_landmarks
+    kinds = np.array([0, 1, 2] * len(truth))[: len(truth)]
+    truth = dataclasses.replace(truth, class_id=kinds, class_names=("can", "box", "mug"))
+    turn = np.select([kinds == 0, kinds == 1], [1.0, np.pi], 0.1)
+    known = np.pad(np.nan_to_num(truth.rotation, nan=0.5), ((0, 0), (3, 0)))
+    turned = se3.retract(known, np.eye(6)[5] * turn[:, None])[:, 3:]
+    turned[np.isnan(truth.rotation)] = np.nan
+    estimate = dataclasses.replace(truth, rotation=turned, n_hits=np.full(len(truth), 20))
+    still = se3.identity()
+    alike = {"can": ("axis:z",), "box": ("180:z",), "spoon": ("180:x",)}
+    found = evaluate_landmarks(estimate, truth, still, symmetries=alike).orientation_error_rad
+    there = np.isfinite(truth.rotation[:, 0])
+    assert found[there] == pytest.approx(np.where(kinds == 2, 0.1, 0.0)[there], abs=1e-7)
+    plain = evaluate_landmarks(estimate, truth, still).orientation_error_rad
+    assert plain[there] == pytest.approx(turn[there], abs=1e-7)
+    assert np.isnan(plain[~there]).all()
+
+
 def test_covariances_turn_with_the_map(spatial):
     truth = spatial[0].true_landmarks
     quarter = se3.exp([0, 0, 0, 0, np.pi / 2, 0])  # the map's z is the truth's x

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from evermap.geometry import se2, se3
 from evermap.slam import kernels
-from evermap.slam.kernels3d import compose, odometry_residual, point_residual, pose_residual, retract
+from evermap.slam.kernels3d import (
+    axis_residual,
+    compose,
+    odometry_residual,
+    point_residual,
+    pose_residual,
+    retract,
+)
 
 few = settings(max_examples=60)
 """The first example waits for the compiler."""
@@ -126,6 +133,45 @@ def test_poses_of_landmarks_are_gtsams_and_derivatives_are_differences(pose, lan
     assert j_pose == pytest.approx(by_pose, rel=1e-5, abs=1e-5)
     assert j_mount == pytest.approx(by_mount, rel=1e-5, abs=1e-5)
     assert j_landmark == pytest.approx(by_landmark, rel=1e-5, abs=1e-5)
+
+
+def axis_seen(axis, pose, landmark, mount, measured):
+    return called(axis_residual, (pose, landmark, mount, measured, axis), 6, (6, 6), (6, 6), (6, 6))
+
+
+@few
+@given(st.integers(0, 2), poses, poses, poses, SPACE_CASE.twists(small_turns), st.floats(-3.0, 3.0))
+def test_axes_of_landmarks_are_turned_the_shortest_way_and_derivatives_are_differences(
+    axis, pose, landmark, mount, turn, about
+):
+    """By the angle between the axes alone; a turn of the landmark about its axis changes nothing."""
+    predicted = se3.between(se3.compose(pose, mount), landmark)
+    measured = se3.compose(se3.exp(turn), predicted)
+    assume(se3.rotation_of(predicted)[:, axis] @ se3.rotation_of(measured)[:, axis] > -0.99)
+    e, j_pose, j_landmark, j_mount = axis_seen(axis, pose, landmark, mount, measured)
+    ours, theirs = (se3.rotation_of(at)[:, axis] for at in (predicted, measured))
+    assert np.linalg.norm(e[3:]) == pytest.approx(np.arccos(np.clip(ours @ theirs, -1.0, 1.0)), abs=2e-7)
+    assert se3.rotation_of(se3.exp(np.append(np.zeros(3), e[3:]))) @ ours == pytest.approx(theirs, abs=1e-9)
+    assert e[:3] == pytest.approx(pose_seen(pose, landmark, mount, measured)[0][:3], abs=1e-12)
+    spun = se3.retract(landmark, about * np.eye(6)[3 + axis])
+    assert axis_seen(axis, pose, spun, mount, measured)[0] == pytest.approx(e, abs=1e-9)
+    assert j_landmark[:, 3 + axis] == pytest.approx(0.0, abs=1e-12)
+    assert j_pose == pytest.approx(
+        by(lambda at: axis_seen(axis, at, landmark, mount, measured)[0], pose), rel=1e-4, abs=1e-4
+    )
+    assert j_mount == pytest.approx(
+        by(lambda at: axis_seen(axis, pose, landmark, at, measured)[0], mount), rel=1e-4, abs=1e-4
+    )
+    assert j_landmark == pytest.approx(
+        by(lambda at: axis_seen(axis, pose, at, mount, measured)[0], landmark), rel=1e-4, abs=1e-4
+    )
+
+
+def test_an_axis_upside_down_is_half_a_turn_off():
+    still = se3.identity()
+    e, *slopes = axis_seen(2, still, still, still, se3.exp([0, 0, 0, np.pi, 0, 0]))
+    assert np.linalg.norm(e[3:]) == pytest.approx(np.pi)
+    assert all(np.isfinite(slope).all() for slope in slopes)
 
 
 @few

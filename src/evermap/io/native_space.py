@@ -127,7 +127,11 @@ def spatial_recording(
         source=source,
         clock=settings.clock,
         landmark_names=names,
+        symmetries=rig.symmetries,
     )
+    unknown = [name for name in rig.symmetries if name not in class_names]
+    if unknown:
+        warnings.append(f"symmetries of classes that nothing has: {', '.join(unknown)}")
     return finish_recording(recording, warnings=warnings)
 
 

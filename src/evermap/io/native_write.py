@@ -46,7 +46,8 @@ def write_native(
         if isinstance(recording, Recording):
             texts, tables = {SENSOR_FILE: sensor_toml(settings)}, native_tables(recording)
         else:
-            texts, tables = rig_toml(recording.sensors, settings), spatial_tables(recording)
+            known = {name: said for name, said in recording.symmetries.items() if name in _class_names(recording)}
+            texts, tables = rig_toml(recording.sensors, settings, known), spatial_tables(recording)
         for name, text in texts.items():
             (staging / name).write_text(text, encoding="utf-8")
         for name, columns in tables.items():

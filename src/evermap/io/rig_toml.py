@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from evermap.errors import suggestion
 from evermap.geometry import se3
+from evermap.geometry.symmetry import HINT, Symmetry
 from evermap.io.files import FileSet
 from evermap.io.sensor_toml import FORMAT_VERSION, Settings, TomlReader, toml_string, toml_text
 from evermap.io.spatial import AT, QUATERNION
@@ -44,6 +46,7 @@ class Rig:
         baseline_m: of each sensor that is the left camera of a rectified stereo pair, else nan.
         tag_size_m: edge of tags whose size is not listed; nan where it is not known.
         tag_sizes: edges of single tags, by id.
+        symmetries: turns after which objects look the same, by class; as of `SpatialRecording`.
     """
 
     settings: Settings = field(default_factory=Settings)
@@ -51,6 +54,7 @@ class Rig:
     baseline_m: tuple[float, ...] = (float("nan"),)
     tag_size_m: float = float("nan")
     tag_sizes: Mapping[int, float] = field(default_factory=dict)
+    symmetries: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def size_of(self, landmark_id: IntArray) -> FloatArray:
         """Return the edge of each tag (M,), nan where it is not known."""
@@ -64,11 +68,12 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
     Raises:
         InputError: not TOML, an unknown section or key, a value of the wrong type or out of its limits.
     """
-    settings, common = Settings(), SpatialSensor()
+    settings, common, symmetries = Settings(), SpatialSensor(), dict[str, tuple[str, ...]]()
     if SENSOR_FILE in files:
         reader = TomlReader(files.read(SENSOR_FILE), files.path_of(SENSOR_FILE))
-        reader.expect(("recording", "mount", *_LIMITS), reader.document, section=None)
+        reader.expect(("recording", "mount", "symmetries", *_LIMITS), reader.document, section=None)
         settings = reader.recording(Sensor())
+        symmetries = _symmetries(reader, settings.class_names)
         values: dict[str, Any] = {}
         for section, keys in _LIMITS.items():
             content = reader.section(section, tuple(keys))
@@ -79,12 +84,15 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
     if CAMERA_FILE not in files:
         if SENSOR_FILE not in files:
             warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
-        return Rig(settings, (common,))
-    return _cameras(TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE)), settings, common)
+        return Rig(settings, (common,), symmetries=symmetries)
+    rig = _cameras(TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE)), settings, common)
+    return replace(rig, symmetries=symmetries)
 
 
-def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, str]:
-    """Return the texts of the files, by name, from which `read_rig` makes sensors and settings again."""
+def rig_toml(
+    sensors: Sequence[SpatialSensor], settings: Settings, symmetries: Mapping[str, tuple[str, ...]]
+) -> dict[str, str]:
+    """Return the texts of the files, by name, from which `read_rig` makes sensors, settings and symmetries again."""
     about = {
         "format_version": FORMAT_VERSION,
         "name": settings.name,
@@ -95,7 +103,7 @@ def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, 
     sections: dict[str, dict[str, Any]] = {}
     for sensor in sensors:
         is_camera = sensor.intrinsics is not None
-        section = f"camera.{sensor.name if _BARE.fullmatch(sensor.name) else toml_string(sensor.name)}"
+        section = f"camera.{_key(sensor.name)}"
         sections[section] = {
             "model": sensor.distortion_model if is_camera else None,
             "intrinsics": None if sensor.intrinsics is None else tuple(map(float, sensor.intrinsics)),
@@ -105,7 +113,13 @@ def rig_toml(sensors: Sequence[SpatialSensor], settings: Settings) -> dict[str, 
         }
         pose = map(float, sensor.mount_robot_sensor)
         sections[f"{section}.mount"] = dict(zip((*AT, *QUATERNION), pose, strict=True))
-    return {SENSOR_FILE: toml_text({"recording": about}), CAMERA_FILE: toml_text(sections)}
+    alike = {_key(name): texts for name, texts in symmetries.items()}
+    return {SENSOR_FILE: toml_text({"recording": about, "symmetries": alike}), CAMERA_FILE: toml_text(sections)}
+
+
+def _key(name: str) -> str:
+    """A name as a key of TOML."""
+    return name if _BARE.fullmatch(name) else toml_string(name)
 
 
 def _cameras(reader: TomlReader, settings: Settings, common: SpatialSensor) -> Rig:
@@ -190,6 +204,24 @@ def _tags(reader: TomlReader) -> tuple[float, dict[int, float]]:
         int(name) if name.isdecimal() else landmark_id_of(name): reader.number("tags.sizes", name, size, 1e-4, 1e3)
         for name, size in sizes.items()
     }
+
+
+def _symmetries(reader: TomlReader, class_names: tuple[str, ...] | None) -> dict[str, tuple[str, ...]]:
+    content, found = reader.document.get("symmetries", {}), {}
+    if not isinstance(content, dict):
+        raise reader.error(None, "symmetries", "must be a section", hint="[symmetries]")
+    for name, said in content.items():
+        if class_names is not None and name not in class_names:
+            raise reader.error("symmetries", name, "not one of class_names", hint=suggestion(name, class_names))
+        texts = tuple(said) if isinstance(said, list) else (said,)
+        if not texts or not all(isinstance(text, str) for text in texts):
+            raise reader.error("symmetries", name, "must be a text, or a list of texts", hint=HINT)
+        try:
+            Symmetry.generated(texts)
+        except ValueError as error:
+            raise reader.error("symmetries", name, str(error), hint=HINT) from None
+        found[name] = texts
+    return found
 
 
 def _check_range(reader: TomlReader, section: str, sensor: SpatialSensor) -> None:

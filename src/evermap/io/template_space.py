@@ -50,6 +50,10 @@ sigma_px = 0.3             # of pixels; sigma_m of positions and sigma_rad of or
 [detection]
 p_detect = 0.9             # probability that a landmark in view is detected
 p_false = 0.001            # probability of a false detection in a frame
+
+# [symmetries]             # turns after which objects look the same, by class_id; x, y, z are the object's own axes
+# can = "axis:z"           # any turn about z
+# box = ["180:z", "180:x"] # half a turn about z or x; "90:z" a quarter; "any" for a ball
 """,
     "camera.toml": """\
 # The cameras, and the sizes of tags. Needed where detections are pixels, or where there are several sensors. A sensor

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -10,6 +11,7 @@ import numpy as np
 from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.group import group_of
+from evermap.geometry.symmetry import Symmetries
 from evermap.metrics.consistency import nees, share_in_band
 from evermap.metrics.trajectory import align_points, rotate_covariance
 from evermap.show import ShownTable
@@ -88,6 +90,7 @@ def evaluate_landmarks(
     pose_truth_estimate: FloatArray | None,
     *,
     min_sightings: int = MIN_SIGHTINGS,
+    symmetries: Mapping[str, tuple[str, ...]] | None = None,
 ) -> LandmarkErrors | None:
     """Compute errors after the given alignment (usually the trajectory's), or after the landmarks' own.
 
@@ -97,6 +100,7 @@ def evaluate_landmarks(
         pose_truth_estimate: (3,) or (7,) motion from the map's frame to the truth's; None aligns the scored landmarks
             themselves, which needs no truth of poses and hides a rotation between poses and map.
         min_sightings: landmarks seen less often are listed but not scored.
+        symmetries: turns after which objects look the same, by the names of their classes, as of a `SpatialRecording`.
 
     Returns:
         None if no landmark is in both, or too few for an alignment of their own.
@@ -115,13 +119,14 @@ def evaluate_landmarks(
     group = group_of(pose_truth_estimate)
     aligned = group.transform(pose_truth_estimate, source)
     covariance = rotate_covariance(estimate.covariance_m2[mine], group.rotation_of(pose_truth_estimate))
+    angle = _angles(pose_truth_estimate, rows_of(estimate, mine), rows_of(truth, theirs), symmetries or {})
     return LandmarkErrors(
         landmark_id=ids.astype(np.int64),
         n_hits=n_hits,
         estimate_m=aligned,
         truth_m=target,
         error_m=np.linalg.norm(aligned - target, axis=1),
-        orientation_error_rad=_angles(pose_truth_estimate, estimate, truth, mine, theirs),
+        orientation_error_rad=angle,
         nees=nees(aligned - target, covariance + truth.covariance_m2[theirs]),
         scored=scored,
         pose_truth_estimate=np.asarray(pose_truth_estimate, dtype=np.float64),
@@ -130,16 +135,21 @@ def evaluate_landmarks(
 
 
 def _angles(
-    pose_truth_estimate: FloatArray, estimate: Landmarks, truth: Landmarks, mine: IntArray, theirs: IntArray
+    pose_truth_estimate: FloatArray, estimate: Landmarks, truth: Landmarks, symmetries: Mapping[str, tuple[str, ...]]
 ) -> FloatArray:
-    """Angles (L,) between the orientations of the landmarks in rows `mine` and `theirs`, after the alignment."""
-    out = np.full(len(mine), np.nan)
+    """Angles (L,) between the orientations of the same landmarks after the alignment, the least where turns look the
+    same; nan where either has none.
+    """
+    out = np.full(len(estimate), np.nan)
     if estimate.rotation is None or truth.rotation is None:
         return out
-    turned, reference = (np.pad(r, ((0, 0), (3, 0))) for r in (estimate.rotation[mine], truth.rotation[theirs]))
-    known = np.isfinite(turned).all(axis=1) & np.isfinite(reference).all(axis=1)
-    wrong = se3.local(reference[known], se3.compose(pose_truth_estimate, turned[known]))
-    out[known] = np.linalg.norm(wrong[:, 3:], axis=1)
+    turned, reference = (np.pad(r, ((0, 0), (3, 0))) for r in (estimate.rotation, truth.rotation))
+    known = np.flatnonzero(np.isfinite(turned).all(axis=1) & np.isfinite(reference).all(axis=1))
+    kinds = [dict(enumerate(one.class_names)) for one in (estimate, truth)]
+    classes = zip(estimate.class_id.tolist(), truth.class_id.tolist(), strict=True)
+    alike = Symmetries.of_classes(symmetries, [kinds[0].get(a) or kinds[1].get(b, "") for a, b in classes])
+    turned = alike[known].nearest(se3.compose(pose_truth_estimate, turned[known]), reference[known])
+    out[known] = np.linalg.norm(se3.local(reference[known], turned)[:, 3:], axis=1)
     return out
 
 

@@ -59,11 +59,13 @@ def compare_with_truth(recording: AnyRecording, result: SlamResult, *, rate_hz: 
         dead_reckoning = evaluate_trajectory(result.dead_reckoning, recording.truth, rate_hz=rate_hz)
     if recording.true_landmarks is not None:
         mapped = by_recorded_identity(result.landmarks, result.innovations, recording)
-        own = evaluate_landmarks(mapped, recording.true_landmarks, None)
+        same = recording.symmetries if isinstance(recording, SpatialRecording) else None
+        own = evaluate_landmarks(mapped, recording.true_landmarks, None, symmetries=same)
         if poses is not None:
-            landmarks = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_estimate)
+            landmarks = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_estimate, symmetries=same)
             if poses.pose_truth_anchor is not None:
-                anchored = evaluate_landmarks(mapped, recording.true_landmarks, poses.pose_truth_anchor)
+                anchor = poses.pose_truth_anchor
+                anchored = evaluate_landmarks(mapped, recording.true_landmarks, anchor, symmetries=same)
     nis = summarise_nis(result.innovations)
     view = in_view(recording, poses.stamp_s) if poses is not None else None
     return Evaluation(poses, online, dead_reckoning, landmarks, anchored, own, nis, view, rate_hz)

@@ -99,7 +99,56 @@ def pose_residual(
     r_mount, r_seen = matrix_of(mount), _matrix(seen)
     a, b, c = _rotation_vector(_times(_quaternion(measured), _conjugate(seen)))
     residual[3], residual[4], residual[5] = a, b, c
-    turning = _inverse_jacobian(a, b, c)
+    _by_turns(_inverse_jacobian(a, b, c), r_mount, r_seen, j_pose, j_landmark, j_mount)
+
+
+@kernel
+def axis_residual(
+    pose: FloatArray,
+    landmark: FloatArray,
+    mount: FloatArray,
+    measured: FloatArray,
+    axis: int,
+    residual: FloatArray,
+    j_pose: FloatArray,
+    j_landmark: FloatArray,
+    j_mount: FloatArray,
+) -> None:
+    """Compute as `pose_residual`, of a landmark of which nobody can see how it is turned about one of its axes.
+
+    The last three rows are the shortest rotation vector that turns the predicted axis (0, 1 or 2 of the landmark) into
+    the measured one; a turn of the landmark about its axis changes nothing.
+    """
+    position_residual(pose, landmark, mount, measured, residual, j_pose, j_mount)
+    seen = _times(_conjugate(_times(_quaternion(pose), _quaternion(mount))), _quaternion(landmark))
+    r_mount, r_seen, r_measured = matrix_of(mount), _matrix(seen), matrix_of(measured)
+    x, y, z = r_seen[axis], r_seen[3 + axis], r_seen[6 + axis]
+    u, v, w = r_measured[axis], r_measured[3 + axis], r_measured[6 + axis]
+    a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+    sine, cosine = math.sqrt(a * a + b * b + c * c), x * u + y * v + z * w
+    angle = math.atan2(sine, cosine)
+    if angle < 0.02:
+        q = angle * angle
+        scale, slope = 1.0 + q / 6.0 + q * q * 7.0 / 360.0, 1.0 / 3.0 + q * 2.0 / 15.0
+    elif sine > 1e-6:
+        scale, slope = angle / sine, (sine - angle * cosine) / (sine * sine * sine)
+    else:  # upside down: half a turn about anything
+        scale, slope, a, b, c = 0.0, 0.0, 0.0, 0.0, 0.0
+    residual[3], residual[4], residual[5] = scale * a, scale * b, scale * c
+    if scale == 0.0:
+        residual[3] = math.pi
+    e, d = scale * cosine, slope
+    first = e - scale * x * u + d * a * a, d * a * b - scale * x * v, d * a * c - scale * x * w
+    second = d * b * a - scale * y * u, e - scale * y * v + d * b * b, d * b * c - scale * y * w
+    third = d * c * a - scale * z * u, d * c * b - scale * z * v, e - scale * z * w + d * c * c
+    _by_turns(first + second + third, r_mount, r_seen, j_pose, j_landmark, j_mount)
+
+
+@kernel
+def _by_turns(
+    turning: Matrix, r_mount: Matrix, r_seen: Matrix, j_pose: FloatArray, j_landmark: FloatArray, j_mount: FloatArray
+) -> None:
+    """Fill in derivatives of an orientation's residual by three poses, from that by a turn of the sensor."""
     for i in range(3):
         u, v, w = turning[3 * i], turning[3 * i + 1], turning[3 * i + 2]
         for k in range(3):
@@ -109,6 +158,32 @@ def pose_residual(
         j_pose[3 + i, 3], j_pose[3 + i, 4], j_pose[3 + i, 5] = _turned(r_mount, u, v, w)
         f, g, h = _turned_back(r_seen, u, v, w)
         j_landmark[3 + i, 3], j_landmark[3 + i, 4], j_landmark[3 + i, 5] = -f, -g, -h
+
+
+@kernel
+def nearest_turn(
+    pose: FloatArray, landmark: FloatArray, mount: FloatArray, measured: FloatArray, axis: int, turns: FloatArray,
+    out: FloatArray,
+) -> None:  # fmt: skip
+    """Compute what looks like a measured pose: of its turns (G, 4), beside any about an axis (-1 without), the one
+    that is nearest to the predicted orientation.
+    """
+    seen = _times(_conjugate(_times(_quaternion(pose), _quaternion(mount))), _quaternion(landmark))
+    x, y, z, w = _times(_conjugate(_quaternion(measured)), seen)
+    best, row = -1.0, 0
+    for k in range(len(turns)):
+        a, b, c, d = turns[k, 0], turns[k, 1], turns[k, 2], turns[k, 3]
+        cosine = abs(x * a + y * b + z * c + w * d)
+        if axis == 0:
+            cosine = math.hypot(cosine, x * d + y * c - z * b - w * a)
+        elif axis == 1:
+            cosine = math.hypot(cosine, y * d + z * a - x * c - w * b)
+        elif axis == 2:
+            cosine = math.hypot(cosine, z * d + x * b - y * a - w * c)
+        if cosine > best:
+            best, row = cosine, k
+    turned = _times(_quaternion(measured), (turns[row, 0], turns[row, 1], turns[row, 2], turns[row, 3]))
+    _put(out, measured[0], measured[1], measured[2], turned)
 
 
 @kernel

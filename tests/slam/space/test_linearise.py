@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from evermap.geometry import se3
+from evermap.geometry.symmetry import Symmetry
 from evermap.slam.space.linearise import (
     CORNERS,
     POINT,
@@ -21,7 +23,9 @@ LEVEL = np.array([0.1, 0.05, 0.7, 1.3, 0.4])
 STEP = 1e-6
 
 
-def a_sighting(kind: int, oriented: bool, seed: int) -> tuple[SpatialSightings, np.ndarray, np.ndarray, np.ndarray]:
+def a_sighting(
+    kind: int, oriented: bool, seed: int, alike: Symmetry | None = None
+) -> tuple[SpatialSightings, np.ndarray, np.ndarray, np.ndarray]:
     random = np.random.default_rng(seed)
     pose = se3.exp(random.normal(0.0, 0.5, (1, 6)))
     mount = se3.exp(random.normal(0.0, 0.5, (1, 6)))
@@ -30,6 +34,7 @@ def a_sighting(kind: int, oriented: bool, seed: int) -> tuple[SpatialSightings, 
     if not oriented:
         place[:, 3:] = [0.0, 0.0, 0.0, 1.0]
     width = 14 + (6 if oriented else 3)
+    alike = Symmetry() if alike is None else alike
     seen = SpatialSightings(
         pose_row=np.zeros(1, dtype=np.int64),
         place=np.zeros(1, dtype=np.int64),
@@ -45,6 +50,10 @@ def a_sighting(kind: int, oriented: bool, seed: int) -> tuple[SpatialSightings, 
         first=np.array([0, ROWS[kind] * width]),
         share=np.array([1.0]),
         log_odds=np.full(3, 1e9),
+        symmetry=np.ones(1, dtype=np.int64),
+        axis=np.array([-1, alike.axis]),
+        first_turn=np.array([0, 1, 1 + len(alike.turns)]),
+        turns=np.vstack([Symmetry().turns, alike.turns]),
     )
     return seen, pose, place, mount
 
@@ -56,10 +65,18 @@ def residuals(seen, pose, place, mount, velocity) -> tuple[np.ndarray, np.ndarra
     return residual[0, :rows], values.reshape(rows, -1)
 
 
+KINDS = [
+    (POINT, False, None), (POINT, True, None), (POSE, True, None), (CORNERS, True, None),
+    (POSE, True, ("90:z", "90:x")), (POSE, True, ("axis:y",)), (POSE, True, ("axis:z", "180:x")),
+]  # fmt: skip
+
+
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("kind", "oriented"), [(POINT, False), (POINT, True), (POSE, True), (CORNERS, True)])
-def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, seed):
-    seen, pose, place, mount = a_sighting(kind, oriented, seed)
+@pytest.mark.parametrize(("kind", "oriented", "alike"), KINDS)
+def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, alike, seed):
+    symmetry = Symmetry.generated(alike or ())
+    seen, pose, place, mount = a_sighting(kind, oriented, seed, symmetry)
+    place = se3.compose(place, np.append(np.zeros(3), symmetry.turns[-1])) if oriented else place
     velocity = np.random.default_rng(seed).normal(0.0, 1.0, (1, 6))
     at, block = residuals(seen, pose, place, mount, velocity)
     assert block[:, -1] == pytest.approx(-at, abs=1e-9)
@@ -81,6 +98,30 @@ def test_jacobians_of_sightings_are_those_of_differences(kind, oriented, seed):
                 ends.append(residuals(seen, moved["pose"], moved["place"], moved["mount"], velocity)[0])
             columns.append((ends[0] - ends[1]) / (2.0 * STEP))
     assert block[:, :-1] == pytest.approx(np.column_stack(columns), abs=2e-4 * max(1.0, np.abs(block).max()))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    ("generators", "group"),
+    [
+        (("90:z", "90:x"), Rotation.create_group("O")),
+        (("180:z", "180:x"), Rotation.create_group("D2")),
+        (("axis:z", "180:x"), Rotation.create_group("D720")),
+    ],
+)
+def test_of_what_looks_the_same_the_most_probable_counts(generators, group, seed):
+    """Against the factor without symmetries, of every equivalent measurement."""
+    seen, pose, place, mount = a_sighting(POSE, True, seed, Symmetry.generated(generators))
+    turn = Rotation.from_quat(seen.measured[0, 3:])
+    nothing, costs = np.zeros((1, 6)), []
+    for one in group:
+        measured = np.append(seen.measured[:, :3], (turn * one).as_quat())[None]
+        plain = seen._replace(measured=measured, symmetry=np.zeros(1, dtype=np.int64))
+        costs.append((residuals(plain, pose, place, mount, nothing)[0] ** 2).sum())
+    for one in group[:: max(1, len(group) // 8)]:  # in whichever of these it came
+        measured = np.append(seen.measured[:, :3], (turn * one).as_quat())[None]
+        found = residuals(seen._replace(measured=measured), pose, place, mount, nothing)[0]
+        assert (found**2).sum() == pytest.approx(min(costs), rel=1e-3)
 
 
 def test_jacobians_of_odometry_are_those_of_differences():

@@ -12,6 +12,7 @@ from evermap.config import FitConfig, LivingConfig
 from evermap.geometry import se2, se3
 from evermap.geometry.chunked import of_places
 from evermap.geometry.rigid import consensus, rigid
+from evermap.geometry.symmetry import Symmetries
 from evermap.maps.living import LivingMap, Places
 from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
@@ -61,16 +62,19 @@ class Turned(NamedTuple):
         pose_map_session: (7,) where.
         rotation: (K, 4) quaternions in its frame, nan of points.
         covariance: (K, 3, 3) of them, in the landmarks' own axes [rad^2].
+        symmetries: (K,) turns after which they look the same.
     """
 
     pose_map_session: FloatArray
     rotation: FloatArray
     covariance: FloatArray
+    symmetries: Symmetries
 
     def log_odds(self, landmark: IntArray, places: Places) -> FloatArray:
         """Return (P,) log likelihood ratio of landmarks (P,) being turned as at places, for 'stands' over 'moved'."""
         turn = se3.compose(self.pose_map_session, _turns(self.rotation[landmark]))
-        off = se3.local(_turns(places.rotation), turn)[:, 3:]
+        known_turn = self.symmetries[landmark].nearest(_turns(places.rotation), turn)
+        off = se3.local(known_turn, turn)[:, 3:]
         known = np.isfinite(places.rotation[:, 0]) & np.isfinite(self.rotation[landmark, 0])
         spread = np.where(known[:, None, None], self.covariance[landmark] + places.rotation_covariance, np.eye(3))
 

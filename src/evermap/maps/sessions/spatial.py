@@ -27,9 +27,9 @@ from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import WORTH_A_LOOK, LooksAt
 from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.intake import SpatialIntake
-from evermap.slam.space.problem import PlacePrior
-from evermap.slam.space.result import identities_of, located, most_of, numbered
+from evermap.slam.space.intake import SpatialIntake, most_of
+from evermap.slam.space.problem import ANY_RAD, PlacePrior
+from evermap.slam.space.result import identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
 from evermap.types import (
     UNKNOWN,
@@ -186,10 +186,25 @@ class SpatialVisit:
         else:
             position, covariance = _fused(position, covariance, laid[row], living, where.drift_m)
         kind = most_of(problem.place, self.recording.detections.class_id[self.intake.used], count)
+        rotation = self._as_known(row, rotation, laid[row], living)
         return Found(
             names[row], kind[row], laid[row], probability[row], position, covariance,
             np.full(len(row), UNKNOWN, dtype=np.int64), first[row], last[row], rotation, alone.rotation[row],
         )  # fmt: skip
+
+    def _as_known(self, row: IntArray, rotation: FloatArray, laid: IntArray, living: LivingMap) -> FloatArray:
+        """Orientations (K, 4) of places (K,): of those that look the same the nearest to what the map has, where they
+        are laid (K,), or else anywhere.
+        """
+        alike, names = self.optimum.smoother.problem.symmetries[row], living.places.landmark_id
+        found = se3.identity(len(row))
+        found[:, 3:] = rotation
+        for k in np.flatnonzero((alike.of > 0) & np.isfinite(rotation[:, 0])):
+            places = laid[[k]] if laid[k] >= 0 else np.flatnonzero(names == self.landmark_id[row[k]])
+            known = living.places.rotation[places]
+            if len(known) and np.isfinite(known[-1, 0]):
+                found[k] = alike.kinds[alike.of[k]].nearest(found[k], np.append(np.zeros(3), known[-1]))
+        return found[:, 3:]
 
     def watched(self, entry: Extended, config: LivingConfig) -> Watch:
         """Return at which places of the map the session looked: where its own sightings show that it would have seen
@@ -333,7 +348,8 @@ def _laid(visit: SpatialVisit, living: LivingMap, p_site: FloatArray, config: Li
     alone, names, place = by_itself(visit.optimum), visit.landmark_id, visit.optimum.estimate.place
     row, rotation = visit.told(visit.n_fit >= config.fit.sightings_in_place)
     at = se2.xy_rows(row, 3)
-    turned = Turned(se3.identity(), rotation, alone.rotation[row])
+    alike = visit.optimum.smoother.problem.symmetries[row]
+    turned = Turned(se3.identity(), rotation, alone.rotation[row], alike)
     position = place[row, :3] + alone.shift_m[row]
     return laid_over(living, p_site, names[row], position, alone.covariance_m2[np.ix_(at, at)], config, turned)
 
@@ -361,11 +377,13 @@ def _held(visit: SpatialVisit, living: LivingMap, where: Laid) -> SpatialOptimum
     pose[:, :3] = places.position_m[place]
     turned = np.isfinite(places.rotation[place, 0]) & problem.oriented[row]
     pose[turned, 3:] = places.rotation[place[turned]]
-    sigma = np.full((len(row), 6), np.pi)
+    sigma = np.full((len(row), 6), ANY_RAD)
     own = blocks(living.covariance_m2, 3)[place]
     sigma[:, :3] = np.sqrt(np.trace(own, axis1=1, axis2=2) / 3.0 + where.drift_m**2)[:, None]
-    spread = np.trace(places.rotation_covariance[place], axis1=1, axis2=2) / 3.0
+    unseen = problem.symmetries[row].unseen
+    spread = np.einsum("kii,ki->k", places.rotation_covariance[place], 1.0 - unseen) / (3.0 - unseen.sum(axis=1))
     sigma[turned, 3:] = np.sqrt(spread[turned] + DRIFT_RAD**2)[:, None]
+    sigma[:, 3:][unseen > 0.0] = ANY_RAD
     prior = PlacePrior(row.astype(np.int64), pose, sigma, np.ones(len(row)))
     problem = replace(problem, prior=prior, start_sigma=np.full(6, FREE))
     return converged(problem, optimum.estimate, optimum.noise, heavy_rounds=0)

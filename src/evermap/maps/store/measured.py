@@ -46,6 +46,8 @@ def pack_recording(recording: AnyRecording) -> bytes:
     values["landmark_texts"] = sorted(recording.landmark_names.values())
     if isinstance(recording, SpatialRecording):
         values["sensors"] = len(recording.sensors)
+        if recording.symmetries:  # equal recordings have the bytes that they had before there were any
+            values["symmetries"] = {name: list(texts) for name, texts in recording.symmetries.items()}
         tables = {table: getattr(recording, table) for table in _IN_SPACE}
         tables |= {f"sensor {k}": sensor for k, sensor in enumerate(recording.sensors)}
     else:
@@ -87,7 +89,8 @@ def unpack_recording(data: bytes) -> AnyRecording:
             for table, kind in _IN_SPACE.items()
         }
         sensors = (_table(f"sensor {k}", SpatialSensor, arrays, values) for k in range(values["sensors"]))
-        return SpatialRecording(**about, **tables, sensors=tuple(sensors))
+        symmetries = {name: tuple(texts) for name, texts in values.get("symmetries", {}).items()}
+        return SpatialRecording(**about, **tables, sensors=tuple(sensors), symmetries=symmetries)
     except (KeyError, ValueError, TypeError, OSError, zipfile.BadZipFile) as error:
         raise DamagedError(f"a recording that was kept cannot be read: {error}") from None
 

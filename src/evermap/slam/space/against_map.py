@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.geometry import se2, se3
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.problem import LEAST_WEIGHT, SpatialProblem
+from evermap.slam.space.problem import ANY_RAD, LEAST_WEIGHT, SpatialProblem
 from evermap.types import FloatArray
 
 P_MOVED = 0.03
@@ -91,7 +91,8 @@ def _asked(optimum: SpatialOptimum, sigma: FloatArray) -> MapComparison:
     count, n = len(prior.place), len(problem.stamp_s)
     p_stands, off, covariance = np.ones(count), np.zeros((count, 6)), np.zeros((count, 6, 6))
     for k, place in enumerate(prior.place):
-        mean = prior.off(k, optimum.estimate.place[place], oriented=bool(problem.oriented[place]))
+        own_place = optimum.estimate.place[place][None]
+        mean = problem.off_map(np.array([k]), own_place, oriented=bool(problem.oriented[place]))[0]
         dim, at = len(mean), spread.own_first[n + place]
         own = np.linalg.inv(spread.own[at : at + dim * dim].reshape(dim, dim))
         # the map's own word on it is taken back; what is left may be little, but is something
@@ -145,7 +146,7 @@ def by_itself(optimum: SpatialOptimum) -> Alone:
     information, pull = np.linalg.inv(joint), np.zeros(len(joint))
     for k in np.flatnonzero(np.isin(problem.prior.place, seen)).tolist():
         row = int(problem.prior.place[k])
-        off = problem.prior.off(k, place[row], oriented=bool(problem.oriented[row]))
+        off = problem.off_map(np.array([k]), place[row][None], oriented=bool(problem.oriented[row]))[0]
         jacobian = se3.right_jacobian_inverse(off) if len(off) == 6 else np.eye(3)
         said = jacobian.T * (problem.prior.weight[k] / problem.prior.sigma[k, : len(off)] ** 2)
         own = slice(int(first[row]), int(first[row]) + len(off))
@@ -170,7 +171,8 @@ def _accuracy(found: MapComparison, stated: FloatArray, problem: SpatialProblem)
     for k, place in enumerate(problem.prior.place):
         dim = 6 if problem.oriented[place] else 3
         spread = np.diag(found.covariance[k])[:dim]
+        said = stated[k, :dim] < ANY_RAD
         excess = np.maximum(found.off[k, :dim] ** 2 - spread, 0.0) / stated[k, :dim] ** 2
-        total += found.p_stands[k] * float(np.minimum(excess, 16.0).sum())
-        count += found.p_stands[k] * dim
+        total += found.p_stands[k] * float(np.minimum(excess, 16.0)[said].sum())
+        count += found.p_stands[k] * float(said.sum())
     return float(np.sqrt(total / count))

@@ -97,6 +97,8 @@ def refined(smoother: SpatialSmoother, now: SpatialLinear, noise: SpatialNoise, 
             count = float(w.sum()) * (rows.stop - rows.start)
             if level == POSITION:
                 count -= float(w @ problem.ray[some])  # ranges that nobody measured fit
+            elif level == ORIENTATION:
+                count -= float(w @ problem.about_axis[some])
             levels[level] = _level(before[level], start[level], total, count)
     return SpatialNoise(*np.maximum(levels, FLOOR).tolist())
 
@@ -149,20 +151,21 @@ def oriented(problem: SpatialProblem, estimate: SpatialEstimate, weight: FloatAr
             continue
         some = mine[:: max(1, len(mine) // MOST_CANDIDATES)]
         candidate = np.vstack([first[some], other[some][has_other[some]]])
-        score = np.zeros(len(candidate))
+        symmetry = problem.symmetries.kinds[problem.symmetries.of[place]]
         far = [
-            _likeness(candidate, seen[mine], sigma[mine])
+            _likeness(symmetry.angle_between(candidate[:, None], seen[mine]), sigma[mine])
             for seen in (first, np.where(has_other[:, None], other, first))
         ]
         mixed = first_share[mine] * far[0] + (1.0 - first_share[mine]) * far[1]
         score = np.log(mixed + 1e-6) @ weight[mine]
-        found[place, 3:] = candidate[int(np.argmax(score)), 3:]
+        best = candidate[int(np.argmax(score))]
+        found[place, 3:] = symmetry.nearest(best, estimate.place[place])[3:]
     return found
 
 
-def _likeness(candidate: FloatArray, seen: FloatArray, sigma: FloatArray) -> FloatArray:
-    """(C, D) likelihood ratios of orientations seen, by the angle from candidates."""
-    return np.asarray(np.exp(-0.5 * (se3.angle_between(candidate[:, None], seen) / sigma) ** 2))
+def _likeness(angle: FloatArray, sigma: FloatArray) -> FloatArray:
+    """(C, D) likelihood ratios of orientations seen, by their angles from candidates."""
+    return np.asarray(np.exp(-0.5 * (angle / sigma) ** 2))
 
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:

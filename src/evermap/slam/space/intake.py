@@ -12,6 +12,7 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.geometry.camera import project_each, unproject
 from evermap.geometry.square import SquarePoses, square_poses
+from evermap.geometry.symmetry import HINT, Symmetries
 from evermap.slam.space.linearise import CORNERS, POINT, POSE
 from evermap.slam.space.problem import SpatialProblem
 from evermap.types import ANY_RANGE_M2, UNKNOWN, BoolArray, FloatArray, IntArray, SpatialRecording
@@ -83,6 +84,7 @@ def prepare_space(
     used = np.flatnonzero(usable)
     landmark_id, place = np.unique(detections.landmark_id[used], return_inverse=True)
     some = where.rows(used)
+    symmetries = _symmetries(recording, place, used, some.kind)
     oriented = np.zeros(len(landmark_id), dtype=np.bool_)
     oriented[place[some.kind != POINT]] = True
     driven = recording.odometry is not None
@@ -107,6 +109,7 @@ def prepare_space(
         share=np.ones(len(used)),
         ray=_without_range(recording)[used],
         oriented=oriented,
+        symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
         mount_sigma=np.tile(_mount_sigma(settings), (len(recording.sensors), 1)),
     )
@@ -114,6 +117,33 @@ def prepare_space(
         problem, float(stamps[pose_frame[0]]), pose_frame, used, landmark_id, driven_pose, tuple(warnings),
         recording.landmark_names,
     )  # fmt: skip
+
+
+def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
+    """Return (P,) the class that most detections of each place say."""
+    found = np.full(count, UNKNOWN)
+    for row in range(count):
+        own = class_id[(place == row) & (class_id != UNKNOWN)]
+        if len(own):
+            found[row] = int(np.argmax(np.bincount(own)))
+    return found
+
+
+def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, kind: IntArray) -> Symmetries:
+    """Turns after which places look the same, by their classes; of none tags, which have a pattern.
+
+    What has no orientation becomes a point: `kind` (M,) is written to.
+    """
+    count = int(place.max(initial=-1)) + 1
+    class_id = most_of(place, recording.detections.class_id[used], count)
+    names = dict(enumerate(recording.class_names))
+    try:
+        found = Symmetries.of_classes(recording.symmetries, [names.get(row, str(row)) for row in class_id.tolist()])
+    except ValueError as error:
+        raise DataError(f"{recording.name}: {error}", field="symmetries", hint=HINT) from None
+    found.of[place[kind == CORNERS]] = 0
+    kind[np.array([symmetry.free for symmetry in found.kinds])[found.of[place]]] = POINT
+    return found
 
 
 def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:

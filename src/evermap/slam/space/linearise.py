@@ -9,7 +9,9 @@ import numpy as np
 
 from evermap.compiled import kept
 from evermap.slam.kernels3d import (
+    axis_residual,
     matrix_of,
+    nearest_turn,
     odometry_residual,
     point_residual,
     pose_residual,
@@ -52,6 +54,10 @@ class SpatialSightings(NamedTuple):
         first: (M + 1,) where the values of each begin, counted from the first detection.
         share: (M,) of the information of each that is new: errors of consecutive detections are alike.
         log_odds: (3,) of each kind, beyond which half of the squared residual makes an outlier.
+        symmetry: (M,) row of the turns after which the place looks the same; 0 without any.
+        axis: (K,) axes about which any turn does, of these; -1 without.
+        first_turn: (K + 1,) rows of `turns` of each.
+        turns: (T, 4) quaternions.
     """
 
     pose_row: IntArray
@@ -68,6 +74,10 @@ class SpatialSightings(NamedTuple):
     first: IntArray
     share: FloatArray
     log_odds: FloatArray
+    symmetry: IntArray
+    axis: IntArray
+    first_turn: IntArray
+    turns: FloatArray
 
 
 @kernel
@@ -183,7 +193,16 @@ def _position_or_pose(
     e: FloatArray, jx: FloatArray, jl: FloatArray, jm: FloatArray,
 ) -> None:  # fmt: skip
     """Whitened residuals and Jacobians of a position, or of a position and an orientation."""
-    if seen.oriented[m]:
+    symmetry = seen.symmetry[m]
+    if seen.oriented[m] and seen.kind[m] == POSE and symmetry > 0:
+        axis, nearest = seen.axis[symmetry], np.empty(7)
+        turns = seen.turns[seen.first_turn[symmetry] : seen.first_turn[symmetry + 1]]
+        nearest_turn(pose, place, mount, seen.measured[m], axis, turns, nearest)
+        if axis >= 0:
+            axis_residual(pose, place, mount, nearest, axis, e, jx, jl, jm)
+        else:
+            pose_residual(pose, place, mount, nearest, e, jx, jl, jm)
+    elif seen.oriented[m]:
         pose_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)
     else:
         point_residual(pose, place, mount, seen.measured[m], e, jx, jl, jm)

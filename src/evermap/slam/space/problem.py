@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.slam.space.linearise import POINT, ROWS, SpatialSightings
+from evermap.geometry.symmetry import Symmetries
+from evermap.slam.space.linearise import POINT, POSE, ROWS, SpatialSightings
 from evermap.types import BoolArray, FloatArray, IntArray
 
 OUTLIER_LOG_ODDS = np.array([10.5, 14.0, 16.0])
@@ -19,6 +20,8 @@ JUMP_LOG_ODDS, NO_JUMP_LOG_ODDS = 14.0, 1e3
 
 LEAST_WEIGHT = 1e-6
 """Of a map's word on a landmark that is elsewhere."""
+ANY_RAD = np.pi
+"""Standard deviation of an orientation of which a map says nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +69,6 @@ class PlacePrior:
         """Return a map that says nothing."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, 7)), np.ones((0, 6)), np.ones(0))
 
-    def off(self, row: int | IntArray, place: FloatArray, *, oriented: bool) -> FloatArray:
-        """Return twists (..., 6) from where the map has places to `place` (..., 7); shifts (..., 3) of points."""
-        if oriented:
-            return se3.local(self.pose[row], place)
-        return np.asarray(place[..., :3] - self.pose[row, :3])
-
 
 @dataclass(frozen=True, slots=True)
 class SpatialProblem:
@@ -94,6 +91,7 @@ class SpatialProblem:
         share: (M,) of the information of each detection that is new.
         ray: (M,) detections of which only the direction was seen; their ranges are triangulated first values.
         oriented: (P,) places with an orientation; the others are points.
+        symmetries: (P,) turns after which places look the same.
         mount: (S, 7) nominal poses of the sensors on the robot.
         mount_sigma: (S, 7) standard deviations of its twist and of the delay of the stamps [s]; 0 where exact.
         prior: on places.
@@ -119,6 +117,7 @@ class SpatialProblem:
     share: FloatArray
     ray: BoolArray
     oriented: BoolArray
+    symmetries: Symmetries
     mount: FloatArray
     mount_sigma: FloatArray
     prior: PlacePrior = field(default_factory=PlacePrior.none)
@@ -140,14 +139,45 @@ class SpatialProblem:
         return np.stack([self.measured, np.where(np.isfinite(self.other), self.other, self.measured)])
 
     @property
+    def explanations(self) -> FloatArray:
+        """Return (E, M, 7) as `either`, also those of turns after which a place looks the same, beside those about an
+        axis; the first again where there are fewer.
+        """
+        kinds, of = self.symmetries.kinds, self.symmetries.of[self.place]
+        most = max(2, *(len(kind.turns) for kind in kinds))
+        found = np.concatenate([self.either, np.repeat(self.measured[None], most - 2, axis=0)])
+        for row in np.unique(of[of > 0]).tolist():
+            mine = np.flatnonzero((of == row) & (self.kind == POSE))
+            turns = np.hstack([np.zeros((len(kinds[row].turns), 3)), kinds[row].turns])
+            found[: len(turns), mine] = se3.compose(self.measured[mine], turns[:, None])
+        return found
+
+    def off_map(self, row: IntArray, place: FloatArray, *, oriented: bool) -> FloatArray:
+        """Return twists (K, 6) from where the map has some of its places (K,) to `place` (K, 7); shifts (K, 3) of
+        points. Of what looks the same the nearest counts.
+        """
+        known = self.prior.pose[row]
+        if oriented:
+            return se3.local(self.symmetries[self.prior.place[row]].nearest(known, place), place)
+        return np.asarray(place[:, :3] - known[:, :3])
+
+    @property
+    def about_axis(self) -> BoolArray:
+        """Return (M,) detections of an orientation that is not seen about an axis."""
+        return np.asarray((self.kind == POSE) & (self.symmetries.axis[self.place] >= 0))
+
+    @property
     def sightings(self) -> SpatialSightings:
         """Return the detections as the kernel reads them."""
+        kinds = self.symmetries.kinds
         oriented = self.oriented[self.place].astype(np.int64)
         width = 14 + np.where(oriented, 6, 3)
         first = np.append(0, np.cumsum(ROWS[self.kind] * width))
         return SpatialSightings(
             self.pose_row, self.place, self.sensor, self.kind, oriented, self.measured, self.measured_root,
             self.sigma_rad, self.corner, self.corner_root, self.half_m, first, self.share, OUTLIER_LOG_ODDS,
+            self.symmetries.of[self.place], np.array([kind.axis for kind in kinds]),
+            np.append(0, np.cumsum([len(kind.turns) for kind in kinds])), np.vstack([kind.turns for kind in kinds]),
         )  # fmt: skip
 
     def as_points(self) -> SpatialProblem:

@@ -113,7 +113,7 @@ def other_explanations(problem: SpatialProblem, optimum: SpatialOptimum) -> tupl
     """Return the values with poses and orientations that fit better by themselves, and whether there are any."""
     estimate, noise = optimum.estimate, optimum.noise
     voted = oriented(problem, estimate, optimum.now.weight)
-    turned = se3.angle_between(voted, estimate.place)
+    turned = problem.symmetries.angle_between(voted, estimate.place)
     place = np.where((turned > OTHER_RAD)[:, None], voted, estimate.place)
     pose, n_better = _better_poses(problem, replace(estimate, place=place), noise)
     return replace(estimate, pose=pose, place=place), n_better + int((turned > OTHER_RAD).sum()) > 0
@@ -126,8 +126,11 @@ def _better_poses(problem: SpatialProblem, estimate: SpatialEstimate, noise: Spa
     mount = estimate.mount(problem)[problem.sensor]
     oriented_place = problem.oriented[problem.place]
     rank = np.arange(len(problem.place)) - np.searchsorted(problem.pose_row, problem.pose_row)
-    for measured in problem.either:
-        suggested = se3.compose(estimate.place[problem.place], se3.inverse(se3.compose(mount, measured)))
+    symmetries, place = problem.symmetries[problem.place], estimate.place[problem.place]
+    for measured in problem.explanations:
+        seen = se3.compose(mount, measured)
+        turned = symmetries.twisted(place, se3.compose(estimate.pose[problem.pose_row], seen))
+        suggested = se3.compose(turned, se3.inverse(seen))
         for k in range(int(rank.max(initial=-1)) + 1):
             some = np.flatnonzero((rank == k) & oriented_place)
             rows = problem.pose_row[some]
@@ -199,7 +202,7 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
     located |= problem.driven
     asked = outlier & located[problem.pose_row]
     at = as_seen(problem, estimate, problem.measured)
-    place, places, oriented_too, whose = problem.place.copy(), list[FloatArray](), [], []
+    place, places, copied = problem.place.copy(), list[FloatArray](), list[int]()
     at_places, prior = estimate.place.copy(), problem.prior
     unseen = np.bincount(problem.place, optimum.now.weight, minlength=len(at_places)) < LEAST_SEEN
     for known in np.unique(problem.place[asked]):
@@ -217,13 +220,13 @@ def split(optimum: SpatialOptimum, identity: IntArray) -> tuple[SpatialProblem, 
             else:
                 place[near] = len(estimate.place) + len(places)
                 places.append(at[mine[centre]])
-                oriented_too.append(problem.oriented[known])
-                whose.append(identity[known])
+                copied.append(int(known))
             mine = mine[gap[centre] >= TOGETHER_M]
     if not places and prior is problem.prior:
         return None
+    source = np.append(np.arange(len(problem.oriented)), copied).astype(np.int64)
     larger = replace(
-        problem, place=place, oriented=np.append(problem.oriented, oriented_too).astype(np.bool_), prior=prior
+        problem, place=place, oriented=problem.oriented[source], symmetries=problem.symmetries[source], prior=prior
     )
     added = replace(estimate, place=np.vstack([at_places, *places]))
-    return larger, added, np.append(identity, whose).astype(np.int64)
+    return larger, added, identity[source]

@@ -10,14 +10,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se3
-from evermap.slam.space.intake import SpatialIntake
+from evermap.slam.space.intake import SpatialIntake, most_of
 from evermap.slam.space.linearise import CORNERS, ORIENTATION, PIXEL, POSE, POSITION, ROTATION, ROWS, TRANSLATION
 from evermap.slam.space.problem import SpatialProblem
 from evermap.slam.space.smoother import SpatialLinear
 from evermap.slam.space.solve import SpatialSolved
 from evermap.slam.sparse.elimination import Spread
 from evermap.types import (
-    UNKNOWN,
     BoolArray,
     ChangeKind,
     FloatArray,
@@ -194,16 +193,6 @@ def _landmarks(told: _Told, identities: IntArray, names: Mapping[int, str]) -> L
     )
 
 
-def most_of(place: IntArray, class_id: IntArray, count: int) -> IntArray:
-    """Return (P,) the class that most detections of each place say."""
-    found = np.full(count, UNKNOWN)
-    for row in range(count):
-        own = class_id[(place == row) & (class_id != UNKNOWN)]
-        if len(own):
-            found[row] = int(np.argmax(np.bincount(own)))
-    return found
-
-
 def _sizes(told: _Told, count: int) -> FloatArray:
     """(P, 3) median sizes of boxes."""
     size, place = told.recording.detections.size_m[told.intake.used], told.solved.optimum.smoother.problem.place
@@ -267,7 +256,7 @@ def _innovations(told: _Told, identities: IntArray) -> Innovations:
         landmark_id=identities[problem.place],
         nis=np.maximum(nis, 0.0),
         p_inlier=np.clip(now.weight, 0.0, 1.0),
-        dof=(ROWS[problem.kind] - problem.ray).astype(np.int64),
+        dof=(ROWS[problem.kind] - problem.ray - problem.about_axis).astype(np.int64),
     )
 
 

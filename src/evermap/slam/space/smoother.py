@@ -23,6 +23,9 @@ HELD = 1e-9
 """Information that keeps a place whose every detection is an outlier from going anywhere."""
 FIXED = 1e12
 """Information on a calibration state that is known exactly."""
+ANY_TURN = 3.0 / np.pi**2
+"""Information about how a place is turned about an axis of symmetry: nothing but that a turn is less than half a full
+one. It holds what no detection shows, and ties it to nothing."""
 LARGEST_TURN = 0.5
 """A step turns no pose by more [rad]."""
 COST_SLACK = 1e-3
@@ -57,6 +60,9 @@ class SpatialSmoother:
         self._states = _information(problem.mount_sigma).ravel()
         self._start = np.array(around[0])
         self.system = self._structured(around)
+        axis = problem.symmetries.axis
+        about = np.flatnonzero(problem.oriented & (axis >= 0))
+        self._unseen = self.system.tree.begin[len(problem.stamp_s) + about] + 3 + axis[about]
 
     def optimum(
         self, start: SpatialEstimate, noise: SpatialNoise, *, heavy: bool, iterations: int = 20, tolerance: float = 1e-5
@@ -123,6 +129,7 @@ class SpatialSmoother:
         tree = self.system.tree
         extra = np.zeros(tree.begin[-1])
         extra[6 * len(self.problem.stamp_s) : -len(self._states)] = HELD
+        extra[self._unseen] = ANY_TURN
         if damping > 0.0:
             own = extra + curvature(tree, self.system.factors, now.values)
             own[-len(self._states) :] += self._states
@@ -148,7 +155,7 @@ class SpatialSmoother:
         first = at + np.append(0, np.cumsum(np.where(turned, 42, 12)))
         cost = 0.0
         for some, dim in ((np.flatnonzero(turned), 6), (np.flatnonzero(~turned), 3)):
-            off = prior.off(some, estimate.place[prior.place[some]], oriented=dim == 6)
+            off = problem.off_map(some, estimate.place[prior.place[some]], oriented=dim == 6)
             root = (np.sqrt(prior.weight[some])[:, None] / prior.sigma[some])[:, :dim]
             jacobian = se3.right_jacobian_inverse(off) if dim == 6 else np.eye(3)
             block = np.concatenate([root[..., None] * jacobian, -(root * off)[..., None]], axis=2)

@@ -12,7 +12,7 @@ from evermap.slam.space.drift import drift_of
 from evermap.slam.space.estimate import SpatialOptimum, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake
 from evermap.slam.space.linearise import CORNERS, POINT
-from evermap.slam.space.problem import PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
+from evermap.slam.space.problem import ANY_RAD, PlacePrior, SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.slam.space.repair import rejoined, repaired, split, unjumped
 from evermap.slam.space.smoother import SpatialSmoother
 from evermap.slam.space.start import incremental
@@ -136,7 +136,8 @@ def _with_map(
         if prior_map.rotation_covariance is not None:
             own = np.sqrt(np.einsum("kii->ki", np.nan_to_num(prior_map.rotation_covariance[rows])))
             stated[:, 3:] = np.where(own > 0.0, own, sigma)
-    stated[problem.oriented[place] & ~turned, 3:] = np.pi  # a map of points knows no orientation
+    stated[problem.oriented[place] & ~turned, 3:] = ANY_RAD  # a map of points knows no orientation
+    stated[:, 3:][problem.symmetries[place].unseen > 0.0] = ANY_RAD
     # positions of a map are in its axes, those of tags in their own: all alike
     stated[:, :3] = stated[:, :3].max(axis=1, keepdims=True)
     prior = PlacePrior(place.astype(np.int64), pose, np.maximum(stated, LOOSE_M), np.ones(len(rows)))
@@ -171,7 +172,7 @@ def _whole(problem: SpatialProblem, driven: FloatArray, known: BoolArray, place:
         return se3.identity()
     some = met[:: max(1, len(met) // MOST_TRIED)]
     mount = problem.mount[problem.sensor]
-    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.either))
+    seen = se3.compose(driven[problem.pose_row], se3.compose(mount, problem.explanations))
     trial = se3.compose(place[problem.place[some]], se3.inverse(seen[:, some])).reshape(-1, 7)
     at = se3.transform(trial[:, None], seen[0, some, :3])
     gap = np.linalg.norm(at - place[problem.place[some], :3], axis=2)

@@ -12,6 +12,7 @@ import numpy as np
 
 from evermap.geometry import se3
 from evermap.geometry.rigid import rigid
+from evermap.geometry.symmetry import Symmetries
 from evermap.slam.space.problem import SpatialEstimate, SpatialNoise, SpatialProblem
 from evermap.types import BoolArray, FloatArray, Progress
 
@@ -39,7 +40,7 @@ def incremental(
     """
     n, mount = len(problem.stamp_s), problem.mount[problem.sensor]
     place, known = place.copy(), known.copy()
-    either = se3.compose(mount, problem.either)
+    either, ways = se3.compose(mount, problem.either), se3.compose(mount, problem.explanations)
     share = np.exp(-np.clip(problem.other_log_odds / noise.pixel**2, 0.0, 30.0))
     log_share = np.stack([-np.log1p(share), np.log(share + 1e-12) - np.log1p(share)])
     sigma_m = np.hypot(_sigma_m(problem.measured_root) * noise.position, SLACK_M)
@@ -57,11 +58,12 @@ def incremental(
         met = mine[known[problem.place[mine]]]
         if len(met):
             within = STILL_M + noise.translation * np.sqrt(unsure_s), STILL_RAD + noise.rotation * np.sqrt(unsure_s)
-            candidate = _candidates(pose[row], either[:, met], place[problem.place[met]], turned[met])
+            alike = problem.symmetries[problem.place[met]]
+            candidate = _candidates(pose[row], ways[:, met], place[problem.place[met]], turned[met], alike)
             cost = _moved(candidate, within)
             cost += _seen(
                 candidate, either[:, met], place[problem.place[met]], log_share[:, met], sigma_m[met], sigma_rad[met],
-                turned[met],
+                turned[met], alike,
             ).sum(axis=1)  # fmt: skip
             cost[0] -= WORTH
             best = int(np.argmin(cost))
@@ -84,12 +86,16 @@ def _sigma_m(root: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((inverse**2).sum(axis=(1, 2)) / 3.0))
 
 
-def _candidates(predicted: FloatArray, either: FloatArray, place: FloatArray, turned: BoolArray) -> FloatArray:
-    """(C, 7) the predicted pose, then where each detection (2, K, 7) of a place with an orientation puts the robot, and
+def _candidates(
+    predicted: FloatArray, ways: FloatArray, place: FloatArray, turned: BoolArray, alike: Symmetries
+) -> FloatArray:
+    """(C, 7) the predicted pose, then where each detection (E, K, 7) of a place with an orientation puts the robot, and
     where the positions of three or more put it.
     """
-    by_places = se3.compose(place[None], se3.inverse(either))[:, turned].reshape(-1, 7)
-    by_all = rigid(either[0, :, :3], place[:, :3])[None] if len(place) >= 3 else np.zeros((0, 7))
+    seen, known = ways[:, turned], place[turned]
+    known = np.stack([alike[turned].twisted(known, se3.compose(predicted, one)) for one in seen])
+    by_places = se3.compose(known, se3.inverse(seen)).reshape(-1, 7)
+    by_all = rigid(ways[0, :, :3], place[:, :3])[None] if len(place) >= 3 else np.zeros((0, 7))
     return np.vstack([predicted[None], by_places, by_all])
 
 
@@ -102,11 +108,11 @@ def _moved(candidate: FloatArray, spread: tuple[float, float]) -> FloatArray:
 
 def _seen(
     candidate: FloatArray, either: FloatArray, place: FloatArray, log_share: FloatArray, sigma_m: FloatArray,
-    sigma_rad: FloatArray, turned: BoolArray,
+    sigma_rad: FloatArray, turned: BoolArray, alike: Symmetries,
 ) -> FloatArray:  # fmt: skip
     """(C, K) nats that the detections cost."""
     at = se3.compose(candidate[:, None, None, :], either[None])
     away = np.linalg.norm(at[..., :3] - place[:, :3], axis=-1) / sigma_m
-    angle = np.where(turned, se3.angle_between(at, place), 0.0) / sigma_rad
+    angle = np.where(turned, alike.angle_between(at, place), 0.0) / sigma_rad
     cost = 0.5 * away**2 + 0.5 * angle**2 - log_share[None]
     return np.asarray(np.minimum(cost.min(axis=1), OUTLIER))
