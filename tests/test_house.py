@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 252
-MOST_LINES = 58_975
+MOST_MODULES = 255
+MOST_LINES = 60_080
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

@@ -142,8 +142,7 @@ def _bring_in_space(
     from evermap.slam.space.moving import has_traffic
 
     if has_traffic(recording):
-        problem = f"{recording.name}: boxes without identity are not found again from session to session"
-        raise DataError(problem, field="landmark_id", hint="evermap slam without --map follows them")
+        return _bring_in_traffic(recording, living, config, progress)
     recording, living = steps.admitted(recording, living)
     intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
@@ -163,6 +162,36 @@ def _bring_in_space(
         session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
         after = session.living if vicinity is None else vicinity.put_back(session.living)
         return replace(session, living=in_chunks(after, config.living))
+
+
+def _bring_in_traffic(
+    recording: SpatialRecording, living: LivingMap, config: Config, progress: Progress | None
+) -> Session:
+    """The same with boxes without identity, which get theirs from the map."""
+    from threadpoolctl import threadpool_limits
+
+    from evermap.maps.sessions import believe
+    from evermap.maps.sessions import session as steps
+    from evermap.maps.sessions.boxes import visited_in_traffic, without_strays
+    from evermap.maps.vicinity import in_chunks
+    from evermap.slam.space.moving import take_in_traffic
+
+    recording, whole = steps.admitted(recording, living)
+    with threadpool_limits(limits=1, user_api="blas"):
+        taken = take_in_traffic(recording, config.slam.space, config.track)
+        p_site = believe.aged(whole, config.living, float(taken.recording.frames.stamp_s[0])).p_here
+        visit, where = visited_in_traffic(taken, whole, p_site, config, progress)
+        if where is None and len(whole.places):
+            return steps.lost(visit, whole, config.living, steps.NOT_FOUND)
+        living, vicinity = visit.named(whole), None
+        if where is not None and len(whole.places) > config.living.whole_places:
+            vicinity, where = steps.around(living, where, visit, config.living)
+            living = vicinity.part
+        known = steps.judged(living, where, visit, config.living)
+        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
+        after = session.living if vicinity is None else vicinity.put_back(session.living)
+        after = without_strays(in_chunks(after, config.living))
+        return replace(session, living=after, recording=taken.recording)
 
 
 def solve_alone(recording: Recording, living: LivingMap, config: Config, *, progress: Progress | None = None) -> Solved:

@@ -54,7 +54,12 @@ class _Rows(ShownTable):
     @classmethod
     def empty(cls, dim: int = 2) -> Self:
         """Return a table of no rows, of the plane or, with `dim=3`, of space."""
-        shapes = {"position_m": (0, dim), "rotation": (0, TURNS[dim]), "rotation_covariance": (0, *2 * (AXES[dim],))}
+        shapes = {
+            "position_m": (0, dim),
+            "size_m": (0, 3),
+            "rotation": (0, TURNS[dim]),
+            "rotation_covariance": (0, *2 * (AXES[dim],)),
+        }
         return cls(*(np.zeros(shapes.get(f.name, (0,)), _DTYPES[str(f.type)]) for f in fields(cls)))
 
     def __getitem__(self, rows: IntArray | BoolArray) -> Self:
@@ -194,6 +199,24 @@ class Dated(_Rows):
 
 
 @dataclass(frozen=True, slots=True)
+class Boxes(_Rows):
+    """Landmarks that were seen as boxes without identity: the map gave them their ids.
+
+    Attributes:
+        landmark_id: (B,) sorted.
+        size_m: (B, 3) length, width and height.
+    """
+
+    landmark_id: IntArray
+    size_m: FloatArray
+
+    def of(self, landmark_id: IntArray) -> FloatArray:
+        """Return (K, 3) sizes of landmarks, nan of others."""
+        row = _rows_among(self.landmark_id, landmark_id)
+        return np.asarray(np.vstack([self.size_m, np.full((1, 3), np.nan)])[row])
+
+
+@dataclass(frozen=True, slots=True)
 class LivingMap(Shown):
     """All that is known of a place at one instant; what one session hands to the next.
 
@@ -201,7 +224,7 @@ class LivingMap(Shown):
         stamp_s: until when observations went in: beliefs are those of this instant, but for `dated` ones. -inf before
             the first session.
         session_start_s: begin of the newest session; one that begins earlier is late.
-        members, sites, places, stays, dated: see there.
+        members, sites, places, stays, dated, boxes: see there.
         covariance_m2: (2 P, 2 P) joint covariance of all places, x and y interleaved, as if the map's size were known;
             or (P, 2, 2) blocks, while the places are independent; in chunks where there are many; with 3 for 2 in
             space.
@@ -224,6 +247,7 @@ class LivingMap(Shown):
     places: Places = field(default_factory=Places.empty)
     stays: Stays = field(default_factory=Stays.empty)
     dated: Dated = field(default_factory=Dated.empty)
+    boxes: Boxes = field(default_factory=Boxes.empty)
     covariance_m2: JointCovariance = field(default_factory=lambda: np.zeros((0, 0)))
     log_size_variance: float = 0.0
     log_size_information: float = np.inf
@@ -438,6 +462,7 @@ class LivingMap(Shown):
             names=self.landmark_names,
             rotation=self.places.rotation[row] if oriented else None,
             rotation_covariance=self.places.rotation_covariance[row] if oriented else None,
+            size_m=self.boxes.of(name) if len(self.boxes) else None,
         )
 
     def place_covariance_m2(self, row: IntArray) -> FloatArray:
@@ -483,6 +508,7 @@ class LivingMap(Shown):
             members=members,
             sites=self.sites[np.isin(self.sites.site_id, places.site_id)],
             dated=self.dated[np.isin(self.dated.site_id, places.site_id)],
+            boxes=self.boxes[np.isin(self.boxes.landmark_id, members.landmark_id)],
             places=places,
             stays=self.stays[np.isin(self.stays.clique_id, members.clique_id)],
             covariance_m2=taken(self.covariance_m2, kept, self.dim),

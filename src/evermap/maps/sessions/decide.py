@@ -98,7 +98,7 @@ class _Session:
         last_s, gone_s, p_gone: (K,) of the stays; p_kept: (S,) of the sites.
         same_spot_m: how close to where it stood a clique has not moved.
         hidden, shown: (3,) expected numbers of cliques that were there and not seen, and seen, by `PlaceLooks.sight`.
-        begun: clique, site, not there before, first and last sighting of new stays.
+        begun: clique, site, not there before, first and last sighting of new stays; when they ended, and how probably.
         found: changes.
     """
 
@@ -124,7 +124,7 @@ class _Session:
     p_kept: FloatArray
     hidden: FloatArray
     shown: FloatArray
-    begun: list[tuple[int, int, float, float, float]]
+    begun: list[tuple[int, int, float, float, float, float, float]]
     found: list[MapChange]
 
     @classmethod
@@ -207,6 +207,9 @@ class _Session:
         """Decide on a clique that stood nowhere, or is new."""
         clique, site, sites = int(self.cliques[row]), int(self.site[row]), self.after.sites
         newest = self.newest.get(clique, -1)
+        if site in self.arrivals.left_s and not self._stands(row):
+            self._came_and_left(row, site, newest)
+            return
         if not (self._stands(row) and self.hits[site]):
             if newest >= 0 and np.isfinite(self.gone_s[newest]):
                 at = _row(self.after, int(self.after.stays.site_id[newest]))
@@ -224,7 +227,7 @@ class _Session:
         if newest >= 0:
             self.p_gone[newest] = max(self.p_gone[newest], probability)
         since = self._begins(clique, site, elsewhere_s)
-        if probability >= EXISTS and len(self.before.places):
+        if probability >= EXISTS:
             p, left = probability * float(sites.p_here[site]), _last_site(self.before, self.after, clique)
             n_misses = int(self.misses[left]) if left >= 0 else 0
             self._tell(kind, left, site, elsewhere_s, since, p, int(self.hits[site]), n_misses)
@@ -234,7 +237,8 @@ class _Session:
         stays = replace(self.after.stays, last_s=self.last_s, gone_s=self.gone_s, p_gone=self.p_gone)
         if not self.begun:
             return stays
-        clique_id, site, elsewhere_s, first_s, last_s = (np.array(part) for part in zip(*self.begun, strict=True))
+        columns = (np.array(part) for part in zip(*self.begun, strict=True))
+        clique_id, site, elsewhere_s, first_s, last_s, gone_s, p_gone = columns
         fresh = Stays(
             clique_id,
             self.after.sites.site_id[site],
@@ -243,8 +247,8 @@ class _Session:
             elsewhere_s,
             first_s,
             last_s,
-            np.full(len(site), np.inf),
-            np.zeros(len(site)),
+            gone_s,
+            p_gone,
         )
         stays = stays.joined(fresh)
         return stays[np.argsort(stays.first_s, kind="stable")]
@@ -262,7 +266,7 @@ class _Session:
         site, sites = int(self.site[row]), self.after.sites
         if stay < 0:  # a body that was taken apart: its part goes on
             first_s, last_s = float(sites.since_s[site]), float(sites.seen_s[site])
-            self.begun.append((int(self.cliques[row]), site, -np.inf, first_s, last_s))
+            self.begun.append((int(self.cliques[row]), site, -np.inf, first_s, last_s, np.inf, 0.0))
         else:
             self.last_s[stay] = max(self.last_s[stay], sites.seen_s[site])
             if self.hits[site]:  # if it was missed before, it was hidden then
@@ -292,9 +296,12 @@ class _Session:
 
     def _since_when(self, site: int, newest: int, same: bool, share: float) -> tuple[ChangeKind, float, float]:
         """Whether a clique that is there now returned or appeared, until when it was not there, and how probably."""
+        came_s, p_came = self.arrivals.came.get(site, (-np.inf, 0.0))
         if newest >= 0:  # where it was last it was found missing; elsewhere it may have come when it left
-            elsewhere_s = float(self.gone_s[newest] if same else self.last_s[newest])
+            elsewhere_s = max(float(self.gone_s[newest] if same else self.last_s[newest]), came_s)
             return ChangeKind.RETURNED, elsewhere_s, 1.0 - share if same else 1.0
+        if p_came >= EXISTS:
+            return ChangeKind.APPEARED, came_s, p_came
         at = np.flatnonzero(self.arrivals.site == site)
         if not len(at) or self.arrivals.p_appeared[at[0]] < EXISTS:
             return ChangeKind.APPEARED, -np.inf, 0.0
@@ -310,12 +317,23 @@ class _Session:
             self.p_gone[stay] = probability
         return left_s
 
-    def _begins(self, clique: int, site: int, elsewhere_s: float) -> float:
-        """A stay begins; returns when it was seen first."""
+    def _begins(self, clique: int, site: int, elsewhere_s: float, gone_s: float = np.inf, p_gone: float = 0.0) -> float:
+        """A stay begins, and may have ended by now; returns when it was seen first."""
         sites = self.after.sites
         since = max(float(sites.since_s[site]), float(np.nextafter(elsewhere_s, np.inf)))
-        self.begun.append((clique, site, elsewhere_s, since, max(float(sites.seen_s[site]), since)))
+        last_s = max(float(sites.seen_s[site]), since)
+        self.begun.append((clique, site, elsewhere_s, since, last_s, max(gone_s, last_s), p_gone))
         return since
+
+    def _came_and_left(self, row: int, site: int, newest: int) -> None:
+        """A stay that began and ended while it was looked at."""
+        p_away, left_s = float(self.p_away[row]), self.arrivals.left_s[site]
+        kind, elsewhere_s, probability = self._since_when(site, newest, same=False, share=0.0)
+        since = self._begins(int(self.cliques[row]), site, elsewhere_s, left_s, p_away)
+        if probability >= EXISTS:
+            self._tell(kind, -1, site, elsewhere_s, since, probability, int(self.hits[site]), 0)
+        last_s = float(self.after.sites.seen_s[site])
+        self._tell(ChangeKind.VANISHED, site, -1, last_s, max(left_s, last_s), p_away, 0, int(self.misses[site]))
 
     def _tell(
         self,

@@ -14,8 +14,8 @@ known of a class). Without a look the map grew, and nothing has changed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -264,11 +264,15 @@ class Arrivals:
         site: (A,) row of the new site.
         looked_s: (A,) last time before this session at which its place was looked at; -inf for never.
         p_appeared: (A,) probability that it came after that; 0 without a look.
+        came: by row of a site, until when what was seen to come there was not there, and how probably it came.
+        left_s: by row of a site, when what came there was seen to leave again.
     """
 
     site: IntArray
     looked_s: FloatArray
     p_appeared: FloatArray
+    came: Mapping[int, tuple[float, float]] = field(default_factory=dict)
+    left_s: Mapping[int, float] = field(default_factory=dict)
 
 
 def arrivals(

@@ -29,10 +29,10 @@ from evermap.maps.sessions.gaussian import (
 from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, arrivals, looked_at
 from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
 from evermap.maps.sessions.spatial import SpatialVisit
+from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam import result as of_slam
 from evermap.slam.estimate import Solved
-from evermap.slam.space.result import concluded_in_space
 from evermap.slam.streaming import Outcome
 from evermap.types import (
     UNKNOWN,
@@ -200,6 +200,15 @@ def widened(
     return vicinity, replace(where, place=place)
 
 
+def around(living: LivingMap, where: Laid, visit: SpatialVisit, config: LivingConfig) -> tuple[Vicinity, Laid]:
+    """Return the part of a large map that a session can touch, and where it lies there, by rows of the whole."""
+    at = where.place >= 0
+    seen = Vicinity.of(living, cliques_of(living, where.landmark_id[at]), config)
+    place, places = where.place.copy(), living.places[where.place[at]]
+    place[at] = seen.part.place_row(places.landmark_id, places.site_id)
+    return widened(seen, replace(where, place=place), visit.path_m, visit.floor_sensor, config)
+
+
 def refit(
     living: LivingMap, p_site: FloatArray, where: Laid, alone: Solved, config: LivingConfig, *, robust: bool, part: bool
 ) -> tuple[LivingMap, Laid, Solved]:
@@ -310,7 +319,8 @@ def judged(
     entry = entered(living, aged.p_here, where, found, visit, config)
     seen, eye = looks(entry, visit, config)
     now = believed(entry, seen, visit, config)
-    after, changes = decided(entry.before, now, seen, visit, config, known.classes if known is not None else None)
+    now, seen = _without_departed(entry, now, seen, visit)
+    after, changes = decided(entry, now, seen, visit, config, known.classes if known is not None else None)
     after, classes = learned(after, seen, replace(entry, living=now.living), eye, config)
     return Judged(after, changes, now.evidence, missed(now.living, seen, visit), classes, found)
 
@@ -426,6 +436,15 @@ def believed(entry: Extended, seen: PlaceLooks, visit: Visit, config: LivingConf
     return Believed(living, log_evidence, evidence)
 
 
+def _without_departed(entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit) -> tuple[Believed, PlaceLooks]:
+    """Beliefs and looks with what was seen to leave."""
+    if not isinstance(visit, SpatialVisit):
+        return now, seen
+    site = visit.witnessed.sites(entry.living, entry.landmark_id, entry.place)
+    living, said, evidence, seen = departed(now.living, now.log_evidence, now.evidence, seen, visit.witnessed, site)
+    return Believed(living, said, evidence), seen
+
+
 def _sensor(visit: Visit) -> Sensor:
     return visit.floor_sensor if isinstance(visit, SpatialVisit) else visit.recording.sensor
 
@@ -446,20 +465,24 @@ def missed(living: LivingMap, seen: PlaceLooks, visit: Visit) -> Misses:
 
 
 def decided(
-    before: LivingMap, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
+    entry: Extended, now: Believed, seen: PlaceLooks, visit: Visit, config: LivingConfig, classes: ClassLives | None
 ) -> tuple[LivingMap, tuple[MapChange, ...]]:
     """Return the map with its stays up to date and without what is forgotten, and what changed since the session
     before.
 
     Args:
-        before: the map as the session found it.
+        entry: the map as the session found it, and what it found.
         now: with the session's beliefs.
         seen: looks of the session.
         visit: the session.
         config: which parts of the engine are on.
         classes: how long things stay, as the session teaches; None for nothing.
     """
+    before = entry.before
     came = arrivals(before, now.living, seen, _sensor(visit), config.looks)
+    if isinstance(visit, SpatialVisit):
+        site = visit.witnessed.sites(entry.living, entry.landmark_id, entry.place)
+        came = arrived(came, now.living, before, visit.witnessed, site)
     after, changes = decide.decided(
         before, now.living, seen, now.log_evidence, came, visit.start_s, classes, settings=config.decisions
     )
@@ -494,10 +517,7 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     known = replace(found.living.landmarks(), frame=frame, names=names)
     landmarks, gone = rows_of(known, known.p_exists >= EXISTS), rows_of(known, known.p_exists < EXISTS)
     changes = tuple(change.named(names) for change in found.changes)
-    if isinstance(visit, SpatialVisit):
-        slam = concluded_in_space(visit.recording, visit.intake, visit.solved)
-    else:
-        slam = of_slam.result(visit, frame, landmarks)
+    slam = visit.concluded() if isinstance(visit, SpatialVisit) else of_slam.result(visit, frame, landmarks)
     slam = replace(slam, landmarks=landmarks, misses=found.misses, changes=changes, gone=gone)
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
@@ -505,7 +525,7 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
 def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: str) -> Session:
     """Return a session that cannot be found in the map: it stands by itself, and the map as it was."""
     if isinstance(alone, SpatialVisit):
-        result = concluded_in_space(alone.recording, alone.intake, alone.solved)
+        result = alone.concluded()
     else:
         landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, "first_pose")
         result = of_slam.result(alone, "first_pose", landmarks)

@@ -9,7 +9,7 @@ map said. It is laid over the map as any other session, and solved once more wit
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -22,6 +22,7 @@ from evermap.maps.sessions.extend import Extended, Found
 from evermap.maps.sessions.gaussian import anchored, drifted
 from evermap.maps.sessions.looks import Watch
 from evermap.maps.sessions.placing import Laid, Turned, laid_over
+from evermap.maps.sessions.witnessed import Witnessed
 from evermap.sensing import learned
 from evermap.sensing.profile import Assumed, Field, Projection
 from evermap.sensing.visibility import WORTH_A_LOOK, LooksAt
@@ -29,7 +30,7 @@ from evermap.slam.space.against_map import by_itself
 from evermap.slam.space.estimate import SpatialOptimum, converged
 from evermap.slam.space.intake import SpatialIntake, most_of
 from evermap.slam.space.problem import ANY_RAD, PlacePrior
-from evermap.slam.space.result import identities_of, located, numbered
+from evermap.slam.space.result import concluded_in_space, identities_of, located, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved, solve_space
 from evermap.types import (
     UNKNOWN,
@@ -39,6 +40,7 @@ from evermap.types import (
     Landmarks,
     Progress,
     Sensor,
+    SlamResult,
     SpatialRecording,
     landmark_id_of,
 )
@@ -70,11 +72,17 @@ class SpatialVisit:
         recording: as it was used.
         intake: as the estimator wants it.
         solved: its values.
+        witnessed: what was seen to come to rest, or to leave.
     """
 
     recording: SpatialRecording
     intake: SpatialIntake
     solved: SpatialSolved
+    witnessed: Witnessed = field(default_factory=Witnessed.nothing)
+
+    def concluded(self) -> SlamResult:
+        """Return the session as the estimator has it."""
+        return concluded_in_space(self.recording, self.intake, self.solved)
 
     @property
     def start_s(self) -> float:
@@ -219,7 +227,7 @@ class SpatialVisit:
         pose[:, :3, :3] = se3.rotation_of(eye) @ axes[which]
         detected = np.zeros(p.shape, dtype=np.bool_)
         detected[hits] = True
-        for sensor in np.unique(which):
+        for sensor in np.unique(which) if len(places) else ():
             mine = np.flatnonzero(which == sensor)
             model = self._model(int(sensor), places.position_m, places.rotation, pose[mine], detected[mine])
             there = _near_hits(stamp_s[mine], detected[mine], config.looks.settled_s)

@@ -52,7 +52,7 @@ MEMBERS = "members."
 """The table that stays of a pruned revision: whose evidence it has, and what operators said."""
 _LIFE = ("lives.life", "lives.prior")
 _NEWER = ("lives.prior_class_id", "lives.prior", "dated.site_id", "dated.stamp_s", "places.rotation",
-          "places.rotation_covariance")  # fmt: skip
+          "places.rotation_covariance", "boxes.landmark_id", "boxes.size_m")  # fmt: skip
 """Not written where there is none, so that an older evermap reads the map."""
 
 Fetch = Callable[[Iterable[bytes]], Mapping[bytes, bytes]]
@@ -304,6 +304,7 @@ _EQUALLY_LONG = {
     "places": tuple(item.name for item in fields(Places)),
     "stays": tuple(item.name for item in fields(Stays)),
     "dated": ("site_id", "stamp_s"),
+    "boxes": ("landmark_id", "size_m"),
     "lives": ("class_id", "chunk", "life"),
     "sightlines": ("site_id", "landmark_id", "cell", "hits", "looks"),
     "views": ("cell", "heading", "stamp_s", "frames"),
@@ -322,7 +323,8 @@ _NEXT_FREE = {
 _FINITE = (
     "places.position_m", "stays.position_m", "log_size_variance", "dated.stamp_s", "lives.chunk_m",
     "sightlines.cell_m", "sightlines.hits", "sightlines.looks", "sightlines.hidden", "sightlines.shown",
-    "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s", "sites.since_s", "sites.seen_s",
+    "boxes.size_m", "views.cell_m", "views.stamp_s", "views.frames", "stays.first_s", "stays.last_s",
+    "sites.since_s", "sites.seen_s",
 )  # fmt: skip
 _NUMBERS = ("stays.elsewhere_s", "stays.gone_s", "lives.looks_s", "stamp_s", "session_start_s")
 _PROBABILITIES = ("sites.p_here", "sites.p_kept", "stays.p_gone")
@@ -366,7 +368,7 @@ def _flaws_of_shapes(living: LivingMap) -> Iterator[str]:
 
 def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
     """Sorted unique ids, references that lead somewhere."""
-    for column in ("members.landmark_id", "sites.site_id", "dated.site_id"):
+    for column in ("members.landmark_id", "sites.site_id", "dated.site_id", "boxes.landmark_id"):
         ids = attrgetter(column)(living)
         if np.any(ids[1:] <= ids[:-1]):
             yield f"'{column}' is not sorted, or not unique"
@@ -377,6 +379,7 @@ def _flaws_of_ids(living: LivingMap) -> Iterator[str]:
         ("dated.site_id", living.sites.site_id),
         ("places.site_id", living.sites.site_id),
         ("places.landmark_id", living.members.landmark_id),
+        ("boxes.landmark_id", living.members.landmark_id),
     ):
         if not np.isin(attrgetter(column)(living), known).all():
             yield f"'{column}' names one that is not there"

@@ -149,7 +149,7 @@ def _symmetries(recording: SpatialRecording, place: IntArray, used: IntArray, ki
 def _too_little(recording: SpatialRecording, seen: int, fewest: int) -> DataError:
     hint = "check landmark ids, and that detections and odometry share one clock"
     if np.isfinite(recording.detections.size_m).any():
-        hint = "boxes without identities need `odometry`, and are solved without a map"
+        hint = "boxes without identities need `odometry`"
     return DataError(
         f"{recording.name}: landmarks of known identity were seen in {seen} frames, at least {fewest} needed", hint=hint
     )

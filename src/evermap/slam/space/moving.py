@@ -18,7 +18,7 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import SIGMA_BEND, SIGMA_SCALE, Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import NO_TURN, prepare_space
+from evermap.slam.space.intake import NO_TURN, SpatialIntake, prepare_space
 from evermap.slam.space.result import concluded_in_space, numbered
 from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
@@ -70,7 +70,7 @@ class Traffic:
 
 def has_traffic(recording: SpatialRecording) -> bool:
     """Return whether there are boxes without identity, and odometry."""
-    return recording.odometry is not None and len(recording.odometry) > 1 and len(_boxes(recording)) > 0
+    return recording.odometry is not None and len(recording.odometry) > 1 and len(boxes_of(recording)) > 0
 
 
 def run_in_traffic(
@@ -94,8 +94,42 @@ def run_in_traffic(
         NumericalError: no finite optimum.
     """
     if prior_map is not None:
-        problem = "boxes without identity cannot be found in a map"
-        raise ConfigError(problem, field="prior_map", hint="leave it out: what stands becomes a map")
+        problem = "boxes without identity cannot be found in a map that is fixed"
+        raise ConfigError(problem, field="prior_map", hint="leave it out, or enter the session into a living map")
+    taken = take_in_traffic(recording, space, track)
+    result, followed = conclude_in_traffic(taken, taken.intake, solve_in_traffic(taken, progress), track)
+    return with_stays(result, taken.traffic, followed, taken.known, taken.rows)
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficIntake:
+    """A recording in traffic as the solver takes it.
+
+    Attributes:
+        recording: with a frame for every pose; its other detections are left out.
+        rows: (M,) of these in the recording that was given.
+        driven: (F, 7) poses by the odometry, from the first frame.
+        traffic: what stands, and what moves.
+        known: the first identity that is no landmark of the recording: stay `k` has `known + k`.
+        used: (K,) rows of the detections that have an identity for the solver.
+        standing: the recording with these only, without errors that repeat themselves.
+        intake: of that.
+    """
+
+    recording: SpatialRecording
+    rows: IntArray
+    driven: FloatArray
+    traffic: Traffic
+    known: int
+    used: IntArray
+    standing: SpatialRecording
+    intake: SpatialIntake
+
+
+def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: TrackConfig) -> TrafficIntake:
+    """Return what stands in a recording with the errors that repeat themselves taken off; arguments as of
+    `run_in_traffic`.
+    """
     recording, rows = _whole(recording)
     driven = _driven(recording)
     traffic = _settled(recording, driven, space, track)
@@ -103,19 +137,41 @@ def run_in_traffic(
     standing_only = _standing_only(recording, driven, traffic, identity)
     intake = prepare_space(standing_only, space, fewest=0)
     intake = replace(intake, problem=replace(intake.problem, steady=True))
-    solved = _wandering(solve_space(intake, None, progress=progress))
-    result = concluded_in_space(standing_only, intake, solved)
-    followed = _followed(recording, result.trajectory.pose_world_robot, traffic.gauge, track)
+    used = np.flatnonzero(identity != UNKNOWN)
+    return TrafficIntake(recording, rows, driven, traffic, _known(recording), used, standing_only, intake)
+
+
+def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:
+    """Return the solution of what stands, by itself.
+
+    Raises:
+        NumericalError: no finite optimum.
+    """
+    return _wandering(solve_space(taken.intake, None, progress=progress))
+
+
+def conclude_in_traffic(
+    taken: TrafficIntake, intake: SpatialIntake, solved: SpatialSolved, track: TrackConfig
+) -> tuple[SlamResult, TrackResult | None]:
+    """Return poses and what stands, rows of detections those of `taken.recording`; and tracks along these poses."""
+    result = concluded_in_space(taken.standing, intake, solved)
+    followed = _followed(taken.recording, result.trajectory.pose_world_robot, taken.traffic.gauge, track)
     if followed is not None:
-        p_still = _stands(recording, followed).p_still
+        p_still = _stands(taken.recording, followed).p_still
         of_row = [p_still.get(one, np.nan) for one in followed.tracks.track_id.tolist()]
         followed = replace(followed, p_static=np.array(of_row, dtype=np.float64))
-    rows = rows[identity != UNKNOWN]
-    return with_stays(_beside(result, driven), traffic, followed, _known(recording), rows)
+    alone = se3.compose(result.trajectory.pose_world_robot[0], taken.driven)
+    return replace(
+        result,
+        innovations=replace(result.innovations, detection=taken.used[result.innovations.detection]),
+        dead_reckoning=replace(result.dead_reckoning, pose_world_robot=alone),
+        parameters=(*result.parameters, *_parameters(taken.traffic.gauge)),
+        followed=followed,
+    ), followed
 
 
-def _boxes(recording: SpatialRecording) -> IntArray:
-    """Rows of boxes without identity."""
+def boxes_of(recording: SpatialRecording) -> IntArray:
+    """Return rows of boxes without identity."""
     given = recording.detections
     return np.flatnonzero((given.landmark_id == UNKNOWN) & np.isfinite(given.size_m).all(axis=1))
 
@@ -149,8 +205,8 @@ def _driven(recording: SpatialRecording) -> FloatArray:
 
 def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig, track: TrackConfig) -> Traffic:
     """Identities, what stands, and the errors that repeat themselves: in turns, until the errors are the same."""
-    rows, stamps, gauge = _boxes(recording), recording.frames.stamp_s, Gauge(space.range_scale)
-    mount, frame = _mounts(recording)[rows], recording.detections.frame[rows]
+    rows, stamps, gauge = boxes_of(recording), recording.frames.stamp_s, Gauge(space.range_scale)
+    mount, frame = mounts_of(recording)[rows], recording.detections.frame[rows]
     seen = se3.transform(mount, recording.detections.position_sensor_m[rows])
     followed, stands = None, _stands(recording, None)
     for _ in range(ROUNDS):
@@ -169,15 +225,15 @@ def _settled(recording: SpatialRecording, driven: FloatArray, space: SpaceConfig
     return Traffic(followed, stands, gauge)
 
 
-def _mounts(recording: SpatialRecording) -> FloatArray:
-    """(M, 7) of the sensor of each detection."""
+def mounts_of(recording: SpatialRecording) -> FloatArray:
+    """Return (M, 7) poses on the robot of the sensor of each detection."""
     return np.array([sensor.mount_robot_sensor for sensor in recording.sensors])[recording.detections.sensor]
 
 
 def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track: TrackConfig) -> TrackResult | None:
     """What the tracker says of the boxes, with the robot at poses (F, 7)."""
-    given, rows, stamps = recording.detections, _boxes(recording), recording.frames.stamp_s
-    mount = _mounts(recording)[rows]
+    given, rows, stamps = recording.detections, boxes_of(recording), recording.frames.stamp_s
+    mount = mounts_of(recording)[rows]
     local = np.column_stack([gauge.range_scale * given.position_sensor_m[rows], given.rotation[rows]])
     local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], NO_TURN)
     local = se3.compose(mount, local)
@@ -207,7 +263,7 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
 
 def _stands(recording: SpatialRecording, followed: TrackResult | None) -> Stood:
     """What of the boxes stands."""
-    rows = _boxes(recording)
+    rows = boxes_of(recording)
     stamp_s = recording.frames.stamp_s[recording.detections.frame[rows]]
     if followed is None:
         nobody = np.full(len(rows), UNKNOWN)
@@ -220,7 +276,7 @@ def _stands(recording: SpatialRecording, followed: TrackResult | None) -> Stood:
 def _identity(recording: SpatialRecording, stands: Stood) -> IntArray:
     """(M,) identities of the solver: of boxes their stay, where they stand."""
     identity = recording.detections.landmark_id.copy()
-    identity[_boxes(recording)] = np.where(stands.stay == UNKNOWN, UNKNOWN, _known(recording) + stands.stay)
+    identity[boxes_of(recording)] = np.where(stands.stay == UNKNOWN, UNKNOWN, _known(recording) + stands.stay)
     return identity
 
 
@@ -229,7 +285,7 @@ def _standing_only(
 ) -> SpatialRecording:
     """The recording as the solver takes it: with what has an identity (M,), and without repeated errors."""
     assert recording.odometry is not None
-    rows, given = _boxes(recording), recording.detections
+    rows, given = boxes_of(recording), recording.detections
     rotation, position = given.rotation.copy(), given.position_sensor_m.copy()
     rotation[rows] = np.nan  # the heading of a box is no better than a few degrees, and the wrong way now and then
     position[rows] *= traffic.gauge.range_scale
@@ -259,12 +315,6 @@ def _wandering(solved: SpatialSolved) -> SpatialSolved:
     return replace(solved, optimum=other) if better else solved
 
 
-def _beside(result: SlamResult, driven: FloatArray) -> SlamResult:
-    """The result beside the odometry as it was given."""
-    alone = replace(result.dead_reckoning, pose_world_robot=se3.compose(result.trajectory.pose_world_robot[0], driven))
-    return replace(result, dead_reckoning=alone)
-
-
 def with_stays(
     result: SlamResult, traffic: Traffic, followed: TrackResult | None, known: int, rows: IntArray
 ) -> SlamResult:
@@ -275,7 +325,7 @@ def with_stays(
         traffic: by which these were chosen.
         followed: the tracks along the estimated poses.
         known: the first id that is no landmark of the recording.
-        rows: (K,) of the recording's detections that were used.
+        rows: (M,) of the detections in the recording that was given.
     """
     landmarks, track = result.landmarks, _tracks(traffic.standing, followed)
     identities, names = _identities(track, known)
@@ -294,9 +344,7 @@ def with_stays(
         result,
         landmarks=rows_of(told, np.argsort(new, kind="stable")),
         innovations=replace(result.innovations, landmark_id=asked, detection=rows[result.innovations.detection]),
-        parameters=(*result.parameters, *_parameters(traffic.gauge)),
         changes=(*result.changes, *_changes(traffic.standing, identities, names)),
-        followed=followed,
     )
 
 

@@ -1,0 +1,204 @@
+"""Where boxes without identity lie in a map: by the frame of an odometry, or by their constellation.
+
+One way to lay a session over the map must be far better than all others, since a wrong place is worse than none: rows
+of parked cars resemble each other, and cars come and go (`slam.association.constellation`).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from evermap.geometry import se2
+from evermap.geometry.chunked import blocks
+from evermap.geometry.rigid import rigid
+from evermap.maps.living import LivingMap
+from evermap.maps.sessions.box_visit import HEADING_RAD, SeenBoxes
+from evermap.slam.association.constellation import CERTAIN_NATS, LocalMap, agreed_pairs
+from evermap.slam.association.identify import ALL_TRIED
+from evermap.slam.association.place_index import PlaceIndex
+from evermap.tracking.frame import heading_of
+from evermap.types import BoolArray, FloatArray, IntArray
+
+DRIFT_M = 0.2
+"""By which a box that nobody moved seems to be elsewhere, each axis: another side of it is seen."""
+SIZE_M, SIZES_M = (0.4, 0.15, 0.15), (0.6, 0.2, 0.25)
+"""Standard deviations of the size of one box from session to session, and of boxes of a class."""
+GATE = 18.4
+"""Squared distance of two dimensions that one of 10,000 exceeds."""
+LEAST_DENSITY = 0.02
+"""Boxes a square metre that are expected where things stand."""
+SHARED_PAIRS, FOUND_PAIRS, ENOUGH_PAIRS = 3, 4, 8
+"""Boxes that must agree with the odometry's frame, and with a place that was searched for; so many are not searched
+for again.
+"""
+SHARED_NATS = 4.0
+"""Evidence that it takes for the odometry's frame, which is asked once."""
+LEAD_NATS = 12.0
+"""By how much the constellation of a place must beat all others: rows of parked cars resemble each other."""
+WINDOW, STRIDE = 12, 6
+"""Boxes, one after the other on the way, that are searched for in the map together."""
+TESTED_M2 = 157.0
+"""Area that one trial of the search covers: what agrees by chance in a large map is that much more probable."""
+PROBABLE = 0.9
+NEAR_M, LARGEST_TURN = 30.0, 0.3
+"""How far boxes may be off behind a stretch in which nothing was seen [m, rad]."""
+
+
+class MapBoxes(NamedTuple):
+    """Boxes of a map at their places: (M,) rows.
+
+    Attributes:
+        place: row of the map's places.
+        landmark_id, class_id: which.
+        position_m, covariance_m2: (M, 3), (M, 3, 3).
+        heading_rad, size_m: (M,), nan where there is none, and (M, 3).
+        p: probability that it stands there when the session begins.
+    """
+
+    place: IntArray
+    landmark_id: IntArray
+    class_id: IntArray
+    position_m: FloatArray
+    covariance_m2: FloatArray
+    heading_rad: FloatArray
+    size_m: FloatArray
+    p: FloatArray
+
+    @classmethod
+    def of(cls, living: LivingMap, p_site: FloatArray) -> MapBoxes:
+        """Return those of a map, by beliefs (S,) in its sites."""
+        places, members = living.places, living.members
+        row = np.flatnonzero(np.isin(places.landmark_id, living.boxes.landmark_id))
+        name = places.landmark_id[row]
+        known = np.isfinite(places.rotation[row, :1])
+        pose = np.hstack([places.position_m[row], np.where(known, places.rotation[row], [0.0, 0.0, 0.0, 1.0])])
+        member = np.searchsorted(members.landmark_id, name)
+        p = p_site[np.searchsorted(living.sites.site_id, places.site_id[row])]
+        return cls(
+            row, name, members.class_id[member], places.position_m[row],
+            blocks(living.covariance_m2, 3)[row].reshape(-1, 3, 3),
+            np.where(known[:, 0], heading_of(pose), np.nan), living.boxes.of(name),
+            np.where(members.deleted[member], PROBABLE, p),
+        )  # fmt: skip
+
+
+def placed(seen: SeenBoxes, known: MapBoxes) -> FloatArray | None:
+    """Return the motion (7,) from a session to the map; None where nothing tells it without doubt.
+
+    Args:
+        seen: boxes of the session, in the frame of its odometry.
+        known: those of the map.
+    """
+    if not len(known.place) or not len(seen.place):
+        return None
+    every = np.ones(len(known.place), dtype=np.bool_)
+    windows = _windows(np.flatnonzero(np.isfinite(seen.size_m[:, 0])), seen)
+    best = max((_agreed(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
+    if len(best) < SHARED_PAIRS:
+        best = []
+        for some in windows:
+            best = max(best, _agreed(seen, known, some, every), key=len)
+            if len(best) >= ENOUGH_PAIRS:
+                break
+        if len(best) < FOUND_PAIRS:
+            return None
+    mine, theirs = (np.array(part) for part in zip(*best, strict=True))
+    motion = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])
+    return in_space(motion, seen.position_m[mine], known.position_m[theirs])
+
+
+def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
+    """Return rows of boxes of a session, and of the map, that are the same by their constellation.
+
+    Args:
+        seen: boxes of the session, in the map as far as it is known.
+        known: those of the map.
+        place: (K,) rows of the map's places at which those of the session stand, -1 for none.
+    """
+    found: dict[int, int] = {}
+    for some in _windows(np.flatnonzero((place < 0) & np.isfinite(seen.size_m[:, 0])), seen):
+        free = ~np.isin(known.place, place)
+        away = np.linalg.norm(known.position_m[:, None, :2] - seen.position_m[some, :2], axis=2).min(axis=1)
+        pairs = _agreed(seen, known, some, free & (away < NEAR_M))
+        if len(pairs) < FOUND_PAIRS:
+            continue
+        mine, theirs = (np.array(part) for part in zip(*pairs, strict=True))
+        motion = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])
+        off = np.linalg.norm(se2.transform(motion, seen.position_m[mine, :2]) - seen.position_m[mine, :2], axis=1)
+        if abs(motion[2]) < LARGEST_TURN and off.max() < NEAR_M:
+            taken = set(found.values())
+            found |= {one: other for one, other in pairs if one not in found and other not in taken}
+    return np.array(list(found), dtype=np.int64), np.array(list(found.values()), dtype=np.int64)
+
+
+def _windows(rows: IntArray, seen: SeenBoxes) -> list[IntArray]:
+    """Boxes, some at a time, in the order in which they were met."""
+    order = rows[np.argsort(seen.first_s[rows], kind="stable")]
+    return [order[k : k + WINDOW] for k in range(0, max(len(order) - STRIDE, 1), STRIDE)] if len(order) > 1 else []
+
+
+def _agreed(
+    seen: SeenBoxes, known: MapBoxes, some: IntArray, among: BoolArray, motion: FloatArray | None = None
+) -> list[tuple[int, int]]:
+    """Pairs of some boxes of a session with some of the map that are certain; by any motion, or by one that is given.
+
+    Of a covariance only what neighbours do not share matters: those next to each other drift alike.
+    """
+    row = np.flatnonzero(among)
+    if len(row) < 2 or len(some) < 2:
+        return []
+    at, area_m2 = known.position_m[row, :2], float(np.prod(np.ptp(known.position_m[row, :2], axis=0) + 10.0))
+    source = LocalMap(seen.position_m[some, :2], block_diag(*_floor(seen.covariance_m2[some])))
+    motions = None if motion is None else [motion]
+    if motion is None and len(row) > ALL_TRIED:
+        sigma_m = math.sqrt(float(np.trace(source.covariance)) / len(some))
+        motions = list(PlaceIndex(at, _floor(known.covariance_m2[row])).motions(source.place, sigma_m))
+    found = agreed_pairs(
+        source,
+        LocalMap(at, block_diag(*_floor(known.covariance_m2[row]))),
+        _alike(seen, known)[np.ix_(some, row)],
+        density=max(len(row) / area_m2, LEAST_DENSITY),
+        probability=PROBABLE,
+        motions=motions,
+        least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0) if motion is None else SHARED_NATS,
+        lead_nats=LEAD_NATS,
+    )
+    pairs = [(int(some[k]), int(row[m])) for k, m in found]
+    return pairs if not pairs or _headings_agree(seen, known, pairs) else []
+
+
+def _floor(covariance_m2: FloatArray) -> FloatArray:
+    """(K, 2, 2) of positions on the floor."""
+    own = np.minimum(np.diagonal(covariance_m2[:, :2, :2], axis1=1, axis2=2), DRIFT_M**2)
+    return np.asarray((own + DRIFT_M**2)[:, :, None] * np.eye(2))
+
+
+def in_space(motion: FloatArray, own_m: FloatArray, there_m: FloatArray) -> FloatArray:
+    """Return a motion (3,) on the floor as one in space (7,), with the difference in height of points (K, 3)."""
+    half = 0.5 * motion[2]
+    height_m = float(np.median(there_m[:, 2] - own_m[:, 2]))
+    return np.array([motion[0], motion[1], height_m, 0.0, 0.0, np.sin(half), np.cos(half)])
+
+
+def _alike(seen: SeenBoxes, known: MapBoxes) -> BoolArray:
+    """(K, M) boxes that may be one by their class, and by their size about."""
+    off = (seen.size_m[:, None] - known.size_m[None]) / np.array(SIZES_M)
+    return np.asarray((seen.class_id[:, None] == known.class_id) & ~((off**2).sum(axis=2) > GATE))
+
+
+def _headings_agree(seen: SeenBoxes, known: MapBoxes, pairs: list[tuple[int, int]]) -> bool:
+    """Whether boxes turn with the motion that their positions say."""
+    mine, theirs = (np.array(part) for part in zip(*pairs, strict=True))
+    turn = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])[2]
+    off = half_turn(known.heading_rad[theirs] - seen.heading_rad[mine] - turn)
+    off = off[np.isfinite(off)]
+    return not len(off) or float(np.median(np.abs(off))) < 3.0 * HEADING_RAD
+
+
+def half_turn(angle_rad: FloatArray) -> FloatArray:
+    """Return angles between directions that are the same the other way round."""
+    return np.asarray(np.remainder(angle_rad + 0.5 * np.pi, np.pi) - 0.5 * np.pi)

@@ -1,0 +1,360 @@
+"""Boxes without identity in a living map: which of its landmarks they are, and which are new.
+
+The tracker says what stands (`slam.space.moving`). Where a session lies in the map follows from the frame of its
+odometry, if the things that stand agree with it, else from named landmarks, else from the constellation of what stands
+(`slam.association.constellation`): one way to lay it over the map must be far better than all others, since a wrong
+place is worse than none. What stands is then assigned to the boxes of the map, one to one, against 'new' and 'clutter':
+by class, by a Gaussian in the position that the session has with all others held there, by size and heading, and by how
+probably the map's box still stands. Held by these, the session is solved again, until they stay the same.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from evermap.config import Config
+from evermap.geometry import se3
+from evermap.geometry.chunked import blocks
+from evermap.geometry.rigid import consensus
+from evermap.maps.living import LivingMap
+from evermap.maps.sessions.box_search import (
+    DRIFT_M,
+    GATE,
+    LEAST_DENSITY,
+    SHARED_PAIRS,
+    SIZE_M,
+    SIZES_M,
+    MapBoxes,
+    half_turn,
+    in_space,
+    placed,
+    regained,
+)
+from evermap.maps.sessions.box_visit import HEADING_RAD, BoxVisit, SeenBoxes, seen_boxes
+from evermap.maps.sessions.placing import Laid
+from evermap.maps.sessions.witnessed import Witnessed
+from evermap.slam.space.estimate import SpatialOptimum, converged
+from evermap.slam.space.moving import TrafficIntake, solve_in_traffic
+from evermap.slam.space.problem import PlacePrior
+from evermap.slam.space.result import identities_of, numbered
+from evermap.slam.space.solve import FREE, SpatialSolved
+from evermap.types import FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
+
+HEIGHT_M = 0.5
+"""The same of its height over a street that is not flat."""
+SIZE_FLOOR = -8.0
+"""Nats that a size may say against two boxes being one."""
+SAME_SHARE = 0.6
+"""Boxes that stand closer than this share of their widths are one."""
+AT_ONCE_S = 5.0
+"""A box that left, and stands there again so shortly after, had not left."""
+ROUNDS = 12
+MISFIT, STRETCH = 3.0, 8
+"""Mean square of deviations of so many boxes from the map, by what is expected, from which the odometry is believed
+less.
+"""
+WANDERS = (0.003, 0.0003), (0.01, 0.001), (0.03, 0.003)
+"""How much less, one after the other [m/sqrt(s), rad/sqrt(s)]."""
+TILTED = 0.9
+"""Cosine of the tilt up to which the frame of an odometry is upright."""
+NAMED_M = 0.5
+"""A landmark with an identity stands where the map has it if it is this near."""
+LEAST_P, LEAST_GONE = 1e-6, 0.02
+TAILS = (0.7, 1.0), (0.3, 3.0)
+"""Shares of deviations, and how much wider they are than expected."""
+RETURNS = 0.5
+"""Probability beforehand that what is seen to come to where a box of the map had stood is that box."""
+
+
+def visited_in_traffic(
+    taken: TrafficIntake, living: LivingMap, p_site: FloatArray, config: Config, progress: Progress | None = None
+) -> tuple[BoxVisit, Laid | None]:
+    """Return a session solved within a map, and where it lies there; None where the map is empty, or does not show it.
+
+    Args:
+        taken: what stands in the session.
+        living: the map.
+        p_site: (S,) probability of its sites, at the beginning of the session.
+        config: settings.
+        progress: told after every frame.
+
+    Raises:
+        NumericalError: no finite optimum.
+    """
+    solved = solve_in_traffic(taken, progress)
+    solved = replace(solved, optimum=_moved(solved.optimum, _frame_of(taken.recording)))
+    solved = _together(taken, solved, np.arange(len(solved.identity)))
+    known = MapBoxes.of(living, p_site)
+    motion = _placed(taken, solved, living, known) if len(living.places) else None
+    if motion is None:
+        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
+    placed = replace(solved, optimum=_moved(solved.optimum, motion))
+    held, matched = _settled(taken, placed, living, known)
+    if np.count_nonzero(matched.place >= 0) < SHARED_PAIRS:
+        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
+    visit = _visit(taken, held, matched, living, config)
+    order = np.argsort(visit.landmark_id, kind="stable")
+    laid = Laid(
+        visit.landmark_id[order], se3.identity(), matched.place[order], matched.probability[order], DRIFT_M,
+        np.zeros(len(order), dtype=np.bool_),
+    )  # fmt: skip
+    return visit, laid
+
+
+@dataclass(frozen=True, slots=True)
+class _Matched:
+    """Where (P,) places of a session stand in the map: rows of the map's places, -1 for none, and how probably."""
+
+    place: IntArray
+    probability: FloatArray
+
+    @classmethod
+    def nothing(cls, solved: SpatialSolved) -> _Matched:
+        count = len(solved.identity)
+        return cls(np.full(count, -1, dtype=np.int64), np.ones(count))
+
+
+def _frame_of(recording: SpatialRecording) -> FloatArray:
+    """The first pose (7,) in the odometry's own frame, if that is upright."""
+    assert recording.odometry is not None
+    odometry = recording.odometry
+    first = se3.interpolate(odometry.stamp_s, odometry.pose_world_robot, recording.frames.stamp_s[:1])[0]
+    return np.asarray(first if se3.rotation_of(first)[2, 2] > TILTED else se3.identity())
+
+
+def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
+    """The same in another frame, by a rigid motion (7,)."""
+    estimate, oriented = optimum.estimate, optimum.smoother.problem.oriented
+    place = se3.compose(motion, estimate.place)
+    place[~oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    estimate = replace(estimate, pose=se3.compose(motion, estimate.pose), place=place)
+    return converged(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
+
+
+def _together(taken: TrafficIntake, solved: SpatialSolved, label: IntArray) -> SpatialSolved:
+    """The session with places put together that are one: those of one `label` (P,), and boxes that stand in each
+    other.
+    """
+    seen, count = seen_boxes(taken, solved), len(label)
+    first = np.unique(label, return_index=True)[1][np.unique(label, return_inverse=True)[1].ravel()]
+    i, j = _same(seen)
+    one, other = np.concatenate([np.arange(count), seen.place[i]]), np.concatenate([first, seen.place[j]])
+    part = connected_components(csr_array((np.ones(len(one)), (one, other)), shape=(count, count)))[1]
+    if part.max(initial=-1) + 1 == count:
+        return solved
+    began = np.full(count, np.inf)
+    began[seen.place] = seen.first_s
+    order = np.lexsort((began, part))
+    head = order[np.append(True, np.diff(part[order]) > 0)]  # the earliest of each part
+    problem, estimate = solved.optimum.smoother.problem, solved.optimum.estimate
+    weight = np.bincount(problem.place, minlength=count) + 1e-9
+    place = estimate.place[head].copy()
+    total = np.bincount(part, weight)
+    place[:, :3] = np.column_stack([np.bincount(part, weight * axis) / total for axis in estimate.place[:, :3].T])
+    prior = problem.prior
+    kept = np.unique(part[prior.place], return_index=True)[1]
+    prior = replace(rows_of(prior, kept), place=part[prior.place[kept]].astype(np.int64))
+    problem = replace(
+        problem,
+        place=part[problem.place].astype(np.int64),
+        oriented=problem.oriented[head],
+        symmetries=problem.symmetries[head],
+        prior=prior,
+    )
+    optimum = converged(problem, replace(estimate, place=place), solved.optimum.noise, heavy_rounds=0)
+    return replace(solved, optimum=optimum, identity=solved.identity[head], number=solved.number[head])
+
+
+def _same(seen: SeenBoxes) -> tuple[IntArray, IntArray]:
+    """Pairs of boxes that are one: of a class, standing in each other, and neither came when the other had left."""
+    away = np.linalg.norm(seen.position_m[:, None, :2] - seen.position_m[None, :, :2], axis=2)
+    width = np.nan_to_num(seen.size_m[:, 1], nan=0.5)
+    near = (away < SAME_SHARE * 0.5 * (width[:, None] + width)) & (seen.class_id[:, None] == seen.class_id)
+    earlier = (seen.first_s[:, None] < seen.first_s) | np.triu(seen.first_s[:, None] == seen.first_s, 1)
+    left = seen.first_s - seen.until_s[:, None] > AT_ONCE_S  # never where it was not seen to leave
+    came = seen.since_s > seen.last_s[:, None]
+    one, other = np.nonzero(near & earlier & ~left & ~came)
+    return one, other
+
+
+def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tuple[IntArray, IntArray]:
+    """Rows of the problem's places with an identity of the recording, and of where the map has these."""
+    identity = identities_of(taken.intake, solved)[0]
+    members = living.members
+    _, member, row = np.intersect1d(members.landmark_id, identity, return_indices=True)
+    own = taken.intake.landmark_id[solved.identity[row]] < taken.known
+    member, row = member[own], row[own]
+    place = living.place_row(members.landmark_id[member], living.site_of()[member])
+    return row[place >= 0], place[place >= 0]
+
+
+def _placed(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes) -> FloatArray | None:
+    """The motion (7,) from the session to the map; None where nothing tells it without doubt."""
+    row, place = _named(taken, solved, living)
+    own, there = solved.optimum.estimate.place[row, :3], living.places.position_m[place]
+    if len(row) > 1:
+        motion, agree = consensus(own[:, :2], there[:, :2])
+        if agree.sum() > 1:
+            return in_space(motion, own[agree], there[agree])
+    return placed(seen_boxes(taken, solved), known)
+
+
+def _settled(
+    taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
+) -> tuple[SpatialSolved, _Matched]:
+    """The session held by the boxes of the map that it shows, until these stay the same.
+
+    Behind a stretch in which nothing was seen it may be off by more than any gate: there the constellation is asked.
+    """
+    matched = _matched(taken, solved, living, known)
+    for _ in range(ROUNDS):
+        held = _together(taken, _held(solved, living, matched), _labels(matched))
+        following = _matched(taken, held, living, known)
+        settled = np.array_equal(following.place, matched.place)
+        solved, matched = held, following
+        if settled:
+            seen = seen_boxes(taken, solved)
+            mine, theirs = regained(seen, known, matched.place[seen.place])
+            if not len(mine):
+                break
+            matched.place[seen.place[mine]] = known.place[theirs]
+    return solved, matched
+
+
+def _labels(matched: _Matched) -> IntArray:
+    """(P,) the same number for places of a session that stand at one place of the map."""
+    count = len(matched.place)
+    return np.where(matched.place >= 0, count + matched.place, np.arange(count))
+
+
+def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> SpatialSolved:
+    """The session solved with its places held where they stand in the map."""
+    optimum, row = solved.optimum, np.flatnonzero(matched.place >= 0)
+    place = matched.place[row]
+    pose = se3.identity(len(row))
+    pose[:, :3] = living.places.position_m[place]
+    own = np.trace(blocks(living.covariance_m2, 3)[place].reshape(-1, 3, 3)[:, :2, :2], axis1=1, axis2=2) / 2.0
+    sigma = np.full((len(row), 6), np.pi)
+    sigma[:, :3] = np.sqrt(own + DRIFT_M**2)[:, None]
+    sigma[:, 2] = np.hypot(sigma[:, 2], HEIGHT_M)
+    prior = PlacePrior(row, pose, sigma, matched.probability[row])
+    problem = replace(optimum.smoother.problem, prior=prior, start_sigma=np.full(6, FREE), steady=True)
+    noise, found = optimum.noise, optimum
+    for translation, rotation in ((0.0, 0.0), *WANDERS):
+        if translation <= noise.translation and translation > 0.0:
+            continue
+        noise = replace(noise, translation=max(translation, noise.translation), rotation=max(rotation, noise.rotation))
+        found = converged(problem, optimum.estimate, noise, heavy_rounds=0)
+        off = ((found.estimate.place[row, :2] - pose[:, :2]) / sigma[:, :2]) ** 2
+        if max((float(off[k : k + STRETCH].mean()) for k in range(0, len(off), STRETCH)), default=0.0) < MISFIT:
+            break
+    return replace(solved, optimum=found)
+
+
+def _matched(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes) -> _Matched:
+    """Which boxes of the map those of the session are, one to one; parts of one that was lost in between are the
+    same.
+    """
+    seen, count = seen_boxes(taken, solved), len(solved.identity)
+    found = _Matched.nothing(solved)
+    row, place = _named(taken, solved, living)
+    near = np.linalg.norm(solved.optimum.estimate.place[row, :3] - living.places.position_m[place], axis=1)
+    found.place[row[near < NAMED_M]] = place[near < NAMED_M]
+    odds = _log_odds(seen, known)
+    mine, theirs = linear_sum_assignment(np.minimum(-odds, 0.0))
+    good = odds[mine, theirs] > 0.0
+    chosen = np.full(len(seen.place), -1)
+    chosen[mine[good]] = theirs[good]
+    for k in np.flatnonzero(chosen < 0).tolist():
+        other = int(np.argmax(odds[k])) if odds.shape[1] else 0
+        if not odds.shape[1] or odds[k, other] <= 0.0:
+            continue
+        same = np.flatnonzero(chosen == other)
+        apart = (seen.last_s[same] < seen.first_s[k]) | (seen.first_s[same] > seen.last_s[k])
+        seen_to_move = np.isfinite(seen.since_s[k]) | np.isfinite(seen.until_s[same]).any()
+        if apart.all() and not seen_to_move:
+            chosen[k] = other
+    some = np.flatnonzero(chosen >= 0)
+    clutter = np.log((1.0 - seen.p_stay + 1e-6) / (seen.p_stay + 1e-6))
+    total = np.logaddexp(np.logaddexp.reduce(odds[some], axis=1), np.logaddexp(0.0, clutter[some]))
+    found.place[seen.place[some]] = known.place[chosen[some]]
+    found.probability[seen.place[some]] = np.exp(odds[some, chosen[some]] - total)
+    assert len(found.place) == count
+    return found
+
+
+def _log_odds(seen: SeenBoxes, known: MapBoxes) -> FloatArray:
+    """(K, M) log odds that a box of the session is one of the map against that it is new, -inf beyond gates."""
+    off = seen.position_m[:, None, :2] - known.position_m[None, :, :2]
+    spread = seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + DRIFT_M**2 * np.eye(2)
+    squared = np.einsum("kmi,kmi->km", off, np.linalg.solve(spread, off[..., None])[..., 0])
+    near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in TAILS)
+    odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * LEAST_DENSITY)
+    size = seen.size_m[:, None] - known.size_m[None]
+    like, unlike = (-0.5 * (size / np.array(sigma)) ** 2 - np.log(sigma) for sigma in (SIZE_M, SIZES_M))
+    odds += np.maximum(np.nan_to_num((like - unlike).sum(axis=2)), SIZE_FLOOR)
+    turn = half_turn(seen.heading_rad[:, None] - known.heading_rad[None])
+    of_turn = -0.5 * (turn / HEADING_RAD) ** 2 - math.log(math.sqrt(2.0 * math.pi) * HEADING_RAD / math.pi)
+    odds += np.maximum(np.nan_to_num(of_turn), SIZE_FLOOR)
+    # what was seen to come did not stand there, but may have come back
+    p = np.clip(np.where(np.isfinite(seen.since_s)[:, None], RETURNS * (1.0 - known.p), known.p), LEAST_P, 1.0)
+    # and where a box stands there is no room for another one: it must have left
+    width = np.nan_to_num(0.5 * (seen.size_m[:, None, 1] + known.size_m[None, :, 1]), nan=0.5)
+    full = np.linalg.norm(off, axis=2) < SAME_SHARE * width
+    odds += np.log(p) - np.where(full, np.log(np.clip(1.0 - p, LEAST_GONE, 1.0)), 0.0)
+    return np.where((squared < GATE * TAILS[1][1] ** 2) & (seen.class_id[:, None] == known.class_id), odds, -np.inf)
+
+
+def _visit(
+    taken: TrafficIntake, solved: SpatialSolved, matched: _Matched, living: LivingMap, config: Config
+) -> BoxVisit:
+    """The session with ids of the map: its own where a box stands, new ones for the others."""
+    seen = seen_boxes(taken, solved)
+    identity, names = identities_of(taken.intake, solved)
+    kept = np.ones(len(identity), dtype=np.bool_)
+    start = f"{taken.recording.frames.stamp_s[0]:.3f}".rstrip("0").rstrip(".")
+    given = set(living.landmark_texts)
+    for k, place in enumerate(seen.place.tolist()):
+        if matched.place[place] >= 0:
+            continue
+        kind = taken.recording.class_names[seen.class_id[k]] if seen.class_id[k] >= 0 else "box"
+        text, number = f"{kind}-{seen.track[k]}@{start}", 2
+        while text in given:
+            text, number = numbered(f"{kind}-{seen.track[k]}@{start}", number), number + 1
+        given.add(text)
+        identity[place] = landmark_id_of(text)
+        names[int(identity[place])] = text
+    at = np.flatnonzero(matched.place >= 0)
+    identity[at] = living.places.landmark_id[matched.place[at]]
+    members = living.members
+    kept &= ~np.isin(identity, members.landmark_id[members.deleted])
+    brief = seen.until_s - np.where(np.isfinite(seen.since_s), seen.since_s, seen.first_s) < config.track.rest_for_s
+    kept[seen.place[brief & (matched.place[seen.place] < 0)]] = False
+    of_places = taken.intake.landmark_id[solved.identity] >= taken.known
+    kept &= ~of_places | np.isin(np.arange(len(kept)), seen.place)
+    intake = replace(taken.intake, landmark_id=identity, problem=solved.optimum.smoother.problem, names=names)
+    count = len(identity)
+    solved = replace(solved, identity=np.arange(count), number=np.ones(count, dtype=np.int64))
+    moving = np.flatnonzero((np.isfinite(seen.since_s) | np.isfinite(seen.until_s)) & kept[seen.place])
+    witnessed = Witnessed(identity[seen.place[moving]], seen.since_s[moving], seen.until_s[moving], seen.p_stay[moving])
+    return BoxVisit(
+        recording=taken.standing, intake=intake, solved=solved, witnessed=witnessed, taken=taken,
+        track=config.track, boxes=seen, kept=kept,
+    )  # fmt: skip
+
+
+def without_strays(living: LivingMap) -> LivingMap:
+    """Return a map without sizes and names of boxes that it has forgotten."""
+    boxes = living.boxes
+    stays = np.isin(boxes.landmark_id, living.members.landmark_id)
+    if stays.all():
+        return living
+    gone = set(boxes.landmark_id[~stays].tolist())
+    texts = tuple(text for text in living.landmark_texts if landmark_id_of(text) not in gone)
+    return replace(living, boxes=boxes[stays], landmark_texts=texts)

@@ -1,0 +1,148 @@
+"""What was seen to come to rest, or to leave: direct evidence, beside that of looks at places.
+
+A tracker that sees a car drive off knows more than a thousand misses of it would say, since what is missed may be
+hidden. So the belief that it stands ends there and then, and of looks only one remains: the first at which it was gone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from evermap.maps.living import Evidence, LivingMap, clique_rows
+from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
+from evermap.sensing.sightlines import KNOWN
+from evermap.types import FloatArray, IntArray, rows_of
+
+CERTAIN_NATS = 50.0
+"""Log likelihood ratio of having been seen to leave: more than any lifetime outweighs."""
+WHEN_S = 0.5
+"""When a thing came to rest, or left, is known to within this to both sides [s]."""
+LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Witnessed:
+    """Landmarks that a session saw come to rest, or leave: (W,) rows.
+
+    Attributes:
+        landmark_id: which.
+        since_s, until_s: when it came, and when it left; nan where it was not seen.
+        probability: of that.
+    """
+
+    landmark_id: IntArray
+    since_s: FloatArray
+    until_s: FloatArray
+    probability: FloatArray
+
+    @classmethod
+    def nothing(cls) -> Witnessed:
+        """Return none."""
+        return cls(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
+
+    def sites(self, living: LivingMap, landmark_id: IntArray, place: IntArray) -> IntArray:
+        """Return (W,) rows of the sites at which they stood, -1 where they have none: landmarks (K,) at places (K,)."""
+        row = np.full(len(self.landmark_id), -1, dtype=np.int64)
+        _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
+        row[mine] = np.searchsorted(living.sites.site_id, living.places.site_id[place[at]])
+        return row
+
+    def unlooked(self, watch: Watch, landmark_id: IntArray, place: IntArray) -> Watch:
+        """Return what was looked at without the places of these before they came and after they left."""
+        since, until = np.full(1 + int(place.max(initial=0)), -np.inf), np.full(1 + int(place.max(initial=0)), np.inf)
+        _, mine, at = np.intersect1d(self.landmark_id, landmark_id, return_indices=True)
+        since[place[at]] = np.nan_to_num(self.since_s[mine] + WHEN_S, nan=-np.inf)
+        until[place[at]] = np.nan_to_num(self.until_s[mine] - WHEN_S, nan=np.inf)
+        listed = watch.listed
+        row = np.minimum(listed.landmark, len(since) - 1)
+        ours = listed.landmark < len(since)
+        stamp_s = watch.stamp_s[listed.pose]
+        there = ~ours | listed.hit | ((stamp_s > since[row]) & (stamp_s < until[row]))
+        return watch._replace(listed=listed.rows(there))
+
+
+def departed(
+    living: LivingMap, log_evidence: FloatArray, evidence: Evidence, seen: PlaceLooks, what: Witnessed, site: IntArray
+) -> tuple[LivingMap, FloatArray, Evidence, PlaceLooks]:
+    """Return the map without what was seen to leave, and what says so: by clique, frame by frame, and as a look.
+
+    Args:
+        living: the map with the beliefs of the session's looks.
+        log_evidence: (C,) of these for 'it stands somewhere', by clique.
+        evidence: of cliques, frame by frame.
+        seen: looks of the session.
+        what: that was seen.
+        site: (W,) rows of the sites of these, -1 for none.
+    """
+    left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0))
+    if not len(left):
+        return living, log_evidence, evidence, seen
+    sites, (cliques, clique_of) = living.sites, clique_rows(living.sites)
+    at, p_left = site[left], np.clip(what.probability[left], LEAST_P, MOST_P)
+    clique = clique_of[at]
+    p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), log_evidence.copy()
+    p_here[at] *= 1.0 - p_left
+    p_kept[at] *= 1.0 - p_left
+    log_evidence[clique] = -CERTAIN_NATS
+    living = replace(living, sites=replace(sites, p_here=p_here, p_kept=p_kept))
+    total = np.bincount(clique_of, p_here, minlength=len(cliques))
+    stamp_s, none, one = what.until_s[left] + WHEN_S, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)
+    of_left = Evidence(
+        cliques[clique], stamp_s, none, one, np.ones(len(left)), np.log1p(-p_left), np.clip(total[clique], 0.0, 1.0)
+    )
+    evidence = evidence.joined(of_left)
+    evidence = evidence[np.lexsort((evidence.stamp_s, evidence.clique_id))]
+    return living, log_evidence, evidence, _with_looks(living, seen, at, clique, stamp_s)
+
+
+def _with_looks(
+    living: LivingMap, seen: PlaceLooks, site: IntArray, clique: IntArray, stamp_s: FloatArray
+) -> PlaceLooks:
+    """Looks with one more at each of some sites, which finds nothing and cannot be mistaken."""
+    rows, lines, n = seen.rows, seen.lines, len(site)
+    place = np.searchsorted(living.places.site_id, living.sites.site_id[site])
+    last = np.array([np.append(np.flatnonzero(seen.place == one), -1)[-2:][0] for one in place.tolist()])
+    cell = np.append(seen.cell, 0)[last]
+    nothing, lines_of = np.zeros(n, dtype=np.bool_), len(lines.hits)
+    rows = replace(
+        rows,
+        stamp_s=np.append(rows.stamp_s, stamp_s),
+        clique=np.append(rows.clique, clique),
+        site=np.append(rows.site, site),
+        key=np.append(rows.key, np.full(n, lines_of)),
+        hit=np.append(rows.hit, nothing),
+    )
+    sure = lines._replace(
+        p_free=np.append(lines.p_free, 1.0), hits=np.append(lines.hits, KNOWN), misses=np.append(lines.misses, 1.0)
+    )
+    order = np.lexsort((rows.stamp_s, rows.clique))
+    return replace(
+        seen,
+        rows=rows_of(rows, order),
+        place=np.append(seen.place, place)[order],
+        cell=np.append(seen.cell, cell)[order],
+        lines=sure,
+        counts=np.append(seen.counts, ~nothing)[order],
+        settled=np.append(seen.settled, nothing)[order],
+    )
+
+
+def arrived(came: Arrivals, living: LivingMap, before: LivingMap, what: Witnessed, site: IntArray) -> Arrivals:
+    """Return what came with what was seen to come, and what of that left again.
+
+    Args:
+        came: by earlier looks.
+        living: the map with the sites of the session.
+        before: as the session found it.
+        what: that was seen.
+        site: (W,) rows of the sites of these, -1 for none.
+    """
+    seen = {
+        int(site[k]): (float(what.since_s[k] - WHEN_S), float(what.probability[k]))
+        for k in np.flatnonzero(np.isfinite(what.since_s) & (site >= 0))
+    }
+    new = ~np.isin(living.sites.site_id[site], before.sites.site_id) | np.isfinite(what.since_s)
+    left = np.flatnonzero(np.isfinite(what.until_s) & (site >= 0) & new)
+    return replace(came, came=seen, left_s={int(site[k]): float(what.until_s[k] + WHEN_S) for k in left})
