@@ -2,8 +2,12 @@
 
 Each landmark is put where each of its sightings has it along the odometry alone. The squared distance between two of
 these places grows with the time between them: at once by white noise, to a limit by errors that persist (a view, a bias
-of the detector), and for ever by drift. The three are fitted to medians over pairs (a variogram, Matheron 1963), so
-that outliers do not matter.
+of the detector), and for ever by drift. The three are fitted to medians over pairs of instants (a variogram, Matheron
+1963), so that outliers do not matter.
+
+One landmark does not say whether the odometry drifts or its own errors last long. Two that are seen together do: drift
+moves both alike. So the drift is what pairs of landmarks have in common, a robust covariance from the squares of sums
+and of differences (Gnanadesikan and Kettenring 1972).
 
 Things that stand still show what repeats itself: seen from two poses they must be in one place. A scale of the ranges
 looks like one of the odometry, so only their ratio is known, and the odometry's metre holds unless that of the ranges
@@ -14,6 +18,7 @@ sandwich by clusters, Liang and Zeger 1986). A bend is taken only where it is cl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,11 +29,21 @@ from evermap.slam.space.problem import SpatialProblem
 from evermap.types import FloatArray, IntArray
 
 PERSIST_S = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-"""Correlation times of detection errors that are tried together; the last two only where the drift is known."""
+"""Correlation times of detection errors that are tried together; none that is longer than the recording."""
 SIGHTINGS_A_PLACE = 150
 BINS, FEWEST_BINS, FEWEST_PAIRS = 14, 4, 30
+SEEN_TOGETHER, FEWEST_OF_BOTH = 12, 10
+"""Landmarks whose pairs are asked, those seen most; instants, or pairs of these, that it takes."""
 MEDIAN = 2.366
 """Of the chi-square distribution with three degrees of freedom."""
+MOST_LAGS = 50.0
+"""Lags that follow one another in a recording vary independently, but shorter ones are no better known than so many."""
+ROUNDS_OF_FIT, LEAST_OF_SQUARE = 6, 0.1
+LEVERS = (0.5, 1.0, 1.5, 2.0, 3.0)
+"""Drift of one landmark over that which pairs share: farther ones move more when the odometry turns."""
+PERSISTS = 2.0
+"""Nats a curve by which errors that persist must explain all curves better than white ones: of two numbers more for
+each of them (Akaike 1974)."""
 LEAST_DRIFT = 3e-4
 """Metres for the square root of a second; no odometry is better."""
 
@@ -46,46 +61,111 @@ class Drift(NamedTuple):
     share: FloatArray
 
 
+class _Curve(NamedTuple):
+    """Medians of squared distances (K,), for one axis, by their lags [s], and half the degrees of freedom of each."""
+
+    lag_s: FloatArray
+    square: FloatArray
+    worth: FloatArray
+
+
 def drift_of(problem: SpatialProblem, driven: FloatArray) -> Drift:
-    """Return the drift of the odometry, poses (N, 7), and how much of each detection is new."""
+    """Return the drift of the odometry, poses (N, 7), and how much of each detection is new.
+
+    Errors of one detector are alike: either all persist, for the same time on average, or none does.
+    """
     sensor = se3.compose(driven[problem.pose_row], problem.mount[problem.sensor])
     at, stamp_s = se3.transform(sensor, problem.measured[:, :3]), problem.stamp_s[problem.pose_row]
-    medians = {}
+    share, curves = np.ones(len(problem.place)), list[_Curve]()
     for place in range(len(problem.oriented)):
         mine = np.flatnonzero(problem.place == place)
-        some = mine[:: max(1, len(mine) // SIGHTINGS_A_PLACE)]
-        i, j = np.triu_indices(len(some), 1)
-        square = ((at[some[j]] - at[some[i]]) ** 2).sum(axis=1) / MEDIAN
-        lag_s, square = _medians(np.abs(stamp_s[some[j]] - stamp_s[some[i]]), square)
+        i, j = _instants(len(mine))
+        lag_s = np.abs(stamp_s[mine[j]] - stamp_s[mine[i]])
+        lag_s, square = _medians(lag_s, ((at[mine[j]] - at[mine[i]]) ** 2).sum(axis=1) / MEDIAN)
         if len(lag_s) >= FEWEST_BINS:
-            medians[place] = lag_s, square
-    share = np.ones(len(problem.place))
-    if not medians:
+            curves.append(_Curve(lag_s, square, _worth(stamp_s[mine], lag_s)))
+    if not curves:
         return Drift(None, None, share)
-    # all landmarks drift alike: what one of them stays behind, others moved by errors of their own
-    growth = min(_fitted(lag_s, square, PERSIST_S[:-2], 0.0)[-1] for lag_s, square in medians.values())
-    for place, (lag_s, square) in medians.items():
-        mine = np.flatnonzero(problem.place == place)
-        parts = _fitted(lag_s, square, PERSIST_S, growth)
-        repeated = (parts[1:-1] * np.array(PERSIST_S)).sum() / max(parts[:-1].sum(), 1e-12)
-        share[mine] = 1.0 / (1.0 + 2.0 * repeated * _rate(stamp_s[mine]))
+    growth = float(np.clip(min(_least_growth(curve) for curve in curves), *_shared_growth(problem, at, stamp_s)))
+    persist_s = [each_s for each_s in PERSIST_S if each_s <= max(float(np.ptp(stamp_s)), PERSIST_S[0])]
+    gain, lasting_s = 0.0, []
+    for curve in curves:
+        white = max(_fitted(curve, [], lever * growth)[1] for lever in LEVERS)
+        parts, log_likelihood = max((_fitted(curve, persist_s, lever * growth) for lever in LEVERS), key=lambda f: f[1])
+        gain += max(log_likelihood - white, 0.0)
+        lasting_s.append(float(parts[1:] @ persist_s) / max(float(parts.sum()), 1e-12))
+    if gain > PERSISTS * len(curves):
+        for place in range(len(problem.oriented)):
+            mine = np.flatnonzero(problem.place == place)
+            share[mine] = 1.0 / (1.0 + 2.0 * float(np.mean(lasting_s)) * _rate(stamp_s[mine]))
     translation = float(np.sqrt(max(0.5 * growth, LEAST_DRIFT**2)))
     range_m = float(np.median(np.linalg.norm(problem.measured[:, :3], axis=1)))
     return Drift(translation, translation / max(range_m, 1.0), share)
 
 
-def _fitted(lag_s: FloatArray, square: FloatArray, persist_s: tuple[float, ...], growth: float) -> FloatArray:
-    """Parts of a variogram: white, persistent for each of some times, and growing without end; the last is given,
-    unless it is 0.
+def _instants(count: int) -> tuple[IntArray, IntArray]:
+    """All pairs of some of so many sightings."""
+    some = np.arange(count)[:: max(1, count // SIGHTINGS_A_PLACE)]
+    i, j = np.triu_indices(len(some), 1)
+    return some[i], some[j]
+
+
+def _worth(stamp_s: FloatArray, lag_s: FloatArray) -> FloatArray:
+    return 1.5 * np.clip(np.ptp(stamp_s) / lag_s, 1.0, MOST_LAGS)
+
+
+def _shared_growth(problem: SpatialProblem, at: FloatArray, stamp_s: FloatArray) -> tuple[float, float]:
+    """Between which bounds the variance of what moves two landmarks alike grows, by the second: a standard deviation
+    below and above; 0 and inf where no two are seen together.
     """
-    columns = [np.ones(len(lag_s)), *(1.0 - np.exp(-lag_s / each_s) for each_s in persist_s)]
-    rest = np.maximum(square - growth * lag_s, 0.0)
-    columns += [] if growth > 0.0 else [lag_s]
-    found, _ = nnls(np.column_stack(columns) / square[:, None], rest / square)
-    return np.append(found, growth) if growth > 0.0 else np.asarray(found)
+    often = np.argsort(-np.bincount(problem.place, minlength=len(problem.oriented)), kind="stable")[:SEEN_TOGETHER]
+    rows = [np.flatnonzero(problem.place == place) for place in often]
+    slope = weight = 0.0
+    for one in range(len(rows)):
+        for other in range(one):
+            _, a, b = np.intersect1d(problem.pose_row[rows[one]], problem.pose_row[rows[other]], return_indices=True)
+            if len(a) < FEWEST_OF_BOTH:
+                continue
+            a, b = rows[one][a], rows[other][b]
+            i, j = _instants(len(a))
+            moved, with_it = at[a[j]] - at[a[i]], at[b[j]] - at[b[i]]
+            lag_s = np.abs(stamp_s[a[j]] - stamp_s[a[i]])
+            both = [((moved + sign * with_it) ** 2).sum(axis=1) / MEDIAN for sign in (1.0, -1.0)]
+            (lags_s, sums), (_, differences) = (_medians(lag_s, square, FEWEST_OF_BOTH) for square in both)
+            variance = (0.25 * (sums + differences)) ** 2 / _worth(stamp_s[a], lags_s)
+            slope += float((lags_s * 0.25 * (sums - differences) / variance).sum())
+            weight += float((lags_s**2 / variance).sum())
+    if weight == 0.0:
+        return 0.0, np.inf
+    return max(slope / weight - weight**-0.5, 0.0), max(slope / weight, 0.0) + weight**-0.5
 
 
-def _medians(lag_s: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _least_growth(curve: _Curve) -> float:
+    """What grows for ever of a curve, beside errors that persist."""
+    columns = np.column_stack([*_columns(curve, PERSIST_S[:-2]), curve.lag_s])
+    found, _ = nnls(columns / curve.square[:, None], np.ones(len(curve.lag_s)))
+    return float(found[-1])
+
+
+def _columns(curve: _Curve, persist_s: Sequence[float]) -> list[FloatArray]:
+    """Shapes of white noise, and of errors that persist for each of some times."""
+    return [np.ones(len(curve.lag_s)), *(1.0 - np.exp(-curve.lag_s / each_s) for each_s in persist_s)]
+
+
+def _fitted(curve: _Curve, persist_s: Sequence[float], growth: float) -> tuple[FloatArray, float]:
+    """Parts of a curve, white and persistent for each of some times, beside what grows by the second; and their log
+    likelihood (squares are Gamma distributed; reweighted by what is fitted).
+    """
+    columns, known = np.column_stack(_columns(curve, persist_s)), growth * curve.lag_s
+    found, fitted = np.zeros(columns.shape[1]), curve.square
+    for _ in range(ROUNDS_OF_FIT):
+        weight = np.sqrt(curve.worth) / fitted
+        found, _ = nnls(columns * weight[:, None], (curve.square - known) * weight)
+        fitted = np.maximum(columns @ found + known, LEAST_OF_SQUARE * curve.square)
+    return found, float(curve.worth @ (-np.log(fitted) - curve.square / fitted))
+
+
+def _medians(lag_s: FloatArray, square: FloatArray, fewest: int = FEWEST_PAIRS) -> tuple[FloatArray, FloatArray]:
     """Median lag and median square of pairs, by lag."""
     some = lag_s > 0.0
     lag_s, square = lag_s[some], square[some]
@@ -93,7 +173,7 @@ def _medians(lag_s: FloatArray, square: FloatArray) -> tuple[FloatArray, FloatAr
         return np.zeros(0), np.zeros(0)
     edges = np.geomspace(lag_s.min(), lag_s.max() * (1.0 + 1e-9), BINS)
     row = np.digitize(lag_s, edges)
-    bins = [row == k for k in range(1, BINS) if np.count_nonzero(row == k) >= FEWEST_PAIRS]
+    bins = [row == k for k in range(1, BINS) if np.count_nonzero(row == k) >= fewest]
     median = np.array([[np.median(lag_s[mine]), np.median(square[mine])] for mine in bins]).reshape(-1, 2)
     return median[:, 0], np.maximum(median[:, 1], 1e-12)
 

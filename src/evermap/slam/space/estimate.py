@@ -169,11 +169,14 @@ def _likeness(angle: FloatArray, sigma: FloatArray) -> FloatArray:
 
 
 def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
-    """Return places where their first detections put them, along given poses (N, 7)."""
+    """Return places where the middle one of their detections puts them, along given poses (N, 7)."""
     state = np.zeros((len(problem.mount), 7))
     place = se3.identity(len(problem.oriented))
     estimate = SpatialEstimate(pose, place, state)
     at = as_seen(problem, estimate, np.where(np.isfinite(problem.measured), problem.measured, se3.identity()))
-    place[problem.place[::-1]] = at[::-1]
+    for row in np.unique(problem.place).tolist():
+        mine = np.flatnonzero(problem.place == row)
+        away = np.linalg.norm(at[mine, :3] - np.median(at[mine, :3], axis=0), axis=1)
+        place[row] = at[mine[int(np.argmin(away))]]
     place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
     return replace(estimate, place=place)

@@ -1,0 +1,79 @@
+"""What a recording says of its noise before it is solved: drift of the odometry, and errors of detectors that last."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from evermap.config import Config
+from evermap.metrics.summary import compare_with_truth
+from evermap.pipeline import run_slam
+from evermap.slam.space.drift import drift_of
+from evermap.slam.space.estimate import first_places
+from evermap.slam.space.intake import prepare_space
+from evermap.types import SpatialRecording
+
+from .rooms import Room
+
+
+def lasting(recording: SpatialRecording, sigma_m: float, time_s: float) -> SpatialRecording:
+    """The same with errors of each landmark that last so long (Ornstein and Uhlenbeck)."""
+    random, seen = np.random.default_rng(1), recording.detections
+    stamp_s = recording.frames.stamp_s
+    error = np.zeros((len(stamp_s), int(seen.landmark_id.max()) + 1, 3))
+    error[0] = random.normal(0.0, sigma_m, error[0].shape)
+    for k, step_s in enumerate(np.diff(stamp_s)):
+        rest = np.exp(-step_s / time_s)
+        error[k + 1] = rest * error[k] + np.sqrt(1.0 - rest**2) * random.normal(0.0, sigma_m, error[0].shape)
+    at = seen.position_sensor_m + error[seen.frame, seen.landmark_id]
+    return replace(recording, detections=replace(seen, position_sensor_m=at))
+
+
+def improvement(recording: SpatialRecording) -> float:
+    """Error of the robot over that of the odometry alone."""
+    found = compare_with_truth(recording, run_slam(recording), rate_hz=10.0)
+    assert found.poses is not None
+    assert found.dead_reckoning is not None
+    return float(found.poses.rmse_m / found.dead_reckoning.rmse_m)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_drift_is_what_landmarks_share(seed: int) -> None:
+    """It is not taken for errors of the detector, whose white noise lets the robot be located."""
+    recording = Room.of(seed).walk(seed, drift=0.02)
+    intake = prepare_space(recording, Config().slam.space)
+    found = drift_of(intake.problem, intake.driven_pose)
+    assert (found.share == 1.0).all()
+    assert found.translation == pytest.approx(0.014, rel=0.4)  # half of the variance is the rotation's
+    assert improvement(recording) < 0.25
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_errors_that_last_are_found_and_do_not_pull_a_good_odometry_away(seed: int) -> None:
+    recording = lasting(Room.of(seed).walk(seed, drift=0.002), 0.06, 5.0)
+    intake = prepare_space(recording, Config().slam.space)
+    found = drift_of(intake.problem, intake.driven_pose)
+    assert (found.share < 0.1).all()
+    assert found.translation is not None
+    assert found.translation < 0.006
+    assert improvement(recording) < 1.1
+
+
+def test_places_begin_where_most_of_their_detections_are() -> None:
+    """Not where the first ones are, which may be wrong."""
+    room = Room.of(3)
+    recording = room.walk(3, drift=1e-4)
+    seen = recording.detections
+    early = seen.frame < np.median(seen.frame[seen.landmark_id == 0])
+    at = seen.position_sensor_m.copy()
+    at[early & (seen.landmark_id == 0)] += [0.0, 0.0, 2.0]
+    wrong = np.flatnonzero(early & (seen.landmark_id == 0))[::2]
+    at[wrong] = seen.position_sensor_m[wrong]
+    moved = replace(recording, detections=replace(seen, position_sensor_m=at))
+    intake = prepare_space(moved, Config().slam.space)
+    first = first_places(intake.problem, intake.driven_pose).place
+    away = np.linalg.norm(first[:, :3] - first[1, :3], axis=1)
+    expected = np.linalg.norm(room.place - room.place[1], axis=1)
+    assert away == pytest.approx(expected, abs=0.15)
