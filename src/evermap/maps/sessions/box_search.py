@@ -7,6 +7,7 @@ of parked cars resemble each other, and cars come and go (`slam.association.cons
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -39,10 +40,14 @@ SHARED_NATS = 4.0
 """Evidence that it takes for the odometry's frame, which is asked once."""
 LEAD_NATS = 12.0
 """By how much the constellation of a place must beat all others: rows of parked cars resemble each other."""
-WINDOW, STRIDE = 12, 6
-"""Boxes, one after the other on the way, that are searched for in the map together."""
+WINDOWS = 12, 6
+"""Boxes, one after the other on the way, that are searched for in the map together; fewer where it is known about."""
 TESTED_M2 = 157.0
 """Area that one trial of the search covers: what agrees by chance in a large map is that much more probable."""
+FACTORS = 1.0, 0.99, 1.01, 0.98, 1.02
+"""On the lengths of a session, that are tried where its metre is its odometry's."""
+TOLD = 2.0
+"""Standard deviations by which such a factor must differ from 1."""
 PROBABLE = 0.9
 NEAR_M, LARGEST_TURN = 30.0, 0.3
 """How far boxes may be off behind a stretch in which nothing was seen [m, rad]."""
@@ -86,29 +91,52 @@ class MapBoxes(NamedTuple):
         )  # fmt: skip
 
 
-def placed(seen: SeenBoxes, known: MapBoxes) -> FloatArray | None:
-    """Return the motion (7,) from a session to the map; None where nothing tells it without doubt.
+def placed(seen: SeenBoxes, known: MapBoxes, *, metre: bool) -> tuple[FloatArray, float] | None:
+    """Return the motion (7,) from a session to the map, and the factor on its lengths; None where nothing tells these
+    without doubt.
 
     Args:
         seen: boxes of the session, in the frame of its odometry.
         known: those of the map.
+        metre: the session's metre is known: the factor is 1.
     """
     if not len(known.place) or not len(seen.place):
         return None
-    every = np.ones(len(known.place), dtype=np.bool_)
-    windows = _windows(np.flatnonzero(np.isfinite(seen.size_m[:, 0])), seen)
+    every, sized = np.ones(len(known.place), dtype=np.bool_), np.flatnonzero(np.isfinite(seen.size_m[:, 0]))
+    windows = _windows(sized, seen, WINDOWS[0])
     best = max((_agreed(seen, known, some, every, np.zeros(3)) for some in windows), key=len, default=[])
     if len(best) < SHARED_PAIRS:
-        best = []
-        for some in windows:
-            best = max(best, _agreed(seen, known, some, every), key=len)
-            if len(best) >= ENOUGH_PAIRS:
-                break
+        best = _searched(seen, known, windows, (1.0,) if metre else FACTORS)
         if len(best) < FOUND_PAIRS:
             return None
     mine, theirs = (np.array(part) for part in zip(*best, strict=True))
-    motion = rigid(seen.position_m[mine, :2], known.position_m[theirs, :2])
-    return in_space(motion, seen.position_m[mine], known.position_m[theirs])
+    factor = 1.0 if metre else _factor(seen.position_m[mine, :2], known.position_m[theirs, :2])
+    own = np.column_stack([factor * seen.position_m[mine, :2], seen.position_m[mine, 2]])
+    return in_space(rigid(own[:, :2], known.position_m[theirs, :2]), own, known.position_m[theirs]), factor
+
+
+def _searched(
+    seen: SeenBoxes, known: MapBoxes, windows: list[IntArray], factors: tuple[float, ...]
+) -> list[tuple[int, int]]:
+    """Pairs of boxes that are the same, by the constellation of some at a time; the largest such set."""
+    every, best = np.ones(len(known.place), dtype=np.bool_), list[tuple[int, int]]()
+    for factor in factors:
+        scaled = replace(seen, position_m=factor * seen.position_m)
+        for some in windows:
+            best = max(best, _agreed(scaled, known, some, every), key=len)
+            if len(best) >= ENOUGH_PAIRS:
+                return best
+        if len(best) >= FOUND_PAIRS:
+            return best
+    return best
+
+
+def _factor(own_m: FloatArray, there_m: FloatArray) -> float:
+    """How much longer distances between points (K, 2) are in the map; 1 where they hardly tell."""
+    own, there = (np.linalg.norm(at[:, None] - at[None], axis=2) for at in (own_m, there_m))
+    factor = float((own * there).sum() / max(float((own**2).sum()), 1e-9))
+    spread_m = float(np.linalg.norm(own_m - own_m.mean(axis=0)))
+    return factor if abs(factor - 1.0) * spread_m > TOLD * math.sqrt(2.0) * DRIFT_M else 1.0
 
 
 def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArray, IntArray]:
@@ -120,7 +148,8 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
         place: (K,) rows of the map's places at which those of the session stand, -1 for none.
     """
     found: dict[int, int] = {}
-    for some in _windows(np.flatnonzero((place < 0) & np.isfinite(seen.size_m[:, 0])), seen):
+    left = np.flatnonzero((place < 0) & np.isfinite(seen.size_m[:, 0]))
+    for some in [window for size in WINDOWS for window in _windows(left, seen, size)]:
         free = ~np.isin(known.place, place)
         away = np.linalg.norm(known.position_m[:, None, :2] - seen.position_m[some, :2], axis=2).min(axis=1)
         pairs = _agreed(seen, known, some, free & (away < NEAR_M))
@@ -135,10 +164,10 @@ def regained(seen: SeenBoxes, known: MapBoxes, place: IntArray) -> tuple[IntArra
     return np.array(list(found), dtype=np.int64), np.array(list(found.values()), dtype=np.int64)
 
 
-def _windows(rows: IntArray, seen: SeenBoxes) -> list[IntArray]:
+def _windows(rows: IntArray, seen: SeenBoxes, size: int) -> list[IntArray]:
     """Boxes, some at a time, in the order in which they were met."""
     order = rows[np.argsort(seen.first_s[rows], kind="stable")]
-    return [order[k : k + WINDOW] for k in range(0, max(len(order) - STRIDE, 1), STRIDE)] if len(order) > 1 else []
+    return [order[k : k + size] for k in range(0, max(len(order) - size // 2, 1), size // 2)] if len(order) > 1 else []
 
 
 def _agreed(

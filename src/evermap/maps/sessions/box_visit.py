@@ -28,6 +28,8 @@ HEADING_RAD, ROUND = 0.15, 1.3
 GLIMPSE_M, GLIMPSE_SHARE = 1.0, 0.01
 """A detection that no stay has is one of a box that stands so near, and farther off by this share of the range."""
 FEWEST_GLIMPSES = 2
+TIED_M = 80.0
+"""Farther from all boxes that tie a session to the map, it may be beside where it is said to be: misses say nothing."""
 BEHIND_M, COVERED = 1.5, 0.4
 """What is this much farther than another box, and within this share of its length of its middle, is hidden by it."""
 
@@ -121,12 +123,14 @@ class BoxVisit(SpatialVisit):
         track: settings of the tracker.
         boxes: where they are, by the places of the problem.
         kept: (P,) places that enter the map.
+        tied_m: (H, 2) boxes that tie the session to the map; none of a session that begins it.
     """
 
     taken: TrafficIntake
     track: TrackConfig
     boxes: SeenBoxes
     kept: BoolArray
+    tied_m: FloatArray
 
     @functools.cached_property
     def landmark_id(self) -> IntArray:
@@ -195,6 +199,9 @@ class BoxVisit(SpatialVisit):
             if len(mine) and len(other):
                 eye = watch.eye[view, :2]
                 shown[mine] &= ~_hidden_by(place[listed.landmark[mine]] - eye, at[other, :2] - eye, length[other])
+        if len(self.tied_m):
+            away = np.linalg.norm(watch.eye[:, None, :2] - self.tied_m, axis=2).min(axis=1)
+            shown &= hit | (away <= TIED_M)[listed.pose]
         return watch._replace(listed=listed._replace(hit=hit).rows(shown))
 
     def _detected(self) -> tuple[IntArray, FloatArray]:

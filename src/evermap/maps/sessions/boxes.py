@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from evermap.config import Config
+from evermap.errors import NumericalError
 from evermap.geometry import se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import consensus
@@ -36,15 +37,15 @@ from evermap.maps.sessions.box_search import (
     placed,
     regained,
 )
-from evermap.maps.sessions.box_visit import HEADING_RAD, BoxVisit, SeenBoxes, seen_boxes
+from evermap.maps.sessions.box_visit import HEADING_RAD, TIED_M, BoxVisit, SeenBoxes, seen_boxes
 from evermap.maps.sessions.placing import Laid
 from evermap.maps.sessions.witnessed import Witnessed
 from evermap.slam.space.estimate import SpatialOptimum, converged
-from evermap.slam.space.moving import TrafficIntake, solve_in_traffic
+from evermap.slam.space.moving import TrafficIntake, rescaled, solve_in_traffic
 from evermap.slam.space.problem import PlacePrior
 from evermap.slam.space.result import identities_of, numbered
 from evermap.slam.space.solve import FREE, SpatialSolved
-from evermap.types import FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
+from evermap.types import BoolArray, FloatArray, IntArray, Progress, SpatialRecording, landmark_id_of, rows_of
 
 HEIGHT_M = 0.5
 """The same of its height over a street that is not flat."""
@@ -54,7 +55,9 @@ SAME_SHARE = 0.6
 """Boxes that stand closer than this share of their widths are one."""
 AT_ONCE_S = 5.0
 """A box that left, and stands there again so shortly after, had not left."""
-ROUNDS = 12
+ROUNDS = 30
+DRIFT_SHARE, MOST_DRIFT_M = 0.02, 0.5
+"""How far the odometry may be off from one box to the next: a share of the distance, and at most."""
 MISFIT, STRETCH = 3.0, 8
 """Mean square of deviations of so many boxes from the map, by what is expected, from which the odometry is believed
 less.
@@ -63,6 +66,10 @@ WANDERS = (0.003, 0.0003), (0.01, 0.001), (0.03, 0.003)
 """How much less, one after the other [m/sqrt(s), rad/sqrt(s)]."""
 TILTED = 0.9
 """Cosine of the tilt up to which the frame of an odometry is upright."""
+AMONG_M = 15.0
+"""Boxes of the map this near show that a session was here before."""
+LEAST_SHARE, PERHAPS = 0.3, 0.2
+"""Of the boxes that stand among those of the map, how many must be boxes of it; what probably left does not count."""
 NAMED_M = 0.5
 """A landmark with an identity stands where the map has it if it is this near."""
 LEAST_P, LEAST_GONE = 1e-6, 0.02
@@ -87,16 +94,19 @@ def visited_in_traffic(
     Raises:
         NumericalError: no finite optimum.
     """
-    solved = solve_in_traffic(taken, progress)
-    solved = replace(solved, optimum=_moved(solved.optimum, _frame_of(taken.recording)))
-    solved = _together(taken, solved, np.arange(len(solved.identity)))
-    known = MapBoxes.of(living, p_site)
-    motion = _placed(taken, solved, living, known) if len(living.places) else None
-    if motion is None:
+    solved, known = _by_itself(taken, progress), MapBoxes.of(living, p_site)
+    found = _placed(taken, solved, living, known) if len(living.places) else None
+    if found is not None and found[1] != 1.0:
+        taken = rescaled(taken, found[1], config.slam.space)
+        solved = _by_itself(taken, None)
+        found = _placed(taken, solved, living, known)
+    if found is None:
         return _visit(taken, solved, _Matched.nothing(solved), living, config), None
-    placed = replace(solved, optimum=_moved(solved.optimum, motion))
-    held, matched = _settled(taken, placed, living, known)
-    if np.count_nonzero(matched.place >= 0) < SHARED_PAIRS:
+    try:
+        held, matched = _settled(taken, replace(solved, optimum=_moved(solved.optimum, found[0])), living, known)
+    except NumericalError:  # what was held contradicts itself
+        return _visit(taken, solved, _Matched.nothing(solved), living, config), None
+    if not _agrees(taken, held, matched, living, known):
         return _visit(taken, solved, _Matched.nothing(solved), living, config), None
     visit = _visit(taken, held, matched, living, config)
     order = np.argsort(visit.landmark_id, kind="stable")
@@ -118,6 +128,25 @@ class _Matched:
     def nothing(cls, solved: SpatialSolved) -> _Matched:
         count = len(solved.identity)
         return cls(np.full(count, -1, dtype=np.int64), np.ones(count))
+
+
+def _agrees(taken: TrafficIntake, held: SpatialSolved, matched: _Matched, living: LivingMap, known: MapBoxes) -> bool:
+    """Whether enough of what stands is where the map has it: of the boxes that stand among those of the map a share."""
+    if len(_named(taken, held, living)[0]) > 1:
+        return True
+    seen = seen_boxes(taken, held)
+    there = matched.place[seen.place] >= 0
+    off = seen.position_m[:, None, :2] - known.position_m[known.p >= PERHAPS, :2]
+    away = np.linalg.norm(off, axis=2).min(axis=1, initial=np.inf)
+    among = np.count_nonzero(there | (away <= AMONG_M))
+    return bool(np.count_nonzero(there) >= max(SHARED_PAIRS, LEAST_SHARE * among))
+
+
+def _by_itself(taken: TrafficIntake, progress: Progress | None) -> SpatialSolved:
+    """The session alone, in the frame of its odometry, with boxes put together that are one."""
+    solved = solve_in_traffic(taken, progress)
+    solved = replace(solved, optimum=_moved(solved.optimum, _frame_of(taken.recording)))
+    return _together(taken, solved, np.arange(len(solved.identity)))
 
 
 def _frame_of(recording: SpatialRecording) -> FloatArray:
@@ -194,15 +223,19 @@ def _named(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap) -> tu
     return row[place >= 0], place[place >= 0]
 
 
-def _placed(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes) -> FloatArray | None:
-    """The motion (7,) from the session to the map; None where nothing tells it without doubt."""
+def _placed(
+    taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes
+) -> tuple[FloatArray, float] | None:
+    """The motion (7,) from the session to the map, and the factor on its lengths; None where nothing tells these
+    without doubt.
+    """
     row, place = _named(taken, solved, living)
     own, there = solved.optimum.estimate.place[row, :3], living.places.position_m[place]
     if len(row) > 1:
         motion, agree = consensus(own[:, :2], there[:, :2])
         if agree.sum() > 1:
-            return in_space(motion, own[agree], there[agree])
-    return placed(seen_boxes(taken, solved), known)
+            return in_space(motion, own[agree], there[agree]), 1.0
+    return placed(seen_boxes(taken, solved), known, metre=taken.known > 0 or taken.traffic.gauge.stated is not None)
 
 
 def _settled(
@@ -212,18 +245,21 @@ def _settled(
 
     Behind a stretch in which nothing was seen it may be off by more than any gate: there the constellation is asked.
     """
-    matched = _matched(taken, solved, living, known)
+    matched, most = _matched(taken, solved, living, known, np.zeros(0)), -1
     for _ in range(ROUNDS):
+        held_m = solved.optimum.estimate.place[matched.place >= 0, :2]
         held = _together(taken, _held(solved, living, matched), _labels(matched))
-        following = _matched(taken, held, living, known)
+        following = _matched(taken, held, living, known, held_m)
         settled = np.array_equal(following.place, matched.place)
         solved, matched = held, following
         if settled:
             seen = seen_boxes(taken, solved)
             mine, theirs = regained(seen, known, matched.place[seen.place])
-            if not len(mine):
+            count = int(np.count_nonzero(matched.place >= 0))
+            if not len(mine) or count <= most:  # what was regained last did not hold
                 break
             matched.place[seen.place[mine]] = known.place[theirs]
+            most = count
     return solved, matched
 
 
@@ -257,16 +293,22 @@ def _held(solved: SpatialSolved, living: LivingMap, matched: _Matched) -> Spatia
     return replace(solved, optimum=found)
 
 
-def _matched(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes) -> _Matched:
+def _matched(
+    taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, known: MapBoxes, held_m: FloatArray
+) -> _Matched:
     """Which boxes of the map those of the session are, one to one; parts of one that was lost in between are the
-    same.
+    same. The farther from those that are held at (H, 2), the farther off a box may be.
     """
     seen, count = seen_boxes(taken, solved), len(solved.identity)
     found = _Matched.nothing(solved)
     row, place = _named(taken, solved, living)
     near = np.linalg.norm(solved.optimum.estimate.place[row, :3] - living.places.position_m[place], axis=1)
     found.place[row[near < NAMED_M]] = place[near < NAMED_M]
-    odds = _log_odds(seen, known)
+    loose_m = np.zeros(len(seen.place))
+    if len(held_m):
+        away = np.linalg.norm(seen.position_m[:, None, :2] - held_m, axis=2).min(axis=1)
+        loose_m = np.minimum(DRIFT_SHARE * away, MOST_DRIFT_M)
+    odds = _log_odds(seen, known, loose_m)
     mine, theirs = linear_sum_assignment(np.minimum(-odds, 0.0))
     good = odds[mine, theirs] > 0.0
     chosen = np.full(len(seen.place), -1)
@@ -289,10 +331,14 @@ def _matched(taken: TrafficIntake, solved: SpatialSolved, living: LivingMap, kno
     return found
 
 
-def _log_odds(seen: SeenBoxes, known: MapBoxes) -> FloatArray:
-    """(K, M) log odds that a box of the session is one of the map against that it is new, -inf beyond gates."""
+def _log_odds(seen: SeenBoxes, known: MapBoxes, loose_m: FloatArray) -> FloatArray:
+    """(K, M) log odds that a box of the session is one of the map against that it is new, -inf beyond gates.
+
+    Each may be off by `loose_m` (K,) beside what is known.
+    """
     off = seen.position_m[:, None, :2] - known.position_m[None, :, :2]
     spread = seen.covariance_m2[:, None, :2, :2] + known.covariance_m2[None, :, :2, :2] + DRIFT_M**2 * np.eye(2)
+    spread = spread + (loose_m**2)[:, None, None, None] * np.eye(2)
     squared = np.einsum("kmi,kmi->km", off, np.linalg.solve(spread, off[..., None])[..., 0])
     near, far = (math.log(share) - 0.5 * squared / wide**2 - 2.0 * math.log(wide) for share, wide in TAILS)
     odds = np.logaddexp(near, far) - 0.5 * np.linalg.slogdet(spread)[1] - math.log(2.0 * math.pi * LEAST_DENSITY)
@@ -336,6 +382,7 @@ def _visit(
     kept &= ~np.isin(identity, members.landmark_id[members.deleted])
     brief = seen.until_s - np.where(np.isfinite(seen.since_s), seen.since_s, seen.first_s) < config.track.rest_for_s
     kept[seen.place[brief & (matched.place[seen.place] < 0)]] = False
+    kept[seen.place[_doubtful(seen, matched, living)]] = False
     of_places = taken.intake.landmark_id[solved.identity] >= taken.known
     kept &= ~of_places | np.isin(np.arange(len(kept)), seen.place)
     intake = replace(taken.intake, landmark_id=identity, problem=solved.optimum.smoother.problem, names=names)
@@ -345,8 +392,23 @@ def _visit(
     witnessed = Witnessed(identity[seen.place[moving]], seen.since_s[moving], seen.until_s[moving], seen.p_stay[moving])
     return BoxVisit(
         recording=taken.standing, intake=intake, solved=solved, witnessed=witnessed, taken=taken,
-        track=config.track, boxes=seen, kept=kept,
+        track=config.track, boxes=seen, kept=kept, tied_m=solved.optimum.estimate.place[at, :2],
     )  # fmt: skip
+
+
+def _doubtful(seen: SeenBoxes, matched: _Matched, living: LivingMap) -> BoolArray:
+    """(K,) boxes far from all that ties the session to the map, among boxes that the map has there: one of the two is
+    elsewhere.
+    """
+    held = matched.place[seen.place] >= 0
+    if not held.any():
+        return held
+    box = np.isin(living.places.landmark_id, living.boxes.landmark_id)
+    box &= ~np.isin(np.arange(len(box)), matched.place)
+    at, known = seen.position_m[:, :2], living.places.position_m[box, :2]
+    tied = np.linalg.norm(at[:, None] - at[held], axis=2).min(axis=1) <= TIED_M
+    among = np.linalg.norm(at[:, None] - known, axis=2).min(axis=1, initial=np.inf) <= AMONG_M
+    return np.asarray(~held & ~tied & among)
 
 
 def without_strays(living: LivingMap) -> LivingMap:

@@ -132,13 +132,27 @@ def take_in_traffic(recording: SpatialRecording, space: SpaceConfig, track: Trac
     """
     recording, rows = _whole(recording)
     driven = _driven(recording)
-    traffic = _settled(recording, driven, space, track)
+    return _taken(recording, rows, driven, _settled(recording, driven, space, track), space)
+
+
+def _taken(
+    recording: SpatialRecording, rows: IntArray, driven: FloatArray, traffic: Traffic, space: SpaceConfig
+) -> TrafficIntake:
+    """The recording as the solver takes it, with the errors taken off that repeat themselves."""
     identity = _identity(recording, traffic.standing)
     standing_only = _standing_only(recording, driven, traffic, identity)
     intake = prepare_space(standing_only, space, fewest=0)
     intake = replace(intake, problem=replace(intake.problem, steady=True))
     used = np.flatnonzero(identity != UNKNOWN)
     return TrafficIntake(recording, rows, driven, traffic, _known(recording), used, standing_only, intake)
+
+
+def rescaled(taken: TrafficIntake, factor: float, space: SpaceConfig) -> TrafficIntake:
+    """Return the same with all lengths times a factor, by a map that knows the metre: odometry and ranges alike."""
+    gauge = taken.traffic.gauge
+    ranges, driven = factor * gauge.range_scale, factor * gauge.odometry_scale
+    gauge = gauge._replace(stated=ranges, scale=1.0 / driven - 1.0)
+    return _taken(taken.recording, taken.rows, taken.driven, replace(taken.traffic, gauge=gauge), space)
 
 
 def solve_in_traffic(taken: TrafficIntake, progress: Progress | None = None) -> SpatialSolved:
