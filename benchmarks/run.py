@@ -13,7 +13,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import cliques, kitti, localize, npmle, persistence, scale, scale_report, selectors, space, tracking
+from benchmarks import (
+    association,
+    cliques,
+    kitti,
+    localize,
+    npmle,
+    persistence,
+    scale,
+    scale_report,
+    selectors,
+    space,
+    tracking,
+)
 from benchmarks.contenders import CONTENDERS
 from benchmarks.memory import measure
 from benchmarks.world import circular_world
@@ -39,10 +51,23 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **localize.METRICS,
     **scale.METRICS,
     **space.METRICS,
+    **association.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
-PARTS = ("slam", "persistence", "selectors", "cliques", "npmle", "tracking", "kitti", "localize", "scale", "space")
+PARTS = (
+    "slam",
+    "persistence",
+    "selectors",
+    "cliques",
+    "npmle",
+    "tracking",
+    "kitti",
+    "localize",
+    "scale",
+    "space",
+    "association",
+)
 _RENEW = "evermap bench --update-baseline"
 
 
@@ -116,6 +141,9 @@ def run(
         measured |= ratios
     if only == "space" or (only is None and (space.FOLDER / "tagslam").is_dir()):
         ratios, shown["space"] = space.run()
+        measured |= ratios
+    if only == "association" or (only is None and (association.FOLDER / "mrclam").is_dir()):
+        ratios, shown["association"] = association.run()
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only or "kitti" not in shown else {}
@@ -208,6 +236,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", scale_report.as_markdown(shown["scale"])]
     if "space" in shown:
         lines += ["", space.as_markdown(shown["space"])]
+    if "association" in shown:
+        lines += ["", association.as_markdown(shown["association"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

@@ -295,6 +295,10 @@ def test_a_small_run_writes_compares_and_reports(
     (tmp_path / "tagslam").mkdir()
     monkeypatch.setattr(run.space, "FOLDER", tmp_path)
     monkeypatch.setattr(run.space, "run", lambda: tags)
+    nameless = dict.fromkeys(run.association.METRICS, 1.0), {"rows": []}
+    (tmp_path / "mrclam").mkdir()
+    monkeypatch.setattr(run.association, "FOLDER", tmp_path)
+    monkeypatch.setattr(run.association, "run", lambda: nameless)
     measured = run.run(
         update_baseline=True,
         n_poses=80,

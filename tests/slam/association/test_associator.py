@@ -10,13 +10,16 @@ from identity_scores import identity_scores
 from problems import World, make_world
 from recordings import building
 
+from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise
 from evermap.slam.association.identify import identified
+from evermap.slam.association.revise import reassigned, with_overlooked
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, Landmarks
+from evermap_studies.sim.park import ParkConfig, simulate_park
 
 KNOWN_SENSORS = CalibrationPrior.from_settings(calibrated=False, fix={})
 
@@ -58,7 +61,8 @@ def test_merging_and_forgetting_keep_the_detections_together() -> None:
     split = rows.copy()
     split[(rows == 2) & (made.problem.pose_row > 30)] = 8
     landmark = np.vstack([made.truth.landmark, made.truth.landmark[2]])
-    broken = Assignment(made.problem, split, Estimate(made.truth.pose, landmark, made.truth.states))
+    estimate = Estimate(made.truth.pose, landmark, made.truth.states)
+    broken = Assignment(made.problem, split, estimate, np.zeros_like(split))
     np.testing.assert_array_equal(broken.merged([(8, 2)]).landmark_row, rows)
     less = broken.without(np.arange(9) == 0)
     assert less.n_landmarks == 8
@@ -96,3 +100,64 @@ def test_a_building_without_ids_and_in_its_map() -> None:
     assert met.mean() > 0.5
     assert np.mean(inside[met] == recording.detections.landmark_id[met]) > 0.98
     assert np.all(inside[~met & (inside != UNKNOWN)] > 0)
+
+
+def settled(made: World, row: np.ndarray) -> Assignment:
+    """Assigned as told, at the true values; landmarks whose detections go astray keep their places."""
+    sigma = np.tile(made.noise.detection, (len(row), 1))
+    measured = replace(made.problem, sigma_given=sigma)
+    return Assignment(measured, row, made.truth, np.full(len(row), UNKNOWN))
+
+
+def test_detections_of_others_go_back_and_what_was_overlooked_is_a_landmark() -> None:
+    made = world(4)
+    true = made.problem.landmark_row
+    rng = np.random.default_rng(0)
+    row = np.where(rng.random(len(true)) < 0.2, rng.integers(0, 8, len(true)), true)
+    row[rng.random(len(true)) < 0.1] = NOBODY
+    broken = settled(made, row)
+    explained = np.zeros((int(np.sum(row >= 0)), 2, 2))
+    again = reassigned(broken, explained, density=0.1).landmark_row
+    assert np.mean(again == true) > 0.97
+    forgotten = settled(made, np.where(true == 7, NOBODY, true))
+    kept = replace(forgotten, estimate=replace(made.truth, landmark=made.truth.landmark[:7]))
+    found = with_overlooked(kept)
+    assert found.n_landmarks == 8
+    assert np.mean(found.landmark_row[true == 7] == 7) > 0.9
+    np.testing.assert_allclose(found.estimate.landmark[7], made.truth.landmark[7], atol=0.1)
+
+
+def test_landmarks_of_two_classes_are_two_wherever_they_are() -> None:
+    made = world(2)
+    true, pose = made.problem.landmark_row, made.problem.pose_row
+    kind = (true == 3) & (pose % 2 == 1)  # as of two at one place
+    associator = Associator(replace(made.problem, landmark_row=np.zeros_like(true)), made.noise, kind.astype(np.int64))
+    for _ in made.problem.stamp_s:
+        associator.step()
+    row = associator.finish().landmark_row
+    assert len(np.unique(row[true == 3])) >= 2
+    for landmark in np.unique(row[row >= 0]):
+        assert len(np.unique(kind[row == landmark])) == 1
+
+
+@pytest.mark.slow
+def test_a_park_is_driven_again_and_again() -> None:
+    recording = simulate_park(ParkConfig(drive_m=1200.0, n_trees=60), seed=2)
+    found = identified(recording, KNOWN_SENSORS, START)
+    scores = identity_scores(found.detections.landmark_id, recording.detections.landmark_id)
+    assert scores.purity > 0.97
+    assert scores.completeness > 0.9
+
+
+def test_a_park_has_what_was_asked_for() -> None:
+    recording = simulate_park(ParkConfig(drive_m=300.0, n_trees=30, p_car=0.0, p_ghost=0.0), seed=1)
+    assert recording.truth is not None
+    assert recording.true_landmarks is not None
+    step = se2.between(recording.truth.pose_world_robot[:-1], recording.truth.pose_world_robot[1:])
+    assert np.hypot(step[:, 0], step[:, 1]).sum() == pytest.approx(300.0, abs=1.0)
+    detections = recording.detections
+    pose = recording.truth.pose_world_robot[detections.frame]
+    true = se2.transform(se2.inverse(pose), recording.true_landmarks.position_m[detections.landmark_id])
+    assert np.std(np.hypot(*true.T) - detections.range_m) == pytest.approx(0.12, rel=0.15)
+    again = simulate_park(ParkConfig(drive_m=300.0, n_trees=30, p_car=0.0, p_ghost=0.0), seed=1)
+    np.testing.assert_array_equal(again.detections.range_m, detections.range_m)

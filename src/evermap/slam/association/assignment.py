@@ -8,7 +8,8 @@ import numpy as np
 from scipy import sparse
 
 from evermap.slam.problem import Estimate, Problem
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.slam.streaming import sighted_at
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 NOBODY = -1
 """Landmark row of a detection that belongs to none."""
@@ -17,19 +18,31 @@ SHARED_M, SHARED_SHARE = 0.02, 0.5
 """Error [m] that no landmark's sightings average out, and the share of a typical sighting's range noise beside it."""
 
 
+def alike(one: IntArray, other: IntArray) -> BoolArray:
+    """Return which of two classes each may be the same."""
+    same: BoolArray = (one == other) | (one == UNKNOWN) | (other == UNKNOWN)
+    return same
+
+
+ABOUT = 3
+"""Frames before and after one in which a landmark was seen, in which it should have been seen, too."""
+
+
 @dataclass(frozen=True, slots=True)
 class Assignment:
     """Detections, each of one landmark or of nobody, and an estimate of poses, landmarks and states.
 
     Attributes:
-        measured: the measurements so far; its landmark rows and landmark priors mean nothing.
+        measured: the measurements so far, each with its sigma; its landmark rows and landmark priors mean nothing.
         landmark_row: (M,) landmark of every detection, `NOBODY` for none; landmarks in the order they were met.
         estimate: where everything is; every landmark has a position.
+        kind: (M,) class of every detection, `UNKNOWN` where it has none; different ones are never one landmark's.
     """
 
     measured: Problem
     landmark_row: IntArray
     estimate: Estimate
+    kind: IntArray
 
     @property
     def n_landmarks(self) -> int:
@@ -50,29 +63,66 @@ class Assignment:
         return last
 
     @property
-    def apart(self) -> BoolArray:
-        """(L, L) landmarks that were seen in one frame, and so are two."""
+    def of_class(self) -> IntArray:
+        """(L,) class of each landmark."""
+        kind = np.full(self.n_landmarks, UNKNOWN)
         seen = self.landmark_row >= 0
-        at = np.zeros((len(self.measured.stamp_s), self.n_landmarks), dtype=np.float32)
-        at[self.measured.pose_row[seen], self.landmark_row[seen]] = 1.0
-        together: BoolArray = at.T @ at > 0.0
-        return together
+        np.maximum.at(kind, self.landmark_row[seen], self.kind[seen])
+        return kind
 
-    def with_shared_errors(self, joint: FloatArray) -> FloatArray:
-        """Return the covariance (G, G) of landmarks and states with what sightings from one place have in common.
+    @property
+    def together(self) -> sparse.csr_array:
+        """(L, L) frames in which two landmarks were both seen."""
+        each = self._seen_in(0)
+        return sparse.csr_array(each.T @ each)
+
+    @property
+    def in_turn(self) -> sparse.csr_array:
+        """(L, L) frames in which one of two landmarks was seen, and the other one some frames before or after."""
+        each = self._seen_in(0)
+        about = self._seen_in(-ABOUT)
+        for by in range(1 - ABOUT, ABOUT + 1):
+            about = about + self._seen_in(by)
+        about.data[:] = 1.0
+        once = sparse.csr_array(each.T @ about)
+        return sparse.csr_array(once + once.T - 2.0 * self.together)
+
+    def _seen_in(self, frames: int) -> sparse.csr_array:
+        """(N, L) which landmarks were seen so many frames before each."""
+        seen = self.landmark_row >= 0
+        at, row = self.measured.pose_row[seen] + frames, self.landmark_row[seen]
+        inside = (at >= 0) & (at < len(self.measured.stamp_s))
+        shape = (len(self.measured.stamp_s), self.n_landmarks)
+        found = sparse.csr_array((np.ones(int(inside.sum())), (at[inside], row[inside])), shape=shape)
+        found.data[:] = 1.0
+        return found
+
+    @property
+    def shared_variance(self) -> FloatArray:
+        """(L,) variance [m^2] of what the sightings of a landmark have in common.
 
         A robot that stands still makes the same error a hundred times, and the smoother believes it was a hundredth.
         """
-        seen = self.landmark_row >= 0
-        sigma_range = self.measured.sigma_given[seen, 0]
+        seen = np.flatnonzero(self.landmark_row >= 0)
+        order = seen[np.lexsort((self.measured.sigma_given[seen, 0], self.landmark_row[seen]))]
+        count = self.sightings
+        middle = np.cumsum(count) - count + count // 2
         variance = np.full(self.n_landmarks, SHARED_M**2)
-        for j in range(self.n_landmarks):
-            mine = sigma_range[self.landmark_row[seen] == j]
-            variance[j] += (SHARED_SHARE * np.median(mine)) ** 2 if len(mine) else 0.0
+        met = count > 0
+        variance[met] += (SHARED_SHARE * self.measured.sigma_given[order[middle[met]], 0]) ** 2
+        return variance
+
+    def with_shared_errors(self, joint: FloatArray) -> FloatArray:
+        """Return the covariance (G, G) of all landmarks and states with what sightings from one place share."""
         out = joint.copy()
         rows = np.arange(2 * self.n_landmarks)
-        out[rows, rows] += np.repeat(variance, 2)
+        out[rows, rows] += np.repeat(self.shared_variance, 2)
         return out
+
+    def points(self) -> FloatArray:
+        """Return (M, 2) where the detections point to from their poses."""
+        pose = self.estimate.pose[self.measured.pose_row]
+        return sighted_at(pose, self.measured.reading, self.estimate.states, self.measured.mount)
 
     def problem(self) -> Problem:
         """Return the least-squares problem of the detections that belong to a landmark."""
@@ -107,4 +157,4 @@ class Assignment:
         seen = self.landmark_row >= 0
         row[seen] = rank[self.landmark_row[seen]]
         estimate = Estimate(self.estimate.pose, self.estimate.landmark[kept], self.estimate.states)
-        return Assignment(self.measured, row, estimate)
+        return Assignment(self.measured, row, estimate, self.kind)

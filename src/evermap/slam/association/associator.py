@@ -1,8 +1,8 @@
 """Frame after frame, which detection is which landmark, and from time to time which landmarks are one.
 
 A detection is given to a landmark only if no other explanation is nearly as good; in doubt it starts a landmark of its
-own, which can be merged later, when a batch solution knows more. Nothing is decided that cannot be mended: at the end
-every detection is compared once more with the whole map.
+own, which can be merged later, when a batch solution knows more (`merging`). Nothing is decided that cannot be mended:
+at the end every detection is compared once more with the whole map (`revise`).
 """
 
 from __future__ import annotations
@@ -13,17 +13,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.association.assignment import NOBODY, Assignment
-from evermap.slam.association.constellation import RISE_NATS, propose_constellation, propose_merges
+from evermap.slam.association.assignment import NOBODY, Assignment, alike
+from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
+from evermap.slam.association.merging import propose_merges
+from evermap.slam.association.revise import reassigned, with_overlooked
 from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem
 from evermap.slam.smoother import Smoother
+from evermap.slam.sparse.system import exhausted
 from evermap.slam.streaming import sighted_at
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 CAUTION = 2.0
 """Odometry is taken to be this much worse than where learning would start. It is not learned here: what was associated
@@ -38,28 +41,50 @@ P_MATCH = 0.95
 """Probability from which a detection is given to a landmark."""
 TIGHT_M2 = 0.04
 """Product of a gate's standard deviations, (0.2 m)^2, within which a wrong choice is harmless for a while."""
+FOLLOWED = math.log(16.0)
+"""A landmark is followed as long as its place beside the robot at most doubles the standard deviations of readings."""
 P_NEW = 0.1
 """Probability of being none of the known from which it starts a landmark."""
 P_MERGE = 0.97
 """Probability from which two landmarks are one."""
-UNMET, SMALLEST_M2 = 2.0, 20.0
-"""Landmarks not met yet that one expects in the area that the known ones span, which is at least this large."""
+UNMET = 0.1
+"""Share of landmarks that one has not met yet around those that are followed."""
+FEWEST, SMALLEST_M2 = 2.0, 20.0
+"""Landmarks, and the area that they span, at least, where their density is measured."""
 MIN_SIGHTINGS = 3
 """Detections that make a landmark."""
 FORGET_S = 20.0
 """What has less by then is forgotten."""
 FIRST_STOCK = 40
-"""Poses before the first batch solution; the next come whenever their number grew by a tenth, or by as many."""
+"""Poses before the first batch solution; the next come after as many, or as their number grew by this share."""
+STOCK_SHARE = 0.05
+RECENT = 48
+"""Landmarks, those seen last, that are looked up in the map then."""
 NOISE_FLOOR = 0.5
 """Share of the start's noise of sightings that imaginary ones vouch for."""
 INFLATION = 1.3
 """Of the noise of sightings: what was associated is what agreed."""
-MOST_COMPARED = 256
+MOST_COMPARED = 96
 """Landmarks, the nearest, that a frame is compared with."""
-MERGE_ROUNDS = 20
-"""Merges that are tried whenever stock is taken, at most."""
+MERGE_ROUNDS = 8
+"""Merges that are tried whenever everything is relinearised, at most: each makes the map stiffer."""
+RISE_NATS, RISE_SHARE, RISE_MOST = 7.0, 1.75, 100.0
+"""By how much the cost may rise for a pair that is merged: for the difference of the two, and for the detections of the
+lesser of them, of which a quarter may become outliers; at most. Errors of sightings from one place are alike, which the
+cost does not know."""
 LAST_ROUNDS = 5
 """Comparisons of every detection with the whole map at the end, at most."""
+SAME_SHARE = 0.002
+"""Share of detections that change their landmark in the last of these."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """An assignment at its optimum: with covariances, and with its cost, outliers decided."""
+
+    assignment: Assignment
+    marginals: Marginals
+    cost: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +103,13 @@ class Associator:
     Args:
         problem: the measurements; its `landmark_row` is not looked at.
         noise: where the noise levels start.
+        kind: (M,) class of every detection; None where there are none.
     """
 
-    def __init__(self, problem: Problem, noise: Noise) -> None:
+    def __init__(self, problem: Problem, noise: Noise, kind: IntArray | None = None) -> None:
         self._problem = problem
+        self._kind = np.full(len(problem.pose_row), UNKNOWN) if kind is None else kind
+        self._of_class: IntArray = np.zeros(0, dtype=np.int64)
         self._start_noise = noise
         self.noise = replace(noise, odometry=CAUTION * noise.odometry)
         """Noise levels that everything is solved with; detections carry their own."""
@@ -93,6 +121,7 @@ class Associator:
         self._filter = LocalFilter(problem.mount, problem.prior, most=MOST_COMPARED)
         self._done = 0
         self._next_stock = FIRST_STOCK
+        self._density_m2 = landmark_density(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
     def step(self) -> None:
         """Associate the next frame."""
@@ -110,7 +139,7 @@ class Associator:
         self._done += 1
         if self._done == self._next_stock:
             self._take_stock()
-            self._next_stock = self._done + max(FIRST_STOCK, self._done // 10)
+            self._next_stock = self._done + max(FIRST_STOCK, int(STOCK_SHARE * self._done))
 
     def _after_driving(self, row: int, detections: IntArray) -> _Frame:
         """The next frame compared with the map; if nothing is where it should be, as after wheels that slipped."""
@@ -138,23 +167,27 @@ class Associator:
 
     def finish(self) -> Assignment:
         """Settle everything processed so far."""
-        assignment, marginals = self._settled(self._assignment())
+        solved = self._settled(self._assignment())
         for _ in range(LAST_ROUNDS):
-            again = self._reconsidered(assignment, marginals)
-            if np.array_equal(again.landmark_row, assignment.landmark_row):
+            before = solved.assignment
+            again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
+            again = with_overlooked(again)
+            again = again.without(again.sightings < MIN_SIGHTINGS)
+            count = min(before.n_landmarks, again.n_landmarks)
+            changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
+            solved = self._settled(again)
+            if changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count:
                 break
-            assignment, marginals = self._settled(again)
+        assignment = solved.assignment
         return assignment.without(assignment.sightings < MIN_SIGHTINGS)
-
-    @property
-    def _density(self) -> float:
-        """Landmarks a square metre that one may still meet."""
-        return density_of_unmet(self._filter.position)
 
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
-        pairings = pairings_of_frame(self._filter, self._problem, sigma, detections, density=self._density)
+        kind = self._kind[detections], self._of_class
+        pairings = pairings_of_frame(
+            self._filter, self._problem, sigma, detections, density=self._density_m2, kind=kind
+        )
         probability, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
@@ -172,7 +205,7 @@ class Associator:
             first = rows[probability[rows].argmax()]
             rivals = rows[(probability[rows] > 1.0 - P_MATCH) & (rows != first)]
             own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
-            area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density
+            area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density_m2
             tight = area_m2 < TIGHT_M2
             best[first] = tight or all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
         return best
@@ -194,6 +227,7 @@ class Associator:
         local.update(target, problem.reading[known], frame.sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
         self._row[new] = len(local.position) + np.arange(len(new))
+        self._of_class = np.append(self._of_class, self._kind[new])
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
@@ -201,19 +235,26 @@ class Associator:
 
     def _take_stock(self) -> None:
         """Solve everything so far, merge what is one, and go on from there."""
-        assignment, marginals = self._settled(self._without_chance(self._assignment()))
+        solved = self._settled(self._without_chance(self._assignment()), RECENT)
+        assignment = solved.assignment
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
+        self._of_class = assignment.of_class
         place = assignment.estimate.landmark
         near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
-        self._filter.begin(assignment.estimate, marginals, self._done - 1, near)
+        self._filter.begin(assignment.estimate, solved.marginals, self._done - 1, near)
 
     def _assignment(self) -> Assignment:
         measured = self._problem.until(self._done)
-        sigma = INFLATION * self._sighting_noise.of_detections(measured)
-        measured = replace(measured, sigma_given=sigma)
         estimate = Estimate(self._pose[: self._done].copy(), self._filter.position.copy(), self._filter.states.copy())
-        return Assignment(measured, self._row[: len(measured.pose_row)].copy(), estimate)
+        count = len(measured.pose_row)
+        return Assignment(measured, self._row[:count].copy(), estimate, self._kind[:count])
+
+    def _with_sigma(self, measured: Problem) -> Problem:
+        """Detections with the noise that has been learned."""
+        count = len(measured.pose_row)
+        given = replace(measured, sigma_given=self._problem.sigma_given[:count])
+        return replace(measured, sigma_given=INFLATION * self._sighting_noise.of_detections(given))
 
     def _without_chance(self, assignment: Assignment) -> Assignment:
         """Landmarks that were seen once or twice, long ago, were none."""
@@ -221,86 +262,82 @@ class Associator:
         few = assignment.sightings < MIN_SIGHTINGS
         return assignment.without(few & (age > FORGET_S))
 
-    def _settled(self, assignment: Assignment) -> tuple[Assignment, Marginals]:
-        """The batch solution, merged as long as there is something to merge."""
-        assignment, marginals = self._solved(assignment)
+    def _settled(self, assignment: Assignment, recent: int | None = None) -> _Solved:
+        """The batch solution, all landmarks or those seen last merged with others while there is something to merge."""
+        assignment = replace(assignment, measured=self._with_sigma(assignment.measured))
+        solved = self._solved(assignment)
         refused: set[tuple[int, int]] = set()
         for _ in range(MERGE_ROUNDS):
-            honest = assignment.with_shared_errors(marginals.shared)
-            pairs = propose_merges(assignment, honest, density=self._density, probability=P_MERGE)
-            pairs = [pair for pair in pairs if pair not in refused]
-            if not pairs:
-                pairs = propose_constellation(
-                    assignment, honest, density=self._density, probability=P_MERGE, refused=refused
-                )
+            now = solved.assignment
+            self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings)
+            pairs = propose_merges(
+                now, solved.marginals, density=density, probability=P_MERGE, among=_latest(now, recent),
+                refused=refused,
+            )  # fmt: skip
+            if not pairs and now.n_landmarks <= MOST_LAID:
+                honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
+                pairs = propose_constellation(now, honest, density=density, probability=P_MERGE, refused=refused)
             if not pairs:
                 break
-            limit = self._cost(assignment)[0] + RISE_NATS
-            merged = self._merged(assignment, pairs, limit + RISE_NATS * (len(pairs) - 1))
-            if merged is None:  # not all of them; perhaps some
-                singles = (self._merged(assignment, [pair], limit) for pair in pairs if len(pairs) > 1)
-                merged = next((single for single in singles if single is not None), None)
-            if merged is None:
-                refused.update(pairs)
-            else:
+            merged = self._merged(solved, pairs, refused)
+            if merged is not None:
                 refused.clear()
-                assignment, marginals = self._solved(merged)
-        return assignment, marginals
+                solved = merged
+        return solved
 
-    def _merged(self, assignment: Assignment, pairs: list[tuple[int, int]], limit: float) -> Assignment | None:
-        """At its optimum with pairs merged; None where a cost above `limit` says that they are two."""
-        trial = assignment.merged(pairs)
-        cost, estimate = self._cost(trial)
-        if cost > limit:
-            return None
-        return Assignment(trial.measured, trial.landmark_row, estimate)
+    def _merged(self, solved: _Solved, pairs: list[tuple[int, int]], refused: set[tuple[int, int]]) -> _Solved | None:
+        """With all pairs merged, or with half of them, and so on, until the cost agrees; one alone may be refused."""
+        sightings = solved.assignment.sightings
+        while pairs:
+            trial = self._solved(solved.assignment.merged(pairs))
+            lesser = np.array([min(sightings[u], sightings[o]) for u, o in pairs])
+            if trial.cost - solved.cost <= np.minimum(RISE_NATS + RISE_SHARE * lesser, RISE_MOST).sum():
+                return trial
+            if len(pairs) == 1:
+                refused.update(pairs)
+            pairs = pairs[: len(pairs) // 2]
+        return None
 
-    def _solved(self, assignment: Assignment) -> tuple[Assignment, Marginals]:
-        """Optimum and covariances; learns the noise on the way."""
+    def _solved(self, assignment: Assignment) -> _Solved:
+        """Optimum, covariances and cost; learns the noise on the way."""
         problem = assignment.problem()
         smoother = Smoother(problem, self.noise, heavy=True)
-        estimate = smoother.optimum(assignment.estimate, iterations=10, tolerance=1e-4)
-        marginals = smoother.marginals(estimate)
+        slices = smoother.solved_in_slices(assignment.estimate, iterations=8, tolerance=1e-3, settled=0.1)
+        estimate, marginals = exhausted(slices)
         measured = assignment.measured
         given = self._problem.sigma_given[: len(measured.pose_row)]
         unknown = replace(problem, sigma_given=given[assignment.landmark_row >= 0])
-        self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection)
-        return Assignment(assignment.measured, assignment.landmark_row, estimate), marginals
+        left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
+        self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
+        cost = smoother.under(self.noise, heavy=False).cost(estimate)
+        return _Solved(replace(assignment, estimate=estimate), marginals, cost)
 
-    def _cost(self, assignment: Assignment) -> tuple[float, Estimate]:
-        """Cost at the optimum, outliers decided."""
-        problem = assignment.problem()
-        near = Smoother(problem, self.noise, heavy=True)
-        estimate = near.optimum(assignment.estimate, iterations=10, tolerance=1e-3)
-        smoother = near.under(self.noise, heavy=False)
-        estimate = smoother.optimum(estimate, iterations=10, tolerance=1e-3)
-        return smoother.cost(estimate), estimate
 
-    def _reconsidered(self, assignment: Assignment, marginals: Marginals) -> Assignment:
-        """Every detection compared with the whole map once more, and given to whom it most probably belongs."""
-        problem = assignment.measured
-        sigma = problem.sigma_given
-        row, everything = np.full_like(assignment.landmark_row, NOBODY), np.arange(assignment.n_landmarks)
-        smoothed, local = assignment.estimate, LocalFilter(problem.mount, problem.prior)
-        n = 2 * len(everything)
-        order = np.append(n + np.arange(9), np.arange(n))
-        covariance = np.zeros((3 + len(order), 3 + len(order)))
-        covariance[3:, 3:] = marginals.shared[np.ix_(order, order)]
-        for i in range(self._done):
-            detections = np.arange(self._first[i], self._first[i + 1])
-            covariance[:3, :3], covariance[:3, 3:] = marginals.pose[i], marginals.pose_shared[i][:, order]
-            covariance[3:, :3] = covariance[:3, 3:].T
-            local.hold(smoothed.pose[i], smoothed.states, covariance, everything, smoothed.landmark)
-            pairings = pairings_of_frame(local, problem, sigma, detections, density=self._density)
-            probability, _ = pairing_probability(pairings, confidence=GATE)
-            taken = np.flatnonzero(probability > 0.5)
-            row[detections[pairings.source[taken]]] = pairings.target[taken]
-        again = Assignment(problem, row, assignment.estimate)
-        return again.without(again.sightings == 0)
+def _latest(assignment: Assignment, count: int | None) -> BoolArray:
+    """(L,) the landmarks with two sightings that were seen last; None for all."""
+    last = np.where(assignment.sightings > 1, assignment.last_seen_s, -np.inf)
+    if count is None or count >= len(last):
+        return np.ones(len(last), dtype=bool)
+    return np.asarray(last >= np.partition(last, -count)[-count])
+
+
+def _partners(row: IntArray) -> IntArray:
+    """(M,) the first detection of the same landmark; -1 where there is none."""
+    first = np.full(len(row), -1)
+    seen = np.flatnonzero(row >= 0)
+    _, at, of = np.unique(row[seen], return_index=True, return_inverse=True)
+    first[seen] = seen[at][of]
+    return first
 
 
 def pairings_of_frame(
-    local: LocalFilter, problem: Problem, sigma: FloatArray, detections: IntArray, *, density: float
+    local: LocalFilter,
+    problem: Problem,
+    sigma: FloatArray,
+    detections: IntArray,
+    *,
+    density: float,
+    kind: tuple[IntArray, IntArray],
 ) -> Pairings:
     """Return detections of a frame with the landmarks whose gates they pass.
 
@@ -310,12 +347,17 @@ def pairings_of_frame(
         sigma: (M, 2) standard deviations of all detections.
         detections: (n,) rows of those of the frame.
         density: landmarks a square metre that one expects where none was met before.
+        kind: (n,) classes of the detections and (L,) of the landmarks.
     """
     target = np.sort(local.active)
     source, target = np.repeat(np.arange(len(detections)), len(target)), np.tile(target, len(detections))
+    same = alike(kind[0][source], kind[1][target])
+    source, target = source[same], target[same]
     seen = detections[source]
-    nis, _, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
+    nis, log_det, innovation, by = local.compare(target, problem.reading[seen], sigma[seen])
     inside = np.flatnonzero(nis <= gates(1, GATE)[1])
+    # what is followed has a neighbourhood that is known; elsewhere the gate may hold another landmark by chance
+    followed = log_det[inside] <= 2.0 * np.log(sigma[seen[inside]]).sum(axis=1) + FOLLOWED
     source, target, seen, count = source[inside], target[inside], seen[inside], len(inside)
     rows = np.zeros((count, 2, len(local.covariance)))
     rows[:, :, :8] = by[inside, :, :8]
@@ -324,20 +366,35 @@ def pairings_of_frame(
     h = rows.reshape(2 * count, rows.shape[2])
     joint = h @ local.covariance @ h.T + np.diag((sigma[seen] ** 2).ravel())
     # a square metre has r dr db
-    new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
+    new = np.log(np.where(followed, UNMET, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
     return Pairings(source, target, innovation[inside], joint, new, len(detections))
 
 
 def density_of_unmet(place: FloatArray) -> float:
-    """Return landmarks a square metre that one may still meet, by the area that those at `place` (L, 2) span."""
-    area_m2 = float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0
-    return UNMET / max(area_m2, SMALLEST_M2)
+    """Return landmarks a square metre that one may still meet in the area that those at `place` (L, 2) span."""
+    return FEWEST / _area_m2(place)
+
+
+def _area_m2(place: FloatArray) -> float:
+    return max(float(np.prod(np.ptp(place, axis=0))) if len(place) else 0.0, SMALLEST_M2)
+
+
+def landmark_density(place: FloatArray, sightings: IntArray) -> float:
+    """Return landmarks a square metre in the area that those at `place` (L, 2) span, as many as one expects anywhere.
+
+    Those that are seen twice under two numbers are not counted twice: the number is `(sum s)^2 / sum s^2` of the
+    `sightings` (L,), where all are seen alike that of the landmarks.
+    """
+    squares = float((sightings.astype(float) ** 2).sum())
+    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), FEWEST) / _area_m2(place)
 
 
 PSEUDO_SIGHTINGS = 100.0
 """Imaginary sightings with the start's noise: what was associated first is little, and only what agreed."""
 CLIPPED_AT = 9.0
 """Squared normalised residual beyond which a sighting tells nothing more about the noise."""
+LEAST_LEFT = 0.1
+"""Share of a residual's variance that the fit leaves, at least: where it leaves less, the residual tells nothing."""
 ROUNDS = 10
 
 
@@ -363,30 +420,36 @@ class SightingNoise:
         return np.where(np.isfinite(problem.sigma_given), problem.sigma_given, np.sqrt(modelled))
 
 
-def fit_sighting_noise(problem: Problem, estimate: Estimate, start: FloatArray) -> SightingNoise:
+def fit_sighting_noise(
+    problem: Problem, estimate: Estimate, start: FloatArray, left: FloatArray | None = None
+) -> SightingNoise:
     """Estimate noise from the residuals of associated detections, which came without their own.
 
     Args:
         problem: detections with their landmarks.
         estimate: the optimum.
+        left: (M, 2) share of the noise's variance that the fit leaves in the residuals (restricted likelihood, see
+            `slam.noise`); None for all of it.
         start: (2,) standard deviations that `PSEUDO_SIGHTINGS` imaginary sightings vouch for.
     """
     free = ~np.isfinite(problem.sigma_given)
-    squared = detection_residuals(problem, estimate) ** 2
+    left = np.ones(free.shape) if left is None else np.maximum(left, LEAST_LEFT)
+    squared = detection_residuals(problem, estimate) ** 2 / left
     fourth = problem.reading[free[:, 0], 0] ** 4
     middle = float(np.median(fourth)) if len(fourth) else 1.0
     in_range, in_bearing = squared[free[:, 0], 0], squared[free[:, 1], 1]
+    own = left[free[:, 1], 1]
     variance, growth, bearing = start[0] ** 2, 0.0, start[1] ** 2
     for _ in range(ROUNDS):
         expected = variance + growth * fourth
         clipped = np.minimum(in_range, CLIPPED_AT * expected)
         # Fisher scoring of a Gaussian whose variance is linear in two numbers, neither negative
-        weight = np.append(1.0 / expected**2, PSEUDO_SIGHTINGS / (variance + growth * middle) ** 2)
+        weight = np.append((left[free[:, 0], 0] / expected) ** 2, PSEUDO_SIGHTINGS / (variance + growth * middle) ** 2)
         column = np.append(fourth, middle)
         value = np.append(clipped, start[0] ** 2)
         variance, growth = _line_not_negative(column, value, weight)
-        total = np.minimum(in_bearing, CLIPPED_AT * bearing).sum() + PSEUDO_SIGHTINGS * start[1] ** 2
-        bearing = total / (len(in_bearing) + PSEUDO_SIGHTINGS)
+        total = own @ np.minimum(in_bearing, CLIPPED_AT * bearing) + PSEUDO_SIGHTINGS * start[1] ** 2
+        bearing = total / (own.sum() + PSEUDO_SIGHTINGS)
     return SightingNoise(variance, growth, float(bearing))
 
 

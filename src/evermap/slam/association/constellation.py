@@ -13,12 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment
-from evermap.slam.association.jcbb import Pairings, gates, most_pairings, pairing_probability
-from evermap.slam.problem import Estimate
+from evermap.slam.association.jcbb import Pairings, most_pairings
 from evermap.types import BoolArray, FloatArray, IntArray
 
 CONFIDENCE = 0.999
@@ -229,42 +229,13 @@ def _pairings(motion: FloatArray, source: LocalMap, target: LocalMap, allowed: B
     )
 
 
-MAX_SOURCES = 8
-"""Landmarks that are looked up in the rest of the map at the same time."""
 MIN_SIGHTINGS = 2
 LOOSE_GATE = 60.0
 """Squared distance up to which a pair may be meant at all, though the linearisation is far off."""
 STIFF_M = 0.2
 """Landmarks belong to one stiff part if they are known against each other to this."""
-RISE_NATS = 100.0
-"""By how much the cost may rise for every pair that is merged. Errors of sightings from one place are alike, which the
-cost does not know: it rises by some tens for one landmark, by hundreds for two."""
-
-
-def propose_merges(
-    assignment: Assignment, joint: FloatArray, *, density: float, probability: float
-) -> list[tuple[int, int]]:
-    """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
-
-    Args:
-        assignment: at its optimum.
-        joint: (2 L + 9, 2 L + 9) covariance of landmarks and states at it.
-        density: landmarks a square metre that one expects.
-        probability: least posterior probability.
-    """
-    candidates = pairs_in_reach(assignment, joint)
-    sightings = assignment.sightings
-    merges: list[tuple[int, int]] = []
-    # the landmarks with most sightings are the best placed
-    sources = sorted({u for u, _ in candidates}, key=lambda u: (-sightings[u], u))
-    for begin in range(0, len(sources), MAX_SOURCES):
-        some = sorted(sources[begin : begin + MAX_SOURCES])
-        pairs = [(u, o) for u, o in candidates if u in some]
-        pairings = differences(assignment.estimate, joint, pairs, density)
-        weights, complete = pairing_probability(pairings, confidence=CONFIDENCE)
-        if complete:
-            merges += [pairs[k] for k in np.flatnonzero(weights >= probability)]
-    return merges
+MOST_LAID = 120
+"""Landmarks of a map up to which a loose part of it is laid over the rest."""
 
 
 def propose_constellation(
@@ -276,37 +247,36 @@ def propose_constellation(
     refused: set[tuple[int, int]],
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) by which a part of the map that is loose lies on the rest in one way only."""
-    place = assignment.estimate.landmark
-    apart, sightings = assignment.apart, assignment.sightings
-    root, loose = stiff_and_loose(assignment, joint)
+    place, sightings = assignment.estimate.landmark, assignment.sightings
+    apart = assignment.together.toarray() > 0.0
+    root, loose = stiff_and_loose(sightings, joint)
     if len(loose) < 2:
         return []
     loose = loose[np.argsort(-sightings[loose], kind="stable")]
     allowed = ~apart[np.ix_(loose, root)]
+    gap = place[loose][:, None] - place[root][None]
+    spread = _spreads(joint, loose, root)
+    allowed &= np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < LOOSE_GATE
     for k, m in np.argwhere(allowed):
-        pair = _ordered(loose[k], root[m])
-        spread = _spread(joint, *pair)
-        gap = place[pair[0]] - place[pair[1]]
-        allowed[k, m] = pair not in refused and gap @ np.linalg.solve(spread, gap) < LOOSE_GATE
+        allowed[k, m] = _ordered(loose[k], root[m]) not in refused
     source, target = _local(place, joint, loose), _local(place, joint, root)
     pairs = agreed_pairs(source, target, allowed, density=density, probability=probability)
     return [_ordered(loose[k], root[m]) for k, m in pairs]
 
 
-def stiff_and_loose(assignment: Assignment, joint: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return landmarks that hang together with the oldest, each well known against the next; and all others."""
-    seen = np.flatnonzero(assignment.sightings >= MIN_SIGHTINGS)
-    within = np.array(
-        [[np.linalg.norm(_spread(joint, u, o), 2) < STIFF_M**2 for o in seen.tolist()] for u in seen.tolist()]
-    )
-    reached = np.zeros(len(seen), dtype=bool)
-    reached[:1] = True
-    while len(seen):
-        further = within[reached].any(axis=0) | reached
-        if further.sum() == reached.sum():
-            break
-        reached = further
-    return seen[reached], seen[~reached]
+def stiff_and_loose(sightings: IntArray, joint: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return landmarks that hang together with the oldest, each well known against the next; and all others.
+
+    Args:
+        sightings: (L,) detections of each.
+        joint: (G, G) covariance, that of the landmarks first.
+    """
+    seen = np.flatnonzero(sightings >= MIN_SIGHTINGS)
+    if not len(seen):
+        return seen, seen
+    within = np.linalg.eigvalsh(_spreads(joint, seen, seen))[..., 1] < STIFF_M**2
+    _, part = connected_components(within, directed=False)
+    return seen[part == part[0]], seen[part != part[0]]
 
 
 def _ordered(u: int, o: int) -> tuple[int, int]:
@@ -319,45 +289,12 @@ def _local(place: FloatArray, joint: FloatArray, rows: IntArray) -> LocalMap:
     return LocalMap(place[rows], joint[np.ix_(columns, columns)])
 
 
-def _spread(joint: FloatArray, u: int, o: int) -> FloatArray:
-    """(2, 2) covariance of the difference of two landmarks."""
-    a, b = slice(2 * u, 2 * u + 2), slice(2 * o, 2 * o + 2)
-    cross = joint[a, b]
-    spread: FloatArray = joint[a, a] + joint[b, b] - cross - cross.T
-    return spread
-
-
-def pairs_in_reach(assignment: Assignment, joint: FloatArray) -> list[tuple[int, int]]:
-    """Return pairs (younger, older) whose difference is insignificant by itself, sorted."""
-    gate = gates(1, CONFIDENCE)[1]
-    estimate, sightings, apart = assignment.estimate, assignment.sightings, assignment.apart
-    found = []
-    for u in range(len(sightings)):
-        for o in range(u):
-            if apart[u, o] or min(sightings[u], sightings[o]) < MIN_SIGHTINGS:
-                continue
-            gap = estimate.landmark[u] - estimate.landmark[o]
-            spread = _spread(joint, u, o)
-            if gap @ np.linalg.solve(spread, gap) < gate:
-                found.append((u, o))
-    return found
-
-
-def differences(estimate: Estimate, joint: FloatArray, pairs: list[tuple[int, int]], density: float) -> Pairings:
-    """Return pairs (younger, older), sorted, as pairings whose innovation is their difference."""
-    n = len(pairs)
-    select = np.zeros((2 * n, len(joint)))
-    for k, (u, o) in enumerate(pairs):
-        select[2 * k : 2 * k + 2, 2 * u : 2 * u + 2] = np.eye(2)
-        select[2 * k : 2 * k + 2, 2 * o : 2 * o + 2] = -np.eye(2)
-    younger = np.array([u for u, _ in pairs], dtype=np.int64)
-    older = np.array([o for _, o in pairs], dtype=np.int64)
-    sources, source = np.unique(younger, return_inverse=True)
-    return Pairings(
-        source.astype(np.int64),
-        older,
-        estimate.landmark[younger] - estimate.landmark[older],
-        select @ joint @ select.T,
-        np.full(n, np.log(density)),
-        len(sources),
+def _spreads(joint: FloatArray, some: IntArray, others: IntArray) -> FloatArray:
+    """(n, m, 2, 2) covariances of the differences of landmarks."""
+    count = len(joint) // 2
+    blocks = joint[: 2 * count, : 2 * count].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
+    cross = blocks[np.ix_(some, others)]
+    spread: FloatArray = (
+        blocks[some, some][:, None] + blocks[others, others][None] - cross - cross.transpose(0, 1, 3, 2)
     )
+    return spread

@@ -47,7 +47,7 @@ def identified(
     anonymous = replace(recording.detections, landmark_id=np.zeros_like(recording.detections.landmark_id))
     prepared = prepare(replace(recording, detections=anonymous))
     problem = replace(prepared.problem, prior=prior.without_scale())
-    associator = Associator(problem, noise)
+    associator = Associator(problem, noise, recording.detections.class_id[prepared.used])
     for _ in problem.stamp_s:
         associator.step()
     assignment = associator.finish()

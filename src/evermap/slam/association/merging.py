@@ -1,0 +1,171 @@
+"""Landmarks that were met twice: pairs whose difference vanishes, found near each other and weighed together.
+
+Candidates are neighbours (a k-d tree), their covariances come from the sparse factorisation, for the landmarks that are
+compared only. `consensus` weighs the candidates of a group of landmarks at the same time.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import KDTree
+
+from evermap.geometry import se2
+from evermap.slam.association.assignment import Assignment, alike
+from evermap.slam.association.consensus import Candidates, Consensus, consensus
+from evermap.slam.association.jcbb import gates
+from evermap.slam.problem import Marginals
+from evermap.types import BoolArray, FloatArray, IntArray
+
+CONFIDENCE = 0.999
+"""Of the gate of a pair, given others that are one: a pair that fails is none."""
+LOOSE_GATE = 60.0
+"""Squared distance up to which a pair may be meant by itself: the robot's own error may be larger than it knows, which
+many pairs that agree on it outweigh."""
+MIN_SIGHTINGS = 2
+"""Detections of a landmark that is compared: one alone may be of nothing."""
+GROUP = 24
+"""Landmarks, met one after the other, that are looked up in the rest of the map at the same time."""
+MOST_PAIRS = 400
+"""Pairs of a group that are weighed, those with most evidence by themselves."""
+MOST_NEAR = 80
+"""Landmarks, the nearest, that one is compared with."""
+DOUBLE_NATS = 5.0
+"""Evidence against a pair from every frame that detects both: a sensor sees one thing twice in one of 150 frames."""
+
+IN_TURN_NATS, MOST_IN_TURN_NATS = 0.2, 10.0
+"""Evidence for a pair from every frame that detects one of two that are both in view, where one in five is missed by
+chance, and at most: one may hide the other."""
+
+
+def propose_merges(
+    assignment: Assignment,
+    marginals: Marginals,
+    *,
+    density: float,
+    probability: float,
+    among: BoolArray,
+    refused: set[tuple[int, int]],
+) -> list[tuple[int, int]]:
+    """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
+
+    Args:
+        assignment: at its optimum.
+        marginals: covariances at it.
+        density: landmarks a square metre that one expects.
+        probability: least posterior probability.
+        among: (L,) landmarks that are looked up among all.
+        refused: pairs that are not looked at.
+    """
+    sightings = assignment.sightings
+    seen = sightings >= MIN_SIGHTINGS
+    sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen)
+    if len(sources) < 1 or len(targets) < 2:
+        return []
+    younger, older = _near(assignment.estimate.landmark, marginals.landmark, sources, targets)
+    kept = np.array([(int(u), int(o)) not in refused for u, o in zip(younger, older, strict=True)], dtype=bool)
+    younger, older = younger[kept], older[kept]
+    merges: list[tuple[int, int]] = []
+    together, in_turn = assignment.together, assignment.in_turn
+    kind = assignment.of_class
+    kept = alike(kind[younger], kind[older])
+    younger, older = younger[kept], older[kept]
+    last = assignment.last_seen_s
+    order = sources[np.argsort(last[sources], kind="stable")[::-1]]
+    for begin in range(0, len(order), GROUP):
+        mine = np.isin(younger, order[begin : begin + GROUP])
+        # a pair of two sources is looked at once, with the source that comes first
+        later = order[begin + GROUP :]
+        mine |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
+        if mine.any():
+            pairs = younger[mine], older[mine]
+            merges += _agreed(assignment, marginals, pairs, (together, in_turn), density, probability)
+    return sorted(set(merges))
+
+
+def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets: IntArray) -> tuple[IntArray, IntArray]:
+    """Different pairs (younger, older) of a source and a target that may be one for all that their own spreads say."""
+    spread = np.sqrt(2.0 * np.linalg.eigvalsh(covariance)[:, 1])
+    gate = math.sqrt(LOOSE_GATE)
+    tree = KDTree(place[targets])
+    count = min(MOST_NEAR + 1, len(targets))
+    away, column = tree.query(place[sources], k=count)
+    away, column = away.reshape(len(sources), count), np.asarray(column).reshape(len(sources), count)
+    other = targets[np.minimum(column, len(targets) - 1)]
+    reach = gate * np.hypot(spread[sources][:, None], spread[other]) + 0.1
+    row, at = np.nonzero((away < reach) & (other != sources[:, None]))
+    one, two = sources[row], other[row, at]
+    pairs = np.unique(np.column_stack([np.maximum(one, two), np.minimum(one, two)]), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _agreed(
+    assignment: Assignment,
+    marginals: Marginals,
+    pairs: tuple[IntArray, IntArray],
+    seen: tuple[sparse.csr_array, sparse.csr_array],
+    density: float,
+    probability: float,
+) -> list[tuple[int, int]]:
+    """Pairs (younger, older) of a group that are one for certain, with how often two were seen together and in turn."""
+    younger, older = pairs
+    rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
+    u, o = both[: len(younger)], both[len(younger) :]
+    joint = marginals.joint(rows)
+    at = np.arange(len(joint))
+    joint[at, at] += np.repeat(assignment.shared_variance[rows], 2)
+    gap = assignment.estimate.landmark[younger] - assignment.estimate.landmark[older]
+    blocks = joint.reshape(len(rows), 2, len(rows), 2)
+    cross = blocks[u, :, o, :]
+    own = blocks[u, :, u, :] + blocks[o, :, o, :] - cross - cross.transpose(0, 2, 1)
+    squared = np.einsum("ki,ki->k", gap, np.linalg.solve(own, gap[..., None])[..., 0])
+    seen_together, in_turn = (_entries(each, younger, older) for each in seen)
+    against = math.log(density) + DOUBLE_NATS * seen_together - np.minimum(IN_TURN_NATS * in_turn, MOST_IN_TURN_NATS)
+    alone = -0.5 * (squared + np.log(np.linalg.det(own))) - against
+    inside = np.flatnonzero((squared < LOOSE_GATE) & (seen_together < 3))
+    inside = inside[np.argsort(-alone[inside], kind="stable")[:MOST_PAIRS]]
+    if not len(inside):
+        return []
+    u, o, younger, older = u[inside], o[inside], younger[inside], older[inside]
+    difference = joint[:, se2.xy_rows(u)] - joint[:, se2.xy_rows(o)]
+    covariance = difference[se2.xy_rows(u)] - difference[se2.xy_rows(o)]
+    conflict = _conflicts(younger, older, seen[0])
+    found: Consensus = consensus(
+        Candidates(gap[inside], covariance, against[inside], conflict), gate=gates(1, CONFIDENCE)[1], loose=LOOSE_GATE
+    )
+    sure = found.pairs[found.margin >= math.log(probability / (1.0 - probability))]
+    return [(int(younger[k]), int(older[k])) for k in sure]
+
+
+def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array) -> BoolArray:
+    """(P, P) pairs that cannot both be one: a landmark would be two others that were seen together."""
+    conflict = np.zeros((len(younger), len(younger)), dtype=bool)
+    np.fill_diagonal(conflict, True)
+    for mine, other in ((younger, older), (older, younger)):
+        for theirs, another in ((younger, older), (older, younger)):
+            shared = mine[:, None] == theirs[None]
+            one, two = np.nonzero(shared)
+            apart = _entries(together, other[one], another[two]) > 0.0
+            conflict[one[apart], two[apart]] = True
+    return conflict
+
+
+def _entries(matrix: sparse.csr_array, row: IntArray, column: IntArray) -> FloatArray:
+    """(K,) entries of a sparse matrix."""
+    matrix.sum_duplicates()
+    key = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr)) * matrix.shape[1] + matrix.indices
+    wanted = row * matrix.shape[1] + column
+    at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+    return np.where(key[at] == wanted, matrix.data[at], 0.0) if len(key) else np.zeros(len(wanted))
+
+
+def in_reach(place: FloatArray, at: FloatArray, reach_m: float) -> tuple[IntArray, IntArray]:
+    """Return rows of points and rows of places that are nearer to each other than this, sorted."""
+    near: Any = KDTree(place).query_ball_point(at, reach_m, return_sorted=True)
+    count = np.fromiter(map(len, near), dtype=np.int64, count=len(near))
+    column = np.fromiter(chain.from_iterable(near), dtype=np.int64, count=int(count.sum()))
+    return np.repeat(np.arange(len(near)), count), column

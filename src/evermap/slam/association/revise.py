@@ -1,0 +1,110 @@
+"""Every detection compared once more with the smoothed map: who it belongs to, and who was overlooked.
+
+Given all poses, detections no longer share much of an error, so each is compared by itself. What the estimate owes to a
+detection is known from the factorisation (`Marginals.explained_detections`); it is taken for that of the landmarks
+beside, too. Of a frame's detections a landmark takes one. Detections that are left and lie together, from frames
+enough, are a landmark that was overlooked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from evermap.slam.association.assignment import NOBODY, Assignment, alike
+from evermap.slam.association.jcbb import gates
+from evermap.slam.association.merging import in_reach
+from evermap.slam.kernels import kernel
+from evermap.slam.linearise import detection_residuals
+from evermap.types import BoolArray, FloatArray, IntArray
+
+CONFIDENCE = 0.999
+"""Of the gate: a detection outside is not of this landmark."""
+P_OWN = 0.5
+"""Least probability of the landmark that a detection is given to."""
+MIN_SIGHTINGS = 3
+"""Detections, in as many frames, that make a landmark of what was left over."""
+
+
+def reassigned(assignment: Assignment, explained: FloatArray, *, density: float) -> Assignment:
+    """Return the assignment with every detection given to the landmark that it most probably is of, or to none.
+
+    Args:
+        assignment: at its optimum.
+        explained: (M, 2, 2) whitened part of the residuals of detections with a landmark that the estimate's own
+            uncertainty explains, in the order of `assignment.problem()`.
+        density: landmarks a square metre that one expects, known or not.
+    """
+    problem, estimate = assignment.measured, assignment.estimate
+    sigma = problem.sigma_given
+    if assignment.n_landmarks == 0:
+        return assignment
+    spread = np.full(len(sigma), np.nan)
+    used = assignment.landmark_row >= 0
+    spread[used] = np.clip(np.trace(explained, axis1=1, axis2=2) / 2.0, 0.0, 1.0)
+    spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread) if used.any() else 1.0)
+    at = assignment.points()
+    wide = np.hypot(sigma[:, 0], problem.reading[:, 0] * sigma[:, 1]) * np.sqrt(1.0 + spread)
+    gate = gates(1, CONFIDENCE)[1]
+    seen, row = in_reach(estimate.landmark, at, float(np.sqrt(gate) * np.quantile(wide, 0.99)))
+    same = alike(assignment.of_class[row], assignment.kind[seen])
+    seen, row = seen[same], row[same]
+    compared = replace(problem, pose_row=problem.pose_row[seen], landmark_row=row, reading=problem.reading[seen])
+    residual = detection_residuals(compared, estimate)
+    variance = sigma[seen] ** 2 * (1.0 + spread[seen])[:, None]
+    squared = (residual**2 / variance).sum(axis=1)
+    # a square metre has r dr db
+    new = np.log(density * np.maximum(problem.reading[seen, 0], 0.1))
+    score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
+    inside = (squared < gate) & (score > 0.0)
+    seen, row, score = seen[inside], row[inside], score[inside]
+    weight = np.exp(np.minimum(score, 500.0))
+    share = weight / (1.0 + np.bincount(seen, weight, len(sigma))[seen])
+    order = np.lexsort((-score, problem.pose_row[seen]))
+    taken = _given(seen[order], row[order], problem.pose_row, share[order] > P_OWN, len(sigma), assignment.n_landmarks)
+    return replace(assignment, landmark_row=taken)
+
+
+@kernel
+def _given(
+    seen: IntArray, row: IntArray, pose_row: IntArray, sure: BoolArray, n_detections: int, n_landmarks: int
+) -> IntArray:
+    """(M,) landmark of every detection: candidates in order of frame and score, one detection a landmark and frame."""
+    taken = np.full(n_detections, -1)
+    last = np.full(n_landmarks, -1)
+    for k in range(len(seen)):
+        if sure[k] and taken[seen[k]] < 0 and last[row[k]] != pose_row[seen[k]]:
+            taken[seen[k]] = row[k]
+            last[row[k]] = pose_row[seen[k]]
+    return taken
+
+
+def with_overlooked(assignment: Assignment) -> Assignment:
+    """Return the assignment with new landmarks where detections of none lie together in frames enough."""
+    problem = assignment.measured
+    left = np.flatnonzero(assignment.landmark_row == NOBODY)
+    if len(left) < MIN_SIGHTINGS:
+        return assignment
+    at, sigma = assignment.points()[left], problem.sigma_given[left]
+    wide = np.hypot(sigma[:, 0], problem.reading[left, 0] * sigma[:, 1])
+    tree = KDTree(at)
+    row, places = assignment.landmark_row.copy(), [assignment.estimate.landmark]
+    free, count = np.ones(len(left), dtype=bool), assignment.n_landmarks
+    near = [np.array(tree.query_ball_point(at[k], 3.0 * wide[k]), dtype=np.int64) for k in range(len(left))]
+    for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
+        mine = near[k][free[near[k]] & alike(assignment.kind[left[near[k]]], assignment.kind[left[k]])]
+        mine = mine[np.unique(problem.pose_row[left[mine]], return_index=True)[1]]
+        if not free[k] or len(mine) < MIN_SIGHTINGS:
+            continue
+        weight = 1.0 / wide[mine] ** 2
+        middle = (weight[:, None] * at[mine]).sum(axis=0) / weight.sum()
+        mine = mine[np.hypot(*(at[mine] - middle).T) < 3.0 * wide[mine]]
+        if len(mine) < MIN_SIGHTINGS:
+            continue
+        row[left[mine]], free[mine] = count, False
+        places.append(middle[None])
+        count += 1
+    estimate = replace(assignment.estimate, landmark=np.concatenate(places))
+    return replace(assignment, landmark_row=row, estimate=estimate)
