@@ -93,8 +93,7 @@ def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets:
     gate = math.sqrt(LOOSE_GATE)
     tree = KDTree(place[targets])
     count = min(MOST_NEAR + 1, len(targets))
-    away, column = tree.query(place[sources], k=count)
-    away, column = away.reshape(len(sources), count), np.asarray(column).reshape(len(sources), count)
+    away, column = (np.reshape(each, (len(sources), count)) for each in tree.query(place[sources], k=count))
     other = targets[np.minimum(column, len(targets) - 1)]
     reach = gate * np.hypot(spread[sources][:, None], spread[other]) + 0.1
     row, at = np.nonzero((away < reach) & (other != sources[:, None]))
