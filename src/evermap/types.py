@@ -225,6 +225,16 @@ class Misses(_Columns):
         return cls(none, none, np.zeros(0))
 
 
+class SensorKind(StrEnum):
+    """What measures ranges and bearings, which says how its errors are before any is seen."""
+
+    LASER = "laser"
+    CAMERA = "camera"
+    TAG = "tag"
+    STEREO = "stereo"
+    UWB = "uwb"
+
+
 @dataclass(frozen=True, slots=True)
 class Sensor:
     """What the sensor can see and how well: limits and nominal noise of a range-bearing sensor.
@@ -235,6 +245,11 @@ class Sensor:
         sigma_range_m, sigma_bearing_rad: nominal noise, a starting value where noise is estimated; None = unknown.
         p_detect: probability of detecting a landmark in view; p_false: probability of a false detection a frame.
         mount_robot_sensor: pose (x, y, theta) of the sensor in the robot's frame.
+        kind: what it is; None = unknown.
+        sigma_scale: standard deviation of the scale of its ranges, as a share; sigma_offset_m: of what is added to all;
+            sigma_angle_rad: of its angle in the mount. None: as usual for the kind.
+        sigma_odometer_scale: standard deviation of the scale of the odometer; sigma_askew_rad: of the direction in
+            which the robot drives, from its front. None: unknown.
     """
 
     range_min_m: float = 0.0
@@ -246,6 +261,12 @@ class Sensor:
     p_detect: float = 0.9
     p_false: float = 0.01
     mount_robot_sensor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    kind: SensorKind | None = None
+    sigma_scale: float | None = None
+    sigma_offset_m: float | None = None
+    sigma_angle_rad: float | None = None
+    sigma_odometer_scale: float | None = None
+    sigma_askew_rad: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -653,6 +674,7 @@ class ParameterEstimate(Shown):
         unit: 's', 'm', 'rad', '1' ...
         fixed: True where the configuration fixed it.
         meaning: half a sentence for the report.
+        p_needed: probability that it is another than stated, by which it is estimated; nan where that is not asked.
     """
 
     name: str
@@ -663,6 +685,7 @@ class ParameterEstimate(Shown):
     unit: str
     fixed: bool = False
     meaning: str = ""
+    p_needed: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
 from problems import default_prior, make_world
+from scipy.stats import multivariate_normal
 
+from evermap.config import Config
 from evermap.errors import ConfigError
-from evermap.slam.calibration import FORWARD, NAMES, SLOPE, SPECS, CalibrationPrior
+from evermap.geometry import se2
+from evermap.pipeline import run_slam
+from evermap.slam.calibration import BEARING, FORWARD, KINDS, NAMES, SLOPE, SPECS, CalibrationPrior, needed
 from evermap.slam.smoother import Smoother
+from evermap.types import ParameterEstimate, Recording, Sensor, SensorKind
+from evermap_studies.worlds.robots import draw_robot, simulate_robot
 
 
 def test_default_prior_is_the_table():
@@ -134,3 +141,160 @@ def test_metres_are_right_when_the_priors_are_told_the_truth(slope, forward):
     assert divided == pytest.approx(truth, abs=1e-6)
     assert factor * found.landmark == pytest.approx(world.truth.landmark, abs=1e-5)
     assert factor * found.pose[:, :2] == pytest.approx(world.truth.pose[:, :2], abs=1e-5)
+
+
+def test_evidence_of_states_is_that_of_a_gaussian_by_brute_force():
+    """Every subset's marginal likelihood as the density of the readings themselves."""
+    rng = np.random.default_rng(0)
+    prior = replace(default_prior(range_slope=0.0, odometry_delay_s=0.0), p_sensor=0.8)
+    free = np.flatnonzero(prior.free)
+    design = rng.normal(size=(12, 9)) / prior.sigma * [0.3, 1, 3, 0.5, 2, 1, 0.1, 4, 1]
+    truth = np.where(rng.random(9) < 0.5, prior.sigma * rng.normal(size=9), 0.0) * prior.free
+    reading = design @ truth + rng.normal(size=12)
+    odds, inside = [], []
+    for some in product((False, True), repeat=len(free)):
+        on = free[np.array(some)]
+        covariance = np.eye(12) + (design[:, on] * prior.sigma[on] ** 2) @ design[:, on].T
+        p = np.where(free < 5, 0.8, 0.5)
+        odds.append(
+            multivariate_normal(np.zeros(12), covariance).logpdf(reading) + np.log(np.where(some, p, 1 - p)).sum()
+        )
+        inside.append(some)
+    weight = np.exp(np.array(odds) - np.max(odds))
+    expected = weight @ np.array(inside) / weight.sum()
+    information = np.diag(1.0 / prior.sigma[free] ** 2) + design[:, free].T @ design[:, free]
+    covariance, states = np.zeros((9, 9)), prior.mean.copy()
+    covariance[np.ix_(free, free)] = np.linalg.inv(information)
+    states[free] += covariance[np.ix_(free, free)] @ design[:, free].T @ reading
+    found = needed(prior, states, covariance, np.ones(9))
+    assert found[free] == pytest.approx(expected, abs=1e-7)
+    assert np.isnan(found[~prior.free]).all()
+    # readings that are worth a hundredth tell less
+    assert np.all(
+        np.abs(needed(prior, states, covariance, np.full(9, 1e6))[free] - np.where(free < 5, 0.8, 0.5)) < 0.05
+    )
+
+
+def test_readings_that_repeat_themselves_are_worth_one():
+    """Each detection four times over: the states look four times better known than they are."""
+    world = make_world(41, n_poses=400, n_landmarks=12, prior=default_prior(range_slope=0.0))
+    problem, noise = world.problem, world.noise
+
+    def worth(problem):
+        smoother = Smoother(problem, noise, robust=False)
+        found = smoother.optimum(world.near_truth(np.random.default_rng(0)))
+        return smoother.worth(found, smoother.marginals(found))
+
+    once = worth(problem)
+    again = {name: np.repeat(getattr(problem, name), 4, axis=0) for name in (
+        "pose_row", "landmark_row", "reading", "sigma_given"
+    )}  # fmt: skip
+    repeated = worth(replace(problem, **again))
+    assert np.all(once >= 1.0)
+    assert np.median(once) < 1.6
+    # of the range law only detections speak
+    assert np.all(repeated[[0, 3]] > 2.5 * once[[0, 3]])
+
+
+def test_influence_of_each_residual_on_the_states_is_the_dense_one():
+    world = make_world(42, n_poses=60, prior=default_prior(range_slope=0.0))
+    smoother = Smoother(world.problem, world.noise, robust=False)
+    found = smoother.optimum(world.near_truth(np.random.default_rng(0)), tolerance=1e-9)
+    with_states = smoother.marginals(found).with_states
+    dense = smoother.marginals(found)
+    assert with_states[-9:] == pytest.approx(dense.states, abs=1e-12)
+    assert with_states[: 3 * 60].reshape(60, 3, 9) == pytest.approx(dense.pose_shared[:, :, -9:], abs=1e-12)
+    assert with_states[3 * 60 : -9] == pytest.approx(dense.shared[:-9, -9:], abs=1e-12)
+
+
+def stated(**what) -> CalibrationPrior:
+    return CalibrationPrior.from_settings(calibrated=True, fix={}, sensor=Sensor(**what))
+
+
+def test_kind_and_data_sheet_narrow_the_priors():
+    unknown, laser = stated(), stated(kind=SensorKind.LASER)
+    assert laser.sigma[:4].tolist() == list(KINDS[SensorKind.LASER][:4])
+    assert (unknown.slope_share, laser.slope_share) == (0.0, None)
+    exact = stated(kind=SensorKind.CAMERA, sigma_scale=0.001, sigma_offset_m=0.02, sigma_odometer_scale=0.1)
+    assert exact.sigma[[0, 1, FORWARD]].tolist() == [0.02, 0.001, 0.1]
+    states, covariance = exact.mean.copy(), np.eye(9) * 1e-6
+    states[FORWARD] = 1.05
+    assert exact.split_scale(states, covariance)[0][SLOPE] == pytest.approx(0.05 * 0.001**2 / 0.1**2, rel=0.05)
+    assert unknown.split_scale(states, covariance)[0][SLOPE] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("what", "share"),
+    [
+        ({}, 0.0),
+        ({"kind": SensorKind.CAMERA}, 0.0),
+        ({"sigma_angle_rad": 0.04, "sigma_askew_rad": 0.03}, 0.64),
+        ({"sigma_angle_rad": 0.05, "sigma_askew_rad": 0.0}, 1.0),
+    ],
+)
+def test_angle_is_the_robots_unless_the_data_sheet_says_otherwise(what, share):
+    prior = stated(**what)
+    states, covariance = prior.mean.copy(), np.diag(np.full(9, 1e-6))
+    states[BEARING] = 0.08
+    after, _, askew, sigma = prior.split_angle(states, covariance)
+    assert after[BEARING] == pytest.approx(0.08 * share, abs=1e-6)
+    assert askew == pytest.approx(0.08 * (1 - share), abs=1e-6)
+    assert sigma > 0.0
+    # where the sensor is and how it is turned against what it saw stays
+    pose, mount = np.array([3.0, -2.0, 2.5]), np.array([0.4, 0.1, 0.3])
+    eye, before = (se2.compose(p, mount) for p in (se2.compose(pose, prior.front(states, mount)), pose))
+    assert eye[:2] == pytest.approx(before[:2])
+    assert se2.wrap(eye[2] - before[2]) == pytest.approx(-askew)
+
+
+def robot(kind: SensorKind, seed: int, **states: float) -> Recording:
+    """A robot as good as its kind gets, but for some states."""
+    drawn = draw_robot(seed)
+    values = np.array([spec.mean for spec in SPECS])
+    for name, value in states.items():
+        values[NAMES.index(name)] = value
+    made = replace(
+        drawn, kind=kind, states=values, askew_rad=0.0, sigma_range_m=0.01, sigma_range_share=0.0, n_landmarks=20,
+        sigma_bearing_rad=0.004, lasting_share=0.5, lasting_s=2.0, range_max_m=12.0, field_of_view_rad=3.0, size_m=15.0,
+        rate_hz=3.0, p_detect=0.8, duration_s=200.0,
+    )  # fmt: skip
+    return simulate_robot(made, seed)
+
+
+def told(recording: Recording) -> dict[str, ParameterEstimate]:
+    return {parameter.name: parameter for parameter in run_slam(recording).parameters}
+
+
+def test_a_perfect_sensor_is_left_as_stated():
+    found = told(robot(SensorKind.LASER, 3))
+    held = [name for name in NAMES if found[name].fixed]
+    assert len(held) >= 6
+    assert all(found[name].p_needed < 0.5 for name in held)
+
+
+def test_errors_are_found_where_they_are():
+    truth = {
+        "range_bias_m": 0.08,
+        "range_curvature_per_rad2": -0.5,
+        "odometry_delay_s": -0.15,
+        "odometry_turn_scale": 0.93,
+    }
+    found = told(robot(SensorKind.CAMERA, 4, **truth))
+    for name, value in truth.items():
+        assert found[name].p_needed > 0.99
+        assert abs(found[name].value - value) < 3.5 * found[name].sigma
+
+
+def test_heading_is_that_of_the_sensor_as_stated():
+    """What an estimate without calibration has; both readings are told."""
+    recording = robot(SensorKind.LASER, 5, bearing_bias_rad=0.08)
+    result = run_slam(recording)
+    plain = run_slam(recording, Config(slam={"sensor_model": "plain"}))
+    turn = se2.wrap(result.trajectory.pose_world_robot[:, 2] - plain.trajectory.pose_world_robot[:, 2])
+    assert np.abs(turn).max() < np.radians(2.0)
+    assert result.trajectory.pose_world_robot[0] == pytest.approx(np.zeros(3), abs=1e-4)
+    assert result.online.pose_world_robot[0] == pytest.approx(np.zeros(3), abs=1e-9)
+    found = {parameter.name: parameter for parameter in result.parameters}
+    assert found["bearing_bias_rad"].value == 0.0
+    assert found["odometry_askew_rad"].value == pytest.approx(0.08, abs=0.01)
+    assert "0.08" in found["bearing_bias_rad"].meaning

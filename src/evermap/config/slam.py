@@ -9,7 +9,7 @@ from pydantic import Field, field_validator
 
 from evermap.config.section import Count, Positive, Probability, Section, Share
 from evermap.errors import ConfigError
-from evermap.types import Sensor
+from evermap.types import Sensor, SensorKind
 
 
 class CalibrationConfig(Section):
@@ -216,6 +216,24 @@ class SensorConfig(Section):
     p_false: Probability | None = Field(default=None, description="probability of a false detection in a frame")
     mount_robot_sensor: tuple[float, float, float] | None = Field(
         default=None, description="pose of the sensor on the robot: x [m], y [m], theta [rad]"
+    )
+    kind: SensorKind | None = Field(
+        default=None, description="kind of sensor, by which its errors are as usual, not larger"
+    )
+    sigma_scale: float | None = Field(
+        default=None, ge=0, le=1, description="standard deviation of the scale of its ranges, a share"
+    )
+    sigma_offset_m: float | None = Field(
+        default=None, ge=0, description="standard deviation of what is added to all its ranges [m]"
+    )
+    sigma_angle_rad: float | None = Field(
+        default=None, ge=0, le=6.3, description="standard deviation of its angle in the mount [rad]"
+    )
+    sigma_odometer_scale: float | None = Field(
+        default=None, ge=0, le=1, description="standard deviation of the scale of the odometer, a share"
+    )
+    sigma_askew_rad: float | None = Field(
+        default=None, ge=0, le=6.3, description="standard deviation of the direction of driving, from the front [rad]"
     )
 
     def applied_to(self, sensor: Sensor) -> Sensor:

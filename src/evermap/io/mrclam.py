@@ -31,6 +31,7 @@ from evermap.types import (
     Recording,
     RobotSightings,
     Sensor,
+    SensorKind,
     Trajectory,
 )
 from evermap.valid import (
@@ -49,6 +50,7 @@ LAST_ROBOT_SUBJECT = 5
 """Subjects 1 to 5 are robots, 6 to 20 landmarks, in all nine datasets."""
 
 CAMERA = Sensor(
+    kind=SensorKind.CAMERA,
     range_min_m=0.5,
     range_max_m=10.0,
     bearing_min_rad=-0.65,

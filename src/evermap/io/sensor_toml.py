@@ -11,7 +11,7 @@ from typing import Any
 
 from evermap.errors import InputError, suggestion
 from evermap.io.text import decode_text, reason
-from evermap.types import Clock, Sensor
+from evermap.types import Clock, Sensor, SensorKind
 
 FORMAT_VERSION = 1
 
@@ -26,6 +26,8 @@ _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
     "noise": {"sigma_range_m": (1e-9, 1e6), "sigma_bearing_rad": (1e-9, 1e3)},
     "mount": {"x_m": (-1e3, 1e3), "y_m": (-1e3, 1e3), "theta_rad": (-2 * pi, 2 * pi)},
     "detection": {"p_detect": (0.0, 1.0), "p_false": (0.0, 1.0)},
+    "sensor": {"sigma_scale": (0.0, 1.0), "sigma_offset_m": (0.0, 1e3), "sigma_angle_rad": (0.0, 2 * pi)},
+    "odometry": {"sigma_odometer_scale": (0.0, 1.0), "sigma_askew_rad": (0.0, 2 * pi)},
 }
 _RECORDING = ("format_version", "name", "clock", "frames_complete", "class_names")
 
@@ -51,7 +53,7 @@ def parse_sensor_toml(data: bytes, path: Path) -> Settings:
     reader.expect(("recording", *_LIMITS), reader.document, section=None)
     values: dict[str, dict[str, float]] = {}
     for section, keys in _LIMITS.items():
-        content = reader.section(section, tuple(keys))
+        content = reader.section(section, ("kind", *keys) if section == "sensor" else tuple(keys))
         values[section] = {key: reader.number(section, key, content[key], *keys[key]) for key in keys if key in content}
     return reader.recording(_sensor(values, reader))
 
@@ -68,6 +70,7 @@ def sensor_toml(settings: Settings) -> str:
             "class_names": settings.class_names or None,
         },
         **{name: {key: getattr(sensor, key, None) for key in keys} for name, keys in _LIMITS.items()},
+        "sensor": {key: getattr(sensor, key) for key in ("kind", *_LIMITS["sensor"])},
         "mount": dict(zip(_LIMITS["mount"], sensor.mount_robot_sensor, strict=True)),
     }
     return toml_text(sections)
@@ -86,14 +89,25 @@ def toml_text(sections: dict[str, dict[str, Any]]) -> str:
 def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     mount = values.pop("mount")
     x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
-    sensor = Sensor(
-        **{k: v for part in values.values() for k, v in part.items()}, mount_robot_sensor=(x_m, y_m, theta_rad)
-    )
+    numbers: dict[str, Any] = {k: v for part in values.values() for k, v in part.items()}
+    sensor = Sensor(**numbers, kind=_kind(reader), mount_robot_sensor=(x_m, y_m, theta_rad))
     if sensor.range_min_m >= sensor.range_max_m:
         raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
     if sensor.bearing_min_rad >= sensor.bearing_max_rad:
         raise reader.error("limits", "bearing_max_rad", "must be greater than bearing_min_rad")
     return sensor
+
+
+def _kind(reader: TomlReader) -> SensorKind | None:
+    kind = reader.document.get("sensor", {}).get("kind")
+    if kind is None:
+        return None
+    if kind not in list(SensorKind):
+        problem = f"no kind of sensor '{kind}'"
+        raise reader.error(
+            "sensor", "kind", problem, suggestion(str(kind), list(SensorKind)) or "one of " + ", ".join(SensorKind)
+        )
+    return SensorKind(kind)
 
 
 class TomlReader:

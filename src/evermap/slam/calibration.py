@@ -4,18 +4,30 @@ The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and
 that reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
 instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`.
 
-All nine states form one vector, in the order of `SPECS`. Priors are weak and the same for every robot; they say what a
-decent camera, laser or wheel encoder does out of the box and were not fitted to any recording.
+All nine states form one vector, in the order of `SPECS`. Priors say what a decent camera, laser or wheel encoder does
+out of the box; a kind of sensor (`KINDS`) or its data sheet (`Sensor`) makes those of the sensor narrower. None was
+fitted to a recording.
+
+Not all sensors have errors. Each state has a spike at 'as stated' beside its slab, the prior; which of the two holds is
+decided by their evidence (`needed`), under the number of observations that the data are worth: errors of one landmark
+are alike for seconds, and a thousand readings of it are no thousand observations.
+
+Two things only show together, and none of them alone: range slope and odometer scale without a map (`without_scale`),
+and a sensor turned in its mount and a robot that drives askew. They stay as the sensor states them, unless its data
+sheet says how far off it may be.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
+from scipy.special import logsumexp
 
 from evermap.errors import ConfigError
-from evermap.types import BoolArray, FloatArray
+from evermap.geometry import se2
+from evermap.types import BoolArray, FloatArray, Sensor, SensorKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +52,21 @@ SPECS: tuple[Spec, ...] = (
     Spec("odometry_turn_scale", 1.0, 0.1, "1", "true over reported turn rate"),
     Spec("odometry_turn_slip_m", 0.0, 0.05, "m", "forward speed lost per turn rate"),
 )
-N_STATES = len(SPECS)
+N_STATES, N_SENSOR = len(SPECS), 5
 NAMES = tuple(spec.name for spec in SPECS)
-SLOPE, SKEW, CURVATURE, FORWARD, SLIP = 1, 2, 3, 6, 8
+BIAS, SLOPE, SKEW, CURVATURE, BEARING, FORWARD, SLIP = 0, 1, 2, 3, 4, 6, 8
+KINDS: dict[SensorKind, tuple[float, float, float, float, float]] = {
+    SensorKind.LASER: (0.05, 0.002, 0.002, 0.002, 0.01),
+    SensorKind.CAMERA: (0.1, 0.02, 0.1, 0.5, 0.05),
+    SensorKind.TAG: (0.05, 0.02, 0.05, 0.1, 0.05),
+    SensorKind.STEREO: (0.05, 0.02, 0.05, 0.1, 0.03),
+    SensorKind.UWB: (0.3, 0.005, 0.02, 0.02, 0.05),
+}
+"""Standard deviations of the states of the sensor, the first five, by its kind: data sheets, and mounts by hand."""
+ASKEW_SIGMA_RAD = 0.03
+"""Of the direction in which wheels drive: they, or the axis that is called the robot's front, are not parallel."""
+P_NEEDED, P_NEEDED_KNOWN = 0.5, 0.9
+"""Prior probability that a state is not as stated; those of a sensor that is known to be no laser hardly ever are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +76,31 @@ class CalibrationPrior:
     Attributes:
         mean, sigma: (9,) in the order of `SPECS`.
         free: (9,) which states are estimated.
+        slope_share: of what range slope and odometer scale show together, that is the sensor's; None: by their sigmas.
+        angle_share: of what bearing bias and driving askew show together, that is the sensor's.
+        askew_sigma: standard deviation of the latter [rad].
+        p_sensor: probability of each of the sensor's states, the first five, to be another than stated.
     """
 
     mean: FloatArray
     sigma: FloatArray
     free: BoolArray
+    slope_share: float | None = None
+    angle_share: float = 1.0
+    askew_sigma: float = 0.0
+    p_sensor: float = P_NEEDED
 
     @classmethod
-    def from_settings(cls, *, calibrated: bool, fix: dict[str, float]) -> CalibrationPrior:
-        """Return the default priors, all states free unless `calibrated` is False, and some fixed by name.
+    def from_settings(
+        cls, *, calibrated: bool, fix: dict[str, float], sensor: Sensor | None = None
+    ) -> CalibrationPrior:
+        """Return the priors, all states free unless `calibrated` is False, and some fixed by name.
+
+        Args:
+            calibrated: whether any is estimated.
+            fix: values of states that are not, by their names.
+            sensor: its kind and data sheet, by which its errors are smaller, and are told from those of the odometry;
+                None: whatever only shows together is the sensor's as much as the odometry's.
 
         Raises:
             ConfigError: `fix` names an unknown state.
@@ -68,6 +108,7 @@ class CalibrationPrior:
         mean = np.array([spec.mean for spec in SPECS])
         sigma = np.array([spec.sigma for spec in SPECS])
         free = np.full(N_STATES, calibrated)
+        shares = {} if sensor is None else _stated(sensor, sigma)
         for name, value in fix.items():
             if name not in NAMES:
                 raise ConfigError(
@@ -77,7 +118,13 @@ class CalibrationPrior:
                 )
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-        return cls(mean, sigma, free)
+            if name == NAMES[BEARING]:
+                shares["angle_share"] = 1.0
+        return cls(mean, sigma, free, **shares)
+
+    def without(self, spare: BoolArray) -> CalibrationPrior:
+        """Return the prior with some states (9,) held at their means."""
+        return replace(self, free=self.free & ~spare)
 
     def without_scale(self) -> CalibrationPrior:
         """Return the prior of the states that are observable without a prior map, in the metres of the range sensor.
@@ -91,7 +138,7 @@ class CalibrationPrior:
         sigma, free = self.sigma.copy(), self.free.copy()
         free[SLOPE] = False
         sigma[FORWARD] = np.hypot(sigma[FORWARD], sigma[SLOPE])
-        return CalibrationPrior(self.mean, sigma, free)
+        return replace(self, sigma=sigma, free=free)
 
     @property
     def _shares_scale(self) -> bool:
@@ -113,11 +160,12 @@ class CalibrationPrior:
             return states, covariance, 1.0, 0.0
         states, covariance = states.copy(), covariance.copy()
         sigma_slope, sigma_forward = self.sigma[SLOPE], self.sigma[FORWARD]
-        share = sigma_slope**2 / (sigma_slope**2 + sigma_forward**2)
+        believed = sigma_slope**2 / (sigma_slope**2 + sigma_forward**2)
+        share = believed if self.slope_share is None else self.slope_share
         surplus = np.log(states[FORWARD] / self.mean[FORWARD])
         log_slope = share * surplus
         # what the product does not tell keeps the prior's spread; what it tells has the product's
-        spread = np.sqrt(share) * sigma_forward
+        spread = np.sqrt(believed) * sigma_forward
         variance = spread**2 + share**2 * covariance[FORWARD, FORWARD]
         states[SLOPE] = (1.0 + self.mean[SLOPE]) * np.exp(log_slope) - 1.0
         states[FORWARD] *= np.exp(-log_slope)
@@ -127,3 +175,110 @@ class CalibrationPrior:
         covariance[SLOPE, SLOPE] = variance
         covariance[FORWARD, FORWARD] = (1.0 - share) ** 2 * covariance[FORWARD, FORWARD] + spread**2
         return states, covariance, float(np.exp(-log_slope)), float(np.sqrt(variance))
+
+    def split_angle(self, states: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+        """Divide what the graph holds as bearing bias between the angle of the sensor and the robot's driving askew.
+
+        Args:
+            states: (9,) estimate.
+            covariance: (9, 9) of it.
+
+        Returns:
+            States and covariance with the sensor's part alone; the robot's part [rad], to the left of its front where
+            positive, and its standard deviation.
+        """
+        if not self.free[BEARING] or not self.askew_sigma > 0.0:
+            return states, covariance, 0.0, 0.0
+        states, covariance, share = states.copy(), covariance.copy(), self.angle_share
+        askew, variance = (1.0 - share) * states[BEARING], covariance[BEARING, BEARING]
+        own = max(self.sigma[BEARING] ** 2 - self.askew_sigma**2, 0.0)
+        undivided = own * self.askew_sigma**2 / self.sigma[BEARING] ** 2
+        states[BEARING] *= share
+        covariance[BEARING] *= share
+        covariance[:, BEARING] *= share
+        covariance[BEARING, BEARING] += undivided
+        return states, covariance, float(askew), float(np.sqrt((1.0 - share) ** 2 * variance + undivided))
+
+    def front(self, states: FloatArray, mount: FloatArray) -> FloatArray:
+        """Return (3,) where the robot's front is, seen from poses as the graph has them.
+
+        There the robot drives along its front and the sensor is turned by the whole bearing bias; where it is the robot
+        that drives askew, its front is turned the other way. Where the sensor is stays as it was.
+
+        Args:
+            states: (9,) estimate, as the graph has it.
+            mount: (3,) pose of the sensor on the robot.
+        """
+        askew = self.split_angle(states, np.zeros((N_STATES, N_STATES)))[2]
+        turned = se2.compose(se2.compose(mount, np.array([0.0, 0.0, -askew])), se2.inverse(mount))
+        return np.asarray(turned, dtype=np.float64)
+
+
+def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return poses (..., 3) and covariances (..., 3, 3), in their own frames, of the front (3,) that each one sees."""
+    if not front.any():
+        return pose.copy(), covariance.copy()
+    turned = se2.adjoint(se2.inverse(front))
+    return se2.compose(pose, front), turned @ covariance @ turned.T
+
+
+def _stated(sensor: Sensor, sigma: FloatArray) -> dict[str, float]:
+    """Narrow the sigmas (9,) by what is stated of the sensor; return how errors that only show together are divided."""
+    shares = {"slope_share": 0.0, "angle_share": 0.0, "askew_sigma": ASKEW_SIGMA_RAD}
+    if sensor.kind is not None:
+        sigma[:N_SENSOR] = KINDS[sensor.kind]
+        shares.pop("slope_share")
+        shares["p_sensor"] = P_NEEDED if sensor.kind == SensorKind.LASER else P_NEEDED_KNOWN
+    given = {BIAS: sensor.sigma_offset_m, SLOPE: sensor.sigma_scale, BEARING: sensor.sigma_angle_rad}
+    for state, value in given.items():
+        if value is not None:
+            sigma[state] = max(value, 1e-6)
+    if sensor.sigma_odometer_scale is not None:
+        sigma[FORWARD] = max(sensor.sigma_odometer_scale, 1e-6)
+    if sensor.sigma_askew_rad is not None:
+        shares["askew_sigma"] = max(sensor.sigma_askew_rad, 1e-6)
+    if sensor.sigma_scale is not None or sensor.sigma_odometer_scale is not None:
+        shares.pop("slope_share", None)
+    if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
+        shares["angle_share"] = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + shares["askew_sigma"] ** 2)
+    sigma[BEARING] = np.hypot(sigma[BEARING], shares["askew_sigma"])
+    return shares
+
+
+def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:
+    """Return (9,) probability of each free state to be another than stated, nan of others.
+
+    Every subset of states is weighed by its evidence against all as stated: of a Gaussian likelihood of the states,
+    which the estimate under the priors holds, in closed form (Savage and Dickey's ratio).
+
+    Args:
+        prior: under which they were estimated.
+        states: (9,) estimate.
+        covariance: (9, 9) of it.
+        worth: (9,) variances by the errors as they were found, in those of independent errors (`Smoother.worth`).
+    """
+    free = np.flatnonzero(prior.free)
+    probability = np.full(N_STATES, np.nan)
+    if not len(free):
+        return probability
+    at = np.ix_(free, free)
+    before, off = 1.0 / prior.sigma[free] ** 2, (states - prior.mean)[free]
+    # in units of the prior, so that nothing is lost where one state is known far better than another
+    posterior = np.linalg.inv(covariance[at] * np.sqrt(np.outer(before, before)))
+    off = off * np.sqrt(before)
+    data = posterior - np.eye(len(free))
+    told = np.linalg.pinv(data, rcond=1e-10, hermitian=True) @ posterior @ off
+    weaker = 1.0 / np.sqrt(worth[free])
+    data = weaker[:, None] * data * weaker
+    pull = data @ told
+    every = np.array(list(product((False, True), repeat=len(free))))
+    p = np.where(free < N_SENSOR, prior.p_sensor, P_NEEDED)
+    log_odds = np.log(p / (1.0 - p))
+    weight = np.empty(len(every))
+    for k, some in enumerate(every):
+        inside = np.flatnonzero(some)
+        whole = np.eye(len(inside)) + data[np.ix_(inside, inside)]
+        gain = 0.5 * pull[inside] @ np.linalg.solve(whole, pull[inside]) if len(inside) else 0.0
+        weight[k] = gain - 0.5 * np.linalg.slogdet(whole)[1] + log_odds[inside].sum()
+    probability[free] = np.exp(weight - logsumexp(weight)) @ every
+    return probability

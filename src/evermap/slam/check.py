@@ -234,6 +234,7 @@ _CAUSES = {
     "odometry_delay_s": "two clocks: odometry and detections are stamped differently",
     "odometry_forward_scale": "speeds or ranges in another unit, or a wrong wheel radius",
     "odometry_turn_scale": "turn rates in another unit or with the wrong sign, or a wrong wheel base",
+    "odometry_askew_rad": "the sensor is turned otherwise than [mount] theta_rad says, or the robot drives askew",
     "odometry_turn_slip_m": "the sensor sits elsewhere than [mount] x_m, y_m say, or bearings have the wrong sign",
 }
 

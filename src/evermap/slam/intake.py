@@ -105,7 +105,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:
     """Return the prior of the calibration states and the noise levels before the first frame."""
     prior = CalibrationPrior.from_settings(
-        calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix
+        calibrated=settings.sensor_model == "calibrated", fix=settings.calibration.fix, sensor=sensor
     )
     start = start_noise(settings.noise, settings.outlier_log_odds)
     nominal = [sensor.sigma_range_m, sensor.sigma_bearing_rad]

@@ -313,6 +313,12 @@ class Marginals:
         return self._solved.border_covariance()
 
     @property
+    def with_states(self) -> FloatArray:
+        """(G, 9) covariance of everything with the calibration states: poses, known landmarks, states."""
+        n = self._n + int(self.known.sum())
+        return self._solved.columns(np.array([n, n + 1]))
+
+    @property
     def explained_odometry(self) -> FloatArray:
         """(N - 1, 3, 3) `A S A'`: part of whitened odometry residuals that the estimate's own uncertainty explains."""
         return self._held.of_factors[: self._held.of_factors_first[self._n - 1]].reshape(-1, 3, 3)

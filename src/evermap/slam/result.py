@@ -8,7 +8,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.slam.bridge import bridged, dead_reckoned
-from evermap.slam.calibration import SPECS, CalibrationPrior
+from evermap.slam.calibration import BEARING, FORWARD, SLOPE, SPECS, CalibrationPrior, from_front
 from evermap.slam.check import far_off
 from evermap.slam.estimate import Solved
 from evermap.slam.intake import Prepared
@@ -65,7 +65,15 @@ def result(solved: Solved, frame: str, in_map: Landmarks) -> SlamResult:
     """
     recording, prepared, outcome = solved.recording, solved.prepared, solved.outcome
     path = trajectory(prepared, outcome, recording, frame)
-    states = described(outcome.estimate.states, outcome.states_covariance, outcome.noise, solved.prior)
+    values = outcome.estimate.states, outcome.states_covariance
+    states = described(
+        *values,
+        outcome.noise,
+        outcome.prior,
+        askew=outcome.askew,
+        p_needed=outcome.p_needed,
+        undivided=outcome.log_scale_sigma > 0.0,
+    )
     warnings = [*prepared.warnings, *far_off(states, solved.settings.check)]
     if solved.interrupted:
         done_s, all_s = (float(np.ptp(s)) for s in (path.stamp_s, recording.frames.stamp_s))
@@ -98,6 +106,8 @@ def trajectory(prepared: Prepared, outcome: Outcome, recording: Recording, frame
         outcome.noise.noise,
     )
     pose, covariance = _in_metres(pose, covariance, outcome)
+    front = outcome.prior.front(outcome.graph_estimate.states, prepared.problem.mount)
+    pose, covariance = from_front(pose, covariance, front)
     pose[:, 2] = se2.wrap(pose[:, 2])
     return Trajectory(stamps, pose, covariance, frame=frame, clock=recording.clock)
 
@@ -204,9 +214,31 @@ def innovations(prepared: Prepared, slam: StreamingSlam, outcome: Outcome, recor
 
 
 def described(
-    states: FloatArray, covariance: FloatArray, fit: NoiseFit, prior: CalibrationPrior
+    states: FloatArray,
+    covariance: FloatArray,
+    fit: NoiseFit,
+    prior: CalibrationPrior,
+    *,
+    askew: tuple[float, float] = (0.0, 0.0),
+    p_needed: FloatArray | None = None,
+    undivided: bool = False,
 ) -> tuple[ParameterEstimate, ...]:
-    """Return calibration states (9,) with their covariance (9, 9), and noise levels, as records."""
+    """Return calibration states (9,) with their covariance (9, 9), driving askew, and noise levels, as records.
+
+    What only shows together is told both ways in their meanings. With `undivided`, the scale is of that kind.
+    """
+    needs = np.full(len(SPECS), np.nan) if p_needed is None else p_needed
+    meanings = {spec.name: spec.meaning for spec in SPECS}
+    if undivided:
+        scale = states[FORWARD] * (1.0 + states[SLOPE])
+        meanings["range_slope"] += f"; {scale - 1.0:.4f} if the odometer were right"
+        meanings["odometry_forward_scale"] += f"; {scale:.4f} if ranges were right"
+    if askew[1] > 0.0:
+        angle = states[BEARING] + askew[0]
+        meanings["bearing_bias_rad"] += f"; {angle:.4f} if the robot drove straight"
+        meanings["odometry_askew_rad"] = (
+            f"driving to the left of the robot's front; {angle:.4f} if the sensor were mounted as stated"
+        )
     estimates = [
         ParameterEstimate(
             name=spec.name,
@@ -216,15 +248,19 @@ def described(
             prior_sigma=float(prior.sigma[k]) if prior.free[k] else 0.0,
             unit=spec.unit,
             fixed=not prior.free[k],
-            meaning=spec.meaning,
+            meaning=meanings[spec.name],
+            p_needed=float(needs[k]),
         )
         for k, spec in enumerate(SPECS)
     ]
+    if askew[1] > 0.0:
+        name, needed = "odometry_askew_rad", float(needs[BEARING])
+        estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", False, meanings[name], needed))
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
     levels = np.concatenate([fit.noise.detection, fit.noise.odometry])
     started = np.concatenate([START.detection, START.odometry])
     relative = np.concatenate([fit.detection_relative, fit.odometry_relative])
-    meanings = (
+    of_noise = (
         "noise of a range",
         "noise of a bearing",
         "noise of forward motion, by distance",
@@ -236,7 +272,7 @@ def described(
     units = ("m", "rad", "m/sqrt(m)", "m/sqrt(rad)", "m/sqrt(m)", "rad/sqrt(s)", "rad/sqrt(rad)")
     noise = [
         ParameterEstimate(name, float(level), float(level * r), float(s), float("nan"), unit, meaning=meaning)
-        for name, level, r, s, unit, meaning in zip(names, levels, relative, started, units, meanings, strict=True)
+        for name, level, r, s, unit, meaning in zip(names, levels, relative, started, units, of_noise, strict=True)
     ]
     return (*estimates, *noise)
 

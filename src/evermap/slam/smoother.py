@@ -27,6 +27,8 @@ HELD = 1e-9
 """Information that keeps a landmark whose every sighting is an outlier from going anywhere."""
 POSES_A_SLICE = 500
 """Poses that are linearised, with their detections, in about a millisecond."""
+STRETCHES = 40
+"""Stretches of a recording, which are taken to err independently of each other."""
 POSES_A_LEAF = 8
 """Consecutive poses that are eliminated in one front: fewer make more fronts, more make larger ones."""
 
@@ -167,6 +169,40 @@ class Smoother:
 
     def _marginals(self, estimate: Estimate, solved: Factorised) -> Marginals:
         return Marginals(solved, len(estimate.pose), len(self.problem.pose_row), estimate.known)
+
+    def worth(self, estimate: Estimate, marginals: Marginals) -> FloatArray:
+        """Return (9,) variances of the states by residuals as they are, relative to those of independent residuals.
+
+        What each stretch of the recording adds to the states is summed before it is squared, which makes no assumption
+        on how errors hang together within it: White's covariance (1980), with stretches as clusters (Liang and Zeger
+        1986). 1 for states that are not free, and at least.
+        """
+        problem, n = self.problem, len(estimate.pose)
+        now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
+        pose, place, states = with_states[: 3 * n].reshape(n, 3, 9), with_states[3 * n : -9], with_states[-9:]
+        place = place.reshape(-1, 2, 9)
+        split = ODOMETRY * (n - 1)
+        driven = now.values[:split].reshape(-1, 3, 11)
+        seen = now.values[split : split + DETECTION * len(problem.pose_row)].reshape(-1, 2, 11)
+        of_driven = (
+            np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
+            + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
+            + driven[..., 6:10] @ states[5:]
+        )
+        of_seen = (
+            np.einsum("nra,nas->nrs", seen[..., :3], pose[problem.pose_row])
+            + np.einsum("nra,nas->nrs", seen[..., 3:5], place[structure.rank[problem.landmark_row]])
+            + seen[..., 5:10] @ states[:5]
+        )
+        stamp = problem.stamp_s - problem.stamp_s[0]
+        stretch = np.minimum((stamp / max(stamp[-1], 1e-9) * STRETCHES).astype(np.int64), STRETCHES - 1)
+        pull = np.zeros((STRETCHES, 9))
+        np.add.at(pull, stretch[:-1], np.einsum("nrs,nr->ns", of_driven, driven[..., 10]))
+        np.add.at(pull, stretch[problem.pose_row], np.einsum("nrs,nr->ns", of_seen, seen[..., 10]))
+        independent = (of_driven**2).sum(axis=(0, 1)) + (of_seen**2).sum(axis=(0, 1))
+        found = (pull**2).sum(axis=0) * STRETCHES / (STRETCHES - 1.0)
+        free = problem.prior.free & (independent > 0.0)
+        return np.where(free, np.maximum(found / np.where(free, independent, 1.0), 1.0), 1.0)
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return what is known of some poses, the known landmarks and the states, all other poses marginalised.

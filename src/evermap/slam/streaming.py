@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.calibration import CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -53,6 +53,8 @@ NEAR_NOISE_GAIN = 1e-4
 """Or what a step gains (nats) for each detection: by so little do noise levels change with it."""
 NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.01
 """Relative change of every noise level below which it is decided what is an outlier, and the final rounds stop."""
+P_KEPT = 0.5
+"""Probability of a state to be needed from which on it is estimated: the median model (Barbieri and Berger 2004)."""
 FINAL_REVISIONS = 3
 """Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
@@ -72,7 +74,10 @@ class Outcome:
 
     Attributes:
         estimate: smoothed values.
-        states_covariance: (9, 9) of its calibration states, the undivided part of the scale included.
+        states_covariance: (9, 9) of its calibration states, what cannot be divided included.
+        prior: of the states, free those that are needed, as the user means it.
+        p_needed: (9,) probability of each state to be another than stated; nan where it was not asked.
+        askew: direction in which the robot drives, from its front, and its standard deviation [rad].
         problem: with the start and priors that the optimum belongs to, in the graph's metres.
         graph_estimate, graph_marginals: values and covariances as the graph holds them, before the scale was divided.
         noise: levels and how well they are known.
@@ -84,6 +89,9 @@ class Outcome:
 
     estimate: Estimate
     states_covariance: FloatArray
+    prior: CalibrationPrior
+    p_needed: FloatArray
+    askew: tuple[float, float]
     problem: Problem
     graph_estimate: Estimate
     graph_marginals: Marginals
@@ -162,7 +170,10 @@ class StreamingSlam:
         self._work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
-        pose, covariance = self._filter.pose.copy(), self._filter.covariance[:3, :3].copy()
+        front = self._prior.front(self._filter.states, self._problem.mount)
+        pose, covariance = from_front(self._filter.pose, self._filter.covariance[:3, :3], front)
+        if not self._aligned and front.any():
+            pose = se2.compose(se2.inverse(front), pose)
         pose[:2] *= self._scale
         covariance[:2] *= self._scale
         covariance[:, :2] *= self._scale
@@ -199,16 +210,41 @@ class StreamingSlam:
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
             estimate = exhausted(_voted(Smoother(problem, self._noise, heavy=True), estimate))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
+        problem, estimate = self._ahead(problem, estimate)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
             if revision.problem is problem:
                 break
             problem = revision.problem
             smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
-        smoother = smoother.under(fit.noise, heavy=False)
+        smoother, estimate, marginals = self._optimum(problem, estimate, fit)
+        worth = smoother.worth(estimate, marginals)
+        p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
+        spare = p_needed < P_KEPT
+        if spare.any():
+            problem = replace(problem, prior=problem.prior.without(spare))
+            as_stated = Estimate(estimate.pose, estimate.landmark, np.where(spare, problem.prior.mean, estimate.states))
+            smoother, estimate, fit = self._converged(problem, as_stated, fit.noise)
+            smoother, estimate, marginals = self._optimum(problem, estimate, fit)
+            worth = smoother.worth(estimate, marginals)
+        return self._divided(revision, (estimate, marginals, fit, smoother), p_needed, worth)
+
+    def _ahead(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
+        """The same, turned so that the first pose has the robot's front ahead, where it is not in a map."""
+        front = self._prior.front(estimate.states, problem.mount)
+        start = problem.start_pose if self._aligned else se2.inverse(front)
+        if np.array_equal(start, problem.start_pose):
+            return problem, estimate
+        turn = se2.compose(start, se2.inverse(problem.start_pose))
+        pose, landmark = se2.compose(turn, estimate.pose), se2.transform(turn, estimate.landmark)
+        return replace(problem, start_pose=start), Estimate(pose, landmark, estimate.states)
+
+    def _optimum(self, problem: Problem, estimate: Estimate, fit: NoiseFit) -> tuple[Smoother, Estimate, Marginals]:
+        """The final optimum at the noise that was found, and its covariances."""
+        problem, estimate = self._ahead(problem, estimate)
+        smoother = Smoother(problem, fit.noise, robust=self._robust)
         solved = smoother.solved_in_slices(estimate, tolerance=FINAL_TOLERANCE, settled=FINAL_GAIN)
-        estimate, marginals = exhausted(solved)
-        return self._divided(revision, estimate, marginals, fit, smoother)
+        return smoother, *exhausted(solved)
 
     def _converged(self, problem: Problem, estimate: Estimate, noise: Noise) -> tuple[Smoother, Estimate, NoiseFit]:
         """The optimum and its noise levels, in turns until neither changes."""
@@ -410,20 +446,28 @@ class StreamingSlam:
         self._work()
 
     def _divided(
-        self, revision: Explanation, estimate: Estimate, marginals: Marginals, fit: NoiseFit, smoother: Smoother
+        self,
+        revision: Explanation,
+        solved: tuple[Estimate, Marginals, NoiseFit, Smoother],
+        p_needed: FloatArray,
+        worth: FloatArray,
     ) -> Outcome:
-        if self._aligned:
-            states, covariance, scale, log_sigma = estimate.states, marginals.states.copy(), 1.0, 0.0
-        else:
-            states, covariance, scale, log_sigma = self._prior.split_scale(estimate.states, marginals.states)
-        stretched = Estimate(
-            estimate.pose * [scale, scale, 1.0],
-            estimate.landmark * scale,
-            states,
-        )
+        estimate, marginals, fit, smoother = solved
+        prior = self._prior.without(p_needed < P_KEPT)
+        covariance = marginals.states * np.sqrt(np.outer(worth, worth))
+        states, scale, log_sigma = estimate.states, 1.0, 0.0
+        if not self._aligned:
+            states, covariance, scale, log_sigma = prior.split_scale(states, covariance)
+        front = prior.front(states, smoother.problem.mount)
+        states, covariance, *askew = prior.split_angle(states, covariance)
         return Outcome(
-            estimate=stretched,
+            estimate=Estimate(
+                se2.compose(estimate.pose * [scale, scale, 1.0], front), estimate.landmark * scale, states
+            ),
             states_covariance=covariance,
+            prior=prior,
+            p_needed=p_needed,
+            askew=(askew[0], askew[1]),
             problem=smoother.problem,
             graph_estimate=estimate,
             graph_marginals=marginals,

@@ -308,10 +308,13 @@ def refitted(
         if other.cost(straight) < smoother.cost(estimate):
             smoother, estimate, straightened = other, straight, True
     marginals = smoother.marginals(estimate)
+    front = prior.front(estimate.states, problem.mount)
+    states, covariance, *askew = prior.split_angle(estimate.states, marginals.states)
     outcome = replace(
         outcome,
-        estimate=estimate,
-        states_covariance=marginals.states.copy(),
+        estimate=Estimate(se2.compose(estimate.pose, front), estimate.landmark, states),
+        states_covariance=covariance,
+        askew=(askew[0], askew[1]),
         problem=problem,
         graph_estimate=estimate,
         graph_marginals=marginals,

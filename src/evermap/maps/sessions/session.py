@@ -244,7 +244,7 @@ def refit(
         motion = rigid(outcome.graph_estimate.landmark[row] * size, position)
         covariance = drifted(of_places(living.covariance_m2, where.place[stand]), where.drift_m)
         return refitted(
-            outcome, alone.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
+            outcome, outcome.prior, motion, size, Held(row, position, covariance), settings=config.fit, robust=robust
         )
 
     solved, straightened = in_map(where)
