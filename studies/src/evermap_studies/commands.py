@@ -34,6 +34,7 @@ __all__ = [
     "nielsen2024",
     "partial_views",
     "presence",
+    "robots",
     "rosen2016",
 ]
 
@@ -308,6 +309,30 @@ def building(
         return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
 
     _run("building", compute, out, as_json=as_json, force=force, in_seconds=False)
+
+
+def robots(
+    out: Out = None,
+    runs: Annotated[int | None, typer.Option(min=2, help="Robots.", show_default="200")] = None,
+    seed: Seed = 0,
+    quick: Quick = False,
+    as_json: AsJson = False,
+    force: Force = False,
+) -> None:
+    """Calibrate robots of many makes, good and bad, with and without a map, against estimates that believe all readings.
+
+    \b
+    Example:
+      evermap reproduce robots --quick
+    """
+
+    def compute(target: Path, progress: Progress | None) -> tuple[dict[str, Any], AsText]:
+        from evermap_studies.robots import study
+
+        settings = replace(study.QUICK if quick else study.Settings(), seed=seed, **_given(robots=runs))
+        return study.reproduce(target, settings, progress=progress, force=force), study.as_markdown
+
+    _run("robots", compute, out, as_json=as_json, force=force, in_seconds=False)
 
 
 def _run(

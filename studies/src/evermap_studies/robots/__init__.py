@@ -1,0 +1,1 @@
+"""Robots of many makes: is an estimate ever worse because sensor and odometry were calibrated in it?"""
