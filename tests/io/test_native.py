@@ -308,6 +308,18 @@ BAD = {
     ),
     "limits swapped": (edit(TOML, "range_max_m = 8", "range_max_m = 0.05"), [f"{TOML}:7", "greater than range_min_m"]),
     "toml degrees": (edit(TOML, "bearing_max_rad = 2.0", "bearing_max_rad = 120"), [f"{TOML}:9", "radians"]),
+    "unknown kind": (
+        edit(TOML, "[recording]\n", '[sensor]\nkind = "lazer"\n[recording]\n'),
+        [f"{TOML}:2", "'sensor.kind'", "no kind of sensor 'lazer'", "laser"],
+    ),
+    "kind as a number": (
+        edit(TOML, "[recording]\n", "[sensor]\nkind = 3\n[recording]\n"),
+        [f"{TOML}:2", "'sensor.kind'", "no kind of sensor '3'"],
+    ),
+    "data sheet": (
+        edit(TOML, "[recording]\n", "[odometry]\nsigma_odometer_scale = 5\n[recording]\n"),
+        [f"{TOML}:2", "'odometry.sigma_odometer_scale'", "outside [0, 1]"],
+    ),
     "unknown clock": (edit(TOML, '"unix"', '"gps"'), [f"{TOML}:3", "'recording.clock'", "no clock 'gps'"]),
     "newer version": (
         edit(TOML, "[recording]\n", "[recording]\nformat_version = 2\n"),

@@ -319,7 +319,7 @@ def robots(
     as_json: AsJson = False,
     force: Force = False,
 ) -> None:
-    """Calibrate robots of many makes, good and bad, with and without a map, against estimates that believe all readings.
+    """Calibrate robots of many makes, good and bad, with and without a map, beside believing all readings.
 
     \b
     Example:
