@@ -672,7 +672,7 @@ class ParameterEstimate(Shown):
         value, sigma: estimate and standard deviation (0 where fixed).
         prior_mean, prior_sigma: the weak prior; nan where there is none.
         unit: 's', 'm', 'rad', '1' ...
-        fixed: True where the configuration fixed it.
+        fixed: True where it was held: by the configuration, or because it is not needed.
         meaning: half a sentence for the report.
         p_needed: probability that it is another than stated, by which it is estimated; nan where that is not asked.
     """

@@ -251,5 +251,6 @@ def _counts(recording: AnyRecording, result: SlamResult) -> dict[str, Any]:
 
 
 def _parameter(parameter: ParameterEstimate) -> dict[str, Any]:
-    numbers = {name: json_number(getattr(parameter, name)) for name in ("value", "sigma", "prior_mean", "prior_sigma")}
+    names = ("value", "sigma", "prior_mean", "prior_sigma", "p_needed")
+    numbers = {name: json_number(getattr(parameter, name)) for name in names}
     return {**asdict(parameter), **numbers, "fixed": bool(parameter.fixed)}

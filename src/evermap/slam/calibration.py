@@ -65,6 +65,8 @@ KINDS: dict[SensorKind, tuple[float, float, float, float, float]] = {
 """Standard deviations of the states of the sensor, the first five, by its kind: data sheets, and mounts by hand."""
 ASKEW_SIGMA_RAD = 0.03
 """Of the direction in which wheels drive: they, or the axis that is called the robot's front, are not parallel."""
+P_SPARE, P_CERTAIN = 0.01, 0.999
+"""Probabilities of a state to be needed below which it is held as stated, and from which on it is simply estimated."""
 P_NEEDED, P_NEEDED_KNOWN = 0.5, 0.9
 """Prior probability that a state is not as stated; those of a sensor that is known to be no laser hardly ever are."""
 
@@ -122,9 +124,20 @@ class CalibrationPrior:
                 shares["angle_share"] = 1.0
         return cls(mean, sigma, free, **shares)
 
-    def without(self, spare: BoolArray) -> CalibrationPrior:
-        """Return the prior with some states (9,) held at their means."""
-        return replace(self, free=self.free & ~spare)
+    def averaged(self, p_needed: FloatArray, variance: FloatArray) -> CalibrationPrior:
+        """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior'.
+
+        Such a mean lies nearer to what is stated, by the probability of the latter; that of a Gaussian does where its
+        prior is narrower. So nothing jumps where the evidence is in doubt.
+
+        Args:
+            p_needed: (9,) as `needed` returns it.
+            variance: (9,) of the states, as estimated under this prior.
+        """
+        narrower = self.free & (p_needed < P_CERTAIN)
+        p = np.where(narrower, np.maximum(p_needed, P_SPARE), 1.0)
+        information = (1.0 / p - 1.0) / np.where(self.free, variance, 1.0) + 1.0 / self.sigma**2
+        return replace(self, sigma=1.0 / np.sqrt(information), free=self.free & ~(p_needed < P_SPARE))
 
     def without_scale(self) -> CalibrationPrior:
         """Return the prior of the states that are observable without a prior map, in the metres of the range sensor.

@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import CalibrationPrior, from_front, needed
+from evermap.slam.calibration import P_CERTAIN, P_SPARE, CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -53,8 +53,6 @@ NEAR_NOISE_GAIN = 1e-4
 """Or what a step gains (nats) for each detection: by so little do noise levels change with it."""
 NOISE_NEAR, NOISE_CONVERGED = 0.05, 0.01
 """Relative change of every noise level below which it is decided what is an outlier, and the final rounds stop."""
-P_KEPT = 0.5
-"""Probability of a state to be needed from which on it is estimated: the median model (Barbieri and Berger 2004)."""
 FINAL_REVISIONS = 3
 """Times that the method thinks again at the end, at most: other places mean other noise, and that other gates."""
 
@@ -220,11 +218,14 @@ class StreamingSlam:
         smoother, estimate, marginals = self._optimum(problem, estimate, fit)
         worth = smoother.worth(estimate, marginals)
         p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
-        spare = p_needed < P_KEPT
-        if spare.any():
-            problem = replace(problem, prior=problem.prior.without(spare))
-            as_stated = Estimate(estimate.pose, estimate.landmark, np.where(spare, problem.prior.mean, estimate.states))
-            smoother, estimate, fit = self._converged(problem, as_stated, fit.noise)
+        if np.any(p_needed < P_CERTAIN):
+            prior = problem.prior.averaged(p_needed, np.diag(marginals.states))
+            nearer = prior.mean + np.where(prior.free, p_needed, 0.0) * (estimate.states - prior.mean)
+            states = np.where(np.isnan(p_needed), estimate.states, nearer)
+            problem = replace(problem, prior=prior)
+            smoother, estimate, fit = self._converged(
+                problem, Estimate(estimate.pose, estimate.landmark, states), fit.noise
+            )
             smoother, estimate, marginals = self._optimum(problem, estimate, fit)
             worth = smoother.worth(estimate, marginals)
         return self._divided(revision, (estimate, marginals, fit, smoother), p_needed, worth)
@@ -453,8 +454,10 @@ class StreamingSlam:
         worth: FloatArray,
     ) -> Outcome:
         estimate, marginals, fit, smoother = solved
-        prior = self._prior.without(p_needed < P_KEPT)
+        prior = replace(self._prior, free=self._prior.free & ~(p_needed < P_SPARE))
         covariance = marginals.states * np.sqrt(np.outer(worth, worth))
+        doubt = np.where(p_needed >= P_SPARE, 1.0 / np.maximum(p_needed, P_SPARE) - 1.0, 0.0)
+        covariance += np.diag(doubt * (estimate.states - prior.mean) ** 2)
         states, scale, log_sigma = estimate.states, 1.0, 0.0
         if not self._aligned:
             states, covariance, scale, log_sigma = prior.split_scale(states, covariance)

@@ -298,8 +298,7 @@ def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
     rows = [
         (
             f"<code>{escape(p.name)}</code>",
-            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit))
-            + (" <small>fixed</small>" if p.fixed else ""),
+            escape(quantity(p.value, 0.0 if p.fixed else p.sigma, p.unit)) + _held(p),
             escape(quantity(p.prior_mean, p.prior_sigma, p.unit)) if has_prior(p) else "–",
             _learned(p),
             escape(p.meaning),
@@ -307,6 +306,15 @@ def _parameters(parameters: Sequence[ParameterEstimate]) -> str:
         for p in parameters
     ]
     return table(("name", "estimate, 1σ", "prior, 1σ", "narrower", "meaning"), rows, numbers=(1, 2, 3))
+
+
+def _held(parameter: ParameterEstimate) -> str:
+    """Why a state was not estimated."""
+    if not parameter.fixed:
+        return ""
+    if math.isnan(parameter.p_needed):
+        return " <small>fixed</small>"
+    return " <small>as stated</small>"
 
 
 def _learned(parameter: ParameterEstimate) -> str:
