@@ -256,11 +256,16 @@ def described(
     if askew[1] > 0.0:
         name, needed = "odometry_askew_rad", float(needs[BEARING])
         estimates.append(ParameterEstimate(name, *askew, 0.0, prior.askew_sigma, "rad", False, meanings[name], needed))
+    return (*estimates, *_levels(fit))
+
+
+def _levels(fit: NoiseFit) -> list[ParameterEstimate]:
+    """Noise levels as records."""
     names = ("sigma_range_m", "sigma_bearing_rad", *NOISE_NAMES)
     levels = np.concatenate([fit.noise.detection, fit.noise.odometry])
     started = np.concatenate([START.detection, START.odometry])
     relative = np.concatenate([fit.detection_relative, fit.odometry_relative])
-    of_noise = (
+    meanings = (
         "noise of a range",
         "noise of a bearing",
         "noise of forward motion, by distance",
@@ -270,11 +275,10 @@ def described(
         "noise of turning, by angle turned",
     )
     units = ("m", "rad", "m/sqrt(m)", "m/sqrt(rad)", "m/sqrt(m)", "rad/sqrt(s)", "rad/sqrt(rad)")
-    noise = [
+    return [
         ParameterEstimate(name, float(level), float(level * r), float(s), float("nan"), unit, meaning=meaning)
-        for name, level, r, s, unit, meaning in zip(names, levels, relative, started, units, of_noise, strict=True)
+        for name, level, r, s, unit, meaning in zip(names, levels, relative, started, units, meanings, strict=True)
     ]
-    return (*estimates, *noise)
 
 
 def dead_reckoning(prepared: Prepared, trajectory: Trajectory) -> Trajectory:
