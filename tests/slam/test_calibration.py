@@ -15,6 +15,7 @@ from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.pipeline import run_slam
 from evermap.slam.calibration import BEARING, FORWARD, KINDS, NAMES, SLOPE, SPECS, CalibrationPrior, needed
+from evermap.slam.problem import Drive
 from evermap.slam.smoother import Smoother
 from evermap.types import ParameterEstimate, Recording, Sensor, SensorKind
 from evermap_studies.worlds.robots import draw_robot, simulate_robot
@@ -306,8 +307,23 @@ def test_average_of_as_stated_and_estimated_is_the_optimum_of_the_narrower_prior
     prior = default_prior()
     p, data, seen = np.linspace(0.05, 0.95, 9), np.linspace(3.0, 900.0, 9) / prior.sigma**2, 0.7 * prior.sigma
     variance = 1.0 / (data + 1.0 / prior.sigma**2)
-    averaged = prior.averaged(p, variance)
+    averaged = prior.averaged(p, variance, np.ones(9))
     estimated = variance * data * seen
     assert data * seen / (data + 1.0 / averaged.sigma**2) == pytest.approx(p * estimated)
-    assert not prior.averaged(np.full(9, 0.001), variance).free.any()
-    assert prior.averaged(np.ones(9), variance).sigma.tolist() == pytest.approx(prior.sigma.tolist())
+    # where ten readings are worth one, the prior counts ten times as much
+    fewer = prior.averaged(p, variance, np.full(9, 10.0))
+    less = 0.1 * data * seen / (0.1 * data + 1.0 / prior.sigma**2)
+    assert data * seen / (data + 1.0 / fewer.sigma**2) == pytest.approx(p * less)
+    assert not prior.averaged(np.full(9, 0.001), variance, np.ones(9)).free.any()
+    assert prior.averaged(np.ones(9), variance, np.ones(9)).sigma.tolist() == pytest.approx(prior.sigma.tolist())
+
+
+def test_jitter_of_reported_velocities_is_told_from_their_changes():
+    rng = np.random.default_rng(5)
+    stamp = np.arange(0.0, 400.0, 0.05)
+    velocity = np.column_stack([0.5 + 0.4 * np.sin(stamp / 3), np.zeros(len(stamp)), np.sign(np.sin(stamp / 7))])
+    noise = np.array([0.05, 0.0, 0.1]) * rng.normal(size=velocity.shape)
+    assert np.sqrt(Drive.from_rows(stamp, velocity).jitter) == pytest.approx(np.zeros(3), abs=1e-3)
+    assert np.sqrt(Drive.from_rows(stamp, velocity + noise).jitter) == pytest.approx(
+        [0.05, 0.0, 0.1], rel=0.05, abs=1e-9
+    )

@@ -54,7 +54,7 @@ SPECS: tuple[Spec, ...] = (
 )
 N_STATES, N_SENSOR = len(SPECS), 5
 NAMES = tuple(spec.name for spec in SPECS)
-BIAS, SLOPE, SKEW, CURVATURE, BEARING, FORWARD, SLIP = 0, 1, 2, 3, 4, 6, 8
+BIAS, SLOPE, SKEW, CURVATURE, BEARING, DELAY, FORWARD, SLIP = 0, 1, 2, 3, 4, 5, 6, 8
 KINDS: dict[SensorKind, tuple[float, float, float, float, float]] = {
     SensorKind.LASER: (0.05, 0.002, 0.002, 0.002, 0.01),
     SensorKind.CAMERA: (0.1, 0.02, 0.1, 0.5, 0.05),
@@ -65,8 +65,8 @@ KINDS: dict[SensorKind, tuple[float, float, float, float, float]] = {
 """Standard deviations of the states of the sensor, the first five, by its kind: data sheets, and mounts by hand."""
 ASKEW_SIGMA_RAD = 0.03
 """Of the direction in which wheels drive: they, or the axis that is called the robot's front, are not parallel."""
-P_SPARE, P_CERTAIN = 0.01, 0.999
-"""Probabilities of a state to be needed below which it is held as stated, and from which on it is simply estimated."""
+P_SPARE = 0.01
+"""Probability of a state to be needed below which it is held as stated."""
 P_NEEDED, P_NEEDED_KNOWN = 0.5, 0.9
 """Prior probability that a state is not as stated; those of a sensor that is known to be no laser hardly ever are."""
 
@@ -124,19 +124,23 @@ class CalibrationPrior:
                 shares["angle_share"] = 1.0
         return cls(mean, sigma, free, **shares)
 
-    def averaged(self, p_needed: FloatArray, variance: FloatArray) -> CalibrationPrior:
+    def averaged(self, p_needed: FloatArray, variance: FloatArray, worth: FloatArray) -> CalibrationPrior:
         """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior'.
 
-        Such a mean lies nearer to what is stated, by the probability of the latter; that of a Gaussian does where its
-        prior is narrower. So nothing jumps where the evidence is in doubt.
+        Such a mean lies nearer to what is stated, by the probability of the latter, and the more so the less the
+        readings are worth; that of a Gaussian does where its prior is narrower. So nothing jumps where the evidence is
+        in doubt.
 
         Args:
             p_needed: (9,) as `needed` returns it.
             variance: (9,) of the states, as estimated under this prior.
+            worth: (9,) variances by the errors as they were found, in those of independent errors.
         """
-        narrower = self.free & (p_needed < P_CERTAIN)
-        p = np.where(narrower, np.maximum(p_needed, P_SPARE), 1.0)
-        information = (1.0 / p - 1.0) / np.where(self.free, variance, 1.0) + 1.0 / self.sigma**2
+        asked = self.free & ~np.isnan(p_needed)
+        p, before = np.where(asked, np.clip(p_needed, P_SPARE, 1.0), 1.0), 1.0 / self.sigma**2
+        data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
+        told = data / worth
+        information = np.where(asked, data * ((told + before) / (p * told) - 1.0), before)
         return replace(self, sigma=1.0 / np.sqrt(information), free=self.free & ~(p_needed < P_SPARE))
 
     def without_scale(self) -> CalibrationPrior:

@@ -23,6 +23,12 @@ LONGEST_SILENCE_S = 60.0
 """After a longer silence no more is unknown than after this: a clock set forward by a day is no drive of one."""
 
 
+FEWEST_ROWS = 20
+"""Rows of odometry from which its jitter is estimated."""
+TRIMMED = 0.6234
+"""Mean of a squared standard normal below its 90 % quantile."""
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
     """Odometry prepared for integration.
@@ -37,6 +43,17 @@ class Drive:
     velocity: FloatArray
     unknown: FloatArray
     _preintegration: Preintegration = field(init=False, repr=False, compare=False, default_factory=Preintegration)
+
+    @property
+    def jitter(self) -> FloatArray:
+        """(3,) variance of what in the velocities is another from row to row: noise of the report, not of the motion.
+
+        By second differences, the largest tenth left out: a robot that starts or stops does not jitter.
+        """
+        if len(self.velocity) < FEWEST_ROWS:
+            return np.zeros(3)
+        square = np.sort(np.diff(self.velocity, n=2, axis=0) ** 2, axis=0)[: int(0.9 * (len(self.velocity) - 2))]
+        return np.asarray(square.mean(axis=0) / (6.0 * TRIMMED))
 
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
         """Return motion between each two consecutive of the (N,) stamps, for (9,) calibration states."""

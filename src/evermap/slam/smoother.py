@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from evermap.errors import NumericalError
 from evermap.geometry import se2
+from evermap.slam.calibration import DELAY
 from evermap.slam.linearise import DETECTION, ODOMETRY, Readings, linearise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, between_rows
 from evermap.slam.sparse.elimination import curvature
@@ -29,6 +30,8 @@ POSES_A_SLICE = 500
 """Poses that are linearised, with their detections, in about a millisecond."""
 STRETCHES = 40
 """Stretches of a recording, which are taken to err independently of each other."""
+LEAST_CHANGE = 1e-3
+"""Share of the changes of velocity that is no jitter, at least."""
 POSES_A_LEAF = 8
 """Consecutive poses that are eliminated in one front: fewer make more fronts, more make larger ones."""
 
@@ -202,7 +205,12 @@ class Smoother:
         independent = (of_driven**2).sum(axis=(0, 1)) + (of_seen**2).sum(axis=(0, 1))
         found = (pull**2).sum(axis=0) * STRETCHES / (STRETCHES - 1.0)
         free = problem.prior.free & (independent > 0.0)
-        return np.where(free, np.maximum(found / np.where(free, independent, 1.0), 1.0), 1.0)
+        worth = np.where(free, np.maximum(found / np.where(free, independent, 1.0), 1.0), 1.0)
+        # the delay shows where the velocity changes; where it only jitters, no delay explains it
+        jitter = 2.0 * (driven[..., 3:6] ** 2).sum(axis=(0, 1)) @ problem.drive.jitter
+        changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
+        worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
+        return worth
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return what is known of some poses, the known landmarks and the states, all other poses marginalised.

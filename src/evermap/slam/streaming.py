@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import P_CERTAIN, P_SPARE, CalibrationPrior, from_front, needed
+from evermap.slam.calibration import P_SPARE, CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -218,8 +218,8 @@ class StreamingSlam:
         smoother, estimate, marginals = self._optimum(problem, estimate, fit)
         worth = smoother.worth(estimate, marginals)
         p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
-        if np.any(p_needed < P_CERTAIN):
-            prior = problem.prior.averaged(p_needed, np.diag(marginals.states))
+        if not np.all(np.isnan(p_needed)):
+            prior = problem.prior.averaged(p_needed, np.diag(marginals.states), worth)
             nearer = prior.mean + np.where(prior.free, p_needed, 0.0) * (estimate.states - prior.mean)
             states = np.where(np.isnan(p_needed), estimate.states, nearer)
             problem = replace(problem, prior=prior)
