@@ -31,7 +31,6 @@ STUDIES = (
     "kitti",
     "space",
     "building",
-    "robots",
     "persistence-speed",
     "soak",
     "scale",
