@@ -31,6 +31,7 @@ STUDIES = (
     "kitti",
     "space",
     "building",
+    "robots",
     "persistence-speed",
     "soak",
     "scale",
