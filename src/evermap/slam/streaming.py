@@ -220,12 +220,8 @@ class StreamingSlam:
         p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
         if not np.all(np.isnan(p_needed)):
             prior = problem.prior.averaged(p_needed, np.diag(marginals.states), worth)
-            nearer = prior.mean + np.where(prior.free, p_needed, 0.0) * (estimate.states - prior.mean)
-            states = np.where(np.isnan(p_needed), estimate.states, nearer)
-            problem = replace(problem, prior=prior)
-            smoother, estimate, fit = self._converged(
-                problem, Estimate(estimate.pose, estimate.landmark, states), fit.noise
-            )
+            problem, estimate = replace(problem, prior=prior), _nearer(estimate, prior, p_needed)
+            smoother, estimate, fit = self._converged(problem, estimate, fit.noise)
             smoother, estimate, marginals = self._optimum(problem, estimate, fit)
             worth = smoother.worth(estimate, marginals)
         return self._divided(revision, (estimate, marginals, fit, smoother), p_needed, worth)
@@ -481,6 +477,13 @@ class StreamingSlam:
             aligned=self._aligned,
             revision=revision,
         )
+
+
+def _nearer(estimate: Estimate, prior: CalibrationPrior, p_needed: FloatArray) -> Estimate:
+    """The estimate with its states about where such a prior pulls them; those that it holds are at its mean."""
+    off = np.where(prior.free, np.nan_to_num(p_needed, nan=1.0), 0.0) * (estimate.states - prior.mean)
+    states = np.where(np.isnan(p_needed), estimate.states, prior.mean + off)
+    return Estimate(estimate.pose, estimate.landmark, states)
 
 
 def _settled(before: Noise, after: Noise, within: float) -> bool:
