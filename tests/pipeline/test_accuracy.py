@@ -32,7 +32,9 @@ def test_trajectory_and_map_in_a_prior_map_are_as_good_as_they_say():
 @pytest.mark.slow
 def test_many_runs_are_as_good_as_they_say():
     consistent([judged(seed) for seed in range(16)])
-    consistent([judged(seed, with_map=True) for seed in range(16)])
+    # the simulated robot drives straight, which a map does not tell: its heading is known where that is stated
+    straight = "sensor.sigma_askew_rad=0.001"
+    consistent([judged(seed, straight, with_map=True) for seed in range(16)])
 
 
 def test_wrong_identities_are_found():

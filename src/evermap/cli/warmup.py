@@ -8,6 +8,7 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.pipeline import run_session, run_slam
+from evermap.slam.association.consensus import warm_up as of_the_association
 from evermap.slam.localize_recording import warm_up as of_the_localizer
 from evermap.slam.warmup import warm_up as of_the_estimator
 from evermap.tracking.run import warm_up as of_the_tracker
@@ -62,6 +63,8 @@ def warm_up(
         of_the_localizer()
         return
     of_the_estimator(search=search or sessions)
+    if unknown_ids:
+        of_the_association()
     if sessions:
         run_session(_drive(1e5), run_session(_drive(0.0)).living)
     else:

@@ -9,6 +9,7 @@ of counts, and greedy in place of branch and bound: polynomial however wide the 
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,6 +89,13 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
         _, rest = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, *every)
         margin[m] = evidence[top] - max(0.0, rest, without.max(initial=0.0))
     return Consensus(best, float(evidence[top]), margin)
+
+
+@functools.cache
+def warm_up() -> None:
+    """Compile the kernels, or load them where that was done before: by one pair that is one."""
+    one = Candidates(np.zeros((1, 2)), np.eye(2), np.array([-9.0]), np.zeros((1, 1), dtype=np.bool_))
+    consensus(one, gate=9.0, loose=9.0)
 
 
 @kernel
