@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 259
-MOST_LINES = 61_210
+MOST_MODULES = 260
+MOST_LINES = 61_620
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

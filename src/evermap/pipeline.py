@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.config import Config
-from evermap.errors import DataError
+from evermap.errors import ConfigError, DataError
 from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
@@ -201,6 +201,7 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     """
     from threadpoolctl import threadpool_limits
 
+    from evermap.maps.sessions.nameless import named_in, without_ids
     from evermap.maps.sessions.session import admitted
     from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
@@ -208,9 +209,14 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.slam.intake import beliefs, prepare
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
-    recording, _ = admitted(clean(recording, config.slam.cleaning), living)
+    anonymous = config.slam.unknown_ids
+    recording = clean(without_ids(recording) if anonymous else recording, config.slam.cleaning)
     prior, noise = beliefs(recording.sensor, config.slam)
-    prepared = prepare(recording, remarks=odd(recording, settings=config.slam.check))
+    remarks = odd(recording, identities=not anonymous, settings=config.slam.check)
+    recording, _ = admitted(recording, living)
+    if anonymous:
+        recording, _ = admitted(named_in(recording, living, prior, noise, config.living), living)
+    prepared = prepare(recording, remarks=remarks)
     # what moved is asked when it lies over the map
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
     with threadpool_limits(limits=1, user_api="blas"):
@@ -276,6 +282,7 @@ def run_localization(
         progress: told after every frame.
 
     Raises:
+        ConfigError: `slam.unknown_ids`: that is not causal.
         DataError: the map is empty, or the robot's place in it could not be found.
     """
     from evermap.maps.sessions.believe import aged
@@ -287,6 +294,9 @@ def run_localization(
     from evermap.slam.localize_recording import localize
 
     config = config or Config()
+    if config.slam.unknown_ids:
+        problem = "landmarks without identity are told by what is seen later, which is not causal"
+        raise ConfigError(problem, field="slam.unknown_ids", hint="leave it out, or enter the session")
     if not len(living.places):
         raise DataError("the map is empty", field="living", hint="enter a session first")
     if isinstance(recording, SpatialRecording):

@@ -167,7 +167,7 @@ def test_the_next_session_goes_into_the_same_map(copy: Path, recordings: list[Pa
         (["--prior-map", "truth"], "--prior-map"),
         (["--method", "viterbi"], "--method"),
         (["--realtime"], "--realtime"),
-        (["--unknown-ids"], "needs identities"),
+        (["--unknown-ids", "--localize"], "is not causal"),
         (["--set", "living.search=guess"], "living.search"),
     ],
 )

@@ -338,10 +338,11 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     in_space = isinstance(recording, SpatialRecording)
     if realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
-    if config.slam.unknown_ids:
-        raise ConfigError("a living map needs identities", field="slam.unknown_ids", hint="leave out --unknown-ids")
+    if config.slam.unknown_ids and in_space:
+        raise ConfigError("is for the plane", field="slam.unknown_ids", hint="leave out --unknown-ids")
     said = priors_of(*priors_by_class(priors))
-    warm_up(lambda: compile_kernels(sessions=not localize, localize=localize, in_space=in_space))
+    unknown = config.slam.unknown_ids
+    warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))
     with held():  # a map without its tables is none
         opened = open_store(map_file, create=not localize)
     kept(map_file, f"the map {map_file} stays as it was")

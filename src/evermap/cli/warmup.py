@@ -62,13 +62,14 @@ def warm_up(
     if localize:
         of_the_localizer()
         return
+    config = Config(slam={"unknown_ids": unknown_ids})
     of_the_estimator(search=search or sessions)
     if unknown_ids:
         of_the_association()
     if sessions:
-        run_session(_drive(1e5), run_session(_drive(0.0)).living)
+        run_session(_drive(1e5), run_session(_drive(0.0), config=config).living, config)
     else:
-        run_slam(_drive(0.0), Config(slam={"unknown_ids": unknown_ids}))
+        run_slam(_drive(0.0), config)
 
 
 def _drive(start_s: float) -> Recording:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
@@ -44,6 +45,23 @@ class LocalMap:
 
     place: FloatArray
     covariance: FloatArray
+
+    def part(self, rows: IntArray) -> LocalMap:
+        """Return some of the landmarks, in that order."""
+        at = se2.xy_rows(rows)
+        return LocalMap(self.place[rows], self.covariance[np.ix_(at, at)])
+
+    @property
+    def beside_m(self) -> float:
+        """Standard deviation of a landmark beside its neighbours [m]: of the differences to the nearest."""
+        n = len(self.place)
+        near: IntArray = np.asarray(KDTree(self.place).query(self.place, k=2)[1])[:, 1]
+        by = np.zeros((2 * n, 2 * n))
+        for k in range(n):
+            by[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.eye(2)
+            by[2 * k : 2 * k + 2, 2 * near[k] : 2 * near[k] + 2] = -np.eye(2)
+        spread = np.diag(by @ self.covariance @ by.T).reshape(n, 2).sum(axis=1)
+        return math.sqrt(0.5 * max(float(np.median(spread)), 0.0))
 
 
 @dataclass(frozen=True, slots=True)

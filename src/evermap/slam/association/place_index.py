@@ -116,9 +116,9 @@ class PlaceIndex:
 
     def _first(self, source: LocalMap, rows: IntArray, density: float, probability: float) -> list[tuple[int, int]]:
         """Pairs of some landmarks, wherever in the map they are."""
-        local = _part(source, rows)
-        motions = self.motions(local.place, _sigma(local))
-        places = self._around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
+        local = source.part(rows)
+        motions = self.motions(local.place, local.beside_m)
+        places = self.around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
         area_m2 = float(np.prod(np.ptp(self._position, axis=0)))
         elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * MOTION_SIGMA[0] * MOTION_SIGMA[1])))
         least = CERTAIN_NATS + elsewhere
@@ -148,16 +148,16 @@ class PlaceIndex:
             near = np.argsort(np.hypot(*(source.place[at] - start).T), kind="stable")[:PATCH]
             motion = rigid(source.place[at[near]], self._position[to[near]])
             rows = np.append(at[near], new)
-            places = self._around(se2.transform(motion, source.place[rows]), REACH_M)
-            pairs = self._agreed(_part(source, rows), places, [motion], density=density, probability=probability)
+            places = self.around(se2.transform(motion, source.place[rows]), REACH_M)
+            pairs = self._agreed(source.part(rows), places, [motion], density=density, probability=probability)
             fresh = [(int(rows[k]), m) for k, m in pairs if k >= len(near) and m not in to]
             if fresh:
                 found += fresh
                 at, to = np.append(at, [k for k, _ in fresh]), np.append(to, [m for _, m in fresh])
         return found
 
-    def _around(self, at_m: FloatArray, reach_m: float) -> IntArray:
-        """Rows of the places near any of some points (n, 2)."""
+    def around(self, at_m: FloatArray, reach_m: float) -> IntArray:
+        """Return rows of the places near any of some points (n, 2), sorted."""
         near: Any = self._tree.query_ball_point(at_m, reach_m)
         return np.unique(np.fromiter(itertools.chain.from_iterable(near), dtype=np.int64))
 
@@ -231,20 +231,3 @@ def _patch(place: FloatArray, start: FloatArray, done: BoolArray) -> IntArray:
     near = np.argsort(away, kind="stable")[:PATCH]
     rows: IntArray = near[np.isfinite(away[near])]
     return rows
-
-
-def _part(source: LocalMap, rows: IntArray) -> LocalMap:
-    at = se2.xy_rows(rows)
-    return LocalMap(source.place[rows], source.covariance[np.ix_(at, at)])
-
-
-def _sigma(local: LocalMap) -> float:
-    """Of the position of a landmark beside its neighbours [m]: of the differences to the nearest."""
-    n = len(local.place)
-    near: IntArray = np.asarray(KDTree(local.place).query(local.place, k=2)[1])[:, 1]
-    by = np.zeros((2 * n, 2 * n))
-    for k in range(n):
-        by[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = np.eye(2)
-        by[2 * k : 2 * k + 2, 2 * near[k] : 2 * near[k] + 2] = -np.eye(2)
-    spread = np.diag(by @ local.covariance @ by.T).reshape(n, 2).sum(axis=1)
-    return math.sqrt(0.5 * max(float(np.median(spread)), 0.0))

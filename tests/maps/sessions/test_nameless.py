@@ -1,0 +1,146 @@
+"""Sessions of landmarks without identity into one map, against their true identities."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evermap.config import Config, OverlayConfig
+from evermap.errors import ConfigError
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
+from evermap.maps.sessions.nameless import held_at, without_ids
+from evermap.maps.sessions.session import Session
+from evermap.maps.store import open_store
+from evermap.pipeline import run_localization
+from evermap.runs.sessions import enter_session
+from evermap.slam.association.constellation import LocalMap
+from evermap.types import rows_of
+from evermap_studies.sim import BuildingSimulation
+
+from .buildings import FIXED, building, lived_through
+
+NAMELESS = Config(slam=FIXED.model_copy(update={"unknown_ids": True}))
+
+
+def test_what_is_held_is_predicted_by_the_others() -> None:
+    """Against conditioning one at a time on the differences of all others, written down densely."""
+    rng = np.random.default_rng(0)
+    count, held = 6, np.array([0, 2, 3, 5])
+    place = rng.normal(0.0, 5.0, (count, 2))
+    root = rng.normal(0.0, 0.05, (2 * count, 2 * count))
+    local = LocalMap(place, root @ root.T + 1e-3 * np.eye(2 * count))
+    known = np.diag(rng.uniform(1e-4, 1e-2, 2 * len(held)))
+    motion = np.array([3.0, -1.0, 0.7])
+    at = se2.transform(motion, place)[held] + rng.normal(0.0, 0.05, (len(held), 2))
+    drift_m = 0.03
+    found = held_at(local, held, at, known, OverlayConfig(drifts_m=(drift_m,)))
+    assert found.drift_m == drift_m
+
+    about = rigid(place[held], at)
+    own = se2.transform(about, place)
+    turn = np.kron(np.eye(count), se2.rotation(about[2]))
+    free = se2.rigid_directions(own - own[held].mean(axis=0)) * np.array([20.0, 20.0, 3.0])
+    prior = turn @ local.covariance @ turn.T + free @ free.T
+    noise = known + drift_m**2 * np.eye(len(known))
+    for k in range(count):
+        others = np.flatnonzero(held != k)
+        rows, of = se2.xy_rows(held[others]), se2.xy_rows(others)
+        gain = prior[:, rows] @ np.linalg.inv(prior[np.ix_(rows, rows)] + noise[np.ix_(of, of)])
+        mean = own.ravel() - gain @ (own[held[others]] - at[others]).ravel()
+        spread = prior - gain @ prior[rows]
+        mine = slice(2 * k, 2 * k + 2)
+        np.testing.assert_allclose(found.position_m[k], mean[mine], atol=1e-6)
+        np.testing.assert_allclose(found.covariance_m2[k], spread[mine, mine], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def lived() -> tuple[BuildingSimulation, list[Session]]:
+    one = building(0)
+    return one, lived_through(one.sessions, NAMELESS)
+
+
+def names(one: BuildingSimulation, sessions: list[Session], k: int) -> dict[int, int]:
+    """What the map calls the landmarks that a session detected, by their true ids."""
+    given, true = sessions[k].recording.detections, one.truths[k].detection_landmark_id
+    assert len(given) == len(true)
+    return {
+        int(name): int(np.bincount(true[(given.landmark_id == name) & (true >= 0)]).argmax())
+        for name in np.unique(given.landmark_id[(given.landmark_id >= 0) & (true >= 0)])
+    }
+
+
+def test_landmarks_keep_their_names_over_sessions(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    one, sessions = lived
+    assert all(session.found for session in sessions)
+    again = wrong = 0
+    for k in range(1, len(sessions)):
+        before, now = names(one, sessions, k - 1), names(one, sessions, k)
+        both = before.keys() & now.keys()
+        again += len(both)
+        wrong += sum(before[name] != now[name] for name in both)
+    assert again > 40
+    assert wrong <= 0.05 * again
+
+
+def test_the_map_is_as_large_as_that_of_named_landmarks(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    one, sessions = lived
+    named = lived_through(one.sessions, Config(slam=FIXED))
+    for mine, theirs in zip(sessions, named, strict=True):
+        count = [int((session.living.p_exists() >= 0.5).sum()) for session in (mine, theirs)]
+        assert abs(count[0] - count[1]) <= 0.2 * count[1]
+
+
+def test_ids_of_the_recording_are_not_looked_at(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    one, sessions = lived
+    again = lived_through([without_ids(recording) for recording in one.sessions[:2]], NAMELESS)
+    assert again[1].living.landmark_texts == sessions[1].living.landmark_texts
+    np.testing.assert_array_equal(again[1].living.places.position_m, sessions[1].living.places.position_m)
+
+
+def test_what_left_is_believed_in_no_more_and_what_an_operator_deleted_does_not_come_back(
+    lived: tuple[BuildingSimulation, list[Session]],
+) -> None:
+    one, sessions = lived
+    before, now, true = names(one, sessions, 0), names(one, sessions, 1), one.truths[1].detection_landmark_id
+    seen = np.bincount(true[true >= 0])
+    gone = max((name for name in before if now.get(name) == before[name]), key=lambda name: int(seen[before[name]]))
+    kept = true != before[gone]
+    without = replace(one.sessions[1], detections=rows_of(one.sessions[1].detections, kept))
+    session = lived_through([without], NAMELESS, sessions[0].living)[0]
+    assert session.living.p_exists()[session.living.members.landmark_id == gone] < 0.5
+    edited = sessions[0].living.edited(gone, deleted=True)
+    session = lived_through([one.sessions[1]], NAMELESS, edited)[0]
+    assert gone not in session.recording.detections.landmark_id
+    grown = np.setdiff1d(session.living.members.landmark_id, edited.members.landmark_id)
+    assert len(grown) == len(np.setdiff1d(sessions[1].living.members.landmark_id, edited.members.landmark_id))
+
+
+def test_a_session_of_another_building_is_refused(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    _, sessions = lived
+    other = lived_through([building(7).sessions[1]], NAMELESS, sessions[0].living)[0]
+    assert not other.found
+    assert other.living is sessions[0].living or len(other.living.places) == len(sessions[0].living.places)
+
+
+def test_a_late_session_makes_the_map_of_the_right_order(
+    lived: tuple[BuildingSimulation, list[Session]], tmp_path: Path
+) -> None:
+    one, sessions = lived
+    with open_store(tmp_path / "map.evermap", create=True) as store:
+        for k in (0, 2, 1):
+            entered = enter_session(store, one.sessions[k], NAMELESS)
+            entered.commit(store, NAMELESS)
+        late = store.load()
+    assert late.landmark_texts == sessions[2].living.landmark_texts
+    np.testing.assert_array_equal(late.members.landmark_id, sessions[2].living.members.landmark_id)
+    np.testing.assert_array_equal(late.places.position_m, sessions[2].living.places.position_m)
+
+
+def test_localising_frame_by_frame_needs_identities(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    one, sessions = lived
+    with pytest.raises(ConfigError, match="not causal"):
+        run_localization(one.sessions[1], sessions[0].living, NAMELESS)
