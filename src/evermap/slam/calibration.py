@@ -67,6 +67,8 @@ ASKEW_SIGMA_RAD = 0.03
 """Of the direction in which wheels drive: they, or the axis that is called the robot's front, are not parallel."""
 P_SPARE = 0.01
 """Probability of a state to be needed below which it is held as stated."""
+LEAST_SIGMA = 1e-6
+"""Of a data sheet that says that there is no error: nothing divides by zero."""
 P_NEEDED, P_NEEDED_KNOWN = 0.5, 0.9
 """Prior probability that a state is not as stated; those of a sensor that is known to be no laser hardly ever are."""
 
@@ -107,10 +109,7 @@ class CalibrationPrior:
         Raises:
             ConfigError: `fix` names an unknown state.
         """
-        mean = np.array([spec.mean for spec in SPECS])
-        sigma = np.array([spec.sigma for spec in SPECS])
-        free = np.full(N_STATES, calibrated)
-        shares = {} if sensor is None else _stated(sensor, sigma)
+        mean, free = np.array([spec.mean for spec in SPECS]), np.full(N_STATES, calibrated)
         for name, value in fix.items():
             if name not in NAMES:
                 raise ConfigError(
@@ -120,9 +119,37 @@ class CalibrationPrior:
                 )
             mean[NAMES.index(name)] = value
             free[NAMES.index(name)] = False
-            if name == NAMES[BEARING]:
-                shares["angle_share"] = 1.0
-        return cls(mean, sigma, free, **shares)
+        prior = cls(mean, np.array([spec.sigma for spec in SPECS]), free)
+        return prior if sensor is None else prior._as_stated(sensor)
+
+    def _as_stated(self, sensor: Sensor) -> CalibrationPrior:
+        """The prior narrowed by what is stated of the sensor, and how errors that only show together are divided."""
+        sheet = {
+            BIAS: sensor.sigma_offset_m,
+            SLOPE: sensor.sigma_scale,
+            BEARING: sensor.sigma_angle_rad,
+            FORWARD: sensor.sigma_odometer_scale,
+        }
+        sigma = self.sigma.copy()
+        if sensor.kind is not None:
+            sigma[:N_SENSOR] = KINDS[sensor.kind]
+        for state, value in sheet.items():
+            if value is not None:
+                sigma[state] = max(value, LEAST_SIGMA)
+        askew = ASKEW_SIGMA_RAD if sensor.sigma_askew_rad is None else max(sensor.sigma_askew_rad, LEAST_SIGMA)
+        angle_share = 0.0
+        if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
+            angle_share = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + askew**2)
+        sigma[BEARING] = np.hypot(sigma[BEARING], askew)
+        scale_as_stated = sensor.kind is None and sheet[SLOPE] is None and sheet[FORWARD] is None
+        return replace(
+            self,
+            sigma=sigma,
+            slope_share=0.0 if scale_as_stated else None,
+            angle_share=angle_share,
+            askew_sigma=askew,
+            p_sensor=P_NEEDED if sensor.kind in (None, SensorKind.LASER) else P_NEEDED_KNOWN,
+        )
 
     def averaged(self, p_needed: FloatArray, variance: FloatArray, worth: FloatArray) -> CalibrationPrior:
         """Return the prior under which each estimate is the mean over 'as stated' and 'drawn from this prior'.
@@ -141,7 +168,16 @@ class CalibrationPrior:
         data = np.maximum(1.0 / np.where(self.free, variance, self.sigma**2) - before, 1e-9 * before)
         told = data / worth
         information = np.where(asked, data * ((told + before) / (p * told) - 1.0), before)
-        return replace(self, sigma=1.0 / np.sqrt(information), free=self.free & ~(p_needed < P_SPARE))
+        return replace(self.spared(p_needed), sigma=1.0 / np.sqrt(information))
+
+    def spared(self, p_needed: FloatArray) -> CalibrationPrior:
+        """Return the prior with those states held as stated that hardly need to be free, by `p_needed` (9,)."""
+        return replace(self, free=self.free & ~(p_needed < P_SPARE))
+
+    def doubt(self, p_needed: FloatArray, states: FloatArray) -> FloatArray:
+        """Return (9,) variances between 'as stated' and 'drawn from this prior', given their means (9,): `averaged`."""
+        odds = np.where(p_needed >= P_SPARE, 1.0 / np.maximum(p_needed, P_SPARE) - 1.0, 0.0)
+        return odds * (states - self.mean) ** 2
 
     def without_scale(self) -> CalibrationPrior:
         """Return the prior of the states that are observable without a prior map, in the metres of the range sensor.
@@ -204,17 +240,26 @@ class CalibrationPrior:
             States and covariance with the sensor's part alone; the robot's part [rad], to the left of its front where
             positive, and its standard deviation.
         """
-        if not self.free[BEARING] or not self.askew_sigma > 0.0:
+        if not self._shares_angle:
             return states, covariance, 0.0, 0.0
-        states, covariance, share = states.copy(), covariance.copy(), self.angle_share
-        askew, variance = (1.0 - share) * states[BEARING], covariance[BEARING, BEARING]
+        askew, variance, share = self._askew(states), covariance[BEARING, BEARING], self.angle_share
+        states, covariance = states.copy(), covariance.copy()
         own = max(self.sigma[BEARING] ** 2 - self.askew_sigma**2, 0.0)
         undivided = own * self.askew_sigma**2 / self.sigma[BEARING] ** 2
         states[BEARING] *= share
         covariance[BEARING] *= share
         covariance[:, BEARING] *= share
         covariance[BEARING, BEARING] += undivided
-        return states, covariance, float(askew), float(np.sqrt((1.0 - share) ** 2 * variance + undivided))
+        return states, covariance, askew, float(np.sqrt((1.0 - share) ** 2 * variance + undivided))
+
+    @property
+    def _shares_angle(self) -> bool:
+        """True where neither the sensor's angle nor the robot's is given, so that only their sum shows."""
+        return bool(self.free[BEARING]) and self.askew_sigma > 0.0
+
+    def _askew(self, states: FloatArray) -> float:
+        """Direction in which the robot drives, to the left of its front [rad]."""
+        return float((1.0 - self.angle_share) * states[BEARING]) if self._shares_angle else 0.0
 
     def front(self, states: FloatArray, mount: FloatArray) -> FloatArray:
         """Return (3,) where the robot's front is, seen from poses as the graph has them.
@@ -226,7 +271,9 @@ class CalibrationPrior:
             states: (9,) estimate, as the graph has it.
             mount: (3,) pose of the sensor on the robot.
         """
-        askew = self.split_angle(states, np.zeros((N_STATES, N_STATES)))[2]
+        askew = self._askew(states)
+        if askew == 0.0:
+            return np.zeros(3)
         turned = se2.compose(se2.compose(mount, np.array([0.0, 0.0, -askew])), se2.inverse(mount))
         return np.asarray(turned, dtype=np.float64)
 
@@ -237,29 +284,6 @@ def from_front(pose: FloatArray, covariance: FloatArray, front: FloatArray) -> t
         return pose.copy(), covariance.copy()
     turned = se2.adjoint(se2.inverse(front))
     return se2.compose(pose, front), turned @ covariance @ turned.T
-
-
-def _stated(sensor: Sensor, sigma: FloatArray) -> dict[str, float]:
-    """Narrow the sigmas (9,) by what is stated of the sensor; return how errors that only show together are divided."""
-    shares = {"slope_share": 0.0, "angle_share": 0.0, "askew_sigma": ASKEW_SIGMA_RAD}
-    if sensor.kind is not None:
-        sigma[:N_SENSOR] = KINDS[sensor.kind]
-        shares.pop("slope_share")
-        shares["p_sensor"] = P_NEEDED if sensor.kind == SensorKind.LASER else P_NEEDED_KNOWN
-    given = {BIAS: sensor.sigma_offset_m, SLOPE: sensor.sigma_scale, BEARING: sensor.sigma_angle_rad}
-    for state, value in given.items():
-        if value is not None:
-            sigma[state] = max(value, 1e-6)
-    if sensor.sigma_odometer_scale is not None:
-        sigma[FORWARD] = max(sensor.sigma_odometer_scale, 1e-6)
-    if sensor.sigma_askew_rad is not None:
-        shares["askew_sigma"] = max(sensor.sigma_askew_rad, 1e-6)
-    if sensor.sigma_scale is not None or sensor.sigma_odometer_scale is not None:
-        shares.pop("slope_share", None)
-    if sensor.sigma_angle_rad is not None or sensor.sigma_askew_rad is not None:
-        shares["angle_share"] = sigma[BEARING] ** 2 / (sigma[BEARING] ** 2 + shares["askew_sigma"] ** 2)
-    sigma[BEARING] = np.hypot(sigma[BEARING], shares["askew_sigma"])
-    return shares
 
 
 def needed(prior: CalibrationPrior, states: FloatArray, covariance: FloatArray, worth: FloatArray) -> FloatArray:

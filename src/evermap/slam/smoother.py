@@ -181,6 +181,8 @@ class Smoother:
         1986). 1 for states that are not free, and at least.
         """
         problem, n = self.problem, len(estimate.pose)
+        if not problem.prior.free.any():
+            return np.ones(9)
         now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
         pose, place, states = with_states[: 3 * n].reshape(n, 3, 9), with_states[3 * n : -9], with_states[-9:]
         place = place.reshape(-1, 2, 9)

@@ -14,7 +14,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
-from evermap.slam.calibration import P_SPARE, CalibrationPrior, from_front, needed
+from evermap.slam.calibration import CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
@@ -215,16 +215,16 @@ class StreamingSlam:
                 break
             problem = revision.problem
             smoother, estimate, fit = self._converged(problem, revision.estimate, fit.noise)
-        smoother, estimate, marginals = self._optimum(problem, estimate, fit)
+        solved = smoother, estimate, marginals = self._optimum(problem, estimate, fit)
         worth = smoother.worth(estimate, marginals)
         p_needed = needed(problem.prior, estimate.states, marginals.states, worth)
         if not np.all(np.isnan(p_needed)):
             prior = problem.prior.averaged(p_needed, np.diag(marginals.states), worth)
-            problem, estimate = replace(problem, prior=prior), _nearer(estimate, prior, p_needed)
+            problem = replace(problem, prior=prior)
+            estimate = replace(estimate, states=np.where(prior.free, estimate.states, prior.mean))
             smoother, estimate, fit = self._converged(problem, estimate, fit.noise)
-            smoother, estimate, marginals = self._optimum(problem, estimate, fit)
-            worth = smoother.worth(estimate, marginals)
-        return self._divided(revision, (estimate, marginals, fit, smoother), p_needed, worth)
+            solved = self._optimum(problem, estimate, fit)
+        return divided(solved, self._prior, p_needed, fit, revision, aligned=self._aligned)
 
     def _ahead(self, problem: Problem, estimate: Estimate) -> tuple[Problem, Estimate]:
         """The same, turned so that the first pose has the robot's front ahead, where it is not in a map."""
@@ -442,48 +442,52 @@ class StreamingSlam:
         self._job = self._relinearised(learn=True)
         self._work()
 
-    def _divided(
-        self,
-        revision: Explanation,
-        solved: tuple[Estimate, Marginals, NoiseFit, Smoother],
-        p_needed: FloatArray,
-        worth: FloatArray,
-    ) -> Outcome:
-        estimate, marginals, fit, smoother = solved
-        prior = replace(self._prior, free=self._prior.free & ~(p_needed < P_SPARE))
-        covariance = marginals.states * np.sqrt(np.outer(worth, worth))
-        doubt = np.where(p_needed >= P_SPARE, 1.0 / np.maximum(p_needed, P_SPARE) - 1.0, 0.0)
-        covariance += np.diag(doubt * (estimate.states - prior.mean) ** 2)
-        states, scale, log_sigma = estimate.states, 1.0, 0.0
-        if not self._aligned:
-            states, covariance, scale, log_sigma = prior.split_scale(states, covariance)
-        front = prior.front(states, smoother.problem.mount)
-        states, covariance, *askew = prior.split_angle(states, covariance)
-        return Outcome(
-            estimate=Estimate(
-                se2.compose(estimate.pose * [scale, scale, 1.0], front), estimate.landmark * scale, states
-            ),
-            states_covariance=covariance,
-            prior=prior,
-            p_needed=p_needed,
-            askew=(askew[0], askew[1]),
-            problem=smoother.problem,
-            graph_estimate=estimate,
-            graph_marginals=marginals,
-            noise=fit,
-            inlier=smoother.inlier_probability(estimate),
-            scale=scale,
-            log_scale_sigma=log_sigma,
-            aligned=self._aligned,
-            revision=revision,
-        )
 
+def divided(
+    solved: tuple[Smoother, Estimate, Marginals],
+    prior: CalibrationPrior,
+    p_needed: FloatArray,
+    noise: NoiseFit,
+    revision: Explanation,
+    *,
+    aligned: bool,
+) -> Outcome:
+    """Return what a session knows at its optimum, with what only shows together divided as its sensor states it.
 
-def _nearer(estimate: Estimate, prior: CalibrationPrior, p_needed: FloatArray) -> Estimate:
-    """The estimate with its states about where such a prior pulls them; those that it holds are at its mean."""
-    off = np.where(prior.free, np.nan_to_num(p_needed, nan=1.0), 0.0) * (estimate.states - prior.mean)
-    states = np.where(np.isnan(p_needed), estimate.states, prior.mean + off)
-    return Estimate(estimate.pose, estimate.landmark, states)
+    Args:
+        solved: the final optimum, in the graph's metres.
+        prior: of the calibration states as the user means it.
+        p_needed: (9,) probability of each state to be another than stated.
+        noise: levels at which it was solved.
+        revision: the method's last word.
+        aligned: True where lengths and frame are those of a map.
+    """
+    smoother, estimate, marginals = solved
+    prior, worth = prior.spared(p_needed), smoother.worth(estimate, marginals)
+    covariance = marginals.states * np.sqrt(np.outer(worth, worth))
+    covariance += np.diag(prior.doubt(p_needed, estimate.states))
+    states, scale, log_sigma = estimate.states, 1.0, 0.0
+    if not aligned:
+        states, covariance, scale, log_sigma = prior.split_scale(states, covariance)
+    front = prior.front(states, smoother.problem.mount)
+    states, covariance, *askew = prior.split_angle(states, covariance)
+    pose = se2.compose(estimate.pose * [scale, scale, 1.0], front)
+    return Outcome(
+        estimate=Estimate(pose, estimate.landmark * scale, states),
+        states_covariance=covariance,
+        prior=prior,
+        p_needed=p_needed,
+        askew=(askew[0], askew[1]),
+        problem=smoother.problem,
+        graph_estimate=estimate,
+        graph_marginals=marginals,
+        noise=noise,
+        inlier=smoother.inlier_probability(estimate),
+        scale=scale,
+        log_scale_sigma=log_sigma,
+        aligned=aligned,
+        revision=revision,
+    )
 
 
 def _settled(before: Noise, after: Noise, within: float) -> bool:

@@ -18,7 +18,7 @@ from evermap.maps.sessions.overlay import ELSEWHERE, Known, Sighted, lay_over
 from evermap.slam.calibration import FORWARD, N_STATES, SLOPE, CalibrationPrior
 from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
-from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, sighted_at
+from evermap.slam.streaming import ALIGNED_INFORMATION, FINAL_TOLERANCE, Outcome, divided, sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 USUAL = FitConfig()
@@ -307,23 +307,8 @@ def refitted(
         other, straight = _solved(problem, noise, _placed(problem, start, held.row, settings), robust=robust)
         if other.cost(straight) < smoother.cost(estimate):
             smoother, estimate, straightened = other, straight, True
-    marginals = smoother.marginals(estimate)
-    front = prior.front(estimate.states, problem.mount)
-    states, covariance, *askew = prior.split_angle(estimate.states, marginals.states)
-    outcome = replace(
-        outcome,
-        estimate=Estimate(se2.compose(estimate.pose, front), estimate.landmark, states),
-        states_covariance=covariance,
-        askew=(askew[0], askew[1]),
-        problem=problem,
-        graph_estimate=estimate,
-        graph_marginals=marginals,
-        inlier=smoother.inlier_probability(estimate),
-        scale=1.0,
-        log_scale_sigma=0.0,
-        aligned=True,
-    )
-    return outcome, straightened
+    solved = smoother, estimate, smoother.marginals(estimate)
+    return divided(solved, prior, outcome.p_needed, outcome.noise, outcome.revision, aligned=True), straightened
 
 
 def _in_map(
