@@ -12,9 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from evermap.geometry import se2
 from evermap.sensing import learned
+from evermap.sensing.kernels import OUT_OF_FIELD
 from evermap.sensing.profile import Assumed
-from evermap.sensing.sightlines import LearnedField, SightLines
+from evermap.sensing.sightlines import SightLines
 from evermap.sensing.visibility import WORTH_A_LOOK, DetectionModel, NominalField, looks_at
 from evermap.tracking.views import View
 from evermap.types import FloatArray, IntArray, Sensor
@@ -54,9 +56,29 @@ def learned_field(sensor: Sensor) -> Callable[[FloatArray, IntArray], DetectionM
         eye, at = eye[: len(row)], position_m[order][row]
         hit = (eye[:, 0] * at[:, 0] > 0.0) & (rng.random(len(row)) < 0.8)  # there is a wall along the y axis
         lines = lines.learned(places, row, lines.cells(eye, at), hit, np.ones(len(row)))
-        return InOrder(LearnedField(NominalField(sensor), lines, places), order)
+        return InOrder(Learned(NominalField(sensor), lines, places), order)
 
     return make
+
+
+class Learned:
+    """The nominal field of view with what was learned of lines of sight to places, sorted by site and landmark."""
+
+    def __init__(self, nominal: NominalField, lines: SightLines, places: tuple[IntArray, IntArray]) -> None:
+        self.nominal, self.lines, self.places = nominal, lines, places
+
+    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
+        nominal = self.nominal.p_detect(pose, position_m)
+        eye = se2.compose(pose, np.asarray(self.nominal.sensor.mount_robot_sensor))
+        frame, place = np.nonzero(nominal >= OUT_OF_FIELD)
+        cell = self.lines.cells(eye[:, :2], position_m, (frame, place))
+        along = nominal[frame, place]
+        lines, p_clear, _ = self.lines.lines(self.places, place, cell, along)
+        p = np.zeros(nominal.shape)
+        p[frame, place] = p_clear * lines.p_detect + (1.0 - p_clear) * np.minimum(
+            self.lines.rules.p_blocked_detect, along
+        )
+        return p
 
 
 class InOrder:

@@ -7,6 +7,7 @@ import functools
 import numpy as np
 
 from evermap.config import Config
+from evermap.geometry.se3 import NO_TURN
 from evermap.pipeline import run_session, run_slam
 from evermap.slam.association.consensus import warm_up as of_the_association
 from evermap.slam.localize_recording import warm_up as of_the_localizer
@@ -111,7 +112,7 @@ def _flight(start_s: float) -> SpatialRecording:
         sensor=seen.source_line,
         landmark_id=seen.landmark_id,
         position_sensor_m=position,
-        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        rotation=np.tile(NO_TURN, (count, 1)),
         covariance_sensor_m2=np.full((count, 3, 3), np.nan),
         sigma_rad=unsaid,
         corner_px=np.full((count, 4, 2), np.nan),

@@ -17,11 +17,13 @@ from evermap.types import FloatArray
 dim = 6
 size = 7
 point_dim = 3
+NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
+"""Quaternion of no rotation, and of one that nobody knows."""
 
 
 def identity(*shape: int) -> FloatArray:
     """Return poses (*shape, 7) at the origin."""
-    return np.broadcast_to([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (*shape, 7)).copy()
+    return np.broadcast_to(np.append(np.zeros(3), NO_TURN), (*shape, 7)).copy()
 
 
 def normalised(pose: ArrayLike) -> FloatArray:

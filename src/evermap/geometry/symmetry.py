@@ -34,7 +34,7 @@ class Symmetry:
     """
 
     axis: int = -1
-    turns: FloatArray = field(default_factory=lambda: np.array([[0.0, 0.0, 0.0, 1.0]]))
+    turns: FloatArray = field(default_factory=lambda: se3.NO_TURN[None])
     free: bool = False
 
     @classmethod

@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import dataclass, field
+from enum import StrEnum
 from math import inf, pi
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from evermap.errors import InputError, suggestion
 from evermap.io.text import decode_text, reason
 from evermap.types import Clock, Sensor, SensorKind
 
 FORMAT_VERSION = 1
+_Choice = TypeVar("_Choice", bound=StrEnum)
 
 # sections and keys with their limits; those of all but the mount are fields of `Sensor`
 _LIMITS: dict[str, dict[str, tuple[float, float]]] = {
@@ -90,24 +92,13 @@ def _sensor(values: dict[str, dict[str, float]], reader: TomlReader) -> Sensor:
     mount = values.pop("mount")
     x_m, y_m, theta_rad = (mount.get(key, 0.0) for key in _LIMITS["mount"])
     numbers: dict[str, Any] = {k: v for part in values.values() for k, v in part.items()}
-    sensor = Sensor(**numbers, kind=_kind(reader), mount_robot_sensor=(x_m, y_m, theta_rad))
+    kind = reader.choice("sensor", "kind", SensorKind, "no kind of sensor")
+    sensor = Sensor(**numbers, kind=kind, mount_robot_sensor=(x_m, y_m, theta_rad))
     if sensor.range_min_m >= sensor.range_max_m:
         raise reader.error("limits", "range_max_m", "must be greater than range_min_m")
     if sensor.bearing_min_rad >= sensor.bearing_max_rad:
         raise reader.error("limits", "bearing_max_rad", "must be greater than bearing_min_rad")
     return sensor
-
-
-def _kind(reader: TomlReader) -> SensorKind | None:
-    kind = reader.document.get("sensor", {}).get("kind")
-    if kind is None:
-        return None
-    if kind not in list(SensorKind):
-        problem = f"no kind of sensor '{kind}'"
-        raise reader.error(
-            "sensor", "kind", problem, suggestion(str(kind), list(SensorKind)) or "one of " + ", ".join(SensorKind)
-        )
-    return SensorKind(kind)
 
 
 class TomlReader:
@@ -158,6 +149,15 @@ class TomlReader:
             raise self.error(section, key, f"must be a list of {wanted} numbers")
         return tuple(self.number(section, key, item, -1e9, 1e9) for item in value)
 
+    def choice(self, section: str, key: str, among: type[_Choice], problem: str) -> _Choice | None:
+        value = self.document.get(section, {}).get(key)
+        if value is None:
+            return None
+        if value not in list(among):
+            hint = suggestion(str(value), list(among)) or "one of " + ", ".join(among)
+            raise self.error(section, key, f"{problem} '{value}'", hint)
+        return among(value)
+
     def recording(self, sensor: Sensor) -> Settings:
         content = self.section("recording", _RECORDING)
         types: dict[str, type] = {
@@ -169,9 +169,6 @@ class TomlReader:
         if content.get("format_version", FORMAT_VERSION) != FORMAT_VERSION:
             problem = f"{content['format_version']} is not a version this evermap reads, which is {FORMAT_VERSION}"
             raise self.error("recording", "format_version", problem, hint="a newer evermap")
-        clock = content.get("clock", Clock.RECORDING.value)
-        if clock not in list(Clock):
-            raise self.error("recording", "clock", f"no clock '{clock}'", hint="one of " + ", ".join(Clock))
         names = content.get("class_names")
         if names is not None and not all(isinstance(name, str) and name.strip() == name and name for name in names):
             raise self.error("recording", "class_names", "must be a list of names")
@@ -179,7 +176,7 @@ class TomlReader:
             raise self.error("recording", "class_names", "a name appears twice")
         return Settings(
             name=content.get("name"),
-            clock=Clock(clock),
+            clock=self.choice("recording", "clock", Clock, "no clock") or Clock.RECORDING,
             frames_complete=content.get("frames_complete"),
             class_names=None if names is None else tuple(names),
             sensor=sensor,

@@ -18,13 +18,9 @@ import numpy as np
 
 from evermap.config import SightConfig
 from evermap.errors import InputError
-from evermap.geometry import se2
-from evermap.sensing.visibility import NominalField
 from evermap.types import BoolArray, FloatArray, IntArray
 
 USUAL = SightConfig()
-OUT_OF_VIEW = 0.01
-"""Nominal detection rate below which lines of sight do not matter."""
 LONGEST = 80
 """Cells; lines longer than this are taken together."""
 ROUNDS = 10
@@ -252,35 +248,6 @@ def nominal_lines(p_detect: FloatArray, rules: SightConfig = USUAL) -> Lines:
     """Return lines of a sensor whose nominal field of view (N,) is taken for the truth."""
     nominal = np.clip(np.asarray(p_detect, dtype=np.float64), *rules.rates)
     return Lines(np.ones(len(nominal)), KNOWN * nominal, KNOWN * (1.0 - nominal), rules.p_blocked_detect)
-
-
-@dataclass(frozen=True, slots=True)
-class LearnedField:
-    """The nominal field of view with what was learned of lines of sight; a `visibility.DetectionModel`.
-
-    Attributes:
-        nominal: where nothing is in the way.
-        lines: hits and looks along lines of sight.
-        places: (L,) sites and (L,) landmarks of the places, sorted by both.
-    """
-
-    nominal: NominalField
-    lines: SightLines
-    places: tuple[IntArray, IntArray]
-
-    def p_detect(self, pose: FloatArray, position_m: FloatArray) -> FloatArray:
-        """Return (F, L) probabilities of places at (L, 2) from robot poses (F, 3); 0 far out of the field of view."""
-        nominal = self.nominal.p_detect(pose, position_m)
-        eye = se2.compose(pose, np.asarray(self.nominal.sensor.mount_robot_sensor))
-        frame, place = np.nonzero(nominal >= OUT_OF_VIEW)
-        cell = self.lines.cells(eye[:, :2], position_m, (frame, place))
-        along = nominal[frame, place]
-        lines, p_clear, _ = self.lines.lines(self.places, place, cell, along)
-        p = np.zeros(nominal.shape)
-        p[frame, place] = p_clear * lines.p_detect + (1.0 - p_clear) * np.minimum(
-            self.lines.rules.p_blocked_detect, along
-        )
-        return p
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from evermap.geometry import se2
 from evermap.geometry.chunked import ChunkedCovariance, JointCovariance, blocks, of_places
 from evermap.geometry.rigid import AGREE_M, consensus
 from evermap.slam.streaming import sighted_at
-from evermap.types import FloatArray, IntArray, Landmarks
+from evermap.types import FloatArray, IntArray
 
 LEAST_VARIANCE = 1e-6
 """Of a place, m^2: a survey is good to a millimetre."""
@@ -71,11 +71,6 @@ class KnownPlaces:
         if self.joint_m2 is None:
             return self.covariance_m2[rows[0]] if len(rows) == 1 else np.asarray(block_diag(*self.covariance_m2[rows]))
         return of_places(self.joint_m2, self.joint_row[rows]) + LEAST_VARIANCE * np.eye(2 * len(rows))
-
-    @classmethod
-    def from_landmarks(cls, landmarks: Landmarks) -> KnownPlaces:
-        """Return records of a map; here, other than elsewhere, a landmark may have several."""
-        return cls.of(landmarks.landmark_id, landmarks.position_m, landmarks.covariance_m2, landmarks.p_exists)
 
     def rows_of(self, landmark_id: IntArray) -> tuple[IntArray, IntArray]:
         """Return the first row of (M,) landmarks, and the one after the last; both equal where the map lacks one."""

@@ -26,6 +26,8 @@ LEAST_S, FEWEST = 0.4, 4
 """What a track or a stay must last, and detections that it takes."""
 SAME_M, ELSEWHERE_M = 0.5, 2.0
 """Stays this close are one; what left was farther away than that."""
+WHEN_S = 0.5
+"""When a thing came to rest, or left, is known to within this to both sides [s]."""
 SURE = 0.8
 """Probability to stand from which on a thing is believed to."""
 

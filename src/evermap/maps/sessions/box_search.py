@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.geometry import se2
+from evermap.geometry import se2, se3
 from evermap.geometry.chunked import blocks
 from evermap.geometry.rigid import rigid
 from evermap.maps.living import LivingMap
@@ -80,7 +80,7 @@ class MapBoxes(NamedTuple):
         row = np.flatnonzero(np.isin(places.landmark_id, living.boxes.landmark_id))
         name = places.landmark_id[row]
         known = np.isfinite(places.rotation[row, :1])
-        pose = np.hstack([places.position_m[row], np.where(known, places.rotation[row], [0.0, 0.0, 0.0, 1.0])])
+        pose = np.hstack([places.position_m[row], np.where(known, places.rotation[row], se3.NO_TURN)])
         member = np.searchsorted(members.landmark_id, name)
         p = p_site[np.searchsorted(living.sites.site_id, places.site_id[row])]
         return cls(

@@ -161,7 +161,7 @@ def _moved(optimum: SpatialOptimum, motion: FloatArray) -> SpatialOptimum:
     """The same in another frame, by a rigid motion (7,)."""
     estimate, oriented = optimum.estimate, optimum.smoother.problem.oriented
     place = se3.compose(motion, estimate.place)
-    place[~oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    place[~oriented, 3:] = se3.NO_TURN
     estimate = replace(estimate, pose=se3.compose(motion, estimate.pose), place=place)
     return converged(optimum.smoother.problem, estimate, optimum.noise, heavy_rounds=0)
 

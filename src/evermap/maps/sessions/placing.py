@@ -92,7 +92,7 @@ class Turned(NamedTuple):
 def _turns(rotation: FloatArray) -> FloatArray:
     """Poses (K, 7) at the origin with orientations (K, 4); of nan with none."""
     known = np.isfinite(rotation[:, :1])
-    return np.hstack([np.zeros((len(rotation), 3)), np.where(known, rotation, [0.0, 0.0, 0.0, 1.0])])
+    return np.hstack([np.zeros((len(rotation), 3)), np.where(known, rotation, se3.NO_TURN)])
 
 
 def laid_over(

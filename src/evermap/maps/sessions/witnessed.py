@@ -13,12 +13,11 @@ import numpy as np
 from evermap.maps.living import Evidence, LivingMap, clique_rows
 from evermap.maps.sessions.looks import Arrivals, PlaceLooks, Watch
 from evermap.sensing.sightlines import KNOWN
+from evermap.tracking.standing import WHEN_S
 from evermap.types import FloatArray, IntArray, rows_of
 
-CERTAIN_NATS = 50.0
+WITNESSED_NATS = 50.0
 """Log likelihood ratio of having been seen to leave: more than any lifetime outweighs."""
-WHEN_S = 0.5
-"""When a thing came to rest, or left, is known to within this to both sides [s]."""
 LEAST_P, MOST_P = 1e-6, 1.0 - 1e-6
 
 
@@ -85,7 +84,7 @@ def departed(
     p_here, p_kept, log_evidence = sites.p_here.copy(), sites.p_kept.copy(), log_evidence.copy()
     p_here[at] *= 1.0 - p_left
     p_kept[at] *= 1.0 - p_left
-    log_evidence[clique] = -CERTAIN_NATS
+    log_evidence[clique] = -WITNESSED_NATS
     living = replace(living, sites=replace(sites, p_here=p_here, p_kept=p_kept))
     total = np.bincount(clique_of, p_here, minlength=len(cliques))
     stamp_s, none, one = what.until_s[left] + WHEN_S, np.zeros(len(left), np.int64), np.ones(len(left), np.int64)

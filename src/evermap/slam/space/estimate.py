@@ -178,5 +178,5 @@ def first_places(problem: SpatialProblem, pose: FloatArray) -> SpatialEstimate:
         mine = np.flatnonzero(problem.place == row)
         away = np.linalg.norm(at[mine, :3] - np.median(at[mine, :3], axis=0), axis=1)
         place[row] = at[mine[int(np.argmin(away))]]
-    place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    place[~problem.oriented, 3:] = se3.NO_TURN
     return replace(estimate, place=place)

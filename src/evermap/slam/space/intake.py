@@ -33,7 +33,6 @@ LEAST_PARALLAX = 0.25
 """Standard deviation of a range that makes a first value, as a share of it."""
 HARDLY = 1.0
 """Standard deviation with which it counts, as a share of the range: as good as nothing."""
-NO_TURN = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +208,9 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
     count = len(given)
     found = _Where(
         kind=np.where(np.isfinite(given.rotation[:, 0]), POSE, POINT).astype(np.int64),
-        measured=np.hstack([given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, NO_TURN)]),
+        measured=np.hstack(
+            [given.position_sensor_m, np.where(np.isfinite(given.rotation), given.rotation, se3.NO_TURN)]
+        ),
         covariance=_covariance(recording),
         sigma_rad=_sigma_rad(recording),
         corner=np.zeros((count, 4, 2)),

@@ -18,12 +18,12 @@ from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
 from evermap.slam.space.drift import SIGMA_BEND, SIGMA_SCALE, Gauge, gauge_of
 from evermap.slam.space.estimate import converged
-from evermap.slam.space.intake import NO_TURN, SpatialIntake, prepare_space
+from evermap.slam.space.intake import SpatialIntake, prepare_space
 from evermap.slam.space.result import concluded_in_space, numbered
 from evermap.slam.space.solve import SpatialSolved, solve_space
 from evermap.tracking.frame import DetectionTable, Poses, heading_of, in_world, with_empty_frames
 from evermap.tracking.run import TrackResult, run_track
-from evermap.tracking.standing import Stood, long_enough, standing
+from evermap.tracking.standing import WHEN_S, Stood, long_enough, standing
 from evermap.types import (
     UNKNOWN,
     ChangeKind,
@@ -49,8 +49,6 @@ FEWEST_WITNESSES, FAR_BETTER = 10, 2.0
 """Things that must say so, and the factor by which their deviations become smaller."""
 TILT = 0.05
 """Boxes are upright to within this [rad]."""
-WHEN_S = 0.5
-"""When a thing came to rest, or left, is known to within this to both sides [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +247,7 @@ def _followed(recording: SpatialRecording, pose: FloatArray, gauge: Gauge, track
     given, rows, stamps = recording.detections, boxes_of(recording), recording.frames.stamp_s
     mount = mounts_of(recording)[rows]
     local = np.column_stack([gauge.range_scale * given.position_sensor_m[rows], given.rotation[rows]])
-    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], NO_TURN)
+    local[:, 3:] = np.where(np.isfinite(local[:, 3:]), local[:, 3:], se3.NO_TURN)
     local = se3.compose(mount, local)
     names = recording.class_names or ("",)
     turn = se3.rotation_of(mount)

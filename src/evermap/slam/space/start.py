@@ -76,7 +76,7 @@ def incremental(
         step_s[row] = time.perf_counter() - began
         if progress is not None:
             progress(float(problem.stamp_s[row]), float(problem.stamp_s[-1]))
-    place[~problem.oriented, 3:] = [0.0, 0.0, 0.0, 1.0]
+    place[~problem.oriented, 3:] = se3.NO_TURN
     return SpatialEstimate(pose, place, np.zeros((len(problem.mount), 7))), spread, step_s
 
 

@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from itertools import chain
-from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.slam.association.merging import in_reach
 from evermap.types import (
     UNKNOWN,
     Detections,
     FloatArray,
     Frames,
-    IntArray,
     Landmarks,
     Odometry,
     Recording,
@@ -186,7 +183,7 @@ def _detections(
     config: WarehouseConfig, pose: FloatArray, landmark: FloatArray, rng: np.random.Generator
 ) -> Detections:
     """Readings of what is in view and detected, by frame, then by landmark."""
-    frame, seen = _within_range(pose[:, :2], landmark, config.range_m)
+    frame, seen = in_reach(landmark, pose[:, :2], config.range_m)
     offset = se2.transform(se2.inverse(pose)[frame], landmark[seen])
     range_m, bearing_rad = np.hypot(*offset.T), np.arctan2(offset[:, 1], offset[:, 0])
     hit = (np.abs(bearing_rad) < config.half_view_rad) & (rng.random(len(frame)) < config.p_detect)
@@ -205,11 +202,3 @@ def _detections(
         sigma_bearing_rad=np.full(len(frame), np.nan),
         source_line=np.zeros(len(frame), dtype=np.int64),
     )
-
-
-def _within_range(position_m: FloatArray, landmark: FloatArray, range_m: float) -> tuple[IntArray, IntArray]:
-    """Pairs (rows of positions, rows of landmarks) that are nearer to each other than this, sorted."""
-    near: Any = KDTree(landmark).query_ball_point(position_m, range_m, return_sorted=True)
-    count = np.fromiter(map(len, near), dtype=np.int64, count=len(near))
-    column = np.fromiter(chain.from_iterable(near), dtype=np.int64, count=int(count.sum()))
-    return np.repeat(np.arange(len(near)), count), column
