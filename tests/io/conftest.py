@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -12,6 +13,8 @@ import numpy as np
 import pytest
 
 from evermap.types import Recording
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 Files = dict[str, str]
 
@@ -127,6 +130,15 @@ def ycbv() -> Files:
         "camera_truth.tum": path,
         "object_truth_002_can.tum": seen,
     }
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> dict[str, bytes]:
+    """A bag of ROS 2 in MCAP; a robot drives past two markers."""
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    from bags import write
+
+    return {file.name: file.read_bytes() for file in write(tmp_path / "drive", "aruco").iterdir()}
 
 
 @pytest.fixture

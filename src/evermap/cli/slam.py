@@ -112,6 +112,14 @@ Template = Annotated[
     typer.Option(metavar="DIR", help="Write a commented template of a recording and exit.", show_default=False),
 ]
 
+InitBag = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="BAG",
+        help="Write BAG.toml, which topics of a ROS bag are read and how, to be edited, and exit.",
+        show_default=False,
+    ),
+]
 InSpace = Annotated[bool, typer.Option("--3d", help="With --init: a recording in space, of a camera that sees tags.")]
 
 HELP = """\
@@ -122,6 +130,7 @@ Examples:
   evermap slam --init my-recording
   evermap slam --init my-flight --3d
   evermap slam my-recording --out out/mine
+  evermap slam monday.mcap
   evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
   evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
   evermap slam monday --map building.evermap
@@ -150,11 +159,15 @@ def slam(
     force: Force = False,
     init: Template = None,
     in_space: InSpace = False,
+    init_bag: InitBag = None,
     show_config: ShowConfig = False,
 ) -> None:
     """Estimate trajectory and landmarks of a recording and write the folder of the run."""
     if init is not None:
         _write_template(init, in_space=in_space)
+        return
+    if init_bag is not None:
+        _write_bag_settings(init_bag)
         return
     if in_space:
         raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
@@ -162,7 +175,7 @@ def slam(
     chosen = configured(config, settings, given, within="slam", show=show_config)
     if input is None:
         raise ConfigError(
-            "a recording is needed", field="input", hint="a folder or zip; --init DIR shows what to put in"
+            "a recording is needed", field="input", hint="a folder, zip or ROS bag; --init DIR shows what to put in"
         )
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
     if prior and (map_file is None or localize):
@@ -283,6 +296,19 @@ def _write_template(folder: Path, *, in_space: bool) -> None:
 
     write_template(folder, in_space=in_space)
     say(f"wrote a template to {folder}; fill it with your recording, then: evermap slam {folder}")
+
+
+def _write_bag_settings(bag: Path) -> None:
+    from evermap.io.bag import bag_settings, settings_path
+    from evermap.io.files import write_atomic
+
+    path = settings_path(bag)
+    if path.exists():
+        raise ConfigError(f"{path} is there already", field="init_bag", hint="edit it, or delete it to guess again")
+    text = bag_settings(bag)
+    write_atomic(path, text)
+    typer.echo(text)
+    say(f"wrote this to {path}; edit it where it is wrong, then: evermap slam {bag}")
 
 
 def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) -> Landmarks:

@@ -183,7 +183,8 @@ class Reader:
         holds: whether files look like this format, by their names.
         read: returns the recording of a path and a robot; None for the format's default robot.
         robots: robots in files that can be asked for; none where the format does not number them.
-        endings: of single files that are a recording of this format.
+        endings: of single files that are a recording of this format,
+        beside: where such files are beside them.
     """
 
     name: str
@@ -192,11 +193,13 @@ class Reader:
     read: Callable[[str | Path, int | None], Recording | SpatialRecording]
     robots: Callable[[FileSet], tuple[int, ...]] = lambda _: ()
     endings: tuple[str, ...] = ()
+    beside: Callable[[FileSet], bool] | None = None
 
     def matches(self, path: str | Path) -> bool:
         """Return whether the files of this format are there, at the top or one folder down."""
-        if self.endings and Path(path).is_file() and Path(path).name.endswith(self.endings):
-            return True
+        path = Path(path)
+        if self.endings and path.is_file() and path.name.endswith(self.endings):
+            return self.beside is None or find_file_set(path.parent, self.beside) is not None
         return find_file_set(path, self.holds) is not None
 
 

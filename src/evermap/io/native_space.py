@@ -9,7 +9,6 @@ import numpy as np
 
 from evermap import valid as q
 from evermap.errors import DataError
-from evermap.geometry import se3
 from evermap.geometry.camera import unproject
 from evermap.io.assemble import finish_recording, forward_stamps, frames_of, last_of_equal
 from evermap.io.files import FileSet
@@ -22,6 +21,8 @@ from evermap.io.spatial import (
     QUATERNION,
     boxes,
     covariances,
+    directions,
+    integrated,
     poses,
     positions,
     quaternions,
@@ -32,7 +33,6 @@ from evermap.io.spatial import (
 from evermap.io.table import Table
 from evermap.io.text import counted
 from evermap.types import (
-    ANY_RANGE_M2,
     BoolArray,
     Clock,
     FloatArray,
@@ -159,7 +159,7 @@ def _odometry(table: Table | None, clock: Clock, warnings: list[str]) -> Spatial
     if given is TWIST:
         zero = np.zeros(len(table))
         twist = np.stack([table.numbers(axis) if axis.name in table else zero for axis in q.TWIST], axis=1)
-        return _integrated(stamp_s[keep], twist[keep], clock)
+        return integrated(stamp_s[keep], twist[keep], clock)
     unknown = np.full(len(table), np.nan)
     variance = [
         table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in VARIANCES
@@ -171,16 +171,7 @@ def _in_space(odometry: Odometry) -> SpatialOdometry:
     """The odometry of a robot on a floor, as poses in space."""
     twist = np.zeros((len(odometry), 6))
     twist[:, 0], twist[:, 1], twist[:, 5] = odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps
-    return _integrated(odometry.stamp_s, twist, odometry.clock)
-
-
-def _integrated(stamp_s: FloatArray, twist: FloatArray, clock: Clock) -> SpatialOdometry:
-    """Poses from the origin, each velocity (N, 6) held until the next stamp."""
-    pose = se3.identity(len(stamp_s))
-    step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
-    for row in range(len(step)):
-        pose[row + 1] = se3.compose(pose[row], step[row])
-    return SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan), clock=clock)
+    return integrated(odometry.stamp_s, twist, odometry.clock)
 
 
 def _truth(table: Table | None, clock: Clock, warnings: list[str]) -> Trajectory | None:
@@ -343,7 +334,8 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
     _need_camera(table, ~camera, POINT[0], rig)
     left = np.stack([table.numbers(replace(_pixel(name), optional=False)) for name in POINT], axis=1)
     if RIGHT[0] not in table:
-        return _directions(left, sensor, rig)
+        position, covariance = directions(left, sensor, rig.sensors)
+        return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
     lone = np.flatnonzero(np.isnan(baseline))
     if len(lone):
         hint = f"baseline_m of the left camera in {CAMERA_FILE}"
@@ -361,20 +353,6 @@ def _points(table: Table, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
                 plane = rays[..., :2] / rays[..., 2:]
             noise = (one.sigma_px or 1.0) / np.array(one.intrinsics[:2])
             position[rows], covariance[rows] = _triangulated(plane, baseline[rows], noise)
-    return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
-
-
-def _directions(pixel: FloatArray, sensor: IntArray, rig: Rig) -> dict[str, FloatArray]:
-    """Unit vectors to points that one camera saw, with the covariance of a pixel across, and any range."""
-    position, covariance = np.full((len(pixel), 3), np.nan), np.full((len(pixel), 3, 3), np.nan)
-    for number, one in enumerate(rig.sensors):
-        rows = np.flatnonzero(sensor == number)
-        if len(rows) and one.intrinsics is not None:
-            ray = unproject(pixel[rows], one)
-            along = ray[:, :, None] * ray[:, None, :]
-            sigma = (one.sigma_px or 1.0) / float(np.mean(one.intrinsics[:2]))
-            position[rows] = ray
-            covariance[rows] = sigma**2 * (np.eye(3) - along) + 1e3 * ANY_RANGE_M2 * along
     return {"position_sensor_m": position, "covariance_sensor_m2": covariance}
 
 

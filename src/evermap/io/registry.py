@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from evermap.errors import InputError
+from evermap.io.bag import BAG
 from evermap.io.files import Reader, file_sets, find_file_set
 from evermap.io.mrclam import MRCLAM
 from evermap.io.native import NATIVE
@@ -12,7 +13,7 @@ from evermap.io.tagslam import TAGSLAM
 from evermap.io.ycbv import YCBV
 from evermap.types import Recording, SpatialRecording
 
-READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, NATIVE)
+READERS: tuple[Reader, ...] = (MRCLAM, TAGSLAM, YCBV, BAG, NATIVE)
 """All formats, in the order in which they are asked. A new reader is added here and nowhere else."""
 
 

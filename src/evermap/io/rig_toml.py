@@ -85,7 +85,9 @@ def read_rig(files: FileSet, warnings: list[str]) -> Rig:
         if SENSOR_FILE not in files:
             warnings.append(f"no {SENSOR_FILE}: the sensor is assumed to see all around, from the robot's centre")
         return Rig(settings, (common,), symmetries=symmetries)
-    rig = _cameras(TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE)), settings, common)
+    reader = TomlReader(files.read(CAMERA_FILE), files.path_of(CAMERA_FILE))
+    reader.expect(("camera", "tags"), reader.document, section=None)
+    rig = cameras(reader, settings, common)
     return replace(rig, symmetries=symmetries)
 
 
@@ -122,15 +124,25 @@ def _key(name: str) -> str:
     return name if _BARE.fullmatch(name) else toml_string(name)
 
 
-def _cameras(reader: TomlReader, settings: Settings, common: SpatialSensor) -> Rig:
-    reader.expect(("camera", "tags"), reader.document, section=None)
-    cameras = reader.document.get("camera", {})
-    if not isinstance(cameras, dict) or not cameras or not all(isinstance(c, dict) for c in cameras.values()):
+def cameras(reader: TomlReader, settings: Settings, common: SpatialSensor, also: tuple[str, ...] = ()) -> Rig:
+    """Return the sensors in the sections `[camera.NAME]` of a document, and what its section `[tags]` says.
+
+    Args:
+        reader: of the document.
+        settings: of the recording.
+        common: what holds for all sensors.
+        also: further keys that a section may have.
+
+    Raises:
+        InputError: a key is unknown, or its value of the wrong type or out of its limits.
+    """
+    listed = reader.document.get("camera", {})
+    if not isinstance(listed, dict) or not listed or not all(isinstance(c, dict) for c in listed.values()):
         raise reader.error(None, "camera", "there is no camera", hint="[camera.NAME] with model and intrinsics")
     sensors, baselines = [], []
-    for name, content in cameras.items():
+    for name, content in listed.items():
         section = f"camera.{name}"
-        reader.checked(section, content, _CAMERA)
+        reader.checked(section, content, (*_CAMERA, *also))
         values: dict[str, Any] = {
             key: reader.number(section, key, content[key], *limits)
             for key, limits in _OF_CAMERA.items()

@@ -1,18 +1,30 @@
-"""ROS 1 bags of tag detections and odometry, read by the package `rosbags` (extra `ros`)."""
+"""Bags of ROS 1 and ROS 2 (SQLite, MCAP), read by the package `rosbags` (extra `ros`), and TagSLAM's messages."""
 
 from __future__ import annotations
 
 import bz2
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from evermap.errors import InputError, MissingExtraError
 from evermap.io.text import reason
 from evermap.types import Clock, FloatArray, IntArray, SpatialOdometry
+
+Handler: TypeAlias = Callable[[Any, float], None]
+BAG_ENDINGS = (".bag", ".bag.bz2", ".mcap", ".db3")
+MOST_HAMMING = 2
+"""Tags of which the detector had to correct more bits are left out: most of them are no tags."""
+
+
+class Topic(NamedTuple):
+    """Type of a topic's messages, such as 'nav_msgs/msg/Odometry', and how many there are."""
+
+    kind: str
+    messages: int
 
 
 class TagSightings(NamedTuple):
@@ -57,34 +69,30 @@ def read_tag_bag(
         InputError: the bag is missing, damaged, or has none of the topics.
         MissingExtraError: `rosbags` is not installed.
     """
-    try:
-        from rosbags.rosbag1 import Reader, ReaderError
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ImportError:
-        raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
-    store = get_typestore(Stores.ROS1_NOETIC)
     looks: list[tuple[float, int]] = []
     tags: list[tuple[float, ...]] = []
     odometry: list[tuple[float, ...]] = []
     camera_of = {topic: camera for camera, topic in enumerate(tag_topics) if topic}
-    try:
-        with tempfile.TemporaryDirectory() as folder, Reader(_unpacked(path, Path(folder))) as bag:
-            held = [one for one in bag.connections if one.topic in (*camera_of, odometry_topic)]
-            if not any(one.topic in camera_of for one in held):
-                wanted, found = ", ".join(camera_of), ", ".join(sorted(bag.topics))
-                raise InputError(f"holds none of the topics {wanted}", path=path, hint=f"tagtopic: one of {found}")
-            for one in held:
-                store.register(get_types_from_msg(one.msgdef.data, one.msgtype))
-            for one, _, raw in bag.messages(connections=held):
-                message: Any = store.deserialize_ros1(raw, one.msgtype)
-                stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-                if one.topic == odometry_topic:
-                    odometry.append((stamp_s, *_pose(message), *np.diagonal(message.pose.covariance.reshape(6, 6))))
-                else:
-                    looks.append((stamp_s, camera_of[one.topic]))
-                    tags += [(stamp_s, camera_of[one.topic], *tag) for tag in _tags(message)]
-    except (ReaderError, OSError, EOFError, ValueError, KeyError, AttributeError) as error:
-        raise InputError(f"cannot be read: {reason(error)}", path=path, hint="a ROS 1 bag of tags") from error
+
+    def driven(message: Any, _: float) -> None:
+        odometry.append(
+            (stamp_of(message), *pose_of(message.pose.pose), *np.diagonal(message.pose.covariance.reshape(6, 6)))
+        )
+
+    def seen_by(camera: int) -> Handler:
+        def handle(message: Any, _: float) -> None:
+            looks.append((stamp_of(message), camera))
+            tags.extend((stamp_of(message), camera, *tag) for tag in _tags(message))
+
+        return handle
+
+    def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
+        if not topics.keys() & camera_of.keys():
+            wanted, found = ", ".join(camera_of), ", ".join(sorted(topics))
+            raise InputError(f"holds none of the topics {wanted}", path=path, hint=f"tagtopic: one of {found}")
+        return {odometry_topic: driven} | {topic: seen_by(camera) for topic, camera in camera_of.items()}
+
+    scan(path, handlers)
     rows = np.array(tags, dtype=np.float64).reshape(-1, 12)
     whole = rows[:, 1:4].astype(np.int64)
     seen = TagSightings(
@@ -97,6 +105,52 @@ def read_tag_bag(
         line=np.zeros(len(rows), dtype=np.int64),
     )
     return seen, _odometry(odometry)
+
+
+def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Handler]]) -> dict[str, Topic]:
+    """Hand the messages of some topics of a bag, in the order in which they were recorded, to what handles them.
+
+    Args:
+        path: `.bag` or `.bag.bz2` of ROS 1; of ROS 2 a folder with `metadata.yaml`, a `.mcap` or a `.db3`.
+        handlers: from all topics of the bag to a function for each topic that is wanted; it gets the message and the
+            time at which it was recorded [s].
+
+    Returns:
+        All topics by name.
+
+    Raises:
+        InputError: the bag is missing or damaged, or a message is not what its type says.
+        MissingExtraError: `rosbags` is not installed.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
+    usual = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in UNSTATED.items():
+        usual.register(get_types_from_msg(text, name))
+    try:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            AnyReader([_unpacked(path, Path(folder))], default_typestore=usual) as bag,
+        ):
+            topics = {name: Topic(str(one.msgtype), one.msgcount) for name, one in bag.topics.items()}
+            wanted = handlers(topics)
+            held = [one for one in bag.connections if one.topic in wanted]
+            for one, received_ns, raw in bag.messages(connections=held) if held else ():
+                wanted[one.topic](bag.deserialize(raw, one.msgtype), 1e-9 * received_ns)
+    except InputError:
+        raise
+    except Exception as error:  # the package has no error that all of its errors are
+        hint = "ros2 bag info, or rosbag check, says more"
+        raise InputError(f"cannot be read as a bag: {reason(error)}", path=path, hint=hint) from error
+    return topics
+
+
+def stamp_of(message: Any) -> float:
+    """Return the stamp [s] in the header of a message."""
+    return float(message.header.stamp.sec) + 1e-9 * float(message.header.stamp.nanosec)
 
 
 def _unpacked(path: Path, folder: Path) -> Path:
@@ -117,8 +171,10 @@ def _tags(message: Any) -> list[tuple[float, ...]]:
     ]
 
 
-def _pose(message: Any) -> tuple[float, ...]:
-    at, turn = message.pose.pose.position, message.pose.pose.orientation
+def pose_of(message: Any) -> tuple[float, ...]:
+    """Return x, y, z, qx, qy, qz, qw of a pose or of a transform."""
+    at = message.position if hasattr(message, "position") else message.translation
+    turn = message.orientation if hasattr(message, "orientation") else message.rotation
     return at.x, at.y, at.z, turn.x, turn.y, turn.z, turn.w
 
 
@@ -129,3 +185,35 @@ def _odometry(rows: list[tuple[float, ...]]) -> SpatialOdometry | None:
     _, keep = np.unique(values[:, 0], return_index=True)
     columns = values[keep]
     return SpatialOdometry(columns[:, 0].copy(), columns[:, 1:8].copy(), columns[:, 8:].copy(), clock=Clock.UNIX)
+
+
+UNSTATED = {
+    "apriltag_msgs/msg/Point": "float64 x\nfloat64 y",
+    "apriltag_msgs/msg/AprilTagDetection": (
+        "string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n"
+        "apriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\nfloat64[9] homography"
+    ),
+    "apriltag_msgs/msg/AprilTagDetectionArray": (
+        "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections"
+    ),
+    "vision_msgs/msg/Point2D": "float64 x\nfloat64 y",
+    "vision_msgs/msg/Pose2D": "vision_msgs/Point2D position\nfloat64 theta",
+    "vision_msgs/msg/BoundingBox2D": "vision_msgs/Pose2D center\nfloat64 size_x\nfloat64 size_y",
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    **{
+        f"vision_msgs/msg/Detection{size}": (
+            "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+            f"vision_msgs/BoundingBox{size} bbox\nstring id"
+        )
+        for size in ("2D", "3D")
+    },
+    **{
+        f"vision_msgs/msg/Detection{size}Array": f"std_msgs/Header header\nvision_msgs/Detection{size}[] detections"
+        for size in ("2D", "3D")
+    },
+}
+"""Messages beyond ROS 2's own (apriltag_msgs 2, vision_msgs 4), for bags in SQLite, which do not hold their types."""

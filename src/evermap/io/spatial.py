@@ -8,10 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from evermap.geometry import se3
+from evermap.geometry.camera import unproject
 from evermap.geometry.square import square_poses
 from evermap.io.table import Table
 from evermap.io.text import counted
-from evermap.types import UNKNOWN, FloatArray, IntArray, SpatialDetections, SpatialSensor, rows_of
+from evermap.types import (
+    ANY_RANGE_M2,
+    UNKNOWN,
+    Clock,
+    FloatArray,
+    IntArray,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialSensor,
+    rows_of,
+)
 from evermap.valid import QUATERNION as QUANTITIES
 from evermap.valid import X_M, Y_M, Z_M, Quantity, is_covariance
 
@@ -147,3 +158,43 @@ def with_tag_poses(
         warnings.append(f"{counted(int(broken.sum()), 'tag')} left out: their corners are not those of a square")
     filled = replace(detections, position_sensor_m=position, rotation=rotation)
     return rows_of(filled, ~sizeless & ~broken) if (sizeless | broken).any() else filled
+
+
+def directions(pixel: FloatArray, sensor: IntArray, sensors: Sequence[SpatialSensor]) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors (M, 3) to points that one camera saw, with the covariance of a pixel across, and any range.
+
+    Args:
+        pixel: (M, 2) right and down in the image.
+        sensor: (M,) rows of sensors.
+        sensors: those that are no cameras see nothing: nan.
+    """
+    position, covariance = np.full((len(pixel), 3), np.nan), np.full((len(pixel), 3, 3), np.nan)
+    for number, one in enumerate(sensors):
+        rows = np.flatnonzero(sensor == number)
+        if len(rows) and one.intrinsics is not None:
+            ray = unproject(pixel[rows], one)
+            along = ray[:, :, None] * ray[:, None, :]
+            sigma = (one.sigma_px or 1.0) / float(np.mean(one.intrinsics[:2]))
+            position[rows] = ray
+            covariance[rows] = sigma**2 * (np.eye(3) - along) + 1e3 * ANY_RANGE_M2 * along
+    return position, covariance
+
+
+def integrated(stamp_s: FloatArray, twist: FloatArray, clock: Clock) -> SpatialOdometry:
+    """Return poses from the origin, each velocity (N, 6) held until the next stamp."""
+    pose = se3.identity(len(stamp_s))
+    step = se3.exp(twist[:-1] * np.diff(stamp_s)[:, None])
+    for row in range(len(step)):
+        pose[row + 1] = se3.compose(pose[row], step[row])
+    return SpatialOdometry(stamp_s, pose, np.full((len(pose), 6), np.nan), clock=clock)
+
+
+def of_rig(odometry: SpatialOdometry, mount: FloatArray) -> SpatialOdometry:
+    """Return poses of the robot from those of the odometry's body, mounted at a pose (7,) on it.
+
+    Variances, which ROS states along the axes of the odometry's frame, become those along the robot's.
+    """
+    pose = se3.compose(odometry.pose_world_robot, se3.inverse(mount))
+    share = se3.rotation_of(pose) ** 2
+    variance = [np.einsum("nij,ni->nj", share, half) for half in (odometry.variance[:, :3], odometry.variance[:, 3:])]
+    return replace(odometry, pose_world_robot=pose, variance=np.concatenate(variance, axis=1))

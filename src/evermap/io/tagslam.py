@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from evermap.geometry import se3
 from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
 from evermap.io.landmarks import landmarks_from_table, map_of_survey
-from evermap.io.rosbag import TagSightings, read_tag_bag
-from evermap.io.spatial import poses, spatial_detections, with_tag_poses
+from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
+from evermap.io.spatial import of_rig, poses, spatial_detections, with_tag_poses
 from evermap.io.table import Table, parse_csv, parse_parquet
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
@@ -39,14 +39,10 @@ from evermap.types import (
 )
 from evermap.valid import CAMERA_MODELS, Quantity
 
-MOST_HAMMING = 2
-"""Tags of which the detector had to correct more bits are left out: most of them are no tags."""
-
 _MOST_TAGS = 100_000
 """On a board: no tag family has more."""
 
 CAMERAS, CAMERA_POSES, SETTINGS = "cameras.yaml", "camera_poses.yaml", "tagslam.yaml"
-BAG_ENDINGS = (".bag", ".bag.bz2")
 _ENDINGS = (".csv", ".csv.gz", ".parquet")
 _CORNERS = tuple(f"{axis}{corner}_px" for corner in range(4) for axis in "uv")
 _VARIANCES = ("cxx", "cyy", "czz", "crr", "cpp", "cww")
@@ -103,7 +99,7 @@ def read_tagslam(path: str | Path, robot: int | None = None) -> SpatialRecording
         seen, odometry = read_tag_bag(bag, setup.tag_topics, setup.odometry_topic)
     odometry = odometry or _odometry(files, warnings)
     if odometry is not None:
-        odometry = _of_rig(odometry, setup.mount_rig_odometry)
+        odometry = of_rig(odometry, setup.mount_rig_odometry)
     return _recording(files, path, setup, seen, odometry, warnings)
 
 
@@ -140,6 +136,7 @@ TAGSLAM = Reader(
     is_tagslam,
     read_tagslam,
     endings=BAG_ENDINGS,
+    beside=_is_calibrated,
 )
 
 
@@ -302,16 +299,6 @@ def _odometry(files: FileSet, warnings: list[str]) -> SpatialOdometry | None:
         table.numbers(Quantity(name, 0.0, 1e12, optional=True)) if name in table else unknown for name in _VARIANCES
     ]
     return SpatialOdometry(stamp_s[keep], poses(table)[keep], np.stack(variance, axis=1)[keep], clock=Clock.UNIX)
-
-
-def _of_rig(odometry: SpatialOdometry, mount: FloatArray) -> SpatialOdometry:
-    """Poses of the rig from those of the odometry's body, and variances along the rig's axes from those along the
-    axes of the odometry's frame, as ROS states them.
-    """
-    pose = se3.compose(odometry.pose_world_robot, se3.inverse(mount))
-    share = se3.rotation_of(pose) ** 2
-    variance = [np.einsum("nij,ni->nj", share, half) for half in (odometry.variance[:, :3], odometry.variance[:, 3:])]
-    return replace(odometry, pose_world_robot=pose, variance=np.concatenate(variance, axis=1))
 
 
 def _reference(files: FileSet, warnings: list[str]) -> Trajectory | None:

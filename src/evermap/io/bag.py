@@ -1,0 +1,470 @@
+"""Bags of ROS 1 and ROS 2 as recordings in space: which topics are what, where the sensors are, what was seen.
+
+What a topic holds follows from the type of its messages, the sensors' mounts from the tree of frames, the cameras from
+their `CameraInfo`. What is guessed can be written to a file beside the bag (`bag_settings`), edited there, and is read
+with the bag from then on. ROS need not be installed.
+
+
+- Odometry and truth: `nav_msgs/Odometry`, `geometry_msgs/PoseStamped`, `TransformStamped`, `TwistStamped`, and those
+  with covariance.
+- Tags: `AprilTagDetectionArray` of several packages, `ArucoMarkers`, `ArucoDetection`, `FiducialTransformArray`.
+- Objects: `vision_msgs/Detection3DArray`, `Detection2DArray`; else `visualization_msgs/MarkerArray`,
+  `foxglove_msgs/SceneUpdate` in a frame of the robot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.errors import DataError, InputError, suggestion
+from evermap.geometry import se3
+from evermap.io.assemble import SAME_STAMP_S, finish_recording
+from evermap.io.bag_messages import POSES, TWISTS, BagContent, Seen, scanned
+from evermap.io.files import Reader
+from evermap.io.rig_toml import Rig, cameras
+from evermap.io.rosbag import BAG_ENDINGS
+from evermap.io.sensor_toml import Settings, TomlReader, toml_text
+from evermap.io.spatial import directions, integrated, of_rig, spatial_detections, unit, with_tag_poses
+from evermap.io.text import counted
+from evermap.types import (
+    UNKNOWN,
+    Clock,
+    FloatArray,
+    Frames,
+    IntArray,
+    SpatialDetections,
+    SpatialOdometry,
+    SpatialRecording,
+    SpatialSensor,
+    Trajectory,
+    landmark_id_of,
+    rows_of,
+)
+from evermap.valid import CAMERA_MODELS
+
+METADATA = "metadata.yaml"
+"""Of a folder that is a bag of ROS 2."""
+FEWEST_LOOKS = 20
+"""From so many messages on, none of them empty, a detector says nothing where it sees nothing."""
+LATE_S = 0.5
+"""By so much more than another's do a topic's messages arrive after their stamps where the two clocks differ."""
+SINCE_1970_S = 1e8
+"""Stamps above count from 1970; those below from the start of a simulation."""
+_TRUTH = re.compile(r"(^|[/_])(gt|truth|ground_?truth|mocap|vicon|vrpn|optitrack|qualisys)([/_]|$)")
+_NO_ODOMETRY = re.compile(r"amcl|goal|initialpose|target|plan|cmd|map_|landmark")
+_PICTURES = ("MarkerArray", "SceneUpdate")
+"""Messages that draw what others detected: read only where there is nothing else."""
+_MODELS = {"plumb_bob": "radtan", "radtan": "radtan", "equidistant": "equidistant", "": "pinhole"}
+
+
+@dataclass(frozen=True, slots=True)
+class BagSensor:
+    """How the messages of one topic are read.
+
+    Attributes:
+        topic: of the detections.
+        frame: name of the frame in which they are.
+        camera_info: topic of the camera's calibration; '' where there is none.
+        rectified: whether pixels are those of the image without distortion.
+        identity: what tells a landmark from others: its 'id', its 'class', or 'none'.
+        stated: as the settings file says; None for what is guessed.
+        stated_mount: whether that says where the sensor is.
+    """
+
+    topic: str
+    frame: str = ""
+    camera_info: str = ""
+    rectified: bool = False
+    identity: str = "id"
+    stated: SpatialSensor | None = None
+    stated_mount: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class BagSettings:
+    """What is read of a bag.
+
+    Attributes:
+        odometry, truth: topics; '' for none.
+        base_frame: name of the robot's frame, which the odometry moves.
+        clock: 'header', the stamps of messages, or 'receive', when they were recorded.
+        sensors: whose detections are read, by name.
+        rig: what is stated of the tags' sizes, and how objects look the same.
+    """
+
+    odometry: str = ""
+    truth: str = ""
+    base_frame: str = ""
+    clock: str = "header"
+    sensors: Mapping[str, BagSensor] = field(default_factory=dict)
+    rig: Rig = field(default_factory=Rig)
+
+
+def settings_path(path: str | Path) -> Path:
+    """Return where the settings of a bag are: beside it, with '.toml' behind its name."""
+    path = Path(path)
+    return path.with_name(path.resolve().name + ".toml")
+
+
+def read_bag(path: str | Path, robot: int | None = None) -> SpatialRecording:
+    """Return the recording in a bag, by its settings file where there is one, else by what its topics seem to be.
+
+    Args:
+        path: `.bag` or `.bag.bz2` of ROS 1; of ROS 2 a folder with `metadata.yaml`, a `.mcap` or a `.db3`.
+        robot: must be None.
+
+    Raises:
+        InputError: the bag or its settings are missing or damaged, or a topic in the settings is not in the bag.
+        DataError: nothing was detected, or the size of tags or the calibration of a camera is not known.
+        MissingExtraError: `rosbags` is not installed.
+    """
+    path = Path(path)
+    if robot is not None:
+        raise InputError(f"there is no robot {robot}: a bag is of one", path=path, hint="leave it out")
+    content, stated = scanned(path), settings_path(path)
+    settings = _guessed(content)
+    if not stated.is_file():
+        return _recording(path, content, settings, guessed=True)
+    return _recording(path, content, _parsed(stated, content, settings), guessed=False)
+
+
+def bag_settings(path: str | Path) -> str:
+    """Return the settings of a bag as they are guessed, as the text of its settings file.
+
+    Raises:
+        InputError: the bag is missing or damaged.
+        MissingExtraError: `rosbags` is not installed.
+    """
+    content = scanned(Path(path))
+    settings = _guessed(content)
+    sections: dict[str, dict[str, Any]] = {"bag": {key: getattr(settings, key) for key in _TEXTS}}
+    for name, one in settings.sensors.items():
+        given: dict[str, Any] = {key: getattr(one, key) for key in _OF_SENSOR}
+        sections[f"camera.{name}"] = given if one.camera_info else given | {"rectified": None}
+    listed = "\n".join(f"#   {name}  {one.kind}  {one.messages}" for name, one in sorted(content.topics.items()))
+    return f"{_HEAD}{toml_text(sections)}\n# All topics, with the type and number of their messages:\n{listed}\n"
+
+
+_TEXTS = ("odometry", "truth", "base_frame", "clock")
+_OF_SENSOR = {"topic": str, "frame": str, "camera_info": str, "identity": str, "rectified": bool}
+_HEAD = """\
+# What evermap reads of this bag. It is guessed from the types of the messages: edit it, and it is read with the bag.
+# clock = "receive": the times at which messages were recorded, instead of their own stamps.
+# identity = "id", "class" or "none": what tells a landmark from others.
+# A section [camera.NAME] takes all that it may hold in a camera.toml, too, which goes before what the bag says:
+#   intrinsics = [fx, fy, cx, cy], model, distortion; [camera.NAME.mount] with x_m, y_m, z_m, roll_rad, ...
+# Tags of which messages hold only the corners need a size:
+# [tags]
+# size_m = 0.16
+
+"""
+
+
+def _guessed(content: BagContent) -> BagSettings:
+    """What topics seem to be, by their types and names."""
+
+    def rank(topic: str) -> tuple[bool, int, bool, int]:
+        kind = (*POSES, *TWISTS).index(content.kind(topic))
+        return kind == 3, kind > 0, "odom" not in topic and "vio" not in topic, -len(content.motion[topic])
+
+    moving = [topic for topic in content.motion if content.motion[topic]]
+    true = sorted((one for one in moving if _TRUTH.search(one) and content.kind(one) in POSES), key=rank)
+    driven = sorted((one for one in moving if not _TRUTH.search(one) and not _NO_ODOMETRY.search(one)), key=rank)
+    odometry = driven[0] if driven else ""
+    sighted = [topic for topic in content.seen if content.seen[topic]]
+    named = {name for edge in content.edges for name in edge}
+    usual = next((name for name in ("base_link", "base_footprint") if name in named), "")
+    base = content.frames.get(odometry, "") or usual
+    first = next((content.frames.get(topic, "") for topic in sighted if content.kind(topic) not in _PICTURES), "")
+    base = base or first
+    plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES]
+    chosen = plain or [one for one in sighted if content.mount(base, content.frames.get(one, "")) is not None]
+    sensors = {name: _sensor(content, topic) for topic, name in _short(chosen).items()}
+    return BagSettings(odometry, true[0] if true else "", base, "header", sensors)
+
+
+def _short(topics: list[str]) -> dict[str, str]:
+    """Names of sensors after their topics: the first part, where these differ, else all of it."""
+    parts = {topic: topic.strip("/").split("/") for topic in topics}
+    first = {topic: part[0] for topic, part in parts.items()}
+    used = first if len(set(first.values())) == len(topics) else {one: "_".join(part) for one, part in parts.items()}
+    return {topic: re.sub(r"[^A-Za-z0-9_-]", "_", name) or "sensor" for topic, name in used.items()}
+
+
+def _sensor(content: BagContent, topic: str) -> BagSensor:
+    seen, frame = content.seen[topic], content.frames.get(topic, "")
+    pixels = any(np.isfinite(one.corners[0]) or np.isfinite(one.pixel[0]) for one in seen)
+    same = [one for one in content.cameras if content.frames[one] == frame]
+    near = sorted(content.cameras, key=lambda one: -len(_common(one, topic)))
+    camera = next(iter(sorted(same, key=lambda one: -len(_common(one, topic)))), near[0] if near else "")
+    identity = "id"
+    if content.kind(topic) in ("Detection3DArray", "Detection2DArray"):
+        boxed = any(np.isfinite(one.size[0]) for one in seen)
+        identity = "none" if boxed else "id" if any(one.identity is not None for one in seen) else "class"
+    # the node apriltag_ros works on rectified images; TagSLAM's detector on the others
+    rectified = content.kind(topic) == "AprilTagDetectionArray" or "rect" in topic
+    return BagSensor(topic, frame, camera if pixels else "", rectified and pixels, identity)
+
+
+def _common(a: str, b: str) -> str:
+    count = next((k for k, (one, other) in enumerate(zip(a, b, strict=False)) if one != other), min(len(a), len(b)))
+    return a[:count]
+
+
+def _parsed(path: Path, content: BagContent, guessed: BagSettings) -> BagSettings:
+    """The settings in a file; what it leaves out is as guessed."""
+    reader = TomlReader(path.read_bytes(), path)
+    reader.expect(("bag", "camera", "tags"), reader.document, section=None)
+    given = reader.section("bag", _TEXTS)
+    for key, value in given.items():
+        if not isinstance(value, str):
+            raise reader.error("bag", key, f"must be a text, not {type(value).__name__}")
+    if given.get("clock", "header") not in ("header", "receive"):
+        raise reader.error("bag", "clock", f"no clock '{given['clock']}'", hint='"header" or "receive"')
+    for key in ("odometry", "truth"):
+        if given.get(key):
+            _check_topic(reader, "bag", key, given[key], content.motion, "poses or velocities")
+    settings = replace(guessed, **given)
+    if "camera" not in reader.document:
+        return settings
+    rig = cameras(reader, Settings(), SpatialSensor(), tuple(_OF_SENSOR))
+    as_guessed = {one.topic: one for one in guessed.sensors.values()}
+    sensors = {
+        one.name: _parsed_sensor(reader, one, reader.document["camera"][one.name], content, as_guessed)
+        for one in rig.sensors
+    }
+    return replace(settings, sensors=sensors, rig=rig)
+
+
+def _parsed_sensor(
+    reader: TomlReader,
+    stated: SpatialSensor,
+    given: Mapping[str, Any],
+    content: BagContent,
+    guessed: Mapping[str, BagSensor],
+) -> BagSensor:
+    section = f"camera.{stated.name}"
+    for key, kind in _OF_SENSOR.items():
+        if key in given and not isinstance(given[key], kind):
+            wanted = "a text" if kind is str else "true or false"
+            raise reader.error(section, key, f"must be {wanted}, not {type(given[key]).__name__}")
+    topic = given.get("topic", "")
+    _check_topic(reader, section, "topic", topic, content.seen, "detections")
+    if given.get("camera_info"):
+        _check_topic(reader, section, "camera_info", given["camera_info"], content.cameras, "calibration")
+    if given.get("identity", "id") not in ("id", "class", "none"):
+        raise reader.error(section, "identity", f"no identity '{given['identity']}'", hint='"id", "class" or "none"')
+    sensor = guessed.get(topic) or _sensor(content, topic)
+    own = {key: given[key] for key in _OF_SENSOR if key in given}
+    return replace(sensor, **own, stated=stated, stated_mount="mount" in given)
+
+
+def _check_topic(reader: TomlReader, section: str, key: str, topic: str, held: Mapping[str, Any], what: str) -> None:
+    known = sorted(one for one, messages in held.items() if messages)
+    if topic not in known:
+        hint = suggestion(topic, known) or (f"one of {', '.join(known)}" if known else f"the bag has no {what}")
+        raise reader.error(section, key, f"no topic with {what}: '{topic}'", hint)
+
+
+def _recording(path: Path, content: BagContent, settings: BagSettings, *, guessed: bool) -> SpatialRecording:
+    if not settings.sensors:
+        kinds = ", ".join(sorted({one.kind for one in content.topics.values()})) or "no topics"
+        hint = "detections of apriltag_msgs, vision_msgs, aruco or fiducial_msgs, or markers in a frame of the robot"
+        raise InputError(f"holds no detections of landmarks; it holds {kinds}", path=path, hint=hint)
+    warnings: list[str] = []
+    if guessed:
+        read = ", ".join(one.topic for one in settings.sensors.values())
+        moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"
+        warnings.append(f"topics as guessed: detections {read}; {moved} (`--init-bag` writes them to be edited)")
+    sensors = tuple(_mounted(path, content, settings, name, warnings) for name in settings.sensors)
+    _tell_late(content, settings, warnings)
+    stamps = [_stamps(content, one.topic, settings.clock) for one in settings.sensors.values()]
+    looked = np.unique(np.concatenate(stamps))
+    looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
+    clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
+    messages = sum(len({one.look for one in content.seen[sensor.topic]}) for sensor in settings.sensors.values())
+    names: dict[int, str] = {}
+    seen = [(k, one) for k, sensor in enumerate(settings.sensors.values()) for one in content.seen[sensor.topic]]
+    labels = tuple(sorted({one.label for _, one in seen} - {""}))
+    stamp_s = np.array([stamps[k][one.look] for k, one in seen])
+    frame = np.clip(np.searchsorted(looked, stamp_s + SAME_STAMP_S) - 1, 0, None)
+    found = spatial_detections(
+        np.asarray(frame, dtype=np.int64),
+        sensor=np.array([k for k, _ in seen], dtype=np.int64),
+        landmark_id=_identities(seen, settings, names),
+        class_id=np.array([labels.index(one.label) if one.label else UNKNOWN for _, one in seen], dtype=np.int64),
+        score=np.array([one.score for _, one in seen]),
+        size_m=np.array([one.size for _, one in seen]).reshape(-1, 3),
+    )
+    found = _placed(path, found, seen, sensors, settings)
+    detections = with_tag_poses(found, sensors, warnings)
+    finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
+    if not finite.all():
+        warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
+    detections = rows_of(detections, np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")])
+    truth = _odometry(content, settings, settings.truth, clock)
+    recording = SpatialRecording(
+        name=path.resolve().name.split(".")[0],
+        odometry=_odometry(content, settings, settings.odometry, clock),
+        frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),
+        detections=detections,
+        sensors=sensors,
+        truth=None if truth is None else _reference(truth),
+        class_names=labels,
+        source=str(path),
+        clock=clock,
+        landmark_names=names,
+    )
+    return finish_recording(recording, warnings=warnings)
+
+
+def _stamps(content: BagContent, topic: str, clock: str) -> FloatArray:
+    """(K,) of a topic's messages; those without a stamp of their own have the time at which they were recorded."""
+    header, received = np.array(content.stamps[topic]).reshape(-1, 2).T
+    return np.where((header > 0.0) & (clock == "header"), header, received)
+
+
+def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) -> None:
+    """Warn where stamps of two topics seem to be of different clocks."""
+    late = {}
+    for topic in (*(one.topic for one in settings.sensors.values()), settings.odometry):
+        if settings.clock == "header" and topic in content.stamps:
+            header, received = np.array(content.stamps[topic]).reshape(-1, 2).T
+            late[topic] = float(np.median(np.where(header > 0.0, received - header, 0.0)))
+    if late and max(late.values()) - min(late.values()) > LATE_S:
+        slow, fast = max(late, key=lambda one: late[one]), min(late, key=lambda one: late[one])
+        warnings.append(
+            f"messages of {slow} were recorded {late[slow] - late[fast]:.3g} s later after their stamps than those of "
+            f'{fast}: if their clocks differ, set clock = "receive" (`--init-bag`)'
+        )
+
+
+def _mounted(path: Path, content: BagContent, settings: BagSettings, name: str, warnings: list[str]) -> SpatialSensor:
+    """A sensor with its mount and calibration, as stated, or as the bag has them."""
+    one = settings.sensors[name]
+    sensor = SpatialSensor(name=name) if one.stated is None else one.stated
+    if not one.stated_mount:
+        mount = content.mount(settings.base_frame, one.frame)
+        if mount is None:
+            warnings.append(
+                f"no fixed transform from '{settings.base_frame}' to '{one.frame}': '{name}' is taken to be at the "
+                "robot's centre; state its mount (`--init-bag`)"
+            )
+        sensor = replace(sensor, mount_robot_sensor=tuple((se3.identity() if mount is None else mount).tolist()))
+    if sensor.intrinsics is not None or not one.camera_info:
+        return sensor
+    info = content.cameras[one.camera_info]
+    k, d, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), ())), dtype=np.float64) for name in "kdp")
+    k, p = k.reshape(3, 3), p.reshape(3, 4)
+    model, used = _MODELS.get(str(info.distortion_model)), np.trim_zeros(d, "b")
+    if one.rectified and p[0, 0] > 0.0:
+        k, used = p[:, :3], np.zeros(0)
+    if not len(used):
+        model = "pinhole"
+    if model is None or len(used) > max(CAMERA_MODELS[model]) or not (k[0, 0] > 0.0 and k[1, 1] > 0.0):
+        problem = f"{one.camera_info} is of no camera model that is known: '{info.distortion_model}'"
+        raise InputError(
+            problem, path=path, hint="plumb_bob or equidistant; rectified = true; or state it (`--init-bag`)"
+        )
+    count = next(n for n in CAMERA_MODELS[model] if n >= len(used))
+    return replace(
+        sensor,
+        intrinsics=(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])),
+        distortion=tuple(np.pad(used, (0, count - len(used))).tolist()),
+        distortion_model=model,
+        resolution_px=(int(info.width), int(info.height)) if info.width and info.height else None,
+    )
+
+
+def _identities(seen: list[tuple[int, Seen]], settings: BagSettings, names: dict[int, str]) -> IntArray:
+    """(M,) identities of detections, by what their sensor's settings say; `names` gets those that are texts."""
+    kinds = [one.identity for one in settings.sensors.values()]
+    identity = np.full(len(seen), UNKNOWN)
+    for row, (k, one) in enumerate(seen):
+        said: int | str | None = {"id": one.identity, "class": one.label or None}.get(kinds[k])
+        if isinstance(said, str):
+            identity[row] = landmark_id_of(said)
+            names[int(identity[row])] = said
+        elif said is not None:
+            identity[row] = said
+    return identity
+
+
+def _placed(
+    path: Path,
+    found: SpatialDetections,
+    seen: list[tuple[int, Seen]],
+    sensors: tuple[SpatialSensor, ...],
+    settings: BagSettings,
+) -> SpatialDetections:
+    """The detections with poses, corners and directions.
+
+    Raises:
+        DataError: the size of a tag, or the calibration of a camera, is not known.
+    """
+    pose = np.array([one.pose for _, one in seen]).reshape(-1, 7)
+    corner = np.array([one.corners for _, one in seen]).reshape(-1, 4, 2)
+    pixel = np.array([one.pixel for _, one in seen]).reshape(-1, 2)
+    cornered, aimed = np.isfinite(corner[:, 0, 0]), np.isfinite(pixel[:, 0])
+    size = settings.rig.size_of(found.landmark_id)
+    if (cornered & np.isnan(size)).all() and cornered.any():
+        hint = f"`evermap slam --init-bag {path}`, then [tags] with size_m in {settings_path(path).name}"
+        raise DataError("does not say how large its tags are", path=path, hint=hint)
+    blind = np.array([one.intrinsics is None for one in sensors])[found.sensor] & (cornered | aimed)
+    if blind.any():
+        name = sensors[int(found.sensor[blind][0])].name
+        hint = "record its CameraInfo, or state its intrinsics (`--init-bag`)"
+        raise DataError(f"holds no calibration of the camera '{name}'", path=path, hint=hint)
+    unturned = np.isnan(pose).any(axis=1) | ~(np.linalg.norm(pose[:, 3:], axis=1) > 1e-6)
+    pose[unturned, 3:] = np.nan
+    position, covariance = pose[:, :3].copy(), found.covariance_sensor_m2.copy()
+    for row, (_, one) in enumerate(seen):
+        if one.covariance is not None:
+            covariance[row] = one.covariance
+    rays, spread = directions(pixel, found.sensor, sensors)
+    position[aimed], covariance[aimed] = rays[aimed], spread[aimed]
+    return replace(
+        found,
+        position_sensor_m=position,
+        rotation=unit(pose[:, 3:]),
+        covariance_sensor_m2=covariance,
+        corner_px=corner,
+        tag_size_m=np.where(cornered, size, np.nan),
+    )
+
+
+def _odometry(content: BagContent, settings: BagSettings, topic: str, clock: Clock) -> SpatialOdometry | None:
+    """Poses of the robot, in the order of their stamps; the last of those with the same."""
+    if not topic:
+        return None
+    rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), _stamps(content, topic, settings.clock)
+    order = np.argsort(stamp_s, kind="stable")
+    keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
+    stamp_s, rows = stamp_s[keep], rows[keep]
+    if content.kind(topic) in TWISTS:
+        return integrated(stamp_s, rows, clock)
+    variance = np.where(rows[:, 7:] > 0.0, rows[:, 7:], np.nan)
+    odometry = SpatialOdometry(stamp_s, se3.normalised(rows[:, :7]), variance, clock=clock)
+    child = content.frames.get(topic, "")
+    mount = content.mount(settings.base_frame, child) if child else None
+    return of_rig(odometry, se3.identity() if mount is None else mount)
+
+
+def _reference(truth: SpatialOdometry) -> Trajectory:
+    pose = truth.pose_world_robot
+    return Trajectory(truth.stamp_s, pose, np.zeros((len(pose), 6, 6)), frame="truth", clock=truth.clock)
+
+
+BAG = Reader(
+    "bag",
+    "a bag of ROS 1 (.bag) or ROS 2 (folder with metadata.yaml, .mcap, .db3)",
+    lambda files: METADATA in files and not files.zipped,
+    read_bag,
+    endings=BAG_ENDINGS,
+)

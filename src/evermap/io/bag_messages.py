@@ -1,0 +1,245 @@
+"""What the messages in a bag say of motion, detections, cameras and frames, whatever package their types are of.
+
+Fields decide more than types: a pose may come with a header, a covariance, or both; a detection of a tag with its pose
+or its corners; class and score of an object in the forms of three releases of `vision_msgs`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, stamp_of
+from evermap.types import FloatArray
+from evermap.valid import is_covariance
+
+POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
+TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
+
+
+class Seen(NamedTuple):
+    """One detection; `look` is the number of its message."""
+
+    look: int
+    identity: int | str | None = None
+    label: str = ""
+    score: float = float("nan")
+    pose: tuple[float, ...] = (np.nan,) * 7
+    covariance: FloatArray | None = None
+    corners: tuple[float, ...] = (np.nan,) * 8
+    size: tuple[float, ...] = (np.nan,) * 3
+    pixel: tuple[float, float] = (np.nan, np.nan)
+
+
+@dataclass(slots=True)
+class BagContent:
+    """All that a bag says of motion, detections, cameras and frames; lists by topic, in the order of recording."""
+
+    topics: dict[str, Topic] = field(default_factory=dict)
+    stamps: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # in the header, and of recording
+    motion: dict[str, list[tuple[float, ...]]] = field(default_factory=dict)
+    frames: dict[str, str] = field(default_factory=dict)  # of a topic: the child of its poses, or where it sees things
+    seen: dict[str, list[Seen]] = field(default_factory=dict)
+    cameras: dict[str, Any] = field(default_factory=dict)
+    edges: dict[tuple[str, str], FloatArray] = field(default_factory=dict)
+    moving: set[tuple[str, str]] = field(default_factory=set)
+
+    def kind(self, topic: str) -> str:
+        """Return the type of a topic without its package."""
+        return self.topics[topic].kind.rsplit("/", 1)[-1] if topic in self.topics else ""
+
+    def mount(self, base: str, sensor: str) -> FloatArray | None:
+        """Return the pose (7,) of one frame in another, along frames that do not move; None without such a way."""
+        ways: dict[str, list[tuple[str, FloatArray]]] = {}
+        for (parent, child), pose in self.edges.items():
+            if (parent, child) not in self.moving:
+                ways.setdefault(parent, []).append((child, pose))
+                ways.setdefault(child, []).append((parent, se3.inverse(pose)))
+        found, front = {base: se3.identity()}, [base]
+        while front and sensor not in found:
+            here = front.pop()
+            for there, pose in ways.get(here, ()):
+                if there not in found:
+                    found[there] = se3.compose(found[here], pose)
+                    front.append(there)
+        return found.get(sensor)
+
+
+def scanned(path: Path) -> BagContent:
+    """Return what a bag holds.
+
+    Raises:
+        InputError: it is missing or damaged.
+        MissingExtraError: `rosbags` is not installed.
+    """
+    content = BagContent()
+
+    def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
+        content.topics = dict(topics)
+        found: dict[str, Handler] = {}
+        for topic in topics:
+            kind = content.kind(topic)
+            if kind in POSES + TWISTS:
+                found[topic] = _motion_of(content, topic)
+            elif kind in _DETECTIONS:
+                found[topic] = _seen_of(content, topic, _DETECTIONS[kind])
+            elif kind == "CameraInfo":
+                found[topic] = _camera_of(content, topic)
+            elif kind in ("TFMessage", "tfMessage"):
+                found[topic] = lambda message, _: _edges_of(content, message)
+        return found
+
+    scan(path, handlers)
+    return content
+
+
+def _camera_of(content: BagContent, topic: str) -> Handler:
+    def handle(message: Any, _: float) -> None:
+        content.cameras.setdefault(topic, message)
+        content.frames.setdefault(topic, _plain(message.header.frame_id))
+
+    return handle
+
+
+def _motion_of(content: BagContent, topic: str) -> Handler:
+    rows, stamps = content.motion.setdefault(topic, []), content.stamps.setdefault(topic, [])
+
+    def handle(message: Any, received_s: float) -> None:
+        stamps.append((stamp_of(message), received_s))
+        content.frames.setdefault(topic, _plain(getattr(message, "child_frame_id", "")))
+        held: Any = getattr(message, "pose", getattr(message, "twist", getattr(message, "transform", None)))
+        inner = getattr(held, "pose", getattr(held, "twist", held))
+        if hasattr(inner, "linear"):
+            rows.append(tuple(getattr(part, axis) for part in (inner.linear, inner.angular) for axis in "xyz"))
+        else:
+            spread = np.asarray(getattr(held, "covariance", np.zeros(36)), dtype=np.float64).reshape(6, 6)
+            rows.append((*pose_of(inner), *np.diagonal(spread)))
+
+    return handle
+
+
+def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterator[Seen]]) -> Handler:
+    rows, stamps = content.seen.setdefault(topic, []), content.stamps.setdefault(topic, [])
+
+    def handle(message: Any, received_s: float) -> None:
+        header = _header(message)
+        look = len(stamps)
+        stamps.append((np.nan if header is None else stamp_of(header), received_s))
+        rows.extend(parts(message, look))
+        if header is not None and header.header.frame_id:
+            content.frames.setdefault(topic, _plain(header.header.frame_id))
+
+    return handle
+
+
+def _header(message: Any) -> Any:
+    """The message or the first of its parts that has a header."""
+    if hasattr(message, "header"):
+        return message
+    for name in ("markers", "entities"):
+        for one in getattr(message, name, ()):
+            if hasattr(one, "header"):
+                return one
+    return None
+
+
+def _edges_of(content: BagContent, message: Any) -> None:
+    for one in message.transforms:
+        edge, pose = (_plain(one.header.frame_id), _plain(one.child_frame_id)), np.array(pose_of(one.transform))
+        if edge not in content.edges:
+            content.edges[edge] = se3.normalised(pose)
+        elif np.abs(se3.log(se3.compose(se3.inverse(content.edges[edge]), se3.normalised(pose)))).max() > 1e-6:
+            content.moving.add(edge)
+
+
+def _plain(frame: str) -> str:
+    """A frame's name without the slash that older messages begin it with."""
+    return frame.lstrip("/")
+
+
+def _inner(message: Any) -> Any:
+    """The pose within a pose with a header, a covariance, or both."""
+    while hasattr(message, "pose"):
+        message = message.pose
+    return message
+
+
+def _tags(message: Any, look: int) -> Iterator[Seen]:
+    for tag in getattr(message, "apriltags", getattr(message, "detections", ())):
+        names = np.atleast_1d(tag.id).tolist()
+        identity = int(names[0]) if len(names) == 1 else "bundle of " + ", ".join(map(str, names))
+        if hasattr(tag, "pose"):
+            yield Seen(look, identity, pose=pose_of(_inner(tag.pose)))
+        else:
+            corners = tuple(value for corner in tag.corners for value in (corner.x, corner.y))
+            if int(tag.hamming) <= MOST_HAMMING:
+                yield Seen(look, identity, corners=corners)
+
+
+def _markers(message: Any, look: int) -> Iterator[Seen]:
+    """ArUco markers, in a list of each or in two."""
+    if hasattr(message, "marker_ids"):
+        for name, pose in zip(message.marker_ids, message.poses, strict=True):
+            yield Seen(look, int(name), pose=pose_of(pose))
+    for one in getattr(message, "markers", ()):
+        yield Seen(look, int(one.marker_id), pose=pose_of(_inner(one.pose)))
+    for one in getattr(message, "transforms", ()):
+        yield Seen(look, int(one.fiducial_id), pose=pose_of(one.transform))
+
+
+def _objects(message: Any, look: int) -> Iterator[Seen]:
+    for one in message.detections:
+        best = max(one.results, key=_score, default=None)
+        hypothesis = getattr(best, "hypothesis", best)
+        label = "" if hypothesis is None else str(getattr(hypothesis, "class_id", getattr(hypothesis, "id", "")))
+        known: dict[str, Any] = {
+            "identity": str(getattr(one, "id", "")) or None,
+            "label": label,
+            "score": float("nan") if best is None else _score(best),
+        }
+        if hasattr(one.bbox, "size_x"):
+            center = getattr(one.bbox.center, "position", one.bbox.center)
+            yield Seen(look, **known, pixel=(center.x, center.y))
+            continue
+        size = (one.bbox.size.x, one.bbox.size.y, one.bbox.size.z)
+        sized = all(side > 0.0 for side in size)
+        if not sized and best is not None:
+            spread = np.asarray(best.pose.covariance, dtype=np.float64).reshape(6, 6)[:3, :3]
+            stated = bool(np.trace(spread) > 0.0 and is_covariance(spread[None])[0])
+            yield Seen(look, **known, pose=pose_of(_inner(best.pose)), covariance=spread if stated else None)
+        else:
+            yield Seen(look, **known, pose=pose_of(one.bbox.center), size=size if sized else (np.nan,) * 3)
+
+
+def _score(result: Any) -> float:
+    return float(getattr(result, "hypothesis", result).score)
+
+
+def _drawn(message: Any, look: int) -> Iterator[Seen]:
+    for one in getattr(message, "markers", ()):
+        if one.action == 0:  # added or changed
+            name = int(one.id) if not one.ns else f"{one.ns}/{one.id}"
+            yield Seen(look, name, label=str(one.ns), pose=pose_of(one.pose))
+    for one in getattr(message, "entities", ()):
+        shapes = [*one.cubes, *one.spheres, *one.cylinders, *one.models]
+        if shapes:
+            yield Seen(look, str(one.id), pose=pose_of(shapes[0].pose))
+
+
+_DETECTIONS: dict[str, Callable[[Any, int], Iterator[Seen]]] = {
+    "AprilTagDetectionArray": _tags,
+    "ApriltagArrayStamped": _tags,
+    "TagDetectionArray": _tags,
+    "ArucoMarkers": _markers,
+    "ArucoDetection": _markers,
+    "FiducialTransformArray": _markers,
+    "Detection3DArray": _objects,
+    "Detection2DArray": _objects,
+    "MarkerArray": _drawn,
+    "SceneUpdate": _drawn,
+}

@@ -1,0 +1,222 @@
+"""A robot that drives past two tags, as bags of ROS 1 and ROS 2."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from evermap.geometry import se3
+from evermap.geometry.camera import project
+from evermap.types import SpatialSensor
+
+MOUNT = np.array([0.2, 0.0, 0.5, -0.5, 0.5, -0.5, 0.5])
+"""Of the camera on the robot: it looks ahead, with x to the right and y down."""
+CAMERA = SpatialSensor(intrinsics=(400.0, 410.0, 320.0, 240.0), mount_robot_sensor=tuple(MOUNT))
+TAGS = {
+    3: np.array([4.0, 0.5, 0.6, 0.5, -0.5, -0.5, 0.5]),
+    7: np.array([4.5, -0.6, 0.4, 0.5, -0.5, -0.5, 0.5]),
+}
+SIZE_M = 0.2
+CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+START_S = 1.7e9
+STEPS = 25
+
+
+def path_of(k: int) -> np.ndarray:
+    """Pose of the robot, which drives a curve."""
+    return se3.exp(np.array([0.05 * k, 0.0, 0.0, 0.0, 0.0, 0.01 * k]))
+
+
+class Ros:
+    """Messages of one release, by the names of their types."""
+
+    def __init__(self, version: int) -> None:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+        from evermap.io.rosbag import UNSTATED
+
+        self.version = version
+        self.store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+        extra = {
+            "aruco_msgs/msg/ArucoMarkers": "std_msgs/Header header\nint64[] marker_ids\ngeometry_msgs/Pose[] poses",
+            "foxglove_msgs/msg/CubePrimitive": "geometry_msgs/Pose pose\ngeometry_msgs/Vector3 size",
+            "foxglove_msgs/msg/SceneEntity": (
+                "std_msgs/Header header\nstring id\nfoxglove_msgs/CubePrimitive[] cubes\n"
+                "foxglove_msgs/CubePrimitive[] spheres\nfoxglove_msgs/CubePrimitive[] cylinders\n"
+                "foxglove_msgs/CubePrimitive[] models"
+            ),
+            "foxglove_msgs/msg/SceneUpdate": "foxglove_msgs/SceneEntity[] entities",
+        }
+        if version == 1:
+            extra["tf2_msgs/msg/TFMessage"] = "geometry_msgs/TransformStamped[] transforms"
+        for name, text in (UNSTATED | extra).items():
+            self.store.register(get_types_from_msg(text, name))
+
+    def make(self, name: str, *values: Any) -> Any:
+        package, kind = name.split("/")
+        return self.store.types[f"{package}/msg/{kind}"](*values)
+
+    def header(self, stamp_s: float, frame: str) -> Any:
+        nano = round(stamp_s * 1e9)
+        stamp = self.make("builtin_interfaces/Time", nano // 10**9, nano % 10**9)
+        return self.make("std_msgs/Header", *([0] if self.version == 1 else []), stamp, frame)
+
+    def pose(self, pose: np.ndarray) -> Any:
+        at = self.make("geometry_msgs/Point", *map(float, pose[:3]))
+        return self.make("geometry_msgs/Pose", at, self.make("geometry_msgs/Quaternion", *map(float, pose[3:])))
+
+    def transform(self, stamp_s: float, parent: str, child: str, pose: np.ndarray) -> Any:
+        at = self.make("geometry_msgs/Vector3", *map(float, pose[:3]))
+        turn = self.make("geometry_msgs/Quaternion", *map(float, pose[3:]))
+        inner = self.make("geometry_msgs/Transform", at, turn)
+        one = self.make("geometry_msgs/TransformStamped", self.header(stamp_s, parent), child, inner)
+        return self.make("tf2_msgs/TFMessage", [one])
+
+    def odometry(self, stamp_s: float, pose: np.ndarray) -> Any:
+        zero = self.make("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
+        still = self.make(
+            "geometry_msgs/TwistWithCovariance", self.make("geometry_msgs/Twist", zero, zero), np.zeros(36)
+        )
+        with_spread = self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), 0.01 * np.eye(6).ravel())
+        return self.make("nav_msgs/Odometry", self.header(stamp_s, "odom"), "base_link", with_spread, still)
+
+    def camera(self, stamp_s: float) -> Any:
+        fx, fy, cx, cy = CAMERA.intrinsics or ()
+        k = np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0])
+        p = np.insert(k, (3, 6, 9), 0.0)
+        bent = np.array([0.3, 0.1, 0.0, 0.0, 0.0])  # of the image before it is rectified
+        region = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
+        header = self.header(stamp_s, "camera_optical")
+        return self.make(
+            "sensor_msgs/CameraInfo", header, 480, 640, "plumb_bob", bent, k, np.eye(3).ravel(), p, 0, 0, region
+        )
+
+
+def in_camera(k: int) -> dict[int, np.ndarray]:
+    """Where the tags are in the camera, at a step."""
+    eye = se3.inverse(se3.compose(path_of(k), MOUNT))
+    return {name: se3.compose(eye, pose) for name, pose in TAGS.items()}
+
+
+def corners_of(pose: np.ndarray) -> np.ndarray:
+    at = np.hstack([CORNERS * SIZE_M / 2.0, np.zeros((4, 1))])
+    return project(se3.transform(pose, at), CAMERA)[0]
+
+
+def tags(ros: Ros, stamp_s: float, k: int) -> Any:
+    found = []
+    for name, pose in in_camera(k).items() if k % 5 else ():
+        four = [ros.make("apriltag_msgs/Point", *map(float, corner)) for corner in corners_of(pose)]
+        centre, plane = ros.make("apriltag_msgs/Point", 0.0, 0.0), np.eye(3).ravel()
+        found.append(ros.make("apriltag_msgs/AprilTagDetection", "36h11", name, 0, 1.0, 50.0, centre, four, plane))
+    return ros.make("apriltag_msgs/AprilTagDetectionArray", ros.header(stamp_s, "camera_optical"), found)
+
+
+def objects(ros: Ros, stamp_s: float, k: int) -> Any:
+    found = []
+    for name, pose in in_camera(k).items():
+        hypothesis = ros.make("vision_msgs/ObjectHypothesis", "crate", 0.8)
+        spread = ros.make("geometry_msgs/PoseWithCovariance", ros.pose(pose), np.zeros(36))
+        result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis, spread)
+        size = ros.make("geometry_msgs/Vector3", 0.4, 0.3, 0.2)
+        box = ros.make("vision_msgs/BoundingBox3D", ros.pose(pose), size)
+        found.append(
+            ros.make("vision_msgs/Detection3D", ros.header(stamp_s, "camera_optical"), [result], box, f"crate {name}")
+        )
+    return ros.make("vision_msgs/Detection3DArray", ros.header(stamp_s, "camera_optical"), found)
+
+
+def directions(ros: Ros, stamp_s: float, k: int) -> Any:
+    found = []
+    for name, pose in in_camera(k).items():
+        u, v = project(pose[None, :3], CAMERA)[0][0]
+        middle = ros.make("vision_msgs/Pose2D", ros.make("vision_msgs/Point2D", float(u), float(v)), 0.0)
+        box = ros.make("vision_msgs/BoundingBox2D", middle, 20.0, 30.0)
+        found.append(ros.make("vision_msgs/Detection2D", ros.header(stamp_s, "camera_optical"), [], box, str(name)))
+    return ros.make("vision_msgs/Detection2DArray", ros.header(stamp_s, "camera_optical"), found)
+
+
+def aruco(ros: Ros, stamp_s: float, k: int) -> Any:
+    seen = in_camera(k)
+    names = np.array(list(seen), dtype=np.int64)
+    poses = [ros.pose(pose) for pose in seen.values()]
+    return ros.make("aruco_msgs/ArucoMarkers", ros.header(stamp_s, "camera_optical"), names, poses)
+
+
+def scene(ros: Ros, stamp_s: float, k: int) -> Any:
+    found = []
+    for name, pose in in_camera(k).items():
+        cube = ros.make("foxglove_msgs/CubePrimitive", ros.pose(pose), ros.make("geometry_msgs/Vector3", 1.0, 1.0, 1.0))
+        header = ros.header(stamp_s, "camera_optical")
+        found.append(ros.make("foxglove_msgs/SceneEntity", header, str(name), [cube], [], [], []))
+    return ros.make("foxglove_msgs/SceneUpdate", found)
+
+
+DETECTORS: dict[str, tuple[str, Callable[[Ros, float, int], Any]]] = {
+    "tags": ("apriltag_msgs/AprilTagDetectionArray", tags),
+    "objects": ("vision_msgs/Detection3DArray", objects),
+    "directions": ("vision_msgs/Detection2DArray", directions),
+    "aruco": ("aruco_msgs/ArucoMarkers", aruco),
+    "scene": ("foxglove_msgs/SceneUpdate", scene),
+}
+
+
+def write(path: Path, detector: str, *, late_s: float = 0.0, mounted: bool = True, twist: bool = False) -> Path:
+    """A bag of the drive: of ROS 1 where its name ends in `.bag`, else of ROS 2, in SQLite where in `_sqlite`."""
+    from rosbags import rosbag1, rosbag2
+    from rosbags.rosbag2 import StoragePlugin
+
+    ros = Ros(1 if path.suffix == ".bag" else 2)
+    if ros.version == 1:
+        writer: Any = rosbag1.Writer(path)
+        raw = ros.store.serialize_ros1
+    else:
+        plugin = StoragePlugin.SQLITE3 if path.name.endswith("_sqlite") else StoragePlugin.MCAP
+        writer = rosbag2.Writer(path, version=8, storage_plugin=plugin)
+        raw = ros.store.serialize_cdr
+    kind, detect = DETECTORS[detector]
+    topics = {
+        "/odom": "nav_msgs/Odometry", "/gt/pose": "geometry_msgs/PoseStamped",
+        "/amcl_pose": "geometry_msgs/PoseStamped", "/camera/camera_info": "sensor_msgs/CameraInfo",
+        "/tf_static": "tf2_msgs/TFMessage", "/tf": "tf2_msgs/TFMessage", "/camera/seen": kind,
+        "/wheels/twist": "geometry_msgs/TwistStamped", "/rosout_agg": "std_msgs/String",
+    }  # fmt: skip
+    with writer as bag:
+        full = {topic: "{}/msg/{}".format(*name.split("/")) for topic, name in topics.items()}
+        to = {topic: bag.add_connection(topic, name, typestore=ros.store) for topic, name in full.items()}
+
+        def put(topic: str, stamp_s: float, message: Any) -> None:
+            bag.write(to[topic], round((stamp_s + 0.01) * 1e9), raw(message, full[topic]))
+
+        if mounted:
+            half = np.array([0.2, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0])
+            rest = se3.compose(se3.inverse(half), MOUNT)
+            put("/tf_static", START_S, ros.transform(START_S, "base_link", "camera", half))
+            put("/tf_static", START_S, ros.transform(START_S, "/camera", "/camera_optical", rest))
+        for k in range(STEPS):
+            stamp_s = START_S + 0.1 * k
+            pose = path_of(k)
+            put("/tf", stamp_s, ros.transform(stamp_s, "odom", "base_link", pose))
+            if not twist:
+                put("/odom", stamp_s, ros.odometry(stamp_s, pose))
+            step = se3.log(se3.compose(se3.inverse(pose), path_of(k + 1))) / 0.1
+            turning = [ros.make("geometry_msgs/Vector3", *map(float, part)) for part in (step[:3], step[3:])]
+            moving = ros.make("geometry_msgs/Twist", *turning)
+            put(
+                "/wheels/twist",
+                stamp_s,
+                ros.make("geometry_msgs/TwistStamped", ros.header(stamp_s, "base_link"), moving),
+            )
+            for topic in ("/gt/pose", "/amcl_pose"):
+                put(topic, stamp_s, ros.make("geometry_msgs/PoseStamped", ros.header(stamp_s, "map"), ros.pose(pose)))
+            put("/camera/camera_info", stamp_s, ros.camera(stamp_s))
+            put("/camera/seen", stamp_s, detect(ros, stamp_s - late_s, k))
+    for file in path.glob("*.db3"):  # those of Humble do not hold the types of their messages
+        with closing(sqlite3.connect(file)) as database, database:
+            database.execute("DELETE FROM message_definitions")
+    return path

@@ -1,0 +1,234 @@
+"""Bags of ROS 1 and ROS 2: what is guessed of their topics, and that tags are where they are, in every form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bags import CAMERA, MOUNT, SIZE_M, START_S, STEPS, TAGS, in_camera, path_of, write
+from typer.testing import CliRunner
+
+from evermap.cli.main import app
+from evermap.errors import DataError, InputError
+from evermap.geometry import se3
+from evermap.geometry.camera import project, unproject
+from evermap.io import list_robots, read_recording, reader_for
+from evermap.io.bag import bag_settings, read_bag, settings_path
+from evermap.types import UNKNOWN, SpatialRecording, landmark_id_of
+
+pytest.importorskip("rosbags", reason="the extra ros is not installed")
+
+
+def state_size(bag: Path) -> None:
+    settings_path(bag).write_text(bag_settings(bag) + f"\n[tags]\nsize_m = {SIZE_M}\n")
+
+
+def places(recording: SpatialRecording) -> Iterator[tuple[int, np.ndarray]]:
+    """Identity and pose in the world of every detection, by the odometry."""
+    seen, odometry = recording.detections, recording.odometry
+    assert odometry is not None
+    mount = np.array([one.mount_robot_sensor for one in recording.sensors])[seen.sensor]
+    row = np.searchsorted(odometry.stamp_s, recording.frames.stamp_s[seen.frame] - 1e-3)
+    robot = odometry.pose_world_robot[row]
+    rotation = np.where(np.isnan(seen.rotation), se3.NO_TURN, seen.rotation)
+    pose = se3.compose(se3.compose(robot, mount), np.hstack([seen.position_sensor_m, rotation]))
+    yield from zip(seen.landmark_id.tolist(), pose, strict=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "detector"),
+    [("drive.bag", "tags"), ("drive.bag", "aruco"), ("drive", "tags"), ("drive", "aruco"), ("drive_sqlite", "tags")],
+)
+def test_tags_are_where_they_are(name: str, detector: str, tmp_path: Path) -> None:
+    bag = write(tmp_path / name, detector)
+    if detector == "tags":
+        with pytest.raises(DataError, match=r"how large its tags are.*--init-bag"):
+            read_bag(bag)
+        state_size(bag)
+    assert reader_for(bag).name == "bag"
+    assert list_robots(bag) == ()
+    recording = read_recording(bag)
+    assert isinstance(recording, SpatialRecording)
+    assert len(recording.frames) == STEPS
+    assert recording.frames.stamp_s[0] == pytest.approx(START_S, abs=1e-6)
+    assert len(recording.detections) == (40 if detector == "tags" else 50)
+    assert recording.odometry is not None
+    assert recording.odometry.variance == pytest.approx(np.full((STEPS, 6), 0.01))
+    for identity, pose in places(recording):
+        off = se3.log(se3.compose(se3.inverse(TAGS[identity]), pose))
+        assert np.abs(off).max() < 1e-6
+    assert recording.truth is not None
+    assert recording.truth.pose_world_robot == pytest.approx(np.array([path_of(k) for k in range(STEPS)]))
+    # without an empty message among so many the detector may be one that is silent where it sees nothing
+    assert recording.frames.complete == (detector == "tags")
+
+
+def test_a_single_file_of_mcap(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "aruco")
+    (file,) = bag.glob("*.mcap")
+    assert [identity for identity, _ in places(read_bag(file))] == [identity for identity, _ in places(read_bag(bag))]
+
+
+def test_boxes_have_class_size_and_score_but_no_identity(tmp_path: Path) -> None:
+    recording = read_bag(write(tmp_path / "drive", "objects"))
+    seen = recording.detections
+    assert (seen.landmark_id == UNKNOWN).all()
+    assert recording.class_names == ("crate",)
+    assert set(seen.class_id) == {0}
+    assert seen.score == pytest.approx(np.full(50, 0.8))
+    assert seen.size_m == pytest.approx(np.tile([0.4, 0.3, 0.2], (50, 1)))
+
+
+def test_identity_is_what_the_settings_say(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "objects")
+    text = bag_settings(bag)
+    settings_path(bag).write_text(text.replace('identity = "none"', 'identity = "id"'))
+    recording = read_bag(bag)
+    assert set(recording.landmark_names.values()) == {"crate 3", "crate 7"}
+    for identity, pose in places(recording):
+        tag = int(recording.landmark_names[identity].split()[1])
+        assert pose == pytest.approx(TAGS[tag], abs=1e-6)
+    settings_path(bag).write_text(text.replace('identity = "none"', 'identity = "class"'))
+    assert set(read_bag(bag).detections.landmark_id) == {landmark_id_of("crate")}
+
+
+def test_directions_to_what_one_camera_sees(tmp_path: Path) -> None:
+    recording = read_bag(write(tmp_path / "drive", "directions"))
+    seen = recording.detections
+    truth = [in_camera(k)[name][:3] for k in range(STEPS) for name in TAGS]
+    ahead = np.array([point / np.linalg.norm(point) for point in truth])
+    # pixels of Detection2DArray are taken to be of the image as it is
+    bent = replace(CAMERA, distortion=(0.3, 0.1, 0.0, 0.0), distortion_model="radtan")
+    assert seen.position_sensor_m == pytest.approx(unproject(project(np.array(truth), CAMERA)[0], bent), abs=1e-9)
+    assert np.abs(seen.position_sensor_m - ahead).max() > 1e-3
+    assert {recording.landmark_names[int(one)] for one in seen.landmark_id} == {"3", "7"}
+    bag = tmp_path / "drive"
+    settings_path(bag).write_text(bag_settings(bag).replace("rectified = false", "rectified = true"))
+    assert read_bag(bag).detections.position_sensor_m == pytest.approx(ahead, abs=1e-9)
+
+
+def test_drawings_are_read_where_there_is_nothing_else(tmp_path: Path) -> None:
+    recording = read_bag(write(tmp_path / "drive", "scene"))
+    for identity, pose in places(recording):
+        assert pose == pytest.approx(TAGS[int(recording.landmark_names[identity])], abs=1e-6)
+
+
+def test_velocities_are_integrated(tmp_path: Path) -> None:
+    recording = read_bag(write(tmp_path / "drive", "aruco", twist=True))
+    assert recording.odometry is not None
+    assert recording.odometry.pose_world_robot == pytest.approx(np.array([path_of(k) for k in range(STEPS)]), abs=1e-6)
+
+
+def test_clocks_that_differ_are_told_and_can_be_given_up(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "aruco", late_s=3.0)
+    recording = read_bag(bag)
+    assert any("recorded 3 s later after their stamps than those of /odom" in one for one in recording.warnings)
+    settings_path(bag).write_text(bag_settings(bag).replace('clock = "header"', 'clock = "receive"'))
+    recording = read_bag(bag)
+    assert not any("recorded" in one for one in recording.warnings)
+    assert recording.frames.stamp_s[0] == pytest.approx(START_S + 0.01, abs=1e-6)
+
+
+def test_a_sensor_without_a_transform_is_told_and_can_be_mounted(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "aruco", mounted=False)
+    recording = read_bag(bag)
+    assert any("no fixed transform from 'base_link' to 'camera_optical'" in one for one in recording.warnings)
+    x, y, z, qx, qy, qz, qw = MOUNT
+    mount = f"[camera.camera.mount]\nx_m = {x}\ny_m = {y}\nz_m = {z}\nqx = {qx}\nqy = {qy}\nqz = {qz}\nqw = {qw}\n"
+    settings_path(bag).write_text(bag_settings(bag) + mount)
+    recording = read_bag(bag)
+    assert recording.warnings == ()
+    for identity, pose in places(recording):
+        assert pose == pytest.approx(TAGS[identity], abs=1e-6)
+
+
+def test_what_is_guessed_is_told_and_reads_back_the_same(tmp_path: Path, assert_same: Callable) -> None:
+    bag = write(tmp_path / "drive", "aruco")
+    guessed = read_bag(bag)
+    assert guessed.warnings == (
+        "topics as guessed: detections /camera/seen; odometry /odom (`--init-bag` writes them to be edited)",
+    )
+    text = bag_settings(bag)
+    assert "#   /rosout_agg  std_msgs/msg/String  0" in text
+    settings_path(bag).write_text(text)
+    stated = read_bag(bag)
+    assert stated.warnings == ()
+    assert_same(stated.detections, guessed.detections)
+    assert_same(stated.odometry, guessed.odometry)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "match"),
+    [
+        (
+            'odometry = "/odom"',
+            'odometry = "/odo"',
+            r"drive\.toml:11: field 'bag\.odometry': no topic .*'/odo' \(try: /odom",
+        ),
+        ('topic = "/camera/seen"', 'topic = "/camera/sen"', r"'camera\.camera\.topic': no topic with detections.*seen"),
+        ('clock = "header"', 'clock = "wall"', r"'bag\.clock': no clock 'wall'"),
+        ('\nidentity = "id"', '\nidentity = "name"', r"'camera\.camera\.identity': no identity 'name'"),
+        ('\nidentity = "id"', "\nidentity = 3", r"'camera\.camera\.identity': must be a text, not int"),
+        ('truth = "/gt/pose"', "truth = true", r"'bag\.truth': must be a text, not bool"),
+        ("[bag]", "[bags]", r"'bags': unknown section"),
+        ('frame = "camera_optical"', "intrinsics = [1, 2, 3]", r"'camera\.camera\.intrinsics': must be a list of 4"),
+    ],
+)
+def test_settings_that_are_wrong(old: str, new: str, match: str, tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "aruco")
+    text = bag_settings(bag)
+    assert old in text
+    settings_path(bag).write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=match):
+        read_bag(bag)
+
+
+def test_bags_that_cannot_be_used(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "tags")
+    (file,) = bag.glob("*.mcap")
+    raw = file.read_bytes()
+    file.write_bytes(raw[: len(raw) // 2])
+    with pytest.raises(InputError, match="cannot be read as a bag"):
+        read_bag(file)
+    with pytest.raises(InputError, match="robot 2"):
+        read_recording(bag, 2)
+    bag = write(tmp_path / "other", "tags")
+    text = bag_settings(bag).replace('camera_info = "/camera/camera_info"', 'camera_info = ""')
+    settings_path(bag).write_text(f"{text}\n[tags]\nsize_m = 0.2\n")
+    with pytest.raises(DataError, match=r"no calibration of the camera 'camera'"):
+        read_bag(bag)
+
+
+def test_mutated_bags_are_read_or_refused(tmp_path: Path) -> None:
+    """A byte here and there is another: nothing but what the library says in a line."""
+    rng = np.random.default_rng(0)
+    raws = {".bag": write(tmp_path / "drive.bag", "aruco").read_bytes()}
+    (file,) = write(tmp_path / "drive", "aruco").glob("*.mcap")
+    raws[".mcap"] = file.read_bytes()
+    refused = 0
+    for suffix, raw in raws.items():
+        for k in range(60):
+            broken = np.frombuffer(raw, dtype=np.uint8).copy()
+            broken[rng.integers(0, len(raw), 1 + k % 8)] = rng.integers(0, 256, 1 + k % 8)
+            path = tmp_path / f"broken{k}{suffix}"
+            path.write_bytes(broken[: len(raw) if k % 3 else int(rng.integers(1, len(raw)))].tobytes())
+            try:
+                read_bag(path)
+            except (InputError, DataError):
+                refused += 1
+    assert refused > 20
+
+
+def test_settings_are_written_beside_the_bag_once(tmp_path: Path) -> None:
+    bag = write(tmp_path / "drive", "tags")
+    run = CliRunner().invoke
+    written = run(app, ["slam", "--init-bag", str(bag)])
+    assert written.exit_code == 0
+    assert settings_path(bag).read_text() == bag_settings(bag)
+    assert 'odometry = "/odom"' in written.output
+    again = run(app, ["slam", "--init-bag", str(bag)])
+    assert again.exit_code == 2
+    assert "is there already" in again.output
