@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from math import inf, log, pi
 from typing import Any
 
@@ -164,6 +165,8 @@ _ANGLES = (
     ),
 )
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
+LEAST_STEP_S = 0.4
+"""Smaller steps of one clock against the other are the calibration's, which has a delay."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
 
 
@@ -488,6 +491,64 @@ class _Pairs:
             )
             self._motions[forward, turn, delay_s] = first, second
         return self._motions[forward, turn, delay_s]
+
+
+def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[FloatArray, FloatArray]:
+    """Return from when on the odometry's clock is ahead of the detections', and by how much.
+
+    Piecewise constant, by dynamic programming (Viterbi 1967): in every second a pair of sightings has a Cauchy loss, on
+    the scale of the usual residual, at each delay, and a step costs `settings.gain`.
+
+    Args:
+        recording: valid; its truth is not looked at.
+        settings: how much readings must gain by a step.
+
+    Returns:
+        (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
+    """
+    first, second = _pairs(recording, settings)
+    none = np.array([-inf]), np.zeros(1)
+    if len(first) < settings.fewest:
+        return none
+    pairs = _Pairs(recording, first, second)
+    delays_s = np.concatenate([[0.0, 0.5, -0.5], _DELAYS_S, np.negative(_DELAYS_S)])
+    off = np.stack([np.minimum(np.hypot(*pairs.residual(_late(delay_s))), 10.0) for delay_s in delays_s])
+    until_s = recording.frames.stamp_s[recording.detections.frame[second]]
+    second_of = (until_s - until_s.min()).astype(np.int64)
+    usual, path = settings.fits, np.zeros(int(second_of.max()) + 1, dtype=np.int64)
+    for _ in range(2):  # what is usual shows at the right delays only
+        usual = max(settings.fits, float(np.median(off[path[second_of], np.arange(len(first))])))
+        # a sighting is in two pairs
+        loss = 0.5 * np.log1p((off / usual) ** 2)
+        path = _cheapest(np.stack([np.bincount(second_of, row, len(path)) for row in loss], axis=1), settings.gain)
+    begin = np.flatnonzero(np.diff(path, prepend=-1))
+    since_s, delay_s = [-inf], [0.0]
+    for row, (start, stop) in enumerate(pairwise([*begin.tolist(), len(path)])):
+        mine = (second_of >= start) & (second_of < stop)
+        near_s = delays_s[path[start]] + 0.1 * np.arange(-5, 6)
+        left = [_loss(pairs.residual(_late(delay))[:, mine], settings) for delay in near_s]
+        found = float(near_s[int(np.argmin(left))])
+        if row == 0:
+            delay_s[0] = found
+        elif abs(found - delay_s[-1]) > LEAST_STEP_S:
+            since_s.append(float(until_s.min()) + start)
+            delay_s.append(found)
+    return np.array(since_s), np.array(delay_s)
+
+
+def _cheapest(loss: FloatArray, step: float) -> IntArray:
+    """(T,) options, one for each row of a table of losses (T, D), of which each change costs `step`."""
+    total, came = loss[0].copy(), np.zeros(loss.shape, dtype=np.int64)
+    every = np.arange(loss.shape[1])
+    for row in range(1, len(loss)):
+        best = int(np.argmin(total))
+        changed = total > total[best] + step
+        came[row] = np.where(changed, best, every)
+        total = np.where(changed, total[best] + step, total) + loss[row]
+    path = np.full(len(loss), np.argmin(total), dtype=np.int64)
+    for row in range(len(loss) - 1, 0, -1):
+        path[row - 1] = came[row, path[row]]
+    return path
 
 
 def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArray:

@@ -12,10 +12,16 @@ import numpy as np
 
 from evermap.config import CleaningConfig
 from evermap.errors import DataError
+from evermap.slam.check import LEAST_STEP_S, clock_steps
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
 
 USUAL = CleaningConfig()
+AROUND_S = 3.0
+"""To within which readings tell when a clock was set."""
+SET_BACK = "was set back"
+SINGLE = 10.0
+"""Times as far must the robot have moved where a frame has one reading only."""
 
 
 def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
@@ -32,6 +38,7 @@ def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
         * late rows: sorted in; rows with equal stamps: the last odometry is kept, frames are united;
         * clocks that were set back by over 1 s, and clocks of one sensor set forward by over 2 s: taken back,
           to within a few periods of the sensor;
+        * odometry that was stamped by another clock for a while: moved to where landmarks stand still by it;
         * frames more than 10 s before or after the odometry: left out;
         * odometry that is no number, faster than any robot, or a spike: left out, the row before holds on;
         * readings that are no number, not positive, or beyond the sensor's reach: left out;
@@ -43,6 +50,7 @@ def clean(recording: Recording, settings: CleaningConfig = USUAL) -> Recording:
     detections = _readings(recording, settings, remarks)
     frames, detections = _in_time(recording.frames, detections, settings, remarks)
     frames, odometry = _one_clock(frames, odometry, settings, remarks)
+    odometry = _in_step(replace(recording, frames=frames, odometry=odometry, detections=detections), remarks)
     frames, detections = _while_driving(frames, detections, odometry, settings, remarks)
     frames, detections = _fresh(frames, detections, odometry, settings, remarks)
     if not remarks:
@@ -154,6 +162,56 @@ def _taken_back(stamp_s: FloatArray, step: tuple[int, float], what: str, remarks
     return np.append(stamp_s[:row], stamp_s[row:] - by_s)
 
 
+def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
+    """The odometry on the clock of the frames, where readings say that it is not.
+
+    A clock that was set forward leaves a pause in its own stream. One that was set back was taken back already, by
+    counting messages, and is off by those that were lost at that moment.
+    """
+    odometry, frame_s = recording.odometry, recording.frames.stamp_s
+    since_s, delay_s = (column.tolist() for column in clock_steps(recording))
+    unsure_s = AROUND_S if any(SET_BACK in remark for remark in remarks) else LEAST_STEP_S
+
+    def step(row: int) -> tuple[int, float]:
+        """The row of odometry at which the clocks part, and for how long that stream paused."""
+        before_s, after_s = delay_s[row - 1 : row + 1]
+        if after_s > before_s:
+            return _longest_pause(odometry.stamp_s, since_s[row] + before_s, since_s[row] + after_s)
+        frame, pause_s = _longest_pause(frame_s, since_s[row], since_s[row])
+        return int(np.searchsorted(odometry.stamp_s, frame_s[frame] - pause_s + before_s, side="right")), pause_s
+
+    row = 1
+    while row < len(since_s):
+        by_s = abs(delay_s[row] - delay_s[row - 1])
+        if by_s >= LEAST_STEP_S and step(row)[1] >= by_s - unsure_s:
+            row += 1
+            continue
+        # no clock can have done that: the shorter stretch is as the other
+        lasts_s = np.diff([frame_s[0], *since_s[1:], frame_s[-1]])
+        shorter = row if lasts_s[row] < lasts_s[row - 1] else row - 1
+        del delay_s[shorter], since_s[row]
+        row = max(row - 1, 1)
+    usual_s = min(delay_s, key=abs)
+    if len(delay_s) == 1:
+        return odometry
+    rows = np.maximum.accumulate([0, *(step(row)[0] for row in range(1, len(since_s)))])
+    late_s = np.repeat(delay_s, np.diff([*rows, len(odometry)])) - usual_s
+    for at_s, by_s in zip(since_s[1:], np.diff(delay_s).tolist(), strict=True):
+        remarks.append(f"odometry is later by {by_s:+.1f} s than the detections from {at_s:.1f} s on, taken back")
+    stamp_s = odometry.stamp_s - late_s
+    kept = stamp_s > np.maximum.accumulate(np.append(-np.inf, stamp_s[:-1]))
+    return replace(rows_of(odometry, kept), stamp_s=stamp_s[kept])
+
+
+def _longest_pause(stamp_s: FloatArray, first_s: float, last_s: float) -> tuple[int, float]:
+    """The row after the longest pause between two instants, and a few seconds around, and how long it is."""
+    first, last = np.searchsorted(stamp_s, [first_s - AROUND_S, last_s + AROUND_S]).tolist()
+    first = min(max(first, 1), len(stamp_s) - 1)
+    pauses = np.diff(stamp_s[first - 1 : max(last, first) + 1])
+    longest = int(np.argmax(pauses))
+    return first + longest, float(pauses[longest])
+
+
 def _while_driving(
     frames: Frames, detections: Detections, odometry: Odometry, settings: CleaningConfig, remarks: list[str]
 ) -> tuple[Frames, Detections]:
@@ -183,7 +241,7 @@ def _fresh(
 ) -> tuple[Frames, Detections]:
     """Without frames that repeat the one before, number by number, though the robot moved: the sensor hangs.
 
-    A single reading may repeat by chance, where a camera counts whole pixels.
+    A single reading may repeat by chance, where a camera counts whole pixels, but not over a metre.
     """
     if len(frames) < 2 or len(odometry) < 2:
         return frames, detections
@@ -195,9 +253,10 @@ def _fresh(
     for name in ("landmark_id", "range_m", "bearing_rad"):
         column = getattr(detections, name)
         alike &= column == column[at]
-    repeated = (count > 1) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
+    repeated = (count > 0) & (np.bincount(detections.frame, alike, minlength=len(frames)) == count)
+    least = np.where(count > 1, 1.0, SINGLE) * settings.moved
     repeated &= _moved_since(
-        np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry, settings.moved
+        np.maximum.accumulate(np.where(repeated, 0, np.arange(len(frames)))), frames, odometry, least
     )
     if not repeated.any():
         return frames, detections
@@ -205,7 +264,7 @@ def _fresh(
     return _some_frames(frames, detections, ~repeated)
 
 
-def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: float) -> BoolArray:
+def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatArray) -> BoolArray:
     """Return (F,) whether the robot drove or turned by more than `most` since the frames in `row` (F,)."""
     speed = np.stack([np.hypot(odometry.forward_mps, odometry.lateral_mps), np.abs(odometry.angular_radps)])
     way = np.pad(np.cumsum(speed[:, :-1] * np.diff(odometry.stamp_s), axis=1), ((0, 0), (1, 0)))
@@ -223,7 +282,7 @@ def _mended(what: str, stamp_s: FloatArray, settings: CleaningConfig, remarks: l
     _remark(remarks, f"late stamps of the {what} sorted in", late)
     if len(back_s):
         steps = ", ".join(f"{step:.1f}" for step in back_s[:3]) + (", ..." if len(back_s) > 3 else "")
-        remarks.append(f"clock of the {what} was set back, by {steps} s; what follows goes on from there")
+        remarks.append(f"clock of the {what} {SET_BACK}, by {steps} s; what follows goes on from there")
     return stamps
 
 
