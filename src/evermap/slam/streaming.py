@@ -9,6 +9,7 @@ method decides which places detections belong to: of a frame before it is used, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.session_filter import SessionFilter
-from evermap.slam.smoother import Smoother
+from evermap.slam.smoother import COST_SLACK, Smoother
 from evermap.slam.sparse.system import Slices, exhausted
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -39,6 +40,10 @@ MIN_ALIGN_SPREAD_M = 1.0
 ALIGNED_INFORMATION = 1e-2
 """Once in a prior map the first pose is free: held to 10 m only, so that the linear system stays well conditioned."""
 FINAL_ROUNDS = 12
+LOOSE_RAD, MOST_BREAKS = 0.3, 8
+"""Heading that a silence of the odometry leaves unknown, from which the parts are laid over each other; how many."""
+ELSEWHERE = 0.1
+"""Motion (m or rad) of a part that the optimum near it does not take back."""
 SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
 CAUGHT_UP_MS = 0.15
@@ -208,6 +213,10 @@ class StreamingSlam:
         if self._robust:  # a landmark whose first sighting was misread may be disputed since the last relinearisation
             estimate = exhausted(_voted(Smoother(problem, self._noise, heavy=True), estimate))
         smoother, estimate, fit = self._converged(problem, estimate, self._noise)
+        if self._robust:
+            better = _rejoined(smoother, estimate)
+            if better is not estimate:
+                smoother, estimate, fit = self._converged(problem, better, fit.noise)
         problem, estimate = self._ahead(problem, estimate)
         for _ in range(FINAL_REVISIONS):
             revision = self._method.revise(problem, estimate, fit.noise, heavy=False, final=True)
@@ -517,6 +526,47 @@ def _voted(smoother: Smoother, estimate: Estimate) -> Slices[Estimate]:
     """Return what `outvoted` does, by the weights that the detections have there."""
     now = yield from smoother.linearised_in_slices(estimate)
     return outvoted(smoother.problem, estimate, now.weights)
+
+
+def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
+    """Return a better optimum where the odometry was silent, if the landmarks that both sides saw lead to one.
+
+    After a silence the robot may be anywhere: sightings that disagree with where it was taken to go on look like
+    outliers. Each piece is laid over the rest, and all that follows over all before, as most landmarks have it.
+    """
+    problem = smoother.problem
+    loose = problem.drive.between(problem.stamp_s, estimate.states).floor[:, 2, 2] > LOOSE_RAD**2
+    breaks = np.flatnonzero(loose & ~np.append(loose[1:], False))[:MOST_BREAKS] + 1
+    ends = [*breaks.tolist(), len(estimate.pose)]
+    tried = {(first, last) for first, end in pairwise(ends) for last in (end, len(estimate.pose))}
+    cost = smoother.cost(estimate)
+    for first, last in sorted(tried):
+        piece = (problem.pose_row >= first) & (problem.pose_row < last)
+        at = sighted_at(estimate.pose[problem.pose_row], problem.reading, estimate.states, problem.mount)
+        mine, theirs = (
+            _middles(problem.landmark_row[some], at[some], len(estimate.landmark)) for some in (piece, ~piece)
+        )
+        both = np.flatnonzero(np.isfinite(mine[:, 0]) & np.isfinite(theirs[:, 0]))
+        motion, agree = consensus(mine[both], theirs[both])
+        if np.count_nonzero(agree) < MIN_ALIGN_LANDMARKS or not np.any(np.abs(motion) > ELSEWHERE):
+            continue
+        pose, landmark = estimate.pose.copy(), estimate.landmark.copy()
+        pose[first:last] = se2.compose(motion, pose[first:last])
+        alone = np.isfinite(mine[:, 0]) & ~np.isfinite(theirs[:, 0])
+        landmark[alone] = se2.transform(motion, mine[alone])
+        landmark[both] = theirs[both]
+        other = smoother.optimum(Estimate(pose, landmark, estimate.states), tolerance=NEAR)
+        if smoother.cost(other) < cost - COST_SLACK:
+            estimate, cost = other, smoother.cost(other)
+    return estimate
+
+
+def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:
+    """(L, 2) medians of positions (M, 2) of landmarks (M,); nan of those with none."""
+    middle = np.full((count, 2), np.nan)
+    for j in np.unique(row):
+        middle[j] = np.median(at[row == j], axis=0)
+    return middle
 
 
 def outvoted(problem: Problem, estimate: Estimate, weights: FloatArray) -> Estimate:
