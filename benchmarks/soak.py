@@ -47,6 +47,9 @@ class Soak:
 
     Attributes:
         rmse_m: position error of the poses, in the map's frame; nan where the session was refused.
+        off_m: position error that 95 % of the frames are within, at the times when they were truly taken (a clock that
+            was set is no error of a pose); nan where the session was refused or set aside.
+        set_aside: numbers of the sessions that were not entered.
         precision, recall: of the landmarks that the map believes in, against what stands in the building.
         memory_mb: resident memory of the process after the session.
         map_kb: size of all arrays of the map.
@@ -58,6 +61,8 @@ class Soak:
     """
 
     rmse_m: list[float] = field(default_factory=list)
+    off_m: list[float] = field(default_factory=list)
+    set_aside: list[int] = field(default_factory=list)
     precision: list[float] = field(default_factory=list)
     recall: list[float] = field(default_factory=list)
     memory_mb: list[float] = field(default_factory=list)
@@ -81,10 +86,15 @@ class Soak:
             "hours": self.driven_s / 3600.0,
             "sessions": len(self.rmse_m),
             "refused": len(self.refused),
+            "set_aside": len(self.set_aside),
             "defects": len(self.defects),
             "rmse_median_m": float(np.nanmedian(self.rmse_m[half:])),
+            "off_worst_m": float(np.nanmax(self.off_m)),
+            "off_more_than_half_a_metre": float(np.sum(np.array(self.off_m) > 0.5)),
             "precision": float(np.median(self.precision[half:])),
             "recall": float(np.median(self.recall[half:])),
+            "precision_worst": float(np.min(self.precision[half:])),
+            "recall_worst": float(np.min(self.recall[half:])),
             "memory_mb": self.memory_mb[-1],
             "memory_growth_mb": self.growth_mb(),
             "map_kb": self.map_kb[-1],
@@ -186,10 +196,13 @@ def _enter(
     found: Soak, session: Session | None, living: LivingMap, recording: Recording, pose_truth_map: FloatArray | None
 ) -> None:
     """The numbers of a session."""
-    rmse, right, claims, there = np.nan, 0, 0, 1
+    rmse, off, right, claims, there = np.nan, np.nan, 0, 0, 1
+    if session is not None and not session.found:
+        found.set_aside.append(len(found.rmse_m))
     if pose_truth_map is not None:
         if session is not None:
             rmse = _rmse(session, recording, pose_truth_map)
+            off = _off(session, recording, pose_truth_map) if session.found else np.nan
         claimed, truth = living.landmarks(p_least=0.5), recording.true_landmarks
         assert truth is not None
         row = np.clip(np.searchsorted(truth.landmark_id, claimed.landmark_id), 0, len(truth) - 1)
@@ -197,6 +210,7 @@ def _enter(
         right = int(np.sum((truth.landmark_id[row] == claimed.landmark_id) & (away < NEAR_M)))
         claims, there = len(claimed), len(truth)
     found.rmse_m.append(rmse)
+    found.off_m.append(off)
     found.precision.append(right / max(claims, 1))
     found.recall.append(right / there)
     found.step_p99_ms.append(1e3 * float(np.quantile(session.slam.step_s, 0.99)) if session is not None else np.nan)
@@ -229,6 +243,21 @@ def _rmse(session: Session, recording: Recording, pose_truth_map: FloatArray) ->
     poses = interpolate(path, truth.stamp_s[rows])[0]
     error = se2.transform(pose_truth_map, poses[:, :2]) - truth.pose_world_robot[rows, :2]
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def _off(session: Session, recording: Recording, pose_truth_map: FloatArray) -> float:
+    """Frames are recognised by their readings, which no two share, whatever is stamped on them."""
+    truth, path, used, told = recording.truth, session.slam.trajectory, session.recording, recording.detections
+    assert truth is not None and isinstance(used, Recording)
+    order = np.argsort(told.range_m)
+    at = np.minimum(np.searchsorted(told.range_m[order], used.detections.range_m), len(order) - 1)
+    same = told.range_m[order][at] == used.detections.range_m
+    frame, row = np.unique(used.detections.frame[same], return_index=True)
+    stamp_s, taken_s = used.frames.stamp_s[frame], recording.frames.stamp_s[told.frame[order[at[same][row]]]]
+    inside = (stamp_s >= path.stamp_s[0]) & (stamp_s <= path.stamp_s[-1])
+    poses, true = interpolate(path, stamp_s[inside])[0], interpolate(truth, taken_s[inside])[0]
+    error = se2.transform(pose_truth_map, poses[:, :2]) - true[:, :2]
+    return float(np.quantile(np.hypot(*error.T), 0.95))
 
 
 def resident_mb() -> float:

@@ -199,23 +199,33 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
 
     It is the same for all maps that agree on classes and deleted landmarks, whatever else they believe.
     """
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions.nameless import named_in, without_ids
     from evermap.maps.sessions.session import admitted
     from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
-    from evermap.slam.estimate import solve
-    from evermap.slam.intake import beliefs, prepare
+    from evermap.slam.intake import beliefs
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     anonymous = config.slam.unknown_ids
     recording = clean(without_ids(recording) if anonymous else recording, config.slam.cleaning)
-    prior, noise = beliefs(recording.sensor, config.slam)
     remarks = odd(recording, identities=not anonymous, settings=config.slam.check)
     recording, _ = admitted(recording, living)
     if anonymous:
+        prior, noise = beliefs(recording.sensor, config.slam)
         recording, _ = admitted(named_in(recording, living, prior, noise, config.living), living)
+    return _solved(recording, remarks, config, progress)
+
+
+def _solved(
+    recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
+) -> Solved:
+    """The same of a clean recording whose landmarks have names."""
+    from threadpoolctl import threadpool_limits
+
+    from evermap.slam.estimate import solve
+    from evermap.slam.intake import beliefs, prepare
+
+    prior, noise = beliefs(recording.sensor, config.slam)
     prepared = prepare(recording, remarks=remarks)
     # what moved is asked when it lies over the map
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
@@ -223,8 +233,11 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
         return solve(recording, prepared, prior, noise, settings, progress=progress)
 
 
-def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
-    """Enter a session that was solved alone into a map: the second half of `run_session`."""
+def bring_in(alone: Solved, living: LivingMap, config: Config, *, cut: bool = True) -> Session:
+    """Enter a session that was solved alone into a map: the second half of `run_session`.
+
+    With `cut`, without what of it says nothing sure (`doubtful`).
+    """
     from threadpoolctl import threadpool_limits
 
     from evermap.maps.sessions import believe
@@ -252,8 +265,14 @@ def bring_in(alone: Solved, living: LivingMap, config: Config) -> Session:
                 robust=config.slam.robust,
                 part=vicinity is not None,
             )
-            if config.living.search == "joint" and not steps.fits(visit, alone, config.living):
+        if cut and config.living.search == "joint":
+            some = steps.without(visit, steps.doubtful(visit, where, config.living))
+            if some is None:
                 return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
+            if some is not visit.recording:
+                return bring_in(_solved(some, visit.prepared.warnings, config), whole, config, cut=False)
+        if where is not None and config.living.search == "joint" and not steps.fits(visit, alone, config.living):
+            return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
         # judged twice: the second time by the lifetimes that the first has learned
         known = steps.judged(living, where, visit, config.living)
         session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)

@@ -32,6 +32,10 @@ class FitConfig(Section):
     bent_cliques: int = Field(default=3, ge=2, description="bodies that must have moved alike for that")
     window: Count = Field(default=12, description="sightings by which each pose of a bent session is placed")
     placing_m: Positive = Field(default=0.3, description="residual from which sightings count for less in that [m]")
+    loose_m: Positive = Field(
+        default=0.5, description="a session is in parts where odometry was silent and nothing else ties it so well [m]"
+    )
+    loose_rad: Positive = Field(default=0.1, description="the same for the heading [rad]")
 
 
 class OverlayConfig(Section):

@@ -226,11 +226,11 @@ def _while_driving(
     _remark(
         remarks, f"frames more than {settings.stray_s:g} s before or after the odometry left out", int(np.sum(~near))
     )
-    return _some_frames(frames, detections, near)
+    return some_frames(frames, detections, near)
 
 
-def _some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tuple[Frames, Detections]:
-    """The `kept` (F,) frames with their detections."""
+def some_frames(frames: Frames, detections: Detections, kept: BoolArray) -> tuple[Frames, Detections]:
+    """Return the `kept` (F,) frames with their detections."""
     seen = rows_of(detections, kept[detections.frame])
     row: IntArray = (np.cumsum(kept) - 1).astype(np.int64)
     return replace(frames, stamp_s=frames.stamp_s[kept]), replace(seen, frame=row[seen.frame])
@@ -261,7 +261,7 @@ def _fresh(
     if not repeated.any():
         return frames, detections
     _remark(remarks, "frames left out that repeat the one before, though the robot moved", int(repeated.sum()))
-    return _some_frames(frames, detections, ~repeated)
+    return some_frames(frames, detections, ~repeated)
 
 
 def _moved_since(row: IntArray, frames: Frames, odometry: Odometry, most: FloatArray) -> BoolArray:

@@ -535,7 +535,7 @@ def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
     outliers. Each piece is laid over the rest, and all that follows over all before, as most landmarks have it.
     """
     problem = smoother.problem
-    loose = problem.drive.between(problem.stamp_s, estimate.states).floor[:, 2, 2] > LOOSE_RAD**2
+    loose = silent_links(problem, estimate)
     breaks = np.flatnonzero(loose & ~np.append(loose[1:], False))[:MOST_BREAKS] + 1
     ends = [*breaks.tolist(), len(estimate.pose)]
     tried = {(first, last) for first, end in pairwise(ends) for last in (end, len(estimate.pose))}
@@ -559,6 +559,12 @@ def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
         if smoother.cost(other) < cost - COST_SLACK:
             estimate, cost = other, smoother.cost(other)
     return estimate
+
+
+def silent_links(problem: Problem, estimate: Estimate) -> BoolArray:
+    """Return (N - 1,) intervals between poses in which the odometry was silent, and leaves the heading unknown."""
+    floor = problem.drive.between(problem.stamp_s, estimate.states).floor
+    return np.asarray(floor[:, 2, 2] > LOOSE_RAD**2)
 
 
 def _middles(row: IntArray, at: FloatArray, count: int) -> FloatArray:

@@ -32,11 +32,13 @@ from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import Vicinity, cliques_of, near
 from evermap.slam import result as of_slam
+from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved
-from evermap.slam.streaming import Outcome
+from evermap.slam.streaming import Outcome, silent_links
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
+    BoolArray,
     FloatArray,
     IntArray,
     MapChange,
@@ -273,6 +275,68 @@ def fits(visit: Solved, alone: Solved, config: LivingConfig) -> bool:
     there.
     """
     return bool(visit.outcome.inlier.mean() >= config.fit.least_fit * alone.outcome.inlier.mean())
+
+
+def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArray:
+    """Return (F,) frames of a session that say nothing sure: they are not entered.
+
+    Where the odometry was silent, a session falls into parts, if what was seen does not tie them. Those that show none
+    of the map, or in a map that begins, all but the largest, may be anywhere. And where most sightings of a stretch
+    contradict all others, its poses are wrong, or the identities.
+
+    Args:
+        visit: the session, solved with the map as its prior.
+        where: it lies in the map; None for a map's first.
+        config: `fit`.
+    """
+    outcome, settings = visit.outcome, config.fit
+    problem, pose, marginals = outcome.problem, outcome.graph_estimate.pose, outcome.graph_marginals
+    n_poses, n_seen = len(pose), len(outcome.inlier)
+    loose = silent_links(problem, outcome.graph_estimate)
+    if loose.any():
+        carry = se2.adjoint(se2.between(pose[1:], pose[:-1]))
+        across = carry @ marginals.consecutive[:-1]
+        spread = carry @ marginals.pose[:-1] @ carry.transpose(0, 2, 1) + marginals.pose[1:]
+        spread -= across + across.transpose(0, 2, 1)
+        off_m = np.sqrt(np.maximum(np.linalg.eigvalsh(spread[:, :2, :2])[:, -1], 0.0))
+        loose &= (spread[:, 2, 2] > settings.loose_rad**2) | (off_m > settings.loose_m)
+    part = np.append(0, np.cumsum(loose))
+    row, landmark = problem.pose_row[:n_seen], problem.landmark_row[:n_seen]
+    counts = outcome.inlier >= settings.inlier
+    if where is not None:
+        held = np.isin(visit.prepared.landmark_id, where.landmark_id[where.place >= 0])
+        counts &= np.append(held, np.zeros(len(problem.landmark_mean) - len(held), dtype=np.bool_))[landmark]
+    of_part = np.unique(np.column_stack([part[row[counts]], landmark[counts]]), axis=0)[:, 0]
+    shown = np.bincount(of_part, minlength=part[-1] + 1)
+    tied = shown >= 2 if where is not None else np.arange(len(shown)) == np.argmax(np.bincount(part[row], counts))
+    window = min(settings.window, n_seen)
+    fits = np.convolve(outcome.inlier, np.ones(window) / window, "valid")
+    first = np.clip(np.searchsorted(row, np.arange(n_poses)) - window // 2, 0, len(fits) - 1)
+    wrong = ~tied[part] | (fits[first] < settings.inlier)
+    frames = np.arange(len(visit.recording.frames))
+    at = np.searchsorted(visit.prepared.pose_frame, frames)
+    before, after = np.clip(at - 1, 0, n_poses - 1), np.minimum(at, n_poses - 1)
+    seen = visit.prepared.pose_frame[after] == frames
+    return np.asarray(np.where(seen, wrong[after], wrong[before] | wrong[after]))
+
+
+def without(visit: Solved, doubt: BoolArray) -> Recording | None:
+    """Return the recording of a session without doubtful frames (F,); None where that is most of it."""
+    recording = visit.recording
+    if not doubt.any():
+        return recording
+    frames, detections = some_frames(recording.frames, recording.detections, ~doubt)
+    if 2 * len(detections) < len(recording.detections) or len(np.unique(detections.frame)) < 2:
+        return None
+    start_s = recording.frames.stamp_s[0]
+    spans = np.flatnonzero(np.diff(np.concatenate([[False], doubt, [False]])))
+    after_s = recording.frames.stamp_s - start_s
+    told = ", ".join(f"{after_s[a]:.0f} to {after_s[b - 1]:.0f} s" for a, b in spans.reshape(-1, 2)[:3])
+    remark = (
+        f"{int(doubt.sum())} frames left out ({told}{', ...' if len(spans) > 6 else ''} after the first): most of what "
+        "they show contradicts the rest, or the odometry was silent and nothing ties them to it"
+    )
+    return replace(recording, frames=frames, detections=detections, warnings=(*recording.warnings, remark))
 
 
 @dataclass(frozen=True, slots=True)
