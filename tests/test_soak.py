@@ -14,10 +14,12 @@ from hypothesis import strategies as st
 
 from evermap.cli.bench import load_benchmarks
 from evermap.errors import DataError
+from evermap.geometry import se2
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
+from evermap.metrics.trajectory import align_points
 from evermap.pipeline import run_session
-from evermap.types import Recording
+from evermap.types import Recording, rows_of
 from evermap_studies.sim import BuildingConfig, DriveConfig, OdometryConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, STRANGER, FaultConfig, StreamFaults, with_faults
 
@@ -103,6 +105,21 @@ def test_a_few_sessions_of_faults_do_not_spoil_the_map(soak: ModuleType) -> None
     assert plain.refused == []
     assert np.nanmedian(faulty.rmse_m) < LARGEST_FACTOR * np.median(plain.rmse_m)
     assert faulty.n_landmarks[-1] < 1.5 * plain.n_landmarks[-1]
+
+
+@pytest.mark.parametrize("silent_s", [(40.0, 50.0), (25.0, 60.0)])
+def test_a_map_begins_with_what_is_sure_of_a_session(soak: ModuleType, silent_s: tuple[float, float]) -> None:
+    """The odometry falls silent while the robot drives: nothing of the map may be where that only guesses."""
+    recording = soak.world(0.05, seed=1)[0]
+    since_s = recording.odometry.stamp_s - recording.odometry.stamp_s[0]
+    heard = (since_s < silent_s[0]) | (since_s > silent_s[1])
+    landmarks = run_session(replace(recording, odometry=rows_of(recording.odometry, heard))).living.landmarks()
+    truth = recording.true_landmarks
+    assert truth is not None
+    place_m = truth.position_m[np.searchsorted(truth.landmark_id, landmarks.landmark_id)]
+    off_m = np.hypot(*(se2.transform(align_points(landmarks.position_m, place_m), landmarks.position_m) - place_m).T)
+    assert len(landmarks) > 15
+    assert off_m.max() < 0.6
 
 
 def test_the_same_faults_make_the_same_map(visits: tuple[Recording, ...]) -> None:

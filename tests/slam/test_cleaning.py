@@ -20,6 +20,7 @@ from evermap.slam.cleaning import clean
 from evermap.types import Recording
 from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
+from evermap_studies.worlds.robots import draw_robot, simulate_robot
 
 RATE_HZ = 5.0
 
@@ -274,3 +275,50 @@ def test_frames_far_from_any_odometry_are_left_out() -> None:
     kept = patrol().frames.stamp_s
     np.testing.assert_array_equal(cleaned.frames.stamp_s, kept[kept >= late.odometry.stamp_s[0] - 10.0])
     assert set(cleaned.detections.range_m) < set(patrol().detections.range_m)
+
+
+@pytest.mark.parametrize(
+    ("part", "at_s", "by_s"), [("odometry", 20.0, 7.3), ("odometry", 45.0, 1.5), ("frames", 30.0, 5.0)]
+)
+def test_a_clock_that_parts_is_told_by_what_was_seen(part: str, at_s: float, by_s: float) -> None:
+    """One stream is stamped later from some instant on, and both end together: only readings tell."""
+    recording = patrol(90.0)
+    table = getattr(recording, part)
+    start_s = float(recording.odometry.stamp_s[0])
+    late = np.where(table.stamp_s - start_s > at_s, table.stamp_s + by_s, table.stamp_s)
+    kept = late <= recording.odometry.stamp_s[-1]
+    bad = with_rows(recording, part, stamp_s=np.where(kept, late, np.nan))
+    mended = clean(bad)
+    check_valid(mended)
+    now, then = mended.odometry, recording.odometry  # rows are recognised by their values
+    off = []
+    for k in range(0, len(now), 7):
+        same = np.flatnonzero((then.forward_mps == now.forward_mps[k]) & (then.angular_radps == now.angular_radps[k]))
+        if len(same) == 1:
+            seen_late = by_s if part == "frames" and then.stamp_s[same[0]] - start_s > at_s else 0.0
+            off.append(abs(now.stamp_s[k] - then.stamp_s[same[0]] - seen_late))
+    assert len(off) > 20
+    assert np.quantile(off, 0.9) < 0.3
+
+
+def test_clocks_of_many_makes_of_robots_are_left_alone() -> None:
+    for seed in range(8):
+        recording = simulate_robot(draw_robot(seed), seed)
+        assert clean(recording).odometry is recording.odometry
+
+
+def test_a_sensor_that_hangs_with_a_single_reading() -> None:
+    recording = patrol(60.0)
+    detections, frames = recording.detections, recording.frames
+    first = int(np.flatnonzero(np.bincount(detections.frame, minlength=len(frames)) == 1)[3])
+    hangs = (detections.frame < first + 1) | (detections.frame > first + 40)
+    keep = np.flatnonzero(hangs)
+    one = int(np.flatnonzero(detections.frame == first)[0])
+    rows = np.concatenate([keep, np.full(40, one)])
+    frame = np.concatenate([detections.frame[keep], np.arange(first + 1, first + 41)])
+    order = np.argsort(frame, kind="stable")
+    shown = {name: getattr(detections, name)[rows][order] for name in detections.__dataclass_fields__}
+    shown["frame"] = frame[order]
+    mended = clean(replace(recording, detections=replace(detections, **shown)))
+    assert any("repeat the one before" in warning for warning in mended.warnings)
+    assert len(mended.frames) < len(frames) - 15

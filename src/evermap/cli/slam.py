@@ -239,7 +239,7 @@ class _How(TypedDict):
     inputs: Sequence[str | Path | None]
 
 
-def _info(config: Config, elapsed_s: float, *, realtime: bool, grown: int | None = None) -> RunInfo:
+def _info(config: Config, elapsed_s: float, *, realtime: bool, entered: Entered | None = None) -> RunInfo:
     """What the result cannot say of a run."""
     from evermap.runs.summary import RunInfo
 
@@ -248,7 +248,8 @@ def _info(config: Config, elapsed_s: float, *, realtime: bool, grown: int | None
         seeds={"slam": config.slam.seed},
         processing_s=None if realtime else elapsed_s,  # at the recording's pace most of it is waiting
         total_s=elapsed_s,
-        grown=grown,
+        grown=None if entered is None else len(entered.grown),
+        accepted=None if entered is None else entered.session.found,
     )
 
 
@@ -386,8 +387,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
                 entered = enter_session(store, recording, config, priors=said, progress=progress)
                 result, recording = replace(entered.session.slam, changes=entered.changes), entered.session.recording
         elapsed_s = time.perf_counter() - start
-        grown = None if entered is None else len(entered.grown)
-        _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, grown=grown), **how)
+        _write(out, recording, result, config, _info(config, elapsed_s, realtime=realtime, entered=entered), **how)
         if result.interrupted:
             raise KeyboardInterrupt(
                 f"the part of the recording that was processed is in {out}; the map stays as it was"
@@ -399,7 +399,10 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
 def _commit(entered: Entered, store: MapStore, map_file: Path, config: Config, elapsed_s: float) -> None:
     """Make a session the newest revision of a map."""
     if not entered.session.found:
-        raise ConfigError("the session was not found in this map, which stays as it was", path=map_file)
+        problem, hint = entered.session.set_aside
+        raise ConfigError(
+            f"the session was not found in this map, which stays as it was: {problem}", path=map_file, hint=hint
+        )
     with held():
         revision = entered.commit(store, config, command=command_line(), wall_s=elapsed_s)
         kept(map_file, f"the session is revision {revision} of {map_file}")

@@ -49,6 +49,7 @@ class RunInfo:
         total_s: wall time of everything so far; None if not measured.
         peak_memory_mb: of the process; None asks the operating system.
         grown: number of landmarks that a living map grew by; None without a map.
+        accepted: whether the session was entered into the map; None without one.
     """
 
     command: str = ""
@@ -58,6 +59,7 @@ class RunInfo:
     total_s: float | None = None
     peak_memory_mb: float | None = None
     grown: int | None = None
+    accepted: bool | None = None
 
 
 def summary_head(
@@ -131,6 +133,7 @@ def summary_dict(
             "clock": f"{recording.clock.value}; seconds",
         },
         "metrics": dict(metrics),
+        "accepted": info.accepted,
         "counts": {**_counts(recording, result), "landmarks_grown": info.grown},
         "changes": [change_dict(change) for change in result.changes],
         "alternatives": [

@@ -54,9 +54,15 @@ RecordingT = TypeVar("RecordingT", Recording, SpatialRecording)
 
 Visit = Solved | SpatialVisit
 """A session that is solved, in the plane or in space."""
-NOT_FOUND = "too few of its landmarks were seen standing to each other as it says"
-CONTRADICTED = "most sightings contradict it; the session is bent, or of another place"
-"""Why a session cannot be localised in a map."""
+NOT_FOUND = (
+    "too few of its landmarks were seen standing to each other as it says",
+    "begin another map with it, or first enter a session that sees both",
+)
+CONTRADICTED = (
+    "most sightings contradict it or each other; the session is bent, or of another place",
+    "`evermap check` names what is odd; `--set living.search=gate` enters it all the same, by what most agree on",
+)
+"""Why a session cannot be localised in a map, and what to try."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +77,7 @@ class Session:
         slam: trajectory, landmarks and all else, in the map's frame.
         changes: what appeared, vanished, moved, was exchanged or returned since the session before.
         evidence: what was seen of every clique, frame by frame.
+        set_aside: why it was not found, and what to try; empty where it was.
     """
 
     living: LivingMap
@@ -79,6 +86,7 @@ class Session:
     slam: SlamResult
     changes: tuple[MapChange, ...]
     evidence: Evidence
+    set_aside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -586,7 +594,7 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
 
 
-def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: str) -> Session:
+def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: tuple[str, str]) -> Session:
     """Return a session that cannot be found in the map: it stands by itself, and the map as it was."""
     if isinstance(alone, SpatialVisit):
         result = alone.concluded()
@@ -594,8 +602,8 @@ def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: str) -> 
         landmarks = of_slam.landmarks(alone.prepared, alone.outcome, alone.recording, "first_pose")
         result = of_slam.result(alone, "first_pose", landmarks)
     slam = existing(alone, result, config)
-    slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason}"))
-    return Session(living, False, alone.recording, slam, (), Evidence.empty())
+    slam = replace(slam, warnings=(*slam.warnings, f"cannot localise in the map: {reason[0]}"))
+    return Session(living, False, alone.recording, slam, (), Evidence.empty(), reason)
 
 
 def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult:
