@@ -63,6 +63,8 @@ CONTRADICTED = (
     "`evermap check` names what is odd; `--set living.search=gate` enters it all the same, by what most agree on",
 )
 """Why a session cannot be localised in a map, and what to try."""
+STRETCH = 3
+"""Windows of sightings that contradict the rest where poses are wrong: a few misread ones are outliers, and no more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +319,7 @@ def doubtful(visit: Solved, where: Laid | None, config: LivingConfig) -> BoolArr
     of_part = np.unique(np.column_stack([part[row[counts]], landmark[counts]]), axis=0)[:, 0]
     shown = np.bincount(of_part, minlength=part[-1] + 1)
     tied = shown >= 2 if where is not None else np.arange(len(shown)) == np.argmax(np.bincount(part[row], counts))
-    window = min(settings.window, n_seen)
+    window = min(STRETCH * settings.window, n_seen)
     fits = np.convolve(outcome.inlier, np.ones(window) / window, "valid")
     first = np.clip(np.searchsorted(row, np.arange(n_poses)) - window // 2, 0, len(fits) - 1)
     wrong = ~tied[part] | (fits[first] < settings.inlier)
