@@ -216,9 +216,7 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     return _solved(recording, remarks, config, progress)
 
 
-def _solved(
-    recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None
-) -> Solved:
+def _solved(recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None) -> Solved:
     """The same of a clean recording whose landmarks have names."""
     from threadpoolctl import threadpool_limits
 

@@ -173,7 +173,7 @@ def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
     unsure_s = AROUND_S if any(SET_BACK in remark for remark in remarks) else LEAST_STEP_S
 
     def step(row: int) -> tuple[int, float]:
-        """The row of odometry at which the clocks part, and for how long that stream paused."""
+        """Return the row of odometry at which the clocks part, and for how long that stream paused."""
         before_s, after_s = delay_s[row - 1 : row + 1]
         if after_s > before_s:
             return _longest_pause(odometry.stamp_s, since_s[row] + before_s, since_s[row] + after_s)
