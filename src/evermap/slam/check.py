@@ -514,8 +514,8 @@ def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[Fl
     delays_s = np.concatenate([[0.0, 0.5, -0.5], _DELAYS_S, np.negative(_DELAYS_S)])
     off = np.stack([np.minimum(np.hypot(*pairs.residual(_late(delay_s))), 10.0) for delay_s in delays_s])
     until_s = recording.frames.stamp_s[recording.detections.frame[second]]
-    second_of = (until_s - until_s.min()).astype(np.int64)
-    usual, path = settings.fits, np.zeros(int(second_of.max()) + 1, dtype=np.int64)
+    begin_s, second_of = np.unique(np.floor(until_s), return_inverse=True)
+    usual, path = settings.fits, np.zeros(len(begin_s), dtype=np.int64)
     for _ in range(2):  # what is usual shows at the right delays only
         usual = max(settings.fits, float(np.median(off[path[second_of], np.arange(len(first))])))
         # a sighting is in two pairs
@@ -531,7 +531,7 @@ def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[Fl
         if row == 0:
             delay_s[0] = found
         elif abs(found - delay_s[-1]) > LEAST_STEP_S:
-            since_s.append(float(until_s.min()) + start)
+            since_s.append(float(begin_s[start]))
             delay_s.append(found)
     return np.array(since_s), np.array(delay_s)
 
