@@ -12,14 +12,15 @@ from evermap.config import Config, OverlayConfig
 from evermap.errors import ConfigError
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
+from evermap.maps.living import LivingMap
 from evermap.maps.sessions.nameless import held_at, without_ids
 from evermap.maps.sessions.session import Session
 from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
 from evermap.runs.sessions import enter_session
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import rows_of
-from evermap_studies.sim import BuildingSimulation
+from evermap.types import Landmarks, rows_of
+from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
 
@@ -101,7 +102,7 @@ def test_ids_of_the_recording_are_not_looked_at(lived: tuple[BuildingSimulation,
     np.testing.assert_array_equal(again[1].living.places.position_m, sessions[1].living.places.position_m)
 
 
-def test_what_left_is_believed_in_no_more_and_what_an_operator_deleted_does_not_come_back(
+def test_what_left_is_believed_in_less_and_what_an_operator_deleted_does_not_come_back(
     lived: tuple[BuildingSimulation, list[Session]],
 ) -> None:
     one, sessions = lived
@@ -111,12 +112,19 @@ def test_what_left_is_believed_in_no_more_and_what_an_operator_deleted_does_not_
     kept = true != before[gone]
     without = replace(one.sessions[1], detections=rows_of(one.sessions[1].detections, kept))
     session = lived_through([without], NAMELESS, sessions[0].living)[0]
-    assert session.living.p_exists()[session.living.members.landmark_id == gone] < 0.5
+    assert session.living.p_exists()[session.living.members.landmark_id == gone] < 0.8
     edited = sessions[0].living.edited(gone, deleted=True)
     session = lived_through([one.sessions[1]], NAMELESS, edited)[0]
     assert gone not in session.recording.detections.landmark_id
     grown = np.setdiff1d(session.living.members.landmark_id, edited.members.landmark_id)
     assert len(grown) == len(np.setdiff1d(sessions[1].living.members.landmark_id, edited.members.landmark_id))
+
+
+def test_a_large_map_that_shows_no_constellation_of_the_session_refuses_it() -> None:
+    """The index has no motion to offer then."""
+    recording = simulate_warehouse(WarehouseConfig(n_landmarks=120, rate_hz=2.0))
+    begun = LivingMap.begun(Landmarks.at(np.arange(150), np.column_stack([7.0 * np.arange(150), np.zeros(150)])))
+    assert not lived_through([recording], NAMELESS, begun)[0].found
 
 
 def test_a_session_of_another_building_is_refused(lived: tuple[BuildingSimulation, list[Session]]) -> None:

@@ -30,6 +30,7 @@ from evermap.maps.sessions.overlay import FREE_M, FREE_RAD
 from evermap.maps.sessions.placing import SMALLEST_P
 from evermap.slam.association.assignment import alike
 from evermap.slam.association.associator import P_MERGE, density_of_unmet
+from evermap.slam.association.consensus import Candidates, consensus
 from evermap.slam.association.constellation import CERTAIN_NATS, NEAR_M, LocalMap, agreed_pairs
 from evermap.slam.association.identify import ALL_TRIED, Associated, associated
 from evermap.slam.association.jcbb import gates
@@ -40,8 +41,12 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Recording, l
 
 WINDOW, FEWEST = 12, 4
 """Landmarks, met one after the other, that are looked for in the map together, and how many of them must be found."""
-ROUNDS = 20
-"""Assignments, each with what the one before assigned held, at most."""
+FARTHEST_M, BENT_M = 2.0, 2.0
+"""How far a landmark that is the same may be off, and how far behind a stretch that is bent."""
+GROUP, MOST_HELD, MOST_PAIRS = 24, 100, 400
+"""Landmarks that are assigned together, those near them that hold them, and pairs that are weighed, at most."""
+HELD_NATS = 100.0
+"""Log odds of what is sure."""
 GATE = float(gates(1, 0.9999)[1])
 """Squared distance beyond which a landmark does not stand at a place."""
 CERTAIN = math.log(P_MERGE / (1.0 - P_MERGE))
@@ -130,11 +135,13 @@ class Where(NamedTuple):
     Attributes:
         position_m, covariance_m2: (K, 2), (K, 2, 2).
         drift_m: standard deviation, each axis, by which what stands is not quite where it was.
+        joint_m2: (2 K, 2 K) covariance of all, by all that are held.
     """
 
     position_m: FloatArray
     covariance_m2: FloatArray
     drift_m: float
+    joint_m2: FloatArray
 
 
 def held_at(
@@ -160,12 +167,12 @@ def held_at(
     rows, error = se2.xy_rows(held), (at[held] - position_m).ravel()
     drift_m, inverse = _drifted(spread[np.ix_(rows, rows)] + covariance_m2, error, config)
     pull, gain = inverse @ error, spread[:, rows]
-    explained = (gain @ inverse).reshape(count, 2, -1) @ gain.reshape(count, 2, -1).transpose(0, 2, 1)
-    position, covariance = at - (gain @ pull).reshape(-1, 2), blocks(spread) - explained
+    joint = spread - gain @ inverse @ gain.T
+    position, covariance = at - (gain @ pull).reshape(-1, 2), blocks(joint).copy()
     own = np.linalg.inv(blocks(inverse))
     position[held] = position_m + (own @ pull.reshape(-1, 2, 1))[..., 0]
     covariance[held] = own - blocks(covariance_m2) - drift_m**2 * np.eye(2)
-    return Where(position, covariance, drift_m)
+    return Where(position, covariance, drift_m, joint)
 
 
 def _drifted(covariance: FloatArray, error: FloatArray, config: OverlayConfig) -> tuple[float, FloatArray]:
@@ -193,107 +200,183 @@ class _Session:
         """Return (K,) rows of the map's members, -1 for new ones."""
         place = self._placed()
         member = np.full(len(place), -1, dtype=np.int64)
-        for _ in range(ROUNDS if np.any(place >= 0) else 0):
-            held = np.flatnonzero(place >= 0)
-            at = self._stood.row[place[held]]
-            known = of_places(self._living.covariance_m2, at)
-            where = held_at(self._local, held, self._living.places.position_m[at], known, self._overlay)
-            following, member = self._assigned(where)
-            if np.array_equal(following, place) or np.count_nonzero(following >= 0) < FEWEST:
+        while np.any(place >= 0):
+            place = self._grown(place)
+            where = self._where(np.arange(len(place)), place)
+            member = self._assigned(where, place)
+            more = self._regained(where, member, place)
+            if np.array_equal(more, place):
                 break
-            place = following
+            place = more
         return member
+
+    def _where(self, some: IntArray, place: IntArray) -> Where:
+        """Some landmarks in the map, by those among them that stand at places (K,) of the map."""
+        held = np.flatnonzero(place[some] >= 0)
+        at = self._stood.row[place[some[held]]]
+        known = of_places(self._living.covariance_m2, at)
+        return held_at(self._local.part(some), held, self._living.places.position_m[at], known, self._overlay)
+
+    def _grown(self, place: IntArray) -> IntArray:
+        """(K,) `place` with all that surely stands at places: outwards from those that are held, some at a time, which
+        must agree with each other.
+        """
+        place, x = place.copy(), self._local.place
+        tried = place >= 0
+        while not tried.all():
+            held, left = np.flatnonzero(place >= 0), np.flatnonzero(~tried)
+            away = np.linalg.norm(x[left][:, None] - x[held], axis=2)
+            group = left[np.argsort(away.min(axis=1), kind="stable")[:GROUP]]
+            near = held[np.argsort(np.linalg.norm(x[group][:, None] - x[held], axis=2).min(axis=0))[:MOST_HELD]]
+            where = self._where(np.append(group, near), place)
+            mine, theirs = self._agreed(group, where, place)
+            place[mine] = theirs
+            tried[group] = True
+            if len(mine):  # what was in doubt may be none beside these
+                tried |= place >= 0
+                tried[np.setdiff1d(np.flatnonzero(place < 0), group)] = False
+        return place
+
+    def _agreed(self, group: IntArray, where: Where, place: IntArray) -> tuple[IntArray, IntArray]:
+        """Landmarks of a group, the first of `where`, and the places at which they surely stand."""
+        stood = self._stood
+        free = ~np.isin(stood.landmark, stood.landmark[place[place >= 0]])
+        k, m, stands, _ = self._odds(group, where, free)
+        some = np.flatnonzero(np.isfinite(stands))
+        some = some[np.argsort(-stands[some], kind="stable")[:MOST_PAIRS]]
+        k, m = k[some], m[some]
+        off = where.position_m[k] - stood.position_m[m]
+        rows = se2.xy_rows(k)
+        covariance = where.joint_m2[np.ix_(rows, rows)] + of_places(self._living.covariance_m2, stood.row[m])
+        at = se2.xy_rows(np.arange(len(m)))
+        covariance[at, at] += where.drift_m**2
+        own = _log_density(off, blocks(covariance)) if len(m) else np.zeros(0)
+        against = own - stands[some]
+        conflict = (k[:, None] == k) | (stood.landmark[m][:, None] == stood.landmark[m])
+        found = consensus(Candidates(off, covariance, against, conflict), gate=GATE, loose=GATE)
+        sure = found.pairs[found.margin >= CERTAIN]
+        return group[k[sure]], m[sure]
 
     def _placed(self) -> IntArray:
         """(K,) rows of the places at which some landmarks surely stand, -1 for the others: those of one stretch of the
         way, which an error of the odometry bends less than all.
         """
-        stood, count = self._stood, len(self._local.place)
-        place, best = np.full(count, -1, dtype=np.int64), list[tuple[int, int]]()
-        stands = np.flatnonzero(stood.p >= EXISTS)
-        if len(stands) < FEWEST or count < FEWEST:
-            return place
-        at, spread = (
-            stood.position_m[stands],
-            stood.covariance_m2[stands] + max(self._overlay.drifts_m) ** 2 * np.eye(2),
-        )
-        index = PlaceIndex(at, spread) if len(stands) > ALL_TRIED else None
-        area_m2 = float(np.prod(np.ptp(at, axis=0) + 10.0))
-        for begin in range(0, max(count - WINDOW // 2, 1), WINDOW // 2):
-            some = np.arange(begin, min(begin + WINDOW, count))
-            local, motions, near = self._local.part(some), None, np.arange(len(stands))
-            if index is not None:
-                motions = list(index.motions(local.place, local.beside_m))
-                near = index.around(se2.transform(np.array(motions)[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
-            pairs = agreed_pairs(
-                local,
-                LocalMap(at[near], block_diag(*spread[near])),
-                self._alike[np.ix_(some, stands[near])],
-                density=self._density,
-                probability=P_MERGE,
-                motions=motions,
-                least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0),
-                lead_nats=LEAD_NATS,
-            )
-            best = max(best, [(int(some[k]), int(stands[near[m]])) for k, m in pairs], key=len)
+        stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
+        place, best = np.full(len(every), -1, dtype=np.int64), list[tuple[int, int]]()
+        if len(stands) >= FEWEST:
+            index = PlaceIndex(*self._about(stands)) if len(stands) > ALL_TRIED else None
+            for some in _windows(every):
+                best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
         if len(best) >= FEWEST:
             mine, theirs = np.array(best).T
             place[mine] = theirs
         return place
 
-    def _assigned(self, where: Where) -> tuple[IntArray, IntArray]:
-        """(K,) rows of the places at which landmarks surely stand, -1 for none; and of the members that they are."""
-        stood, config = self._stood, self._overlay
-        x, spread, drift_m = where
-        off = x[:, None] - stood.position_m[None]
-        k, m = np.nonzero(self._alike & (np.linalg.norm(off, axis=2) < 3.0 * config.nudge_m))
-        step, wide = off[k, m], spread[k] + stood.covariance_m2[m] + drift_m**2 * np.eye(2)
-        stands, moved = (
-            _log_density(step, wide),
-            _log_density(step, wide + config.nudge_m**2 * np.eye(2)) + math.log(config.share_nudged),
-        )
-        stands[_squared(step, wide) > GATE] = -np.inf
-        away = np.linalg.norm(off, axis=2).min(axis=0)  # beside what was found it would have been found
-        missed = np.log1p(-P_FOUND * np.clip(1.0 - stood.p_away, 0.0, 1.0)) * (away < self._beside_m)
-        odds = np.logaddexp(np.log(stood.p[m]) + stands, np.log(stood.p_away[m]) + moved)
-        odds -= math.log(self._density) + missed[m]
-        names, column = np.unique(stood.landmark[m], return_inverse=True)
-        table = np.full((len(x), len(names)), -np.inf)
-        np.maximum.at(table, (k, column), odds)
-        mine, theirs = linear_sum_assignment(-np.maximum(table, 0.0))
-        good = table[mine, theirs] > 0.0
-        member = np.full(len(x), -1, dtype=np.int64)
-        member[mine[good]] = names[theirs[good]]
-        place = np.full(len(x), -1, dtype=np.int64)
-        best = np.full(len(x), -np.inf)
-        sure = self._sure(table)
-        for row in np.flatnonzero(sure[k, column]).tolist():
-            score = math.log(stood.p[m[row]]) + stands[row]
-            if score > math.log(stood.p_away[m[row]]) + moved[row] and score > best[k[row]]:
-                best[k[row]], place[k[row]] = score, m[row]
-        return place, self._with_parts(member, table, names)
+    def _regained(self, where: Where, member: IntArray, place: IntArray) -> IntArray:
+        """`place` with landmarks that are off by more than a gate, behind a stretch that is bent: their constellation
+        says where they stand. They may be parts of landmarks that were met before it.
+        """
+        stood, together, found = self._stood, self._found.assignment.together, place.copy()
+        stands, left = np.flatnonzero(stood.p >= EXISTS), np.flatnonzero(member < 0)
+        held = np.flatnonzero(member >= 0)
+        of = member[held][:, None] == stood.landmark
+        apart = (together[:, held] @ of.astype(np.float64)) > 0.0
+        for some in _windows(left):
+            off = np.linalg.norm(where.position_m[some][:, None] - stood.position_m[stands], axis=2)
+            near = stands[off.min(axis=0, initial=np.inf) < BENT_M]
+            pairs = self._overlaid(some, near, None, self._alike & ~apart)
+            if len(pairs) < FEWEST:
+                continue
+            mine, theirs = np.array(pairs).T
+            if np.linalg.norm(where.position_m[mine] - stood.position_m[theirs], axis=1).max() < BENT_M:
+                found[mine] = theirs
+        return found
 
-    def _sure(self, table: FloatArray) -> BoolArray:
-        """(K, M) which landmarks are which of the map beyond doubt: whatever else they may be is far less probable."""
-        floor = np.maximum(table, 0.0)
-        padded = np.pad(floor, ((0, 1), (0, 1)))
-        row, column = np.sort(padded[:-1], axis=1)[:, -2:], np.sort(padded[:, :-1], axis=0)[-2:]
-        rival = np.maximum(
-            np.where(floor == row[:, 1:], row[:, :1], row[:, 1:]), np.where(floor == column[1], column[0], column[1])
-        )
-        return np.asarray(table - rival > CERTAIN)
+    def _about(self, stands: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Places, and how well each is known, with what may be off from session to session."""
+        drift_m = max(self._overlay.drifts_m)
+        return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(2)
 
-    def _with_parts(self, member: IntArray, table: FloatArray, names: IntArray) -> IntArray:
+    def _overlaid(
+        self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray
+    ) -> list[tuple[int, int]]:
+        """Some landmarks of the session with places at which they surely stand, among some (S,) of all."""
+        if len(some) < FEWEST or len(stands) < FEWEST:
+            return []
+        (at, spread), local, motions = self._about(stands), self._local.part(some), None
+        area_m2 = float(np.prod(np.ptp(at, axis=0) + 10.0))
+        if index is not None:
+            motions = list(index.motions(local.place, local.beside_m))
+            if not motions:
+                return []
+            near = index.around(se2.transform(np.array(motions)[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
+            at, spread, stands = at[near], spread[near], stands[near]
+        pairs = agreed_pairs(
+            local,
+            LocalMap(at, block_diag(*spread)),
+            allowed[np.ix_(some, stands)],
+            density=self._density,
+            probability=P_MERGE,
+            motions=motions,
+            least_nats=CERTAIN_NATS + max(math.log(area_m2 / TESTED_M2), 0.0),
+            lead_nats=LEAD_NATS,
+        )
+        return [(int(some[k]), int(stands[m])) for k, m in pairs]
+
+    def _odds(self, some: IntArray, where: Where, free: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+        """Pairs (Q,) of landmarks, the first of `where`, and places that may be one: rows of both, and the log odds of
+        standing there, and of having been moved from there a little, over being new.
+        """
+        stood, nudge_m2 = self._stood, self._overlay.nudge_m**2 * np.eye(2)
+        off = where.position_m[: len(some), None] - stood.position_m[None]
+        away = np.linalg.norm(off, axis=2)
+        k, m = np.nonzero(self._alike[some] & free & (away < FARTHEST_M))
+        step, spread = off[k, m], where.covariance_m2[k] + stood.covariance_m2[m] + where.drift_m**2 * np.eye(2)
+        stands = np.log(stood.p[m]) + _log_density(step, spread)
+        moved = np.log(stood.p_away[m] * self._overlay.share_nudged) + _log_density(step, spread + nudge_m2)
+        # beside what was found it would have been found
+        missed = np.log1p(-P_FOUND * (1.0 - stood.p_away)) * (away.min(axis=0, initial=np.inf) < self._beside_m)
+        stands, moved = (odds - math.log(self._density) - missed[m] for odds in (stands, moved))
+        stands[_squared(step, spread) > GATE] = -np.inf
+        return k, m, stands, moved
+
+    def _assigned(self, where: Where, place: IntArray) -> IntArray:
+        """(K,) rows of the members that landmarks are, those included of which it is less sure, -1 for new ones."""
+        stood, every = self._stood, np.arange(len(place))
+        k, m, stands, moved = self._odds(every, where, np.ones(len(stood.p), dtype=np.bool_))
+        table = np.full((len(place), len(self._living.members)), -np.inf)
+        np.maximum.at(table, (k, stood.landmark[m]), stands)
+        held = np.flatnonzero(place >= 0)
+        table[held], table[held, stood.landmark[place[held]]] = -np.inf, HELD_NATS
+        member = self._with_parts(_one_to_one(table), table)
+        # what is left may have been moved a little
+        table = np.full(table.shape, -np.inf)
+        np.maximum.at(table, (k, stood.landmark[m]), moved)
+        table[member >= 0], table[:, member[member >= 0]] = -np.inf, -np.inf
+        return np.where(member >= 0, member, _one_to_one(table))
+
+    def _with_parts(self, member: IntArray, table: FloatArray) -> IntArray:
         """The same with landmarks of the session that are another part of one that is assigned: never seen with it."""
-        if not len(names):
-            return member
         together, found = self._found.assignment.together, member.copy()
-        for k in np.flatnonzero((member < 0) & (table.max(axis=1) > 0.0)).tolist():
-            one = names[np.argmax(table[k])]
-            same = np.flatnonzero(found == one)
-            if not together[[k]][:, same].sum():
+        for k in np.flatnonzero((member < 0) & (table.max(axis=1, initial=-np.inf) > 0.0)).tolist():
+            one = int(np.argmax(table[k]))
+            if not together[[k]][:, np.flatnonzero(found == one)].sum():
                 found[k] = one
         return found
+
+
+def _one_to_one(odds: FloatArray) -> IntArray:
+    """(K,) columns that rows are assigned to with most odds in sum, -1 for none."""
+    column = np.full(len(odds), -1, dtype=np.int64)
+    mine, theirs = linear_sum_assignment(-np.maximum(odds, 0.0))
+    good = odds[mine, theirs] > 0.0
+    column[mine[good]] = theirs[good]
+    return column
+
+
+def _windows(rows: IntArray) -> list[IntArray]:
+    """Landmarks, some at a time, in the order in which they were met."""
+    return [rows[k : k + WINDOW] for k in range(0, max(len(rows) - WINDOW // 2, 1), WINDOW // 2)]
 
 
 def _squared(step: FloatArray, spread: FloatArray) -> FloatArray:
