@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 262
-MOST_LINES = 62_770
+MOST_MODULES = 263
+MOST_LINES = 62680
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8

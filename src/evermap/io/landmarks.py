@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from evermap.errors import DataError, InputError
-from evermap.geometry import se3
 from evermap.io.assemble import repeats
 from evermap.io.files import unpacked, write_atomic
 from evermap.io.spatial import (
@@ -27,6 +26,7 @@ from evermap.io.spatial import (
     upper_triangle,
 )
 from evermap.io.table import Table, csv_text, parquet_bytes, parse_csv, parse_parquet
+from evermap.io.tag_maps import is_wpilib, map_of_survey, tags_of_fiducials, tags_of_tagslam, tags_of_wpilib
 from evermap.io.text import decode_text, reason
 from evermap.types import UNKNOWN, Clock, FloatArray, IntArray, Landmarks, rows_of
 from evermap.valid import STAMP_S, X_M, Y_M, Quantity
@@ -63,7 +63,8 @@ def read_prior_map(path: str | Path, sigma_m: float = 0.02, sigma_rad: float = 0
     Args:
         path: CSV, Parquet or GeoJSON with `landmark_id, x_m, y_m` and optionally `sigma_m` or all of `cov_xx_m2,
             cov_xy_m2, cov_yy_m2`, `class_id`, and the other columns of `map.parquet`; or a run or recording folder
-            that has such a file. In space with `z_m` and the columns that go with it; or TagSLAM's `survey`.
+            that has such a file. In space with `z_m` and the columns that go with it. Or tags as TagSLAM
+            (`tagslam.yaml`, `survey`), WPILib (field layout in JSON) or fiducial_slam (`map.txt`) states them.
         sigma_m: standard deviation of positions for which the file gives none.
         sigma_rad: standard deviation of orientations in space for which the file gives none.
 
@@ -99,9 +100,14 @@ def read_landmarks(path: str | Path, *, sigma_m: float = 0.0, sigma_rad: float =
     elif ending in (".parquet", ".pq"):
         table, about = parse_parquet(data, path), parquet_about(data, path)
     elif ending in (".geojson", ".json"):
-        table, about = parse_geojson(data, path)
+        table, about = (tags_of_wpilib(data, path), {}) if is_wpilib(data) else parse_geojson(data, path)
+    elif ending in (".yaml", ".yml"):
+        table = tags_of_tagslam(data, path)
+    elif ending == ".txt":
+        table = tags_of_fiducials(data, path)
     else:
-        raise InputError(f"no map format ends in '{ending}'", path=path, hint=".csv, .parquet or .geojson")
+        hint = ".csv, .parquet, .geojson; of tags .yaml (TagSLAM), .json (WPILib), .txt (fiducial_slam)"
+        raise InputError(f"no map format ends in '{ending}'", path=path, hint=hint)
     return landmarks_from_table(
         map_of_survey(table) if "tag_id" in table and "landmark_id" not in table else table,
         sigma_m=sigma_m,
@@ -161,24 +167,6 @@ def landmarks_from_table(
         **(_pose_columns(table, sigma_rad) if in_space else {}),
     )
     return rows_of(landmarks, order)
-
-
-def map_of_survey(table: Table) -> Table:
-    """Return TagSLAM's table of surveyed tags, `tag_id, size_m, x_m, y_m, z_m` and rotation vectors `rx_rad, ry_rad,
-    rz_rad`, with the columns of a map.
-    """
-    turns = ("rx_rad", "ry_rad", "rz_rad")
-    table.expect(("tag_id", "size_m", *AT, *turns))
-    turn = np.stack([table.numbers(Quantity(name, -10.0, 10.0, hint="radians")) for name in turns], axis=1)
-    rotation = se3.exp(np.concatenate([np.zeros_like(turn), turn], axis=1))[:, 3:]
-    size = Quantity("size_m", 0.0, 1e3, positive=True, hint="metres")
-    columns: dict[str, Sequence[str] | FloatArray] = {
-        "landmark_id": table.ids("tag_id", optional=False).astype(np.float64),
-        **{name: table.columns[name] for name in AT},
-        **dict(zip(QUATERNION, rotation.T, strict=True)),
-        "tag_size_m": table.numbers(size),
-    }
-    return Table(table.path, columns, table.line, table.header_line)
 
 
 def write_map_parquet(landmarks: Landmarks, path: str | Path) -> Path:

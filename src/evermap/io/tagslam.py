@@ -20,10 +20,11 @@ from evermap.errors import DataError, InputError
 from evermap.geometry import se3
 from evermap.io.assemble import SAME_STAMP_S, finish_recording, forward_stamps, last_of_equal
 from evermap.io.files import FileSet, Reader, find_file_set
-from evermap.io.landmarks import landmarks_from_table, map_of_survey
+from evermap.io.landmarks import landmarks_from_table
 from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
 from evermap.io.spatial import of_rig, poses, spatial_detections, with_tag_poses
 from evermap.io.table import Table, parse_csv, parse_parquet
+from evermap.io.tag_maps import map_of_survey
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
 from evermap.types import (
