@@ -191,6 +191,24 @@ def test_a_session_that_is_in_the_map_is_refused(copy: Path, recordings: list[Pa
     assert digest(copy) == before
 
 
+def test_several_sessions_in_one_call(
+    kept: tuple[Path, list[dict[str, Any]]], recordings: list[Path], tmp_path: Path
+) -> None:
+    """One that cannot be read stops none of the others; each has its folder; the map is that of single calls."""
+    map_file, out = tmp_path / "building.evermap", tmp_path / "week"
+    given = (recordings[0], tmp_path / "nothing", recordings[1], "--map", map_file, "--out", out)
+    result = run("slam", *given, *KNOWN_METRE, *QUICK)
+    assert result.exit_code == 2
+    assert "nothing: no such file or folder" in result.stderr
+    assert "1 of 3 sessions were refused" in result.stderr
+    assert sorted(folder.name for folder in out.iterdir()) == ["day0", "day1"]
+    with open_store(map_file) as store, open_store(kept[0]) as single:
+        assert store.load(store.head()).places.position_m == pytest.approx(single.load(2).places.position_m, abs=1e-12)
+    result = run("slam", recordings[0], recordings[1])
+    assert result.exit_code == 2
+    assert "several recordings are sessions of a map (try: --map FILE" in result.stderr
+
+
 def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSimulation, tmp_path: Path) -> None:
     """Its folder is written, for it was driven and solved; the map stays as it was."""
     other = building.sessions[2]

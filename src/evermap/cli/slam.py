@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict, Unpack
 
@@ -21,8 +22,8 @@ from evermap.cli.options import (
     default_out,
     priors_by_class,
 )
-from evermap.cli.terminal import command_line, echo, print_json, print_table, progress_bar, say, warm_up, warn
-from evermap.errors import ConfigError
+from evermap.cli.terminal import command_line, echo, fail, print_json, print_table, progress_bar, say, warm_up, warn
+from evermap.errors import ConfigError, DataError, EvermapError
 from evermap.interrupts import held, kept
 
 if TYPE_CHECKING:
@@ -48,10 +49,20 @@ _ROWS = (
 )
 
 Recorded = Annotated[
-    Path | None,
-    typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.", show_default=False),
+    list[Path] | None,
+    typer.Argument(
+        metavar="INPUT...",
+        help="Folder in the native format, zip or ROS bag; with --map also several, in the order of their sessions.",
+        show_default=False,
+    ),
 ]
-Out = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="evermap-out/<recording>")]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder for the results, of several recordings for one folder each.",
+        show_default="evermap-out/<recording>",
+    ),
+]
 SensorModel = Annotated[
     str | None,
     typer.Option(
@@ -134,6 +145,7 @@ Examples:
   evermap slam MRCLAM_Dataset6.zip --robot 1 --out out/robot1
   evermap slam MRCLAM_Dataset6.zip --prior-map truth --shift "11,12,13:+1.0" --method viterbi
   evermap slam monday --map building.evermap
+  evermap slam tuesday wednesday --map building.evermap --out out/week
   evermap slam tuesday --map building.evermap --localize
   evermap slam monday --map building.evermap --prior "cart=exponential:half-life=2d" --prior wall=never-leaves
 """
@@ -173,32 +185,82 @@ def slam(
         raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": unknown_ids or None}
     chosen = configured(config, settings, given, within="slam", show=show_config)
-    if input is None:
-        raise ConfigError(
-            "a recording is needed", field="input", hint="a folder, zip or ROS bag; --init DIR shows what to put in"
-        )
+    paths = input or []
+    if not paths:
+        hint = "a folder, zip or ROS bag; --init DIR shows what to put in"
+        raise ConfigError("a recording is needed", field="input", hint=hint)
+    if len(paths) > 1 and map_file is None:
+        raise ConfigError("several recordings are sessions of a map", field="input", hint="--map FILE, or one of them")
     _check_map_options(map_file, localize=localize, prior_map=prior_map, method=method)
     if prior and (map_file is None or localize):
         raise ConfigError("is for a session of a map", field="prior", hint="--map FILE, without --localize")
     if shift and prior_map is None:
         raise ConfigError("there is no map to shift", field="shift", hint="--prior-map truth, or --prior-map FILE")
-    from evermap.io import parse_shift, read_recording, shifted
-    from evermap.runs.folder import check_replaceable
+    from evermap.io import parse_shift, shifted
 
     shifts = [parse_shift(text) for text in shift or []]
-    inputs = [input, config, None if prior_map == "truth" else prior_map, map_file]
+
+    def known(recording: AnyRecording) -> Landmarks | None:
+        return None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
+
+    options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime, None)
+    inputs = [*paths, config, None if prior_map == "truth" else prior_map, map_file]
+    how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
+    work = partial(_estimate, robot=robot, config=chosen, options=options, realtime=realtime, how=how)
+    if len(paths) == 1:
+        work(paths[0], out, known=known)
+    else:
+        _each(paths, out, lambda number, path, folder: work(path, folder, known=_nothing if number else known))
+
+
+def _each(paths: Sequence[Path], out: Path | None, work: Callable[[int, Path, Path | None], None]) -> None:
+    """Work on several recordings; one that is refused stops none of the others.
+
+    Raises:
+        DataError: any was refused.
+    """
+    refused = []
+    for number, path in enumerate(paths):
+        say(f"session {number + 1} of {len(paths)}: {path}")
+        try:
+            work(number, path, None if out is None else out / default_out(path.resolve().name).name)
+        except EvermapError as error:
+            refused.append(str(path))
+            fail(error.one_line())
+    if refused:
+        raise DataError(f"{len(refused)} of {len(paths)} sessions were refused: {', '.join(refused)}")
+
+
+def _nothing(_: AnyRecording) -> None:
+    """A map begins with a survey once."""
+
+
+def _estimate(
+    path: Path,
+    out: Path | None,
+    *,
+    robot: int | None,
+    config: Config,
+    known: Callable[[AnyRecording], Landmarks | None],
+    options: MapOptions | None,
+    realtime: bool,
+    how: _How,
+) -> None:
+    """Read a recording, run, and write the folder."""
+    from evermap.io import read_recording
+    from evermap.runs.folder import check_replaceable
+
     if out is not None:  # better now than after the run
-        check_replaceable(out, force=force, inputs=inputs)
-    recording = read_recording(input, robot=robot)
+        check_replaceable(out, force=how["force"], inputs=how["inputs"])
+    recording = read_recording(path, robot=robot)
     if out is None:
         out = default_out(recording.name)
-        check_replaceable(out, force=force, inputs=inputs)
-    how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
-    known = None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
-    if map_file is not None:
-        run_in_map(recording, chosen, MapOptions(map_file, prior or [], localize, realtime, known), out, **how)
-        return
-    run_and_write(recording, chosen, out, prior=known, realtime=realtime, **how)
+        check_replaceable(out, force=how["force"], inputs=how["inputs"])
+    landmarks = known(recording)
+    if options is not None:
+        run_in_map(recording, config, options._replace(survey=landmarks), out, **how)
+    else:
+        run_and_write(recording, config, out, prior=landmarks, realtime=realtime, **how)
 
 
 def run_and_write(

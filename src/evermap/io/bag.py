@@ -308,10 +308,10 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
     detections = rows_of(detections, np.flatnonzero(finite)[np.argsort(detections.frame[finite], kind="stable")])
-    truth = _odometry(content, settings, settings.truth, clock)
+    truth = _odometry(path, content, settings, settings.truth, clock)
     recording = SpatialRecording(
         name=path.resolve().name.split(".")[0],
-        odometry=_odometry(content, settings, settings.odometry, clock),
+        odometry=_odometry(path, content, settings, settings.odometry, clock),
         frames=Frames(looked, complete=messages < sum(map(len, stamps)) or messages < FEWEST_LOOKS, clock=clock),
         detections=detections,
         sensors=sensors,
@@ -439,12 +439,18 @@ def _placed(
     )
 
 
-def _odometry(content: BagContent, settings: BagSettings, topic: str, clock: Clock) -> SpatialOdometry | None:
+def _odometry(
+    path: Path, content: BagContent, settings: BagSettings, topic: str, clock: Clock
+) -> SpatialOdometry | None:
     """Poses of the robot, in the order of their stamps; the last of those with the same."""
     if not topic:
         return None
     rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), _stamps(content, topic, settings.clock)
     order = np.argsort(stamp_s, kind="stable")
+    if content.kind(topic) in POSES:  # nobody knows how a robot is turned whose message leaves it out
+        order = order[np.linalg.norm(rows[order, 3:7], axis=1) > 0.5]
+    if not len(order):
+        raise DataError(f"poses on {topic} have no orientation", path=path, hint="another topic (`--init-bag`)")
     keep = order[np.append(np.diff(stamp_s[order]) > 0.0, True)]
     stamp_s, rows = stamp_s[keep], rows[keep]
     if content.kind(topic) in TWISTS:
