@@ -15,9 +15,9 @@ TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MOD
 
 MOST_MODULES = 263
 <<<<<<< HEAD
-MOST_LINES = 62680
+MOST_LINES = 62_899
 =======
-MOST_LINES = 62_620
+MOST_LINES = 62_899
 >>>>>>> 02e59da (Several sessions of a map in one call; one that is refused stops none of the others)
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
