@@ -14,11 +14,7 @@ MODULES = {
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
 MOST_MODULES = 263
-<<<<<<< HEAD
-MOST_LINES = 62_899
-=======
-MOST_LINES = 62_899
->>>>>>> 02e59da (Several sessions of a map in one call; one that is refused stops none of the others)
+MOST_LINES = 62_900
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8
