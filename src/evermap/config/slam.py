@@ -254,6 +254,7 @@ class OutputConfig(Section):
     figures: bool = Field(default=True, description="draw the figures")
     report: bool = Field(default=True, description="write report.html")
     rerun: bool = Field(default=False, description="write scene.rrd for the rerun viewer, where rerun-sdk is installed")
+    mcap: bool = Field(default=False, description="write run.mcap for Foxglove and ROS 2, which needs rosbags")
     score_rate_hz: float = Field(
         default=2.0, gt=0, le=1000, description="rate at which a trajectory is compared with truth"
     )

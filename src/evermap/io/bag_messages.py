@@ -127,25 +127,24 @@ def _seen_of(content: BagContent, topic: str, parts: Callable[[Any, int], Iterat
     rows, stamps = content.seen.setdefault(topic, []), content.stamps.setdefault(topic, [])
 
     def handle(message: Any, received_s: float) -> None:
-        header = _header(message)
+        stamp_s, frame = _said(message)
         look = len(stamps)
-        stamps.append((np.nan if header is None else stamp_of(header), received_s))
+        stamps.append((stamp_s, received_s))
         rows.extend(parts(message, look))
-        if header is not None and header.header.frame_id:
-            content.frames.setdefault(topic, _plain(header.header.frame_id))
+        if frame:
+            content.frames.setdefault(topic, _plain(frame))
 
     return handle
 
 
-def _header(message: Any) -> Any:
-    """The message or the first of its parts that has a header."""
-    if hasattr(message, "header"):
-        return message
-    for name in ("markers", "entities"):
-        for one in getattr(message, name, ()):
-            if hasattr(one, "header"):
-                return one
-    return None
+def _said(message: Any) -> tuple[float, str]:
+    """Stamp [s] and frame of a message, or of the first of its parts; nan and '' where there is none."""
+    for one in (message, *getattr(message, "markers", ()), *getattr(message, "entities", ())):
+        if hasattr(one, "header"):
+            return stamp_of(one), str(one.header.frame_id)
+        if hasattr(one, "timestamp"):
+            return float(one.timestamp.sec) + 1e-9 * float(one.timestamp.nanosec), str(one.frame_id)
+    return float("nan"), ""
 
 
 def _edges_of(content: BagContent, message: Any) -> None:

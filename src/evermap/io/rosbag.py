@@ -124,12 +124,9 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
     """
     try:
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
         raise MissingExtraError("bags need the package rosbags", path=path, hint="pip install evermap[ros]") from None
-    usual = get_typestore(Stores.ROS2_HUMBLE)
-    for name, text in UNSTATED.items():
-        usual.register(get_types_from_msg(text, name))
+    usual = ros2_types()
     try:
         with (
             tempfile.TemporaryDirectory() as folder,
@@ -146,6 +143,16 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
         hint = "ros2 bag info, or rosbag check, says more"
         raise InputError(f"cannot be read as a bag: {reason(error)}", path=path, hint=hint) from error
     return topics
+
+
+def ros2_types() -> Any:
+    """Return the message types of ROS 2 and those of `UNSTATED`, as `rosbags` has them."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in UNSTATED.items():
+        types.register(get_types_from_msg(text, name))
+    return types
 
 
 def stamp_of(message: Any) -> float:
@@ -187,6 +194,36 @@ def _odometry(rows: list[tuple[float, ...]]) -> SpatialOdometry | None:
     return SpatialOdometry(columns[:, 0].copy(), columns[:, 1:8].copy(), columns[:, 8:].copy(), clock=Clock.UNIX)
 
 
+_DRAWN = "geometry_msgs/Pose pose\n{}foxglove_msgs/Color color"
+_FOXGLOVE = {
+    "Color": "float64 r\nfloat64 g\nfloat64 b\nfloat64 a",
+    "KeyValuePair": "string key\nstring value",
+    "ArrowPrimitive": _DRAWN.format(
+        "float64 shaft_length\nfloat64 shaft_diameter\nfloat64 head_length\nfloat64 head_diameter\n"
+    ),
+    "CubePrimitive": _DRAWN.format("geometry_msgs/Vector3 size\n"),
+    "SpherePrimitive": _DRAWN.format("geometry_msgs/Vector3 size\n"),
+    "CylinderPrimitive": _DRAWN.format("geometry_msgs/Vector3 size\nfloat64 bottom_scale\nfloat64 top_scale\n"),
+    "LinePrimitive": (
+        "uint8 type\ngeometry_msgs/Pose pose\nfloat64 thickness\nbool scale_invariant\ngeometry_msgs/Point[] points\n"
+        "foxglove_msgs/Color color\nfoxglove_msgs/Color[] colors\nuint32[] indices"
+    ),
+    "TriangleListPrimitive": _DRAWN.format("geometry_msgs/Point[] points\n")
+    + "\nfoxglove_msgs/Color[] colors\nuint32[] indices",
+    "TextPrimitive": _DRAWN.format("bool billboard\nfloat64 font_size\nbool scale_invariant\n") + "\nstring text",
+    "ModelPrimitive": _DRAWN.format("geometry_msgs/Vector3 scale\n")
+    + "\nbool override_color\nstring url\nstring media_type\nuint8[] data",
+    "SceneEntityDeletion": "builtin_interfaces/Time timestamp\nuint8 type\nstring id",
+    "SceneEntity": (
+        "builtin_interfaces/Time timestamp\nstring frame_id\nstring id\nbuiltin_interfaces/Duration lifetime\n"
+        "bool frame_locked\nfoxglove_msgs/KeyValuePair[] metadata\nfoxglove_msgs/ArrowPrimitive[] arrows\n"
+        "foxglove_msgs/CubePrimitive[] cubes\nfoxglove_msgs/SpherePrimitive[] spheres\n"
+        "foxglove_msgs/CylinderPrimitive[] cylinders\nfoxglove_msgs/LinePrimitive[] lines\n"
+        "foxglove_msgs/TriangleListPrimitive[] triangles\nfoxglove_msgs/TextPrimitive[] texts\n"
+        "foxglove_msgs/ModelPrimitive[] models"
+    ),
+    "SceneUpdate": "foxglove_msgs/SceneEntityDeletion[] deletions\nfoxglove_msgs/SceneEntity[] entities",
+}
 UNSTATED = {
     "apriltag_msgs/msg/Point": "float64 x\nfloat64 y",
     "apriltag_msgs/msg/AprilTagDetection": (
@@ -211,9 +248,12 @@ UNSTATED = {
         )
         for size in ("2D", "3D")
     },
+    **{f"foxglove_msgs/msg/{name}": text for name, text in _FOXGLOVE.items()},
     **{
         f"vision_msgs/msg/Detection{size}Array": f"std_msgs/Header header\nvision_msgs/Detection{size}[] detections"
         for size in ("2D", "3D")
     },
 }
-"""Messages beyond ROS 2's own (apriltag_msgs 2, vision_msgs 4), for bags in SQLite, which do not hold their types."""
+"""Messages beyond ROS 2's own, for bags in SQLite, which do not hold their types: apriltag_msgs 2, vision_msgs 4,
+foxglove_msgs.
+"""

@@ -374,11 +374,13 @@ class Asked(TypedDict, total=False):
         report: likewise `report.html`, `config.output.report`.
         scene: whether to write `scene.rrd`; `config.output.rerun`, or no. Where rerun-sdk is missing it is left out
             with a warning if the configuration asks for it, else that is an error.
+        mcap: likewise `run.mcap`, `config.output.mcap`, which needs rosbags.
     """
 
     figures: bool | None
     report: bool | None
     scene: bool | None
+    mcap: bool | None
 
 
 def write_run(
@@ -404,11 +406,11 @@ def write_run(
         sections: parts that the caller adds to the report.
         force: write into a folder that holds other files, too; they stay.
         inputs: files and folders that were read, beside the recording's.
-        asked: `figures`, `report` or `scene`, see `Asked`.
+        asked: `figures`, `report`, `scene` or `mcap`, see `Asked`.
 
     Raises:
         ConfigError: `out` must not or cannot be written.
-        MissingExtraError: `scene` is True and rerun-sdk is missing.
+        MissingExtraError: `scene` is True and rerun-sdk is missing, or `mcap` and rosbags.
     """
     from evermap.metrics.summary import RATE_HZ, compare_with_truth, metrics_dict
 
@@ -427,6 +429,8 @@ def write_run(
         remarks = []
         if _choose(asked.get("scene"), wanted, "rerun", default=False):
             remarks += _write_scene(folder, recording, result, evaluation, must=asked.get("scene") is True)
+        if _choose(asked.get("mcap"), wanted, "mcap", default=False):
+            remarks += _write_mcap(folder, recording, result, must=asked.get("mcap") is True)
         measured, settings = metrics_dict(evaluation), _plain(config)
         summary = summary_dict(recording, result, measured, config=settings, info=info, timing=timing, warnings=remarks)
         summary = folder.finish(summary, *(["report.html"] if tell else []))
@@ -512,4 +516,18 @@ def _write_scene(
         if must:
             raise
         return [f"scene.rrd was left out: {error.one_line()}"]
+    return []
+
+
+def _write_mcap(folder: RunFolder, recording: AnyRecording, result: SlamResult, *, must: bool) -> list[str]:
+    """Writes the messages, as `_write_scene` does the scene."""
+    from evermap.errors import MissingExtraError
+    from evermap.runs.mcap import write_mcap
+
+    try:
+        write_mcap(recording, result, folder.path("run.mcap"))
+    except MissingExtraError as error:
+        if must:
+            raise
+        return [f"run.mcap was left out: {error.one_line()}"]
     return []

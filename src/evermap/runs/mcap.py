@@ -1,0 +1,324 @@
+"""A run as ROS 2 messages in one MCAP file, which Foxglove opens as it is, RViz plays, and `evermap slam` reads."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.errors import MissingExtraError
+from evermap.geometry import se3
+from evermap.io.landmarks import labels_of
+from evermap.io.rosbag import ros2_types
+from evermap.runs.summary import change_dict
+from evermap.types import UNKNOWN, AnyRecording, FloatArray, Landmarks, SlamResult, SpatialRecording, Trajectory
+
+TOPICS = {
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/online_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "/detections": "vision_msgs/msg/Detection3DArray",
+    "/landmarks": "visualization_msgs/msg/MarkerArray",
+    "/scene": "foxglove_msgs/msg/SceneUpdate",
+    "/changes": "std_msgs/msg/String",
+}
+"""What is in the file. Frames are `map`, `odom`, `base_link`, and those of the sensors by their names."""
+POINT_M, PLATE_M = 0.1, 0.005
+"""Edge of what stands for a landmark without a size, and the thickness of a tag."""
+CUBE, SPHERE = 1, 2
+"""Types of `visualization_msgs/Marker`."""
+
+
+def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
+    """Write `path` (.mcap): poses with covariance, odometry, frames, detections, the map with P(exists), changes.
+
+    Poses of the smoothed trajectory are on `/pose` and in `/tf`, what the robot knew at the time on `/online_pose`. A
+    landmark appears when it was first seen, as opaque as it probably exists. `/changes` has the lines of
+    `changes.jsonl`; `/scene` draws them.
+
+    Raises:
+        MissingExtraError: `rosbags` is not installed.
+    """
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+    except ImportError:
+        raise MissingExtraError(
+            "MCAP needs the package rosbags, which is not installed", hint="pip install 'evermap[ros]'"
+        ) from None
+    ros = _Ros(ros2_types())
+    with tempfile.TemporaryDirectory() as folder:
+        with Writer(Path(folder) / "run", version=8, storage_plugin=StoragePlugin.MCAP) as bag:
+            to = {name: bag.add_connection(name, kind, typestore=ros.types) for name, kind in TOPICS.items()}
+            for stamp_s, topic, message in sorted(_messages(ros, recording, result), key=lambda one: one[0]):
+                raw = ros.types.serialize_cdr(message, TOPICS[topic])
+                bag.write(to[topic], max(round(stamp_s * 1e9), 0), raw)
+        shutil.move(next((Path(folder) / "run").glob("*.mcap")), path)
+
+
+class _Ros(NamedTuple):
+    """Messages by the names of their types."""
+
+    types: Any
+
+    def make(self, name: str, *values: Any) -> Any:
+        package, kind = name.split("/")
+        return self.types.types[f"{package}/msg/{kind}"](*values)
+
+    def time(self, stamp_s: float) -> Any:
+        nano = max(round(stamp_s * 1e9), 0)
+        return self.make("builtin_interfaces/Time", nano // 10**9, nano % 10**9)
+
+    def header(self, stamp_s: float, frame: str) -> Any:
+        return self.make("std_msgs/Header", self.time(stamp_s), frame)
+
+    def vector(self, values: FloatArray) -> Any:
+        return self.make("geometry_msgs/Vector3", *map(float, values))
+
+    def pose(self, pose: FloatArray) -> Any:
+        at, turn = map(float, pose[:3]), map(float, pose[3:])
+        return self.make(
+            "geometry_msgs/Pose", self.make("geometry_msgs/Point", *at), self.make("geometry_msgs/Quaternion", *turn)
+        )
+
+    def spread(self, pose: FloatArray, covariance: FloatArray) -> Any:
+        return self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), covariance.ravel())
+
+    def transforms(self, stamp_s: float, frames: list[tuple[str, str, FloatArray]]) -> Any:
+        found = []
+        for parent, child, pose in frames:
+            turn = self.make("geometry_msgs/Quaternion", *map(float, pose[3:]))
+            inner = self.make("geometry_msgs/Transform", self.vector(pose[:3]), turn)
+            found.append(self.make("geometry_msgs/TransformStamped", self.header(stamp_s, parent), child, inner))
+        return self.make("tf2_msgs/TFMessage", found)
+
+    def colour(self, rgb: tuple[int, int, int], alpha: float, package: str) -> Any:
+        red, green, blue = (part / 255.0 for part in rgb)
+        name = "foxglove_msgs/Color" if package == "foxglove_msgs" else "std_msgs/ColorRGBA"
+        return self.make(name, red, green, blue, alpha)
+
+
+_Stamped = tuple[float, str, Any]
+
+
+def _messages(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
+    yield from _motion(ros, recording, result)
+    yield from _detections(ros, recording)
+    start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
+    for landmarks in (result.landmarks, result.gone):
+        yield from _map(ros, landmarks, start_s)
+    yield from _changes(ros, result, start_s)
+
+
+def _motion(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
+    path, alone = result.trajectory, in_space(result.dead_reckoning.pose_world_robot)
+    poses = in_space(path.pose_world_robot)
+    if len(path):
+        mounts = [("base_link", name, pose) for name, pose in _mounts(recording)]
+        yield float(path.stamp_s[0]), "/tf_static", ros.transforms(float(path.stamp_s[0]), mounts)
+    known = len(alone) == len(poses)
+    drift = se3.compose(poses, se3.inverse(alone)) if known else poses
+    still = ros.make("geometry_msgs/Twist", ros.vector(np.zeros(3)), ros.vector(np.zeros(3)))
+    unsaid = ros.make("geometry_msgs/TwistWithCovariance", still, np.zeros(36))
+    for row, stamp_s in enumerate(path.stamp_s.tolist()):
+        frames = [("map", "odom", drift[row])]
+        frames.append(("odom", "base_link", alone[row] if known else se3.identity()))
+        yield stamp_s, "/tf", ros.transforms(stamp_s, frames)
+        if known:
+            here = ros.spread(alone[row], np.zeros((6, 6)))
+            yield (
+                stamp_s,
+                "/odom",
+                ros.make("nav_msgs/Odometry", ros.header(stamp_s, "odom"), "base_link", here, unsaid),
+            )
+    for topic, some in (("/pose", path), ("/online_pose", result.online)):
+        poses, covariances = in_space(some.pose_world_robot), ros_covariance(some)
+        for stamp_s, pose, covariance in zip(some.stamp_s.tolist(), poses, covariances, strict=True):
+            message = ros.spread(pose, covariance)
+            yield (
+                stamp_s,
+                topic,
+                ros.make("geometry_msgs/PoseWithCovarianceStamped", ros.header(stamp_s, "map"), message),
+            )
+
+
+def in_space(pose: FloatArray) -> FloatArray:
+    """Return poses (N, 3) in the plane as poses (N, 7) in space; those in space as they are."""
+    if pose.shape[1] == 7:
+        return pose
+    twist = np.zeros((len(pose), 6))
+    twist[:, 5] = pose[:, 2]
+    found = se3.exp(twist)
+    found[:, :2] = pose[:, :2]
+    return found
+
+
+def ros_covariance(trajectory: Trajectory) -> FloatArray:
+    """Return covariances (N, 6, 6) as ROS has them, along and about the axes of the map, not of the robot."""
+    given, poses = trajectory.covariance, in_space(trajectory.pose_world_robot)
+    whole = np.zeros((len(given), 6, 6))
+    rows = np.arange(6) if given.shape[1:] == (6, 6) else np.array([0, 1, 5])
+    whole[:, rows[:, None], rows] = given
+    turn = np.zeros((len(given), 6, 6))
+    turn[:, :3, :3] = turn[:, 3:, 3:] = se3.rotation_of(poses)
+    return np.asarray(turn @ whole @ np.swapaxes(turn, 1, 2))
+
+
+def _mounts(recording: AnyRecording) -> list[tuple[str, FloatArray]]:
+    """Name and pose (7,) of each sensor on the robot."""
+    if isinstance(recording, SpatialRecording):
+        return [(one.name, np.array(one.mount_robot_sensor)) for one in recording.sensors]
+    return [("sensor", in_space(np.array([recording.sensor.mount_robot_sensor]))[0])]
+
+
+def _detections(ros: _Ros, recording: AnyRecording) -> Iterator[_Stamped]:
+    """A message for every frame and sensor, also where nothing was seen."""
+    stamps, mounts, names = recording.frames.stamp_s, _mounts(recording), dict[int, str]()
+    if isinstance(recording, SpatialRecording):
+        seen = recording.detections
+        at, turn, size = seen.position_sensor_m, seen.rotation, np.nan_to_num(seen.size_m)
+        sensor, score = seen.sensor, np.nan_to_num(seen.score, nan=1.0)
+        names = dict(recording.landmark_names)
+        ids, frames, classes = seen.landmark_id, seen.frame, seen.class_id
+    else:
+        flat = recording.detections
+        ids, frames, classes = flat.landmark_id, flat.frame, flat.class_id
+        bearing, zero = flat.bearing_rad, np.zeros(len(flat))
+        at = np.stack([flat.range_m * np.cos(bearing), flat.range_m * np.sin(bearing), zero], axis=1)
+        turn, size = np.full((len(flat), 4), np.nan), np.zeros((len(flat), 3))
+        sensor, score = np.zeros(len(flat), dtype=np.int64), np.ones(len(flat))
+    labels = labels_of(classes, recording.class_names)
+    turn = np.where(np.isnan(turn), se3.NO_TURN, turn)
+    first = np.searchsorted(frames, np.arange(len(stamps) + 1))
+    for frame, stamp_s in enumerate(stamps.tolist()):
+        for number, (name, _) in enumerate(mounts):
+            header, found = ros.header(stamp_s, name), []
+            for row in range(first[frame], first[frame + 1]):
+                if sensor[row] == number:
+                    pose, identity = np.append(at[row], turn[row]), int(ids[row])
+                    hypothesis = ros.make("vision_msgs/ObjectHypothesis", labels[row], float(score[row]))
+                    result = ros.make(
+                        "vision_msgs/ObjectHypothesisWithPose", hypothesis, ros.spread(pose, np.zeros((6, 6)))
+                    )
+                    box = ros.make("vision_msgs/BoundingBox3D", ros.pose(pose), ros.vector(size[row]))
+                    text = "" if identity == UNKNOWN else names.get(identity, str(identity))
+                    found.append(ros.make("vision_msgs/Detection3D", header, [result], box, text))
+            yield stamp_s, "/detections", ros.make("vision_msgs/Detection3DArray", header, found)
+
+
+def _map(ros: _Ros, landmarks: Landmarks, start_s: float) -> Iterator[_Stamped]:
+    """The landmarks, each when it was first seen."""
+    from evermap.viz.rerun_scene import rgb
+    from evermap.viz.style import LANDMARK
+
+    pose, size = poses_of(landmarks), _sizes(landmarks)
+    labels = labels_of(landmarks.class_id, landmarks.class_names)
+    seen_s = np.maximum(np.nan_to_num(landmarks.first_seen_s, nan=start_s), start_s)
+    none = ros.make("builtin_interfaces/Duration", 0, 0)
+    for row, identity in enumerate(landmarks.landmark_id.tolist()):
+        stamp_s, p = float(seen_s[row]), float(landmarks.p_exists[row])
+        name = landmarks.names.get(identity, str(identity))
+        turned = landmarks.rotation is not None and np.isfinite(landmarks.rotation[row]).all()
+        marker = ros.make(
+            "visualization_msgs/Marker", ros.header(stamp_s, "map"), labels[row], row, CUBE if turned else SPHERE, 0,
+            ros.pose(pose[row]), ros.vector(size[row]), ros.colour(rgb(LANDMARK), p, "std_msgs"), none, False, [], [],
+            "", ros.make("sensor_msgs/CompressedImage", ros.header(stamp_s, ""), "", np.zeros(0, dtype=np.uint8)), [],
+            name, "", ros.make("visualization_msgs/MeshFile", "", np.zeros(0, dtype=np.uint8)), False,
+        )  # fmt: skip
+        yield stamp_s, "/landmarks", ros.make("visualization_msgs/MarkerArray", [marker])
+        colour = ros.colour(rgb(LANDMARK), p, "foxglove_msgs")
+        body = ros.make(
+            f"foxglove_msgs/{'Cube' if turned else 'Sphere'}Primitive",
+            ros.pose(pose[row]),
+            ros.vector(size[row]),
+            colour,
+        )
+        said = {"class": labels[row], "p_exists": f"{p:.4f}"}
+        text = f"{name} {p:.2f}" if p < 0.995 else name
+        yield stamp_s, "/scene", _entity(ros, stamp_s, f"landmark {name}", body, said, text, pose[row])
+
+
+def poses_of(landmarks: Landmarks) -> FloatArray:
+    """Return poses (L, 7) of landmarks, on the floor where the map is one of the plane."""
+    at = np.zeros((len(landmarks), 3))
+    at[:, : landmarks.position_m.shape[1]] = landmarks.position_m
+    turn = np.full((len(landmarks), 4), np.nan) if landmarks.rotation is None else landmarks.rotation
+    return np.hstack([at, np.where(np.isnan(turn), se3.NO_TURN, turn)])
+
+
+def _sizes(landmarks: Landmarks) -> FloatArray:
+    size = np.full((len(landmarks), 3), np.nan) if landmarks.size_m is None else landmarks.size_m
+    return np.where(np.isnan(size), POINT_M, np.maximum(size, PLATE_M))
+
+
+def _entity(
+    ros: _Ros, stamp_s: float, name: str, body: Any, said: Mapping[str, str], text: str, pose: FloatArray
+) -> Any:
+    """A scene with one entity: a cube, a sphere or an arrow, and its name."""
+    from evermap.viz.rerun_scene import rgb
+    from evermap.viz.style import INK
+
+    above = pose.copy()
+    above[2] += 2.0 * POINT_M
+    ink = ros.colour(rgb(INK), 1.0, "foxglove_msgs")
+    label = ros.make("foxglove_msgs/TextPrimitive", ros.pose(above), True, POINT_M, False, ink, text)
+    kind = type(body).__name__
+    shapes = [[body] if part in kind else [] for part in ("Arrow", "Cube", "Sphere")]
+    metadata = [ros.make("foxglove_msgs/KeyValuePair", key, value) for key, value in said.items()]
+    lifetime = ros.make("builtin_interfaces/Duration", 0, 0)
+    entity = ros.make(
+        "foxglove_msgs/SceneEntity", ros.time(stamp_s), "map", name, lifetime, False, metadata, *shapes, [], [], [],
+        [label], [],
+    )  # fmt: skip
+    return ros.make("foxglove_msgs/SceneUpdate", [], [entity])
+
+
+def _changes(ros: _Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]:
+    from evermap.viz.rerun_scene import rgb
+    from evermap.viz.style import ALERT
+
+    there = {**_where(result.gone), **_where(result.landmarks)}
+    for number, change in enumerate(result.changes):
+        stamp_s = max(float(np.nan_to_num(change.stamp_to_s, nan=start_s)), start_s)
+        line = json.dumps(change_dict(change), allow_nan=False)
+        yield stamp_s, "/changes", ros.make("std_msgs/String", line)
+        at = [there[identity] for identity in change.landmark_ids if identity in there]
+        if not at:
+            continue
+        moved = np.zeros(3)
+        moved[: len(change.displacement_m)] = np.nan_to_num(change.displacement_m)
+        length = float(np.linalg.norm(moved))
+        along = moved / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
+        pose = _pointing(np.mean(at, axis=0) - moved, along)
+        colour = ros.colour(rgb(ALERT), change.probability, "foxglove_msgs")
+        shaft = max(length - POINT_M, 0.0) if length > 0.0 else 2.0 * POINT_M
+        arrow = ros.make(
+            "foxglove_msgs/ArrowPrimitive", ros.pose(pose), shaft, 0.3 * POINT_M, POINT_M, 0.6 * POINT_M, colour
+        )
+        text = f"{change.kind.value} {', '.join(change.labels)} {change.probability:.2f}"
+        yield (
+            stamp_s,
+            "/scene",
+            _entity(ros, stamp_s, f"change {number}", arrow, {"kind": change.kind.value}, text, pose),
+        )
+
+
+def _where(landmarks: Landmarks) -> dict[int, FloatArray]:
+    return dict(zip(landmarks.landmark_id.tolist(), poses_of(landmarks)[:, :3], strict=True))
+
+
+def _pointing(at: FloatArray, along: FloatArray) -> FloatArray:
+    """A pose (7,) whose x points along a unit vector (3,)."""
+    yaw, pitch = math.atan2(along[1], along[0]), -math.asin(float(np.clip(along[2], -1.0, 1.0)))
+    pose = se3.compose(
+        se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, yaw])), se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch, 0.0]))
+    )
+    pose[:3] = at
+    return pose
