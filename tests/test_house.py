@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 263
-MOST_LINES = 62_980
+MOST_MODULES = 264
+MOST_LINES = 63_362
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8
