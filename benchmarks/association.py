@@ -2,6 +2,12 @@
 
 Precision and recall are those of pairs: of two detections that are given to one landmark, and of two that are of one.
 Truth of association is the recording's own identities.
+
+    python -m benchmarks.association sessions
+
+enters sessions of one world after the other into a map, with identities and without. Since nothing says which of two
+equal landmarks moved, what is told is scored by places: one that a landmark left, or came to, within `NEAR_M` of the
+truth, one to one; a move is both.
 """
 
 from __future__ import annotations
@@ -15,15 +21,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 import evermap as em
-from evermap.config import Config
+from benchmarks.scale_maps import MAP_POSE, SESSION, living_map
+from evermap.config import Config, load_config
 from evermap.errors import EvermapError
+from evermap.geometry import se2
+from evermap.geometry.rigid import rigid
 from evermap.io import read_recording
+from evermap.maps.living import LivingMap
+from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association.identify import identified
 from evermap.slam.intake import beliefs
-from evermap.types import UNKNOWN, IntArray, Recording, SlamResult, Trajectory
+from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Recording, SlamResult, Trajectory, rows_of
+from evermap_studies.demo.truth import truth_of
+from evermap_studies.lifelong.runs import SIMULATED
+from evermap_studies.lifelong.world import recorded_world, simulated_world
+from evermap_studies.partial_views.study import Settings, building_of
+from evermap_studies.sim import simulate_warehouse
 from evermap_studies.sim.park import simulate_park
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
@@ -37,6 +54,9 @@ METRICS: dict[str, tuple[str, float, str]] = {
     "association_park_recall": ("higher", 0.1, "the same in the simulated parks, on average"),
 }
 RATE_HZ = 2.0
+NEAR_M = 0.3
+"""A place that is told is right within this."""
+COMES = (ChangeKind.APPEARED, ChangeKind.RETURNED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +147,106 @@ def pairwise(found: IntArray, true: IntArray) -> tuple[float, float]:
     return agreed / max(pairs(found[given]), 1.0), agreed / max(pairs(true[real]), 1.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Lived:
+    """Sessions of a world in one map: (S, L, 2) where landmarks are, nan while away; its frame in that of the truth."""
+
+    name: str
+    recordings: Sequence[Recording]
+    position_m: FloatArray
+    overrides: tuple[str, ...] = ()
+    begun: LivingMap | None = None
+    pose_truth_map: FloatArray | None = None
+
+
+def worlds(folder: Path = FOLDER) -> Iterator[Lived]:
+    """Simulate, or edit, what lives on."""
+    for seed in range(2):
+        world = simulated_world(3, seed)
+        yield Lived(f"rooms, seed {seed}", world.recordings, world.position_m, SIMULATED)
+    for seed in range(1000, 1002):
+        building = building_of(Settings(sessions=6), seed, 165)
+        yield Lived(f"building, seed {seed}", building.sessions, truth_of(building).position_m)
+    for n_places in (1_000, 10_000):
+        yield warehouse(n_places)
+    for seed in range(2 if (folder / "mrclam").is_dir() else 0):
+        recorded = recorded_world(folder / "mrclam", len(ROBOTS), seed)
+        yield Lived(f"MRCLAM 6, changes {seed}", recorded.recordings, recorded.position_m)
+
+
+def warehouse(n_places: int, *, p_gone: float = 0.05) -> Lived:
+    """A drive past 200 landmarks of a warehouse that is mapped, some of which have left."""
+    config = replace(SESSION, n_landmarks=n_places, rate_hz=2.0)
+    recording = simulate_warehouse(config)
+    assert recording.true_landmarks is not None
+    at = np.stack([recording.true_landmarks.position_m] * 2)
+    at[1, np.random.default_rng(0).random(n_places) < p_gone] = np.nan
+    left = np.isfinite(at[1, recording.detections.landmark_id, 0])
+    recording = replace(recording, detections=rows_of(recording.detections, left))
+    pose = se2.inverse(MAP_POSE)
+    return Lived(f"warehouse, {n_places:,} landmarks", [recording], at, (), living_map(config), pose)
+
+
+def lived_through(world: Lived, *, unknown_ids: bool) -> dict[str, float]:
+    """Enter all sessions; returns how many were found, position error (each aligned) [m], changes by place,
+    landmarks in the end and in truth, and CPU seconds."""
+    config = load_config(None, [*world.overrides, f"slam.unknown_ids={str(unknown_ids).lower()}"])
+    living, pose, squared, began = world.begun, world.pose_truth_map, list[float](), time.process_time()
+    n_found, n_told, n_true, n_right = 0, 0, 0, 0
+    first = len(world.position_m) - len(world.recordings)
+    for number, recording in enumerate(world.recordings, first):
+        before = living
+        session = em.run_session(replace(recording, truth=None, true_landmarks=None), living, config)
+        living, n_found = session.living, n_found + session.found
+        assert recording.truth is not None
+        if pose is None:
+            row = np.searchsorted(recording.truth.stamp_s, session.slam.trajectory.stamp_s - 1e-6)
+            there = recording.truth.pose_world_robot[np.minimum(row, len(recording.truth.stamp_s) - 1), :2]
+            pose = rigid(session.slam.trajectory.pose_world_robot[:, :2], there)
+        if session.found:
+            off = evaluate_trajectory(session.slam.trajectory, recording.truth, rate_hz=RATE_HZ)
+            squared += [] if off is None else [off.rmse_m**2]
+        if number and before is not None:
+            told = _places_told(session, before)
+            true = _places_changed(*world.position_m[number - 1 : number + 1])
+            for mine, theirs in zip(told, true, strict=True):
+                n_right += _matched(se2.transform(pose, mine), theirs)
+                n_told, n_true = n_told + len(mine), n_true + len(theirs)
+    assert living is not None
+    return {
+        "found": n_found / len(world.recordings),
+        "position_m": math.sqrt(float(np.mean(squared))) if squared else math.nan,
+        "precision": n_right / max(n_told, 1),
+        "recall": n_right / max(n_true, 1),
+        "landmarks": float((living.p_exists() >= 0.5).sum()),
+        "true": float(np.isfinite(world.position_m[-1, :, 0]).sum()),
+        "cpu_s": time.process_time() - began,
+    }
+
+
+def _places_told(session: Session, before: LivingMap) -> tuple[FloatArray, FloatArray]:
+    """Places in the map that landmarks left, and that they came to, as a session tells."""
+    found: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    for rows, living, none in zip(found, (before, session.living), (COMES, (ChangeKind.VANISHED,)), strict=True):
+        known = living.landmarks()
+        ids = [i for change in session.changes if change.kind not in none for i in change.landmark_ids]
+        rows += [known.position_m[known.landmark_id == one] for one in ids]
+    left, came = (np.vstack([np.zeros((0, 2)), *rows]) for rows in found)
+    return left, came
+
+
+def _places_changed(was: FloatArray, now: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places (L, 2) that landmarks really left, and that they came to."""
+    changed = ~np.all((was == now) | (np.isnan(was) & np.isnan(now)), axis=1)
+    return was[changed & np.isfinite(was[:, 0])], now[changed & np.isfinite(now[:, 0])]
+
+
+def _matched(mine: FloatArray, theirs: FloatArray) -> int:
+    """How many points of two sets lie together, one to one."""
+    away = np.linalg.norm(mine[:, None] - theirs[None], axis=2)
+    return int(np.count_nonzero(away[linear_sum_assignment(np.minimum(away, NEAR_M))] < NEAR_M))
+
+
 def as_markdown(shown: dict[str, Any]) -> str:
     """Return the table."""
     lines = [
@@ -158,7 +278,14 @@ def _truth(recording: Recording, named: SlamResult) -> Trajectory:
 
 
 def main(names: Sequence[str] = ()) -> None:
-    """Print one line as soon as it is known; names are beginnings of those wanted."""
+    """Print one line as soon as it is known; names are beginnings of those wanted, or 'sessions' and such."""
+    if names and names[0] == "sessions":
+        for world in worlds():
+            for unknown_ids in (False, True) if not names[1:] or world.name.startswith(tuple(names[1:])) else ():
+                row = lived_through(world, unknown_ids=unknown_ids)
+                cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
+                print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
+        return
     for recording in recordings():
         if not names or recording.name.startswith(tuple(names)):
             print(_line(score(recording)), flush=True)
