@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -152,7 +153,9 @@ def export(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Where to write the landmarks: .parquet, .geojson or .csv.", show_default=False
+            metavar="FILE",
+            help="Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for an occupancy grid.",
+            show_default=False,
         ),
     ] = None,
     lifetimes: Annotated[
@@ -163,23 +166,26 @@ def export(
     p_least: Annotated[
         float, typer.Option(min=0.0, max=1.0, help="Leave out what exists with a smaller probability.")
     ] = 0.5,
+    cell_m: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Edge of a cell of the grid [m].")] = 0.05,
+    radius_m: Annotated[float, typer.Option(min=0.0, max=1e3, help="Radius around a landmark in the grid [m].")] = 0.25,
     as_json: AsJson = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
 
-    For other tools, for `evermap slam --prior-map`, and for `--prior` of another map.
+    For other tools, for `evermap slam --prior-map`, for `--prior` of another map, and as a mask for filters of Nav2.
 
     \b
     Examples:
       evermap map export site.evermap --out map.geojson
       evermap map export site.evermap --lifetimes lifetimes.json
+      evermap map export site.evermap --out keepout.yaml --p-least 0.1
     """
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
 
     if out is None and lifetimes is None:
         raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
-    write = None if out is None else _writer(out)
+    write = None if out is None else _writer(out, cell_m, radius_m)
     for path in (out, lifetimes):
         if path is not None:
             check_output_file(path, inputs=[file], ending=".json" if path is lifetimes else "")
@@ -246,16 +252,18 @@ def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:
     return list(models)
 
 
-def _writer(out: Path) -> Any:
+def _writer(out: Path, cell_m: float, radius_m: float) -> Any:
     """What writes such a file.
 
     Raises:
         ConfigError: no map is written to such a file.
     """
     from evermap.io import write_map_geojson, write_map_parquet
+    from evermap.io.grid import write_grid
     from evermap.io.landmarks import write_map_csv
 
     writers = {
+        ".yaml": partial(write_grid, cell_m=cell_m, radius_m=radius_m),
         ".parquet": write_map_parquet,
         ".geojson": write_map_geojson,
         ".json": write_map_geojson,
@@ -264,7 +272,7 @@ def _writer(out: Path) -> Any:
     with suppress(KeyError):
         return writers[out.suffix.lower()]
     raise ConfigError(
-        f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson or .csv"
+        f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson, .csv or .yaml"
     )
 
 
