@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from evermap.errors import ConfigError, DataError
 from evermap.existence.learn_sojourns import Data, LearnedSojourns, learn, with_lifetimes
-from evermap.existence.protocol import Looks
+from evermap.existence.protocol import Instants, Looks
+from evermap.existence.rhythm import BINS, Rhythm, day_shares
 from evermap.existence.run_length import RunLength
 from evermap.existence.sojourns import FAMILIES
 from evermap.survival import Exponential, Gamma, LifetimePrior, LogNormal, Mixture, Weibull
@@ -221,8 +224,9 @@ def test_a_rhythm_has_steps_within_its_ten_minutes() -> None:
     learned = learn(looks, rhythm=True, families=("exponential",))
     # one week and a half: the levels of its weeks may differ, and are those of the last in the filter
     data = Data.of(looks, learned.model.step_s, np.inf, rhythm=True)
-    found = data.expect(learned.model).log_evidence
-    assert found == pytest.approx(learned.model.track(looks).log_evidence.sum(), rel=1e-9)
+    ordinary = replace(learned.model, unusual=None)
+    found = data.expect(ordinary).log_evidence
+    assert found == pytest.approx(ordinary.track(looks).log_evidence.sum(), rel=1e-9)
 
 
 def test_progress_is_told_to_the_end() -> None:
@@ -244,3 +248,84 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
         learn(looks, families=("cauchy",))
     with pytest.raises(ConfigError, match="unknown family 'weibull'"):
         learn(looks, families=("weibull",), rhythm=True)
+
+
+MINUTE_S, DAY_S = 60.0, 86400.0
+
+
+def building(weeks: int, seed: int, still: tuple[int, ...] = ()) -> tuple[FloatArray, FloatArray]:
+    """A door at every ten minutes: it changes every half an hour from nine to five on weekdays, but on still days."""
+    rng = np.random.default_rng(seed)
+    time = 4.0 * DAY_S + np.arange(0.0, weeks * 7 * DAY_S, 10.0 * MINUTE_S)
+    day, hour = ((time - 4.0 * DAY_S) // DAY_S).astype(int), time % DAY_S / 3600.0
+    works = (day % 7 < 5) & (hour >= 9.0) & (hour < 17.0) & ~np.isin(day, still)
+    return time, np.cumsum(works & (rng.random(len(time)) < 0.3)) % 2 * works
+
+
+def looked(time: FloatArray, there: FloatArray) -> Looks:
+    return Looks.from_rows(np.zeros(len(time), int), time, there, 1e-3, 1e-3)
+
+
+def door() -> RunLength:
+    """The model of the building's door."""
+    busy = np.full((7, 144), -12.0)
+    busy[:5, 54:102] = 0.0
+    change = Exponential(-np.log(0.7) / (10.0 * MINUTE_S))
+    return RunLength(change, change, 10.0 * MINUTE_S, Rhythm(np.zeros(BINS)), Rhythm(busy.ravel()))
+
+
+def test_days_on_which_nothing_changed_are_told_and_do_not_count_for_the_others() -> None:
+    time, there = building(6, 1, still=(9, 10, 24))
+    data = Data.of(looked(time, there), 10.0 * MINUTE_S, np.inf, rhythm=True)
+    of_kind, moving, shares = data.days(door(), np.zeros(4))
+    # weekends look the same, still or not: three of thirty days, with half a day of each kind before any
+    assert shares.still == pytest.approx((3.0 + 0.5) / (30.0 + 2.0), rel=0.05)
+    assert of_kind[1] == pytest.approx(3.0 + 12.0 * shares.still, rel=0.05)
+    # never seen: people on one of twelve weekend days
+    assert shares.other == pytest.approx(0.5 / (12.0 + 2.0), rel=0.25)
+    weight = moving.importance[0][np.isin(moving.lattices[0].stamp_s[:-1] % DAY_S, 12.0 * 3600.0)]
+    still, weekend = np.isin(np.arange(42), (9, 10, 24)), np.arange(42) % 7 >= 5
+    assert weight[still].max() < 0.01
+    assert weight[~still & ~weekend].min() > 0.99
+    np.testing.assert_allclose(weight[weekend], 1.0 - shares.still, atol=0.02)
+    _, _, plain = Data.of(looked(*building(6, 1)), 10.0 * MINUTE_S, np.inf, rhythm=True).days(door(), np.zeros(4))
+    assert plain.still == pytest.approx(0.5 / (30.0 + 2.0), rel=0.05)
+
+
+def test_a_weekend_on_which_people_work_is_not_out_of_the_question() -> None:
+    """No weekend like it was seen; with looks it is believed like a weekday."""
+    data = Data.of(looked(*building(6, 1)), 10.0 * MINUTE_S, np.inf, rhythm=True)
+    model = replace(door(), unusual=data.days(door(), np.zeros(4))[2])
+    noon = 4.0 * DAY_S + 61 * DAY_S + 13.0 * 3600.0  # of a Saturday
+    time = noon - 2 * 3600.0 + 20.0 * MINUTE_S * np.arange(6)
+    looks = Looks.from_rows(np.zeros(6, int), time, [0, 1, 1, 0, 1, 1], 0.1, 0.1)
+    asked = Instants(np.array([0, 1]), np.array([noon]))
+    beliefs = [one.track(looks, asked).p_present[0] for one in (model, replace(model, unusual=None))]
+    assert beliefs[0] > 0.3 > 0.1 > beliefs[1]
+    unlooked = model.track(looks.taken(np.zeros(0, int), np.array([0, 0])), asked).p_present[0]
+    assert 1e-3 < unlooked < 0.04
+
+
+def test_shares_of_days_are_those_of_a_sample_of_known_kinds() -> None:
+    """Days that are certain count one each, with half a day of each kind; days that tell nothing do not count."""
+    certain, nothing = np.eye(4)[[0] * 20 + [1] * 3 + [3]], np.ones((50, 4))
+    days = np.concatenate([certain, nothing])
+    total, kind, shares = day_shares(days, np.ones(len(days)), np.zeros(4))
+    np.testing.assert_allclose(shares, (np.array([3.0, 0.0, 1.0]) + 0.5) / (24.0 + 2.0), rtol=1e-3)
+    assert total.sum() == pytest.approx(74.0)
+    np.testing.assert_allclose(kind[:24], certain)
+    _, _, later = day_shares(certain[:4], np.ones(4), np.array([16.0, 3.0, 0.0, 1.0]))
+    np.testing.assert_allclose(later, (np.array([3.0, 0.0, 1.0]) + 0.5) / (24.0 + 2.0), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_shares_of_days_are_learned_and_later_days_are_added() -> None:
+    time, there = building(8, 1, still=(9, 10, 24, 51))
+    late = time >= time[0] + 42 * DAY_S
+    first = learn(looked(time[~late], there[~late]), rhythm=True, families=("exponential",))
+    both = first.updated(looked(time[late], there[late]))
+    assert first.model.unusual is not None
+    assert both.model.unusual is not None
+    assert first.model.unusual.still == pytest.approx((3.0 + 0.5) / (30.0 + 2.0), rel=0.15)
+    assert both.of_kind.sum() == pytest.approx(56.0)
+    assert both.of_kind[1] - first.of_kind[1] == pytest.approx(1.0 + 4 * first.model.unusual.still, abs=0.3)

@@ -15,7 +15,7 @@ import pytest
 from evermap.errors import ConfigError, DataError, InputError, NumericalError
 from evermap.existence.lifetimes import edges
 from evermap.existence.protocol import Instants, Looks, PresenceModel
-from evermap.existence.rhythm import BINS, Rhythm, bin_of_week
+from evermap.existence.rhythm import BINS, DayShares, Rhythm, bin_of_week
 from evermap.existence.run_length import RunLength, RunLengthBelief
 from evermap.existence.run_length_smoothing import Lattice, lattice
 from evermap.survival import Exponential, LifetimePrior, LogNormal, PiecewiseConstantHazard, Uniform, never_leaves
@@ -111,14 +111,15 @@ def beginning(model: RunLength, begin: Any = BEGIN) -> RunLength:
     """The same model with these hypotheses at the first look."""
     from evermap.existence.run_length_kernels import First
 
-    age, weight = np.zeros((1, 2, model.slots)), np.zeros((1, 2, model.slots))
+    share = model.law.share
+    age, weight = np.zeros((1, 2, model.slots)), np.zeros((1, len(share), 2, model.slots))
     number = np.zeros((1, 2), dtype=np.int64)
     for s, old, mass in sorted(begin, key=lambda row: -row[1]):
-        age[0, s, number[0, s]], weight[0, s, number[0, s]] = old, mass
+        age[0, s, number[0, s]], weight[0, :, s, number[0, s]] = old, mass * share
         number[0, s] += 1
     first = First(age, weight, number)
     model = replace(model)
-    model.__dict__["first"] = for_all_week(first) if model.law.factor.shape[1] > 1 else first
+    model.__dict__["first"] = for_all_week(first) if model.law.factor.shape[2] > 1 else first
     return model
 
 
@@ -224,8 +225,8 @@ def test_smoothing_is_the_sum_over_all_patterns(name: str, seed: int) -> None:
     counts = SojournCounts(np.zeros(shape), np.zeros(shape), np.zeros(shape[:2]), np.zeros((2, 3)), np.zeros((2, 3)))
     smoothed = np.empty(steps + 1)
     law = model.law
-    if law.factor.shape[1] == 1:  # so that columns are counted here too
-        law = law._replace(factor=np.ones((2, BINS)))
+    if law.factor.shape[2] == 1:  # so that columns are counted here too
+        law = law._replace(factor=np.ones((1, 2, BINS)))
         first = for_all_week(model.first)
     else:
         first = model.first
@@ -293,7 +294,7 @@ def test_a_long_recording_is_smoothed_as_a_hidden_markov_chain(name: str) -> Non
     x = np.stack([0.04 * factors[0] * gap, 0.06 * factors[1] * gap], axis=1)
     stays_so, ends = np.exp(-x), -np.expm1(-x)
     likelihood = np.stack([grid.absent, grid.present], axis=1)
-    mass = model.first.weight.sum(axis=2)[0 if name == "no rhythm" else bin_of_week(grid.stamp_s[0])]
+    mass = model.first.weight.sum(axis=(1, 3))[0 if name == "no rhythm" else bin_of_week(grid.stamp_s[0])]
     forward, scale = np.empty((n, 2)), np.empty(n)
     for k in range(n):
         before = mass if k == 0 else forward[k - 1] * stays_so[k - 1] + (forward[k - 1] * ends[k - 1])[::-1]
@@ -378,3 +379,113 @@ def test_rows_that_do_not_exist_or_come_twice_are_refused() -> None:
 def test_the_first_instant_must_be_finite() -> None:
     with pytest.raises(InputError, match="row 1: time nan is not finite"):
         RunLengthBelief.first(RunLength(Exponential(1.0), ABSENCE, 1.0), [0.0, np.nan])
+
+
+# --- days that do not follow the rhythm -------------------------------------------------------------------------------
+
+SHARES = DayShares(still=0.2, other=0.15, timeless=0.1)
+UNUSUAL = replace(MODELS["both rhythms"], unusual=SHARES)
+
+
+def on_days_of(kinds: tuple[int, int]) -> RunLength:
+    """The model of a Sunday of one kind and a Monday of another, written as a rhythm of its own: the reference."""
+    factors = []
+    for own in (UNUSUAL.absence_rhythm, UNUSUAL.stay_rhythm):
+        assert own is not None
+        days = own.factor.reshape(7, -1)
+        by_kind = (days, 0.0 * days, np.tile(days.mean(axis=0), (7, 1)), np.full_like(days, days.mean()))
+        days = days.copy()
+        days[6], days[0] = by_kind[kinds[0]][6], by_kind[kinds[1]][0]
+        with np.errstate(divide="ignore"):
+            factors.append(Rhythm(np.maximum(np.log(days).ravel(), -1000.0)))  # e^-1000 is 0
+    return beginning(RunLength(STAY, ABSENCE, STEP_S, factors[1], factors[0]))
+
+
+def share_of(kinds: tuple[int, int]) -> float:
+    shares = (1.0 - sum(SHARES), *SHARES)
+    return shares[kinds[0]] * shares[kinds[1]]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_unusual_days_are_the_sum_over_all_their_kinds(seed: int) -> None:
+    """From Sunday to Monday, over midnight: every pattern of changes on days of every two kinds."""
+    looks = looks_at(stamps(seed), seed)
+    model = beginning(UNUSUAL)
+    track = model.track(looks)
+    last_of_time = np.flatnonzero(np.append(np.diff(looks.stamp_s) > 0.0, True))
+    for n in last_of_time[1:]:
+        grid = lattice(looks.taken(np.arange(n + 1)), STEP_S)
+        rows = [(share_of(k), summed(on_days_of(k), grid)) for k in np.ndindex(4, 4)]  # type: ignore[arg-type]
+        mass = np.array([share * np.exp(one.log_evidence) for share, one in rows])
+        there = np.array([one.filtered[-1] for _, one in rows])
+        assert track.p_present[n] == pytest.approx(mass @ there / mass.sum(), rel=1e-10)
+    assert track.log_evidence[0] == pytest.approx(np.log(mass.sum()), abs=1e-10)
+
+
+@pytest.mark.parametrize("ahead_s", [0.4, 0.8, 1.7])
+def test_a_forecast_over_midnight_is_the_sum_over_all_kinds_of_days(ahead_s: float) -> None:
+    """A step whose middle is past midnight is one of the new day."""
+    looks = looks_at(MONDAY_S + np.array([-3.0, -2.1, -1.3, -0.5]), 4)
+    nothing = looks_at(np.append(looks.stamp_s, looks.stamp_s[-1] + ahead_s), 4)
+    asked = nothing.stamp_s[-1:]
+    grid = lattice(looks, STEP_S)
+    steps = lattice(nothing, STEP_S)
+    whole = Lattice(steps.stamp_s, np.ones(len(steps.stamp_s)), np.ones(len(steps.stamp_s)))
+    for column, values in ((whole.absent, grid.absent), (whole.present, grid.present)):
+        column[np.searchsorted(whole.stamp_s, grid.stamp_s)] = values
+    rows = [(share_of(k), summed(on_days_of(k), whole)) for k in np.ndindex(4, 4)]  # type: ignore[arg-type]
+    mass = np.array([share * np.exp(one.log_evidence) for share, one in rows])
+    expected = mass @ np.array([one.ahead[-1] for _, one in rows]) / mass.sum()
+    model = beginning(UNUSUAL)
+    assert model.track(looks, Instants(np.array([0, 1]), asked)).p_present[0] == pytest.approx(expected, rel=1e-10)
+    state = RunLengthBelief.after(model, looks)
+    assert state.predict(asked)[0] == pytest.approx(expected, rel=1e-10)
+
+
+def test_each_day_is_told_by_its_own_looks() -> None:
+    from evermap.existence.run_length_kernels import LookColumns, kinds_of_days
+
+    looks = looks_at(stamps(1), 1)
+    grid, model = lattice(looks, STEP_S), beginning(UNUSUAL)
+    sunday, monday = kinds_of_days(LookColumns(*grid), model.slots, model.law, model.first)
+    mass = np.array(
+        [[share_of((j, k)) * np.exp(summed(on_days_of((j, k)), grid).log_evidence) for k in range(4)] for j in range(4)]
+    )
+    shares = np.array([1.0 - sum(SHARES), *SHARES])
+    posterior = mass.sum(axis=0) / mass.sum()  # of Monday, the last day: that of Sunday does not know Monday's looks
+    np.testing.assert_allclose(monday * shares, posterior, rtol=1e-9)
+    early = lattice(looks.taken(looks.stamp_s < MONDAY_S), STEP_S)
+    mass = np.array([shares[j] * np.exp(summed(on_days_of((j, 0)), early).log_evidence) for j in range(4)])
+    np.testing.assert_allclose(sunday * shares, mass / mass.sum(), rtol=1e-9)
+
+
+def test_few_looks_tell_a_still_day_and_midnight_forgets_it() -> None:
+    """Hazards of one change in ten minutes by day: an hour of misses on a Monday is unlike a working day."""
+    busy = np.full((7, 144), -20.0)
+    busy[:5, 48:108] = 0.0
+    rhythm = Rhythm(busy.ravel())
+    model = RunLength(
+        Exponential(1 / 600), Exponential(1 / 600), 60.0, rhythm, rhythm, unusual=DayShares(0.02, 0.0, 0.0)
+    )
+    nine, time = MONDAY_S + 9 * 3600.0, np.arange(0.0, 3 * 3600.0, 600.0)
+
+    def p_busy(detected: FloatArray, at: float) -> float:
+        looks = Looks.from_rows(np.zeros(len(time), int), nine + time, detected, 0.1, 0.1)
+        return float(model.track(looks, Instants(np.array([0, 1]), np.array([at]))).p_present[0])
+
+    none, some = np.zeros(len(time)), np.arange(len(time)) % 3 == 0
+    assert p_busy(none, nine + 8 * 3600.0) < 0.05
+    assert p_busy(some, nine + 8 * 3600.0) > 0.45
+    assert p_busy(none, nine + 24 * 3600.0) == pytest.approx(0.5 * (1.0 - 0.02), abs=1e-3)  # closed, if still again
+
+
+def test_unusual_days_are_kept_as_plain_values_and_need_a_rhythm() -> None:
+    again = RunLength.from_dict(UNUSUAL.to_dict())
+    assert again.unusual == SHARES
+    old = {key: value for key, value in UNUSUAL.to_dict().items() if key != "unusual"}
+    assert RunLength.from_dict(old).unusual is None  # written before there were any
+    with pytest.raises(ConfigError, match=r"unusual.*without a rhythm"):
+        RunLength(STAY, ABSENCE, STEP_S, unusual=SHARES)
+    for wrong in (DayShares(-0.1, 0.1, 0.1), DayShares(0.5, 0.3, 0.2), DayShares(np.nan, 0.1, 0.1)):
+        with pytest.raises(ConfigError, match="are not shares of days"):
+            replace(UNUSUAL, unusual=wrong)

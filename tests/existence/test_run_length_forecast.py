@@ -39,7 +39,7 @@ def believed(model: RunLength, seed: int = 1, n: int = 40) -> RunLengthBelief:
 def hypotheses(state: RunLengthBelief, which: int) -> tuple[FloatArray, FloatArray]:
     """Ages and probabilities of one feature's hypotheses about one state."""
     n = state.count[0, which]
-    return state.stamp_s[0] - state.start_s[0, which, :n], state.weight[0, which, :n]
+    return state.stamp_s[0] - state.start_s[0, which, :n], state.weight[0, 0, which, :n]
 
 
 def left_over(prior: LifetimePrior, age: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -269,7 +269,7 @@ def test_beliefs_are_probabilities(seed: int, stay: LifetimePrior, absence: Life
     assert (track.log_evidence <= 1e-9).all()
     state: RunLengthBelief = RunLengthBelief.after(model, looks)
     np.testing.assert_allclose(
-        [[state.weight[f, s, : state.count[f, s]].sum() for s in (0, 1)] for f in range(3)],
+        [[state.weight[f, 0, s, : state.count[f, s]].sum() for s in (0, 1)] for f in range(3)],
         np.stack([1.0 - state.probability, state.probability], axis=1),
         atol=1e-12,
     )

@@ -17,7 +17,7 @@ import numpy as np
 from evermap.errors import ConfigError, DataError
 from evermap.existence.lifetimes import edges
 from evermap.existence.protocol import Candidate, Looks
-from evermap.existence.rhythm import BIN_S, BINS, WEEK_S, fit, steady_level
+from evermap.existence.rhythm import BIN_S, BINS, DAY_S, UNUSUAL, WEEK_S, DayShares, day_shares, fit, steady_level
 from evermap.existence.run_length import RunLength
 from evermap.existence.run_length_smoothing import Lattice, lattice
 from evermap.existence.sojourns import FAMILIES, WITH_RHYTHM, Fitted, Sojourns
@@ -112,11 +112,38 @@ class Data(Shown):
         n = 1 + max(int(weeks.max()) for weeks in ago)
         return cls(tuple(pieces), weights, tuple(n - 1 - weeks for weeks in ago), n, step_s, rhythm, span, last)
 
+    def days(self, model: RunLength, counted: FloatArray) -> tuple[FloatArray, Data, DayShares]:
+        """Tell the kinds of the days by the looks of each.
+
+        Args:
+            model: how features come and go, with a rhythm.
+            counted: (K,) numbers of earlier days of each kind.
+
+        Returns:
+            (K,) how many days were of each kind; the same looks, with no weight on days on which nothing could change,
+            so that what is learned from them is of the others; and the shares of days to come.
+        """
+        from evermap.existence.run_length_kernels import LookColumns, kinds_of_days
+
+        guess = replace(model, unusual=DayShares(UNUSUAL, UNUSUAL, UNUSUAL))
+        law, first = guess.law, guess.first
+        likelihood = [kinds_of_days(LookColumns(*piece), guess.slots, law, first) for piece in self.lattices]
+        begun = [piece.stamp_s // DAY_S for piece in self.lattices]
+        steps = [(days[:-1] - days[0]).astype(np.int64) for days in begun]
+        weights = [
+            np.bincount(day, weight, len(rows)) / np.maximum(np.bincount(day, minlength=len(rows)), 1)
+            for day, weight, rows in zip(steps, self.importance, likelihood, strict=True)
+        ]
+        total, kind, shares = day_shares(np.concatenate(likelihood), np.concatenate(weights), counted)
+        moving = np.split(1.0 - kind[:, 1], np.cumsum([len(rows) for rows in likelihood])[:-1])
+        importance = tuple(w * m[day] for w, m, day in zip(self.importance, moving, steps, strict=True))
+        return total, replace(self, importance=importance), shares
+
     def expect(self, model: RunLength, level: FloatArray | None = None) -> Expected:
         """Run the filter forward and backward and count.
 
         Args:
-            model: how features come and go.
+            model: how features come and go, on ordinary days.
             level: (2, P) by what the hazards of absences and stays are multiplied in each week.
         """
         from evermap.existence.run_length_smoothing import Calendar, SojournCounts, expectations
@@ -233,6 +260,7 @@ def with_lifetimes(model: RunLength, fitted: tuple[Fitted, Fitted]) -> RunLength
 
 _WARM_UP_ROUNDS = 4
 _TRIAL_ROUNDS = 8
+_LAST_ROUNDS = 3
 _MOST_ROUNDS = 20
 
 Progress = Callable[[float], None]
@@ -250,6 +278,7 @@ class LearnedSojourns(Shown):
         half_life_s: time after which a look counts half; infinite where nothing is forgotten.
         last_s: end of the last look.
         expected: counts of absences and stays: all that learning remembers of the looks.
+        of_kind: (K,) expected numbers of days of each kind (`rhythm.DayShares`); empty where there is no rhythm.
     """
 
     model: RunLength
@@ -259,6 +288,7 @@ class LearnedSojourns(Shown):
     half_life_s: float
     last_s: float
     expected: Expected
+    of_kind: FloatArray
 
     def updated(self, looks: Looks) -> LearnedSojourns:
         """Learn from further looks: one expectation step on them, added to what is remembered of the earlier ones.
@@ -271,8 +301,11 @@ class LearnedSojourns(Shown):
         """
         rhythm = self.model.stay_rhythm is not None
         data = Data.of(looks, self.model.step_s, self.half_life_s, rhythm=rhythm)
-        new = data.expect(self.model)
         fade = 2.0 ** (-max(data.last_s - self.last_s, 0.0) / self.half_life_s)
+        of_kind, unusual = self.of_kind, None
+        if rhythm:
+            of_kind, data, unusual = data.days(self.model, fade * self.of_kind)
+        new = data.expect(replace(self.model, unusual=None))
         absences, stays = (_added(old, more, fade) for old, more in zip(self.expected.counts, new.counts, strict=True))
         fitted = (
             ranked_fits(absences, self.families, None, rhythm=rhythm)[0],
@@ -280,10 +313,11 @@ class LearnedSojourns(Shown):
         )
         return replace(
             self,
-            model=with_lifetimes(self.model, fitted),
+            model=replace(with_lifetimes(self.model, fitted), unusual=unusual),
             log_evidence=new.log_evidence,
             last_s=max(data.last_s, self.last_s),
             expected=replace(new, counts=(absences, stays)),
+            of_kind=of_kind,
         )
 
 
@@ -319,9 +353,7 @@ def learn(
     step = step_s or looks.median_gap_s()
     data = Data.of(looks, step, half_life_s, rhythm=False)
     tell = progress or (lambda _: None)
-
     ascents = [_exponential(data, hypotheses, restarts, tell)]
-    tell(0.5)
     if rhythm or allowed != ("exponential",):
         # what a model of one family counts looks like that family: each has to be tried from its own counts
         calendar = Data.of(looks, step, half_life_s, rhythm=True) if rhythm else data
@@ -333,20 +365,31 @@ def learn(
         best_first = sorted(trials, key=lambda ascent: -ascent.score)
         finals = [climb(calendar, trial.model, allowed, _MOST_ROUNDS) for trial in best_first[: 2 if rhythm else 1]]
         ascents = [*finals, *trials] if rhythm else [*ascents, *trials, *finals]
-    tell(1.0)
     ranked = sorted(ascents, key=lambda ascent: -ascent.score)
     candidates: dict[str, Candidate] = {}
     for ascent in ranked:  # the best of each kind
         candidates.setdefault(ascent.name, ascent.candidate)
+    best, of_kind, unusual = _with_unusual_days(calendar, ranked[0]) if rhythm else (ranked[0], np.zeros(0), None)
+    tell(1.0)
     return LearnedSojourns(
-        ranked[0].model,
-        ranked[0].expected.log_evidence,
+        replace(best.model, unusual=unusual),
+        best.expected.log_evidence,
         tuple(candidates.values()),
         allowed,
         half_life_s,
         data.last_s,
-        ranked[0].expected,
+        best.expected,
+        of_kind,
     )
+
+
+def _with_unusual_days(data: Data, best: Ascent) -> tuple[Ascent, FloatArray, DayShares]:
+    """The same, learned from the days on which something could change; numbers and shares of the days of each kind."""
+    _, moving, _ = data.days(best.model, np.zeros(4))
+    families = tuple(dict.fromkeys(one.family for one in best.fitted))
+    again = climb(moving, best.model, families, _LAST_ROUNDS)
+    of_kind, _, shares = data.days(again.model, np.zeros(4))
+    return again, of_kind, shares
 
 
 def _allowed(families: Sequence[str] | None, *, rhythm: bool) -> tuple[str, ...]:
@@ -367,7 +410,9 @@ def _exponential(data: Data, hypotheses: int, restarts: int, tell: Progress) -> 
         starts.append(climb(data, model, ("exponential",), _WARM_UP_ROUNDS))
         tell(0.3 * (number + 1) / restarts)
     simple = max(starts, key=lambda ascent: ascent.expected.log_evidence)
-    return climb(data, simple.model, ("exponential",), _MOST_ROUNDS)
+    found = climb(data, simple.model, ("exponential",), _MOST_ROUNDS)
+    tell(0.5)
+    return found
 
 
 def _added(old: Sojourns, new: Sojourns, fade: float) -> Sojourns:

@@ -72,6 +72,62 @@ def bin_of_week(stamp_s: ArrayLike) -> IntArray:
     return np.minimum((phase / BIN_S).astype(np.int64), BINS - 1)
 
 
+class DayShares(NamedTuple):
+    """Shares of the days that do not follow their rhythm.
+
+    Attributes:
+        still: nothing changes: a holiday, a building that is closed.
+        other: hazards are those of the mean day, at every time of it: a Saturday on which people work.
+        timeless: hazards are their means over the week, day and night.
+    """
+
+    still: float
+    other: float
+    timeless: float
+
+
+def day_shares(
+    likelihood: FloatArray, importance: FloatArray, counted: FloatArray
+) -> tuple[FloatArray, FloatArray, DayShares]:
+    """Return how many days were of each kind, and the shares to expect of days to come.
+
+    Days are a multinomial sample with the prior Dirichlet(1/2, ..): a kind that none of `n` days was of has the share
+    `1/2 / (n + 2)`, the estimator of least regret in log loss (Krichevsky and Trofimov 1981). A day on which a kind
+    would have looked like any other says nothing about its share. By EM, as each day's kind is uncertain.
+
+    Args:
+        likelihood: (D, K) of each day's looks on each kind of day, up to a factor of the day.
+        importance: (D,) weight of each day.
+        counted: (K,) numbers of earlier days of each kind.
+
+    Returns:
+        (K,) expected numbers of days, (D, K) probability of each kind of each day, and the shares.
+    """
+    share = np.append(1.0 - 3.0 * UNUSUAL, np.full(3, UNUSUAL))
+    for _ in range(_DAY_ROUNDS):
+        kind = share * likelihood
+        kind /= kind.sum(axis=1, keepdims=True)
+        total, before = counted + importance @ kind, share
+        share = (total + 0.5) / (total.sum() + 0.5 * len(total))
+        if np.abs(share - before).max() < _DAY_SETTLED:
+            break
+    return total, kind, DayShares(*map(float, share[1:]))
+
+
+def on_other_days(factor: FloatArray) -> FloatArray:
+    """Return (4, 2, 1008) factors on an ordinary day, and on those of `DayShares`.
+
+    Args:
+        factor: (2, 1008) factors on the hazards of absences and stays on an ordinary day.
+    """
+    other = np.tile(factor.reshape(2, 7, BINS_OF_DAY).mean(axis=1), 7)
+    timeless = np.repeat(factor.mean(axis=1), BINS).reshape(2, BINS)
+    return np.stack([factor, np.zeros_like(factor), other, timeless])
+
+
+UNUSUAL = 0.01
+"""Share of each unusual kind of day to begin with."""
+_DAY_ROUNDS, _DAY_SETTLED = 500, 1e-6
 HALF_AN_EVENT = 0.5
 """Added to every table where the exposure is, so that no rate is zero (Jeffreys' prior of a Poisson rate)."""
 DAY_KNOTS = 72

@@ -17,7 +17,7 @@ from evermap.existence import protocol as checks
 from evermap.existence.belief import RecurrentBeliefTable
 from evermap.existence.lifetimes import HazardTable, Lifetimes, bins_of, edges, proportional, tabulate
 from evermap.existence.protocol import Instants, Looks, Track, impossible
-from evermap.existence.rhythm import BIN_S, BINS, Rhythm
+from evermap.existence.rhythm import BIN_S, BINS, DayShares, Rhythm, on_other_days
 from evermap.show import Shown
 from evermap.survival.base import LifetimePrior
 from evermap.types import FloatArray, IntArray
@@ -36,6 +36,11 @@ class RunLength(Shown):
     A hazard at local time `t` of a stay of age `a` is that of its lifetime at `a` times its rhythm at `t`. Within one
     step of time a feature changes at most once, in the middle of it.
 
+    With `unusual` days, each day from midnight to midnight is of a kind `k`, drawn from their shares `p_k`, and the
+    rhythm is `r_k(t)` (`rhythm.on_other_days`). The filter holds `w_k(s, b) = P(k, in state s since b | looks)`: within
+    a day a look multiplies all kinds by the same likelihood of `s`, so that kinds are told by how their hazards
+    predicted it, and at midnight `w_k(s, b) <- p_k sum_j w_j(s, b)`.
+
     Attributes:
         stay: lifetime of presences.
         absence: lifetime of absences.
@@ -44,9 +49,11 @@ class RunLength(Shown):
         absence_rhythm: factor on the hazard of returning.
         newborn: features are there, and new, when they are first heard of; otherwise they have come and gone for ever.
         hypotheses: how many are kept of each feature.
+        unusual: shares of the days that do not follow the rhythm; all do where None.
 
     Raises:
-        ConfigError: a step that is not positive, or fewer than 8 hypotheses or more than 10,000.
+        ConfigError: a step that is not positive, fewer than 8 hypotheses or more than 10,000, or unusual days without a
+            rhythm.
     """
 
     stay: LifetimePrior
@@ -56,6 +63,7 @@ class RunLength(Shown):
     absence_rhythm: Rhythm | None = None
     newborn: bool = False
     hypotheses: int = 64
+    unusual: DayShares | None = None
 
     def __post_init__(self) -> None:
         if not 0.0 < self.step_s < np.inf:
@@ -65,6 +73,10 @@ class RunLength(Shown):
         if self.hypotheses > _MOST_HYPOTHESES:
             problem = f"{self.hypotheses} hypotheses are too many"
             raise ConfigError(problem, field="hypotheses", hint=f"at most {_MOST_HYPOTHESES}")
+        if self.unusual and not (self.stay_rhythm or self.absence_rhythm):
+            raise ConfigError("without a rhythm no day is unusual", field="unusual", hint="None, or a rhythm")
+        if self.unusual and not (min(self.unusual) >= 0.0 and sum(self.unusual) < 1.0):
+            raise ConfigError(f"{tuple(self.unusual)} are not shares of days", field="unusual", hint="a sum below 1")
 
     @classmethod
     def from_lifetimes(cls, lifetimes: Lifetimes, *, step_s: float | None = None) -> RunLength:
@@ -115,17 +127,20 @@ class RunLength(Shown):
         from evermap.existence.run_length_kernels import Law
 
         absence, stay = self.tables
-        none = np.ones((2, 1))
+        none = np.ones((1, 2, 1))
         if self.stay_rhythm or self.absence_rhythm:
             rhythms = (self.absence_rhythm, self.stay_rhythm)
-            factor = np.stack([rhythm.factor if rhythm else np.ones(BINS) for rhythm in rhythms])
+            factor = np.stack([rhythm.factor if rhythm else np.ones(BINS) for rhythm in rhythms])[None]
         else:
             factor = none
+        share = np.ones(1)
+        if self.unusual:
+            share, factor = np.array([1.0 - sum(self.unusual), *self.unusual]), on_other_days(factor[0])
         hazard = np.stack([absence.hazard_hz, stay.hazard_hz])
         intercept = np.stack([table.cumulative - table.hazard_hz * table.edge_s for table in self.tables])
         # a step is never longer than the rhythm is constant
         step_s = min(self.step_s, BIN_S) if factor is not none else self.step_s
-        return Law(float(step_s), factor, absence.offset, hazard, intercept)
+        return Law(float(step_s), share, factor, absence.offset, hazard, intercept)
 
     @cached_property
     def tables(self) -> tuple[HazardTable, HazardTable]:
@@ -137,19 +152,21 @@ class RunLength(Shown):
         """What is believed before the first look."""
         from evermap.existence.run_length_kernels import First, RunHypotheses, week_of_beliefs
 
-        age, weight = np.zeros((1, 2, self.slots)), np.zeros((1, 2, self.slots))
+        kinds = len(self.law.share)
+        age, weight = np.zeros((1, 2, self.slots)), np.zeros((1, kinds, 2, self.slots))
         if self.newborn:
-            weight[0, PRESENT, 0] = 1.0
+            weight[0, :, PRESENT, 0] = self.law.share
             return First(age, weight, np.array([[0, 1]]))
         for state, table in enumerate(self.tables):
-            age[0, state, :-1], weight[0, state, :-1] = _equilibrium(table, self.slots - 1)
+            age[0, state, :-1], mass = _equilibrium(table, self.slots - 1)
+            weight[0, :, state, :-1] = self.law.share[:, None] * mass
         weight /= weight.sum()
         count = np.full((1, 2), self.slots - 1)
-        if self.law.factor.shape[1] == 1:
+        if self.law.factor.shape[2] == 1:
             return First(age, weight, count)
         from evermap.existence.rhythm import MONDAY_S
 
-        ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, 2, self.slots))
+        ages, weights = np.zeros((BINS, 2, self.slots)), np.zeros((BINS, kinds, 2, self.slots))
         counts = np.zeros((BINS, 2), dtype=np.int64)
         week = First(ages, weights, counts)
         week_of_beliefs(RunHypotheses(MONDAY_S - age[0], weight[0], count[0]), self.law, week)
@@ -168,6 +185,7 @@ class RunLength(Shown):
             "absence_rhythm": self.absence_rhythm.to_dict() if self.absence_rhythm else None,
             "newborn": self.newborn,
             "hypotheses": self.hypotheses,
+            "unusual": list(self.unusual) if self.unusual else None,
         }
 
     @classmethod
@@ -185,6 +203,7 @@ class RunLength(Shown):
             absence_rhythm,
             bool(data["newborn"]),
             int(data["hypotheses"]),
+            DayShares(*map(float, data["unusual"])) if data.get("unusual") else None,
         )
 
 
@@ -212,7 +231,7 @@ class RunLengthBelief(RecurrentBeliefTable):
     Attributes:
         model: how they come and go.
         start_s: (N, 2, S) since when.
-        weight: (N, 2, S) with which probability.
+        weight: (N, K, 2, S) with which probability, and on which kind of day.
         count: (N, 2) number of hypotheses; places beyond it hold anything.
         stamp_s: (N,) when these held.
         log_evidence: (N,) `log p(looks)`.
@@ -238,15 +257,16 @@ class RunLengthBelief(RecurrentBeliefTable):
     @property
     def probability(self) -> FloatArray:
         """(N,) probability of presence at `stamp_s`."""
-        held = np.arange(self.weight.shape[2]) < self.count[:, PRESENT, None]
-        return np.asarray(self.weight[:, PRESENT].sum(axis=1, where=held).clip(0.0, 1.0), dtype=np.float64)
+        held = np.arange(self.weight.shape[3]) < self.count[:, PRESENT, None]
+        there = self.weight[:, :, PRESENT].sum(axis=1)
+        return np.asarray(there.sum(axis=1, where=held).clip(0.0, 1.0), dtype=np.float64)
 
     @classmethod
     def _first(cls, model: RunLength, time: FloatArray) -> Self:
         from evermap.existence.run_length_kernels import RunHypotheses, begin_rows
 
         n = len(time)
-        start, weight = np.zeros((2, n, 2, model.slots))
+        start, weight = np.zeros((n, 2, model.slots)), np.zeros((n, len(model.law.share), 2, model.slots))
         count = np.zeros((n, 2), dtype=np.int64)
         begin_rows(RunHypotheses(start, weight, count), time, model.first)
         return cls(model, start, weight, count, time, np.zeros(n), np.zeros(n))
@@ -285,14 +305,14 @@ class RunLengthBelief(RecurrentBeliefTable):
         With a rhythm, a numerical integral over the coming weeks.
         """
         which, law = int(present), self.model.law
-        if law.factor.shape[1] > 1:
+        if law.factor.shape[2] > 1:
             from evermap.existence.run_length_kernels import remaining_rows
 
             left = np.empty(len(self))
             remaining_rows(self.rows, which, law, WEEKS, left)
             return left
-        held = np.arange(self.weight.shape[2]) < self.count[:, which, None]
-        weight = np.where(held, self.weight[:, which], 0.0)
+        held = np.arange(self.weight.shape[3]) < self.count[:, which, None]
+        weight = np.where(held, self.weight[:, 0, which], 0.0)
         age = np.where(held, self.stamp_s[:, None] - self.start_s[:, which], 0.0)
         life = residual_life(self.model.tables[which], age)
         total = weight.sum(axis=1)

@@ -16,7 +16,7 @@ from numba import prange
 
 from evermap.existence.elementary import exp, expm1, inlined, kernel, parallel_kernel, reordered
 from evermap.existence.lifetimes import SHIFT
-from evermap.existence.rhythm import BIN_S, BINS, MONDAY_S, WEEK_S
+from evermap.existence.rhythm import BIN_S, BINS, DAY_S, MONDAY_S, WEEK_S
 from evermap.types import FloatArray, IntArray
 
 MOST = 700.0
@@ -32,14 +32,16 @@ class Law(NamedTuple):
 
     Attributes:
         step_s: longest step of time.
-        factor: (2, 1008) by what the hazards of absences (0) and stays (1) are multiplied at each ten minutes of the
-            week; (2, 1) ones where there is no rhythm.
+        share: (K,) of the kinds of day.
+        factor: (K, 2, 1008) by what the hazards of absences (0) and stays (1) are multiplied at each ten minutes of the
+            week on each kind of day; (1, 2, 1) ones where there is no rhythm.
         offset: of the bins of age (`hazard_table`).
         hazard_hz: (2, B) hazard in each bin.
         intercept: (2, B) the hazard integrated up to an age `a` in bin `i` is `intercept[i] + hazard_hz[i] a`.
     """
 
     step_s: float
+    share: FloatArray
     factor: FloatArray
     offset: int
     hazard_hz: FloatArray
@@ -51,7 +53,7 @@ class RunHypotheses(NamedTuple):
 
     Attributes:
         start: (2, S) since when it has been in state `s`.
-        weight: (2, S) with which probability.
+        weight: (K, 2, S) with which probability, and on which kind of day.
         number: (2,) of hypotheses; places beyond it hold anything.
     """
 
@@ -101,7 +103,7 @@ class First(NamedTuple):
 
     Attributes:
         age_s: (W, 2, S) how long it has been so.
-        weight: (W, 2, S) with which probability.
+        weight: (W, K, 2, S) with which probability, and on which kind of day.
         number: (W, 2) number of hypotheses.
     """
 
@@ -143,13 +145,13 @@ def _week_bin(stamp_s: Any, n: Any) -> Any:
 
 
 @inlined
-def _hazards(start: Any, n: Any, s: Any, now: Any, later: Any, factor: Any, law: Any, hazard: Any) -> None:
-    """Integrated hazard of every hypothesis of state `s` between two instants, into `hazard[s]`.
+def _hazards(start: Any, n: Any, s: Any, now: Any, later: Any, law: Any, hazard: Any) -> None:
+    """Integrated hazard of every hypothesis of state `s` between two instants, without a rhythm, into `hazard[s]`.
 
     A loop of its own: one that looks up a table keeps a compiler from using vectors for the exponentials.
     """
     for j in range(n):
-        hazard[s, j] = min(factor * _integrated(now - start[s, j], later - start[s, j], s, law), MOST)
+        hazard[s, j] = _integrated(now - start[s, j], later - start[s, j], s, law)
 
 
 @inlined
@@ -170,17 +172,23 @@ def _cheapest(start: Any, weight: Any, n: Any, s: Any, now: Any) -> Any:
 
 
 @kernel
-def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float) -> tuple[int, float]:
+def _merge(start: FloatArray, weight: FloatArray, n: int, s: int, now: float, total: FloatArray) -> tuple[int, float]:
     """Unite the two cheapest neighbours; position of the first of them, and the mass of the lighter."""
-    best = _cheapest(start, weight, n, s, now)
-    a, b = weight[s, best], weight[s, best + 1]
+    for j in range(n):
+        total[s, j] = weight[0, s, j]
+    for k in range(1, len(weight)):
+        for j in range(n):
+            total[s, j] += weight[k, s, j]
+    best = _cheapest(start, total, n, s, now)
+    a, b = total[s, best], total[s, best + 1]
     share = b / (a + b) if a + b > 0.0 else 0.5
     start[s, best] += share * (start[s, best + 1] - start[s, best])
-    weight[s, best] = a + b
     for j in range(best + 1, n - 1):
         start[s, j] = start[s, j + 1]
-    for j in range(best + 1, n - 1):
-        weight[s, j] = weight[s, j + 1]
+    for k in range(len(weight)):
+        weight[k, s, best] += weight[k, s, best + 1]
+        for j in range(best + 1, n - 1):
+            weight[k, s, j] = weight[k, s, j + 1]
     return best, min(a, b)
 
 
@@ -195,23 +203,24 @@ def _step(
     start, weight, count = held
     scratch, merged = space
     middle = 0.5 * (now + later)
-    week = _week_bin(middle, law.factor.shape[1])
+    week = _week_bin(middle, law.factor.shape[2])
     for s in range(2):
-        _hazards(start, count[s], s, now, later, scale[s] * law.factor[s, week], law, scratch)
-        for j in range(count[s]):
-            x, mass = scratch[s, j], weight[s, j]
-            scratch[s, j] = -mass * expm1(-x)
-            weight[s, j] = mass * exp(-x) if x < MOST else 0.0
-    ended = (_sum(scratch, 0, count[0]), _sum(scratch, 1, count[1]))
+        _hazards(start, count[s], s, now, later, law, scratch)
+        for k in range(len(weight)):
+            factor = scale[s] * law.factor[k, s, week]
+            for j in range(count[s]):
+                x, mass = min(factor * scratch[s, j], MOST), weight[k, s, j]
+                scratch[1 - s, j] = -mass * expm1(-x)
+                weight[k, s, j] = mass * exp(-x) if x < MOST else 0.0
+            weight[k, 1 - s, count[1 - s]] = _sum(scratch, 1 - s, count[s])
     moved = 0.0
     for s in range(2):
         n = count[s]
         start[s, n] = middle
-        weight[s, n] = ended[1 - s]
         merged[s] = NO_MERGE
         n += 1
         if n == start.shape[1]:
-            merged[s], mass = _merge(start, weight, n, s, later)
+            merged[s], mass = _merge(start, weight, n, s, later, scratch)
             moved += mass
             n -= 1
         count[s] = n
@@ -219,19 +228,54 @@ def _step(
 
 
 @kernel
-def _look(weight: FloatArray, count: IntArray, absent: float, present: float) -> float:
+def _redraw(held: RunHypotheses, now: float, later: float, share: FloatArray) -> None:
+    """Draw the kind of a day that begins between two instants."""
+    weight, count = held.weight, held.number
+    if len(weight) == 1 or later // DAY_S == now // DAY_S:
+        return
+    for s in range(2):
+        for j in range(count[s]):
+            total = 0.0
+            for k in range(len(weight)):
+                total += weight[k, s, j]
+            for k in range(len(weight)):
+                weight[k, s, j] = share[k] * total
+
+
+@reordered
+def _mass(weight: Any, k: Any, s: Any, n: Any) -> Any:
+    """Probability of state `s` on a day of kind `k`, added as `_sum` adds."""
+    total = 0.0
+    for j in range(n):
+        total += weight[k, s, j]
+    return total
+
+
+@inlined
+def _masses(weight: Any, s: Any, n: Any) -> Any:
+    """Probability of state `s`."""
+    total = 0.0
+    for k in range(len(weight)):
+        total += _mass(weight, k, s, n)
+    return total
+
+
+@kernel
+def _look(held: RunHypotheses, absent: float, present: float) -> float:
     """Multiply by the likelihoods of a look and normalise; returns the probability of the look.
 
     A state that the look rules out keeps no hypotheses.
     """
-    mass = (absent * _sum(weight, 0, count[0]), present * _sum(weight, 1, count[1]))
+    weight, count = held.weight, held.number
+    mass = (absent * _masses(weight, 0, count[0]), present * _masses(weight, 1, count[1]))
     total: float = mass[0] + mass[1]
     for s in range(2):
         if mass[s] == 0.0:
             count[s] = 0
         scale = (present if s == 1 else absent) / total
-        for j in range(count[s]):
-            weight[s, j] *= scale
+        for k in range(len(weight)):
+            for j in range(count[s]):
+                weight[k, s, j] *= scale
     return total
 
 
@@ -239,13 +283,20 @@ def _look(weight: FloatArray, count: IntArray, absent: float, present: float) ->
 def _present(held: RunHypotheses, now: float, later: float, law: Law, scratch: FloatArray) -> float:
     """Probability of presence at `later`, at most a step after `now`."""
     start, weight, count = held
-    week = _week_bin(0.5 * (now + later), law.factor.shape[1])
+    middle = 0.5 * (now + later)
+    week = _week_bin(middle, law.factor.shape[2])
+    if len(weight) > 1 and middle // DAY_S > now // DAY_S:
+        weight = weight.copy()
+        _redraw(RunHypotheses(start, weight, count), now, middle, law.share)
+    absent, there = _masses(weight, 0, count[0]), _masses(weight, 1, count[1])
+    present = there
     for s in range(2):
-        _hazards(start, count[s], s, now, later, law.factor[s, week], law, scratch)
-        for j in range(count[s]):
-            scratch[s, j] = -weight[s, j] * expm1(-scratch[s, j])
-    absent, there = _sum(weight, 0, count[0]), _sum(weight, 1, count[1])
-    present = there - _sum(scratch, 1, count[1]) + _sum(scratch, 0, count[0])
+        _hazards(start, count[s], s, now, later, law, scratch)
+        for k in range(len(weight)):
+            factor = law.factor[k, s, week]
+            for j in range(count[s]):
+                scratch[1 - s, j] = -weight[k, s, j] * expm1(-min(factor * scratch[s, j], MOST))
+            present += (1.0 - 2.0 * s) * _sum(scratch, 1 - s, count[s])
     share: float = present / (absent + there)
     return min(max(share, 0.0), 1.0)
 
@@ -259,25 +310,31 @@ def advance(
     Returns:
         The time reached, and the mass merged.
     """
-    moved = 0.0
-    while until - now > law.step_s:
-        moved += _step(held, now, now + law.step_s, law, AS_THEY_ARE, space)
-        now += law.step_s
-    if not whole and until > now:
-        moved += _step(held, now, until, law, AS_THEY_ARE, space)
-        now = until
+    moved, kinds = 0.0, len(law.share)
+    while now < until:
+        later = min(now + law.step_s, until)
+        if whole and until - now <= law.step_s:
+            break
+        if kinds > 1:
+            _redraw(held, now, 0.5 * (now + later), law.share)
+        moved += _step(held, now, later, law, AS_THEY_ARE, space)
+        if kinds > 1:
+            _redraw(held, 0.5 * (now + later), later, law.share)
+        now = later
     return now, moved
 
 
 @kernel
-def _room(slots: int) -> Workspace:
+def room(slots: int) -> Workspace:
+    """Return room to work in."""
     return Workspace(np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
 
 
 @kernel
-def nothing_held(slots: int) -> RunHypotheses:
+def nothing_held(slots: int, law: Law) -> RunHypotheses:
     """Return room for the hypotheses of a feature."""
-    return RunHypotheses(np.zeros((2, slots)), np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
+    kinds = len(law.share)
+    return RunHypotheses(np.zeros((2, slots)), np.zeros((kinds, 2, slots)), np.zeros(2, dtype=np.int64))
 
 
 @kernel
@@ -289,7 +346,8 @@ def begin(held: RunHypotheses, stamp_s: float, prior: First) -> None:
         count[s] = prior.number[week, s]
         for j in range(count[s]):
             start[s, j] = stamp_s - prior.age_s[week, s, j]
-            weight[s, j] = prior.weight[week, s, j]
+            for k in range(len(weight)):
+                weight[k, s, j] = prior.weight[week, k, s, j]
 
 
 @kernel
@@ -305,7 +363,7 @@ def _track_one(
 ) -> tuple[float, float, int]:
     """All looks at one feature and all instants asked for; log evidence, mass merged, impossible look or -1."""
     stamp_s, absent, present = looks
-    held, space = nothing_held(slots), _room(slots)
+    held, space = nothing_held(slots, law), room(slots)
     evidence, moved = 0.0, 0.0
     m, n = stamp_s.size, asked_s.size
     if m + n == 0:
@@ -324,7 +382,7 @@ def _track_one(
         if i < m:
             now, mass = advance(held, now, stamp_s[i], law, space, False)
             moved += mass
-            likelihood = _look(held.weight, held.number, absent[i], present[i])
+            likelihood = _look(held, absent[i], present[i])
             if not likelihood > 0.0:
                 return evidence, moved, i
             evidence += np.log(likelihood)
@@ -364,12 +422,12 @@ def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law) -
     """Return one look at each of many features, in place; the first row that is impossible under both states, or -1."""
     everyone, now_s, evidence, moved = state
     stamp_s, absent, present = looks
-    space = _room(everyone.start.shape[2])
+    space = room(everyone.start.shape[2])
     for i in range(len(rows)):
         f = rows[i]
         held = RunHypotheses(everyone.start[f], everyone.weight[f], everyone.number[f])
         now, mass = advance(held, now_s[f], stamp_s[i], law, space, False)
-        likelihood = _look(held.weight, held.number, absent[i], present[i])
+        likelihood = _look(held, absent[i], present[i])
         if not likelihood > 0.0:
             return i
         now_s[f] = now
@@ -382,7 +440,7 @@ def look_rows(rows: IntArray, state: BeliefRows, looks: LookColumns, law: Law) -
 def predict_rows(rows: IntArray, state: BeliefRows, stamp_s: FloatArray, law: Law, belief: FloatArray) -> None:
     """Evaluate presence of many features at one instant each; nothing of the state changes."""
     everyone, now_s = state.held, state.now_s
-    space = _room(everyone.start.shape[2])
+    space = room(everyone.start.shape[2])
     for i in range(len(rows)):
         f = rows[i]
         held, now = RunHypotheses(everyone.start[f], everyone.weight[f], everyone.number[f]), now_s[f]
@@ -397,18 +455,19 @@ def week_of_beliefs(held: RunHypotheses, law: Law, week: First) -> None:
     """Let a belief run for two weeks from a Monday 00:00, and keep it at every ten minutes of the second."""
     start, weight, count = held
     ages, weights, counts = week
-    space = _room(start.shape[1])
+    space = room(start.shape[1])
     now = MONDAY_S
     for i in range(2 * BINS):
         at = MONDAY_S + i * BIN_S
         now, _ = advance(held, now, at, law, space, False)
-        _look(weight, count, 1.0, 1.0)
+        _look(held, 1.0, 1.0)
         if i >= BINS:
             for s in range(2):
                 counts[i - BINS, s] = count[s]
                 for j in range(count[s]):
                     ages[i - BINS, s, j] = now - start[s, j]
-                    weights[i - BINS, s, j] = weight[s, j]
+                    for k in range(len(weight)):
+                        weights[i - BINS, k, s, j] = weight[k, s, j]
 
 
 _NOTHING = 1e-10
@@ -425,18 +484,23 @@ def _step_end(now: float, law: Law) -> float:
 
 
 @kernel
-def _go_on(
-    held: RunHypotheses, s: int, now: float, later: float, law: Law, scratch: FloatArray, spent: FloatArray
-) -> None:
-    """Take from the weights of state `s` what ends before `later`; `spent[s]`: its time, times probability."""
+def _go_on(held: RunHypotheses, s: int, now: float, later: float, law: Law, scratch: FloatArray) -> float:
+    """Take from the weights of state `s` what ends before `later`; return its time, times probability."""
     start, left, n = held.start, held.weight, held.number[s]
-    week = _week_bin(0.5 * (now + later), law.factor.shape[1])
-    _hazards(start, n, s, now, later, law.factor[s, week], law, scratch)
-    gap = later - now
-    for j in range(n):
-        x, mass = scratch[s, j], left[s, j]
-        spent[s, j] = mass * gap * (-expm1(-x) / x if x > 1e-9 else 1.0)
-        left[s, j] = mass * exp(-x) if x < MOST else 0.0
+    middle = 0.5 * (now + later)
+    week = _week_bin(middle, law.factor.shape[2])
+    _redraw(held, now, middle, law.share)
+    _hazards(start, n, s, now, later, law, scratch)
+    gap, spent = later - now, 0.0
+    for k in range(len(left)):
+        factor = law.factor[k, s, week]
+        for j in range(n):
+            x, mass = min(factor * scratch[s, j], MOST), left[k, s, j]
+            scratch[1 - s, j] = mass * gap * (-expm1(-x) / x if x > 1e-9 else 1.0)
+            left[k, s, j] = mass * exp(-x) if x < MOST else 0.0
+        spent += _sum(scratch, 1 - s, n)
+    _redraw(held, middle, later, law.share)
+    return spent
 
 
 @kernel
@@ -444,18 +508,17 @@ def lasting_rows(state: BeliefRows, s: int, asked_s: FloatArray, law: Law, out: 
     """Evaluate the probability that state `s`, the present one, lasts until instants in order."""
     start, weight, count = state.held
     now_s = state.now_s
-    scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
-    constant = law.factor.shape[1] == 1
+    scratch = np.empty((2, start.shape[2]))
+    constant = law.factor.shape[2] == 1
     for f in range(len(now_s)):
-        left, n, now = weight[f].copy(), count[f, s], now_s[f]
-        held = RunHypotheses(start[f], left, count[f])
-        total = _sum(left, s, n)
+        held, now = RunHypotheses(start[f], weight[f].copy(), count[f]), now_s[f]
+        total = _masses(held.weight, s, count[f, s])
         for k in range(len(asked_s)):
             while now < asked_s[k]:
                 later = asked_s[k] if constant else min(_step_end(now, law), asked_s[k])
-                _go_on(held, s, now, later, law, scratch, spent)
+                _go_on(held, s, now, later, law, scratch)
                 now = later
-            out[f, k] = min(_sum(left, s, n) / total, 1.0) if total > 0.0 else np.nan
+            out[f, k] = min(_masses(held.weight, s, count[f, s]) / total, 1.0) if total > 0.0 else np.nan
 
 
 @kernel
@@ -466,26 +529,42 @@ def remaining_rows(state: BeliefRows, s: int, law: Law, weeks: int, out: FloatAr
     """
     start, weight, count = state.held
     now_s = state.now_s
-    scratch, spent = np.empty((2, start.shape[2])), np.empty((2, start.shape[2]))
+    scratch = np.empty((2, start.shape[2]))
     for f in range(len(now_s)):
-        left, n, now = weight[f].copy(), count[f, s], now_s[f]
-        held = RunHypotheses(start[f], left, count[f])
-        total = _sum(left, s, n)
+        held, now = RunHypotheses(start[f], weight[f].copy(), count[f]), now_s[f]
+        total = _masses(held.weight, s, count[f, s])
         if total == 0.0:
             out[f] = np.nan
             continue
         passed, of_week, kept = 0.0, 0.0, 1.0
         for _ in range(weeks):
-            before, of_week = _sum(left, s, n), 0.0
+            before, of_week = _masses(held.weight, s, count[f, s]), 0.0
             end_of_week = now + WEEK_S
             while now < end_of_week:
                 later = min(_step_end(now, law), end_of_week)
-                _go_on(held, s, now, later, law, scratch, spent)
-                of_week += _sum(spent, s, n)
+                of_week += _go_on(held, s, now, later, law, scratch)
                 now = later
             passed += of_week
-            kept = _sum(left, s, n) / before
-            if _sum(left, s, n) < _NOTHING * total:
+            kept = _masses(held.weight, s, count[f, s]) / before
+            if _masses(held.weight, s, count[f, s]) < _NOTHING * total:
                 kept = 0.0
                 break
         out[f] = np.inf if kept == 1.0 else (passed + of_week * kept / (1.0 - kept)) / total
+
+
+@kernel
+def kinds_of_days(looks: LookColumns, slots: int, law: Law, prior: First) -> FloatArray:
+    """Return (D, K) the likelihood of each day's looks on each kind of day, relative to that on a day of any kind."""
+    stamp_s, absent, present = looks
+    held, space = nothing_held(slots, law), room(slots)
+    now, day, kinds = stamp_s[0], stamp_s // DAY_S - stamp_s[0] // DAY_S, len(law.share)
+    out = np.ones((int(day[-1]) + 1, kinds))
+    begin(held, now, prior)
+    for i in range(len(stamp_s)):
+        now, _ = advance(held, now, stamp_s[i], law, space, False)
+        if not _look(held, absent[i], present[i]) > 0.0:
+            break
+        for k in range(kinds):  # which had its share at the begin of the day
+            mass = _mass(held.weight, k, 0, held.number[0]) + _mass(held.weight, k, 1, held.number[1])
+            out[int(day[i]), k] = mass / law.share[k]
+    return out

@@ -27,6 +27,7 @@ from evermap.existence.run_length_kernels import (
     age_bin,
     begin,
     nothing_held,
+    room,
 )
 from evermap.types import FloatArray, IntArray
 
@@ -116,7 +117,7 @@ def _copy(held: RunHypotheses, out: RunHypotheses) -> None:
     for s in range(2):
         out.number[s] = held.number[s]
         for j in range(held.start.shape[1]):
-            out.start[s, j], out.weight[s, j] = held.start[s, j], held.weight[s, j]
+            out.start[s, j], out.weight[0, s, j] = held.start[s, j], held.weight[0, s, j]
 
 
 @kernel
@@ -140,7 +141,7 @@ def _forward(
         scale = (level[0, period[k]], level[1, period[k]])
         _step(held, stamp_s[k], stamp_s[k + 1], law, scale, space)
         merges[i, 0], merges[i, 1] = space.merged[0], space.merged[1]
-        scales[i] = _look(held.weight, held.number, absent[k + 1], present[k + 1])
+        scales[i] = _look(held, absent[k + 1], present[k + 1])
 
 
 @kernel
@@ -159,7 +160,7 @@ def expectations(
         looks: T + 1 instants at most a step apart, in order and different, with their likelihoods.
         calendar: of the T steps.
         slots: places of a list of hypotheses.
-        law: the model.
+        law: the model; its days are all of one kind.
         prior: its belief before the first look.
         counts_out: filled up.
         smoothed: (T + 1,) filled in.
@@ -171,18 +172,17 @@ def expectations(
     importance, period, level = calendar
     steps = stamp_s.size - 1
     stretches = (steps + STRETCH - 1) // STRETCH
-    held = nothing_held(slots)
+    held, space = nothing_held(slots, law), room(slots)
     start, weight, count = held
-    space = Workspace(np.zeros((2, slots)), np.zeros(2, dtype=np.int64))
-    starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 2, slots))
+    starts, weights = np.zeros((STRETCH, 2, slots)), np.zeros((STRETCH, 1, 2, slots))
     counts, merges = np.zeros((STRETCH, 2), dtype=np.int64), np.zeros((STRETCH, 2), dtype=np.int64)
     scales = np.zeros(STRETCH)
     kept = KeptSteps(RunHypotheses(starts, weights, counts), merges, scales)
-    kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 2, slots))
+    kept_start, kept_weight = np.zeros((stretches + 1, 2, slots)), np.zeros((stretches + 1, 1, 2, slots))
     kept_count = np.zeros((stretches + 1, 2), dtype=np.int64)
 
     begin(held, stamp_s[0], prior)
-    evidence = np.log(_look(weight, count, absent[0], present[0]))
+    evidence = np.log(_look(held, absent[0], present[0]))
     for c in range(stretches):
         _copy(held, RunHypotheses(kept_start[c], kept_weight[c], kept_count[c]))
         a, b = c * STRETCH, min(steps, (c + 1) * STRETCH)
@@ -198,8 +198,8 @@ def expectations(
     for s in range(2):
         for j in range(count[s]):
             oldest = age_bin(stamp_s[steps] - start[s, j], law)
-            counts_out.open_ended[s, group[oldest]] += weight[s, j] * (importance[steps - 1] if steps else 1.0)
-    smoothed[steps] = weight[1, : count[1]].sum()
+            counts_out.open_ended[s, group[oldest]] += weight[0, s, j] * (importance[steps - 1] if steps else 1.0)
+    smoothed[steps] = weight[0, 1, : count[1]].sum()
 
     # what the looks to come say for each hypothesis, after this step and before it
     later, sooner = np.ones((2, slots)), np.ones((2, slots))
@@ -212,7 +212,7 @@ def expectations(
             i = k - a
             now, then = stamp_s[k], stamp_s[k + 1]
             gap, middle = then - now, 0.5 * (now + then)
-            week = _week_bin(middle, law.factor.shape[1])
+            week = _week_bin(middle, law.factor.shape[2])
             column = week if weeks > 1 else 0
             there, when = 0.0, period[k]
             for s in range(2):
@@ -223,8 +223,9 @@ def expectations(
                     newcomer -= 1
                 other *= later[1 - s, newcomer]
                 n, drift = counts[i, s], level[s, when]
-                _hazards(starts[i], n, s, now, then, law.factor[s, week], law, usual)
+                _hazards(starts[i], n, s, now, then, law, usual)
                 for j in range(n):
+                    usual[s, j] *= law.factor[0, s, week]
                     x = min(drift * usual[s, j], MOST)
                     p_end, p_live = -expm1(-x), exp(-x)
                     died[j], lived[j] = p_end * other, p_live * same
@@ -233,7 +234,7 @@ def expectations(
                 ended = expected = 0.0
                 for j in range(n):
                     to = j - 1 if merges[i, s] != NO_MERGE and j > merges[i, s] else j
-                    mass, lives, ends = weights[i, s, j], lived[j] * later[s, to], died[j]
+                    mass, lives, ends = weights[i, 0, s, j], lived[j] * later[s, to], died[j]
                     sooner[s, j] = lives + ends
                     if s == 1:
                         there += mass * (lives + ends)
