@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from evermap.config import Config
-from evermap.errors import ConfigError, DataError
+from evermap.errors import ConfigError, DataError, NumericalError
 from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
@@ -268,7 +268,10 @@ def bring_in(alone: Solved, living: LivingMap, config: Config, *, cut: bool = Tr
             if some is None:
                 return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
             if some is not visit.recording:
-                return bring_in(_solved(some, visit.prepared.warnings, config), whole, config, cut=False)
+                try:
+                    return bring_in(_solved(some, visit.prepared.warnings, config), whole, config, cut=False)
+                except (DataError, NumericalError):  # too little is left
+                    return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
         if where is not None and config.living.search == "joint" and not steps.fits(visit, alone, config.living):
             return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
         # judged twice: the second time by the lifetimes that the first has learned

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from evermap.errors import NumericalError
 from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, from_front, needed
@@ -555,7 +556,10 @@ def _rejoined(smoother: Smoother, estimate: Estimate) -> Estimate:
         alone = np.isfinite(mine[:, 0]) & ~np.isfinite(theirs[:, 0])
         landmark[alone] = se2.transform(motion, mine[alone])
         landmark[both] = theirs[both]
-        other = smoother.optimum(Estimate(pose, landmark, estimate.states), tolerance=NEAR)
+        try:
+            other = smoother.optimum(Estimate(pose, landmark, estimate.states), tolerance=NEAR)
+        except NumericalError:
+            continue
         if smoother.cost(other) < cost - COST_SLACK:
             estimate, cost = other, smoother.cost(other)
     return estimate
