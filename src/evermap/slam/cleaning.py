@@ -191,14 +191,12 @@ def _in_step(recording: Recording, remarks: list[str]) -> Odometry:
         shorter = row if lasts_s[row] < lasts_s[row - 1] else row - 1
         del delay_s[shorter], since_s[row]
         row = max(row - 1, 1)
-    usual_s = min(delay_s, key=abs)
     if len(delay_s) == 1:
         return odometry
     rows = np.maximum.accumulate([0, *(step(row)[0] for row in range(1, len(since_s)))])
-    late_s = np.repeat(delay_s, np.diff([*rows, len(odometry)])) - usual_s
+    stamp_s = odometry.stamp_s - np.repeat(delay_s, np.diff([*rows, len(odometry)])) + min(delay_s, key=abs)
     for at_s, by_s in zip(since_s[1:], np.diff(delay_s).tolist(), strict=True):
         remarks.append(f"odometry is later by {by_s:+.1f} s than the detections from {at_s:.1f} s on, taken back")
-    stamp_s = odometry.stamp_s - late_s
     kept = stamp_s > np.maximum.accumulate(np.append(-np.inf, stamp_s[:-1]))
     return replace(rows_of(odometry, kept), stamp_s=stamp_s[kept])
 
