@@ -14,7 +14,7 @@ from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment
 from evermap.slam.association.associator import Associator, fit_sighting_noise
 from evermap.slam.association.identify import identified
-from evermap.slam.association.revise import reassigned, with_overlooked
+from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
@@ -125,6 +125,15 @@ def test_detections_of_others_go_back_and_what_was_overlooked_is_a_landmark() ->
     assert found.n_landmarks == 8
     assert np.mean(found.landmark_row[true == 7] == 7) > 0.9
     np.testing.assert_allclose(found.estimate.landmark[7], made.truth.landmark[7], atol=0.1)
+
+
+def test_what_is_seen_too_seldom_is_no_landmark() -> None:
+    made = world(4)
+    true = made.problem.landmark_row
+    assert likely_real(settled(made, true)).all()
+    rng = np.random.default_rng(0)
+    ghost = settled(made, np.where((true == 5) & (rng.random(len(true)) < 0.9), NOBODY, true))
+    np.testing.assert_array_equal(likely_real(ghost), np.arange(8) != 5)
 
 
 def test_landmarks_of_two_classes_are_two_wherever_they_are() -> None:

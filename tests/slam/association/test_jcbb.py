@@ -66,7 +66,7 @@ def test_branch_and_bound_equals_all_subsets(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(40))
 def test_probabilities_are_those_of_bayes_rule(seed: int) -> None:
     pairings = random_pairings(seed)
-    probability, complete = pairing_probability(pairings, confidence=0.99)
+    probability, evidence, complete = pairing_probability(pairings, confidence=0.99)
     sets = compatible_sets(pairings, 0.99)
     weight = np.exp([w for *_, w in sets])
     expected = [
@@ -74,6 +74,7 @@ def test_probabilities_are_those_of_bayes_rule(seed: int) -> None:
     ]
     assert complete
     np.testing.assert_allclose(probability, np.array(expected) / weight.sum(), rtol=1e-9, atol=1e-15)
+    assert evidence == pytest.approx(np.log(weight.sum()), abs=1e-9)
 
 
 def test_a_pairing_that_contradicts_the_others_is_left_out() -> None:
@@ -92,7 +93,7 @@ def test_one_landmark_is_seen_once_in_a_frame() -> None:
 def test_a_search_that_is_cut_short_says_so() -> None:
     pairings = random_pairings(0, n_sources=6, n_targets=6, share=1.0, spread=0.1)
     assert not most_pairings(pairings, max_nodes=5).complete
-    assert not pairing_probability(pairings, max_nodes=5)[1]
+    assert not pairing_probability(pairings, max_nodes=5)[2]
 
 
 def test_nothing_to_pair() -> None:

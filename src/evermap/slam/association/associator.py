@@ -17,7 +17,7 @@ from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import propose_merges
-from evermap.slam.association.revise import reassigned, with_overlooked
+from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
@@ -31,14 +31,15 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 CAUTION = 2.0
 """Odometry is taken to be this much worse than where learning would start. It is not learned here: what was associated
 is what agreed with it."""
-SLIP = 3.0
-"""And this much worse in a step after which no landmark is where it should be."""
-
+SLIP, SLIP_NATS = 3.0, math.log(20.0)
+"""And this much worse in a step after which no landmark is where it should be; a priori one step in twenty slips, so
+that the wide gate alone does not make a landmark's detection of that of a ghost."""
 
 GATE = 0.999
 """Confidence of the gates of single detections and of whole frames."""
-P_MATCH = 0.95
-"""Probability from which a detection is given to a landmark."""
+P_MATCH, P_RETURN = 0.95, 0.99
+"""Probability from which a detection is given to a landmark; and to one not seen for `FORGET_S`, which closes a
+loop by itself: wrong, it bends the map for good; in doubt `merging` weighs several landmarks together later."""
 TIGHT_M2 = 0.04
 """Product of a gate's standard deviations, (0.2 m)^2, within which a wrong choice is harmless for a while."""
 FOLLOWED = math.log(16.0)
@@ -89,12 +90,16 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True)
 class _Frame:
-    """A frame compared with the map: rows of `pairings` that are certain, and p (n,) of each to be new."""
+    """A frame compared with the map.
+
+    Rows of `pairings` that are certain, p (n,) of each detection to be new, and evidence [nats] over all being new.
+    """
 
     pairings: Pairings
     taken: IntArray
     p_new: FloatArray
     sigma: FloatArray
+    evidence: float
 
 
 class Associator:
@@ -110,6 +115,7 @@ class Associator:
         self._problem = problem
         self._kind = np.full(len(problem.pose_row), UNKNOWN) if kind is None else kind
         self._of_class: IntArray = np.zeros(0, dtype=np.int64)
+        self._seen_s = np.zeros(0)
         self._start_noise = noise
         self.noise = replace(noise, odometry=CAUTION * noise.odometry)
         """Noise levels that everything is solved with; detections carry their own."""
@@ -155,7 +161,7 @@ class Associator:
         local.pose, local.covariance = before
         local.drive(Motion.between(problem, self._slipping, row, local.states))
         slipped = self._match(detections)
-        if len(slipped.taken):
+        if len(slipped.taken) and slipped.evidence >= frame.evidence + SLIP_NATS:
             return slipped
         local.pose, local.covariance = after
         return frame
@@ -179,7 +185,8 @@ class Associator:
             if changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count:
                 break
         assignment = solved.assignment
-        return assignment.without(assignment.sightings < MIN_SIGHTINGS)
+        assignment = assignment.without(assignment.sightings < MIN_SIGHTINGS)
+        return assignment.without(~likely_real(assignment))
 
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
@@ -188,13 +195,16 @@ class Associator:
         pairings = pairings_of_frame(
             self._filter, self._problem, sigma, detections, density=self._density_m2, kind=kind
         )
-        probability, _ = pairing_probability(pairings, confidence=GATE)
+        probability, evidence, _ = pairing_probability(pairings, confidence=GATE)
         known = np.zeros(len(detections))
         np.add.at(known, pairings.source, probability)
-        taken = np.flatnonzero((probability >= P_MATCH) | self._harmless(pairings, probability, known))
-        return _Frame(pairings, taken, 1.0 - known, sigma)
+        assert pairings.followed is not None
+        away = self._problem.stamp_s[self._done] - self._seen_s[pairings.target] > FORGET_S
+        least = np.where(away & ~pairings.followed, P_RETURN, P_MATCH)
+        taken = np.flatnonzero((probability >= least) | self._harmless(pairings, probability, known, least))
+        return _Frame(pairings, taken, 1.0 - known, sigma, evidence)
 
-    def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray) -> BoolArray:
+    def _harmless(self, pairings: Pairings, probability: FloatArray, known: FloatArray, least: FloatArray) -> BoolArray:
         """(K,) the best pairing of a detection where a wrong choice bends nothing, and the end or a merge will tell.
 
         That is where the gate is small, or where its rivals may well be the same landmark.
@@ -206,8 +216,10 @@ class Associator:
             rivals = rows[(probability[rows] > 1.0 - P_MATCH) & (rows != first)]
             own = pairings.covariance[2 * first : 2 * first + 2, 2 * first : 2 * first + 2]
             area_m2 = math.sqrt(np.linalg.det(own)) * math.exp(pairings.log_density_new[first]) / self._density_m2
-            tight = area_m2 < TIGHT_M2
-            best[first] = tight or all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
+            if area_m2 < TIGHT_M2:
+                best[first] = True
+            elif known[s] >= least[first]:
+                best[first] = all(self._may_be_one(pairings.target[first], pairings.target[k]) for k in rivals)
         return best
 
     def _may_be_one(self, a: int, b: int) -> bool:
@@ -228,6 +240,8 @@ class Associator:
         new = detections[frame.p_new >= P_NEW]
         self._row[new] = len(local.position) + np.arange(len(new))
         self._of_class = np.append(self._of_class, self._kind[new])
+        self._seen_s = np.append(self._seen_s, np.zeros(len(new)))
+        self._seen_s[np.append(target, self._row[new])] = problem.stamp_s[self._done]
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
         for row, place in zip(self._row[new].tolist(), at, strict=True):
             local.meet(row, place)
@@ -239,7 +253,7 @@ class Associator:
         assignment = solved.assignment
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
-        self._of_class = assignment.of_class
+        self._of_class, self._seen_s = assignment.of_class, assignment.last_seen_s
         place = assignment.estimate.landmark
         near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
         self._filter.begin(assignment.estimate, solved.marginals, self._done - 1, near)
@@ -367,7 +381,7 @@ def pairings_of_frame(
     joint = h @ local.covariance @ h.T + np.diag((sigma[seen] ** 2).ravel())
     # a square metre has r dr db
     new = np.log(np.where(followed, UNMET, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
-    return Pairings(source, target, innovation[inside], joint, new, len(detections))
+    return Pairings(source, target, innovation[inside], joint, new, len(detections), followed)
 
 
 def density_of_unmet(place: FloatArray) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from evermap.slam.kernels import kernel
-from evermap.types import FloatArray, IntArray
+from evermap.types import BoolArray, FloatArray, IntArray
 
 MAX_NODES = 200_000
 """Nodes of the tree that are visited at most; a tenth of a second."""
@@ -37,6 +37,7 @@ class Pairings:
         covariance: (2 K, 2 K) of all innovations together.
         log_density_new: (K,) of the innovation, were it a landmark not met before.
         n_sources: how many sources there are, with pairings or not.
+        followed: (K,) whose place beside the robot is known as well as it is measured; None where that is not asked.
     """
 
     source: IntArray
@@ -45,6 +46,7 @@ class Pairings:
     covariance: FloatArray
     log_density_new: FloatArray
     n_sources: int
+    followed: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +74,21 @@ def gates(n: int, confidence: float) -> FloatArray:
 
 def most_pairings(pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES) -> Matching:
     """Return the jointly compatible set with most pairings and, of those, the smallest distance."""
-    found, distance, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
+    found, distance, _, _, complete = _search(*_arguments(pairings, confidence), False, max_nodes)
     return Matching(found, distance, complete)
 
 
 def pairing_probability(
     pairings: Pairings, *, confidence: float = 0.99, max_nodes: int = MAX_NODES
-) -> tuple[FloatArray, bool]:
-    """Return (K,) probability of every pairing over all jointly compatible sets, and whether all sets were weighed."""
-    _, _, probability, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
-    return probability, complete
+) -> tuple[FloatArray, float, bool]:
+    """Return what is known of the pairings over all jointly compatible sets.
+
+    Returns:
+        (K,) probability of every pairing; evidence of all sets together, over all sources being new [nats]; and whether
+        all sets were weighed.
+    """
+    _, _, probability, evidence, complete = _search(*_arguments(pairings, confidence), True, max_nodes)
+    return probability, evidence, complete
 
 
 def _arguments(
@@ -137,7 +144,7 @@ def _search(
     gate: FloatArray,
     weigh_all: bool,
     max_nodes: int,
-) -> tuple[Any, float, FloatArray, bool]:
+) -> tuple[Any, float, FloatArray, float, bool]:
     """Depth first over the tree whose level is a source and whose branches are its pairings, and none.
 
     With `weigh_all` every compatible set is visited and adds its weight to the pairings in it; without, branches that
@@ -205,6 +212,8 @@ def _search(
         level += 1
         if level < n_sources:
             cursor[level] = first[level]
+    evidence = 0.0
     if total > 0.0:
         weight /= total
-    return best, best_distance, weight, nodes < max_nodes
+        evidence = top + np.log(total)
+    return best, best_distance, weight, evidence, nodes < max_nodes

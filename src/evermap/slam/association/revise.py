@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial import KDTree
+from scipy.special import gammainc
 
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.jcbb import gates
@@ -24,6 +25,11 @@ CONFIDENCE = 0.999
 """Of the gate: a detection outside is not of this landmark."""
 P_OWN = 0.5
 """Least probability of the landmark that a detection is given to."""
+LEAST_SEEN = 1.0 / 3.0
+"""Share of the sightings of a typical landmark that lies as it does, below which something is none."""
+LOOK_BINS = 12
+"""Classes of range with as many detections each, within which landmarks are typically seen alike."""
+ROUNDS = 20
 MIN_SIGHTINGS = 3
 """Detections, in as many frames, that make a landmark of what was left over."""
 
@@ -108,3 +114,45 @@ def with_overlooked(assignment: Assignment) -> Assignment:
         count += 1
     estimate = replace(assignment.estimate, landmark=np.concatenate(places))
     return replace(assignment, landmark_row=row, estimate=estimate)
+
+
+def likely_real(assignment: Assignment) -> BoolArray:
+    """Return (L,) landmarks that are seen as often as they should be; ghosts and corners of cars are seen too seldom.
+
+    The sightings of a landmark are Poisson, with a mean that is its own share of what is expected: of the frames that
+    have it in view, as many as see a typical landmark at that range. Something is no landmark if its share is rather
+    below `LEAST_SEEN` than above (posterior with a flat prior; what is none tells nothing about what is typical).
+    """
+    real = np.ones(assignment.n_landmarks, dtype=bool)
+    used = assignment.landmark_row >= 0
+    if not used.any():
+        return real
+    measured, estimate = assignment.measured, assignment.estimate
+    reach, bearing = measured.reading[used].T
+    edges = np.quantile(reach, np.linspace(0.0, 1.0, LOOK_BINS + 1))
+    view = np.array([bearing.min(), bearing.max()])
+    looks = _looks(estimate.pose, estimate.landmark, edges, view)
+    which = np.clip(np.searchsorted(edges, reach) - 1, 0, LOOK_BINS - 1)
+    hits = np.zeros(looks.shape)
+    np.add.at(hits, (assignment.landmark_row[used], which), 1.0)
+    for _ in range(ROUNDS):
+        rate = hits[real].sum(axis=0) / np.maximum(looks[real].sum(axis=0), 1.0)
+        before, real = real, gammainc(hits.sum(axis=1) + 1.0, LEAST_SEEN * (looks @ rate)) <= 0.5
+        if np.array_equal(before, real):
+            break
+    return real
+
+
+@kernel
+def _looks(pose: FloatArray, place: FloatArray, edges: FloatArray, view: FloatArray) -> FloatArray:
+    """(L, B) poses that have a place in view, by range."""
+    looks = np.zeros((len(place), len(edges) - 1))
+    for k in range(len(place)):
+        for n in range(len(pose)):
+            x, y = place[k, 0] - pose[n, 0], place[k, 1] - pose[n, 1]
+            away = np.hypot(x, y)
+            turned = np.arctan2(y, x) - pose[n, 2]
+            turned -= 2.0 * np.pi * np.round(turned / (2.0 * np.pi))
+            if away <= edges[-1] and view[0] <= turned <= view[1]:
+                looks[k, max(np.searchsorted(edges, away) - 1, 0)] += 1.0
+    return looks
