@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from evermap.geometry import se2
 from evermap.slam.association.assignment import Assignment, alike
-from evermap.slam.association.consensus import Candidates, Consensus, consensus
+from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
 from evermap.slam.association.jcbb import gates
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -26,6 +26,8 @@ CONFIDENCE = 0.999
 LOOSE_GATE = 60.0
 """Squared distance up to which a pair may be meant by itself: the robot's own error may be larger than it knows, which
 many pairs that agree on it outweigh."""
+FEW_NATS = 7.0
+"""Margin of a pair of a set that has no more than fix how one map lies over another: any two trees as far apart fit."""
 MIN_SIGHTINGS = 2
 """Detections of a landmark that is compared: one alone may be of nothing."""
 GROUP = 24
@@ -136,7 +138,8 @@ def _agreed(
     found: Consensus = consensus(
         Candidates(gap[inside], covariance, against[inside], conflict), gate=gates(1, CONFIDENCE)[1], loose=LOOSE_GATE
     )
-    sure = found.pairs[found.margin >= math.log(probability / (1.0 - probability))]
+    least = math.log(probability / (1.0 - probability)) if len(found.pairs) > FREE else FEW_NATS
+    sure = found.pairs[found.margin >= least]
     return [(int(younger[k]), int(older[k])) for k in sure]
 
 
