@@ -286,7 +286,7 @@ class Associator:
             self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings)
             pairs = propose_merges(
                 now, solved.marginals, density=density, probability=P_MERGE, among=_latest(now, recent),
-                refused=refused,
+                last=recent is None, refused=refused,
             )  # fmt: skip
             if not pairs and now.n_landmarks <= MOST_LAID:
                 honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]

@@ -27,7 +27,8 @@ LOOSE_GATE = 60.0
 """Squared distance up to which a pair may be meant by itself: the robot's own error may be larger than it knows, which
 many pairs that agree on it outweigh."""
 FEW_NATS = 7.0
-"""Margin of a pair of a set that has no more than fix how one map lies over another: any two trees as far apart fit."""
+"""Margin of a pair of a set of no more than fix how one map lies over another (any two trees as far apart fit), as long
+as later frames may tell more."""
 MIN_SIGHTINGS = 2
 """Detections of a landmark that is compared: one alone may be of nothing."""
 GROUP = 24
@@ -51,6 +52,7 @@ def propose_merges(
     density: float,
     probability: float,
     among: BoolArray,
+    last: bool,
     refused: set[tuple[int, int]],
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
@@ -61,6 +63,7 @@ def propose_merges(
         density: landmarks a square metre that one expects.
         probability: least posterior probability.
         among: (L,) landmarks that are looked up among all.
+        last: True where no later frames will tell more.
         refused: pairs that are not looked at.
     """
     sightings = assignment.sightings
@@ -76,8 +79,7 @@ def propose_merges(
     kind = assignment.of_class
     kept = alike(kind[younger], kind[older])
     younger, older = younger[kept], older[kept]
-    last = assignment.last_seen_s
-    order = sources[np.argsort(last[sources], kind="stable")[::-1]]
+    order = sources[np.argsort(assignment.last_seen_s[sources], kind="stable")[::-1]]
     for begin in range(0, len(order), GROUP):
         mine = np.isin(younger, order[begin : begin + GROUP])
         # a pair of two sources is looked at once, with the source that comes first
@@ -85,7 +87,7 @@ def propose_merges(
         mine |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
         if mine.any():
             pairs = younger[mine], older[mine]
-            merges += _agreed(assignment, marginals, pairs, (together, in_turn), density, probability)
+            merges += _agreed(assignment, marginals, pairs, (together, in_turn), density, probability, last=last)
     return sorted(set(merges))
 
 
@@ -111,6 +113,8 @@ def _agreed(
     seen: tuple[sparse.csr_array, sparse.csr_array],
     density: float,
     probability: float,
+    *,
+    last: bool,
 ) -> list[tuple[int, int]]:
     """Pairs (younger, older) of a group that are one for certain, with how often two were seen together and in turn."""
     younger, older = pairs
@@ -138,7 +142,7 @@ def _agreed(
     found: Consensus = consensus(
         Candidates(gap[inside], covariance, against[inside], conflict), gate=gates(1, CONFIDENCE)[1], loose=LOOSE_GATE
     )
-    least = math.log(probability / (1.0 - probability)) if len(found.pairs) > FREE else FEW_NATS
+    least = math.log(probability / (1.0 - probability)) if last or len(found.pairs) > FREE else FEW_NATS
     sure = found.pairs[found.margin >= least]
     return [(int(younger[k]), int(older[k])) for k in sure]
 
