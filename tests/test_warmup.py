@@ -90,7 +90,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "slam one",
         "slam one --unknown-ids",
         "slam one --map new.evermap",
-        "slam one --map new.evermap --unknown-ids",
+        "slam one --map nameless.evermap --unknown-ids",
         "slam two --map first.evermap",
         "slam two --map first.evermap --localize",
         "track detections.csv --range-m 12",
