@@ -106,7 +106,7 @@ def test_tags_of_wpilib_look_along_x(tmp_path: Path) -> None:
     right, up, to_viewer = np.moveaxis(axes(found), -1, 0)
     assert to_viewer == pytest.approx(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]), abs=1e-9)
     assert up == pytest.approx(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]), abs=1e-9)
-    # who stands before a tag and looks at it has its x to his right
+    # seen from in front of a tag, its x points to the right
     assert right == pytest.approx(np.cross(up, to_viewer))
 
 

@@ -26,6 +26,22 @@ def identity(*shape: int) -> FloatArray:
     return np.broadcast_to(np.append(np.zeros(3), NO_TURN), (*shape, 7)).copy()
 
 
+def from_plane(pose: ArrayLike) -> FloatArray:
+    """Return poses (..., 3) of `se2`, x, y and heading, as poses (..., 7) on the floor."""
+    pose = np.asarray(pose, dtype=np.float64)
+    found, half = np.zeros((*pose.shape[:-1], 7)), 0.5 * pose[..., 2]
+    found[..., :2], found[..., 5], found[..., 6] = pose[..., :2], np.sin(half), np.cos(half)
+    return found
+
+
+def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
+    """Return the pose (7,) at the origin that is turned about x, then y, then z, which stay as they are [rad]."""
+    pose = identity()
+    for axis in (2, 1, 0):
+        pose = compose(pose, exp(np.eye(6)[3 + axis] * np.asarray(roll_pitch_yaw)[axis]))
+    return pose
+
+
 def normalised(pose: ArrayLike) -> FloatArray:
     """Return poses (..., 7) with quaternions of unit length and of one sign."""
     pose = np.array(pose, dtype=np.float64)

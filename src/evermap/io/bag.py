@@ -17,6 +17,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from os.path import commonprefix
 from pathlib import Path
 from typing import Any
 
@@ -171,7 +172,8 @@ def _guessed(content: BagContent) -> BagSettings:
 
     def rank(topic: str) -> tuple[bool, int, bool, int]:
         kind = (*POSES, *TWISTS).index(content.kind(topic))
-        return kind == 3, kind > 0, "odom" not in topic and "vio" not in topic, -len(content.motion[topic])
+        transform = kind == POSES.index("TransformStamped")
+        return transform, kind > 0, "odom" not in topic and "vio" not in topic, -len(content.motion[topic])
 
     moving = [topic for topic in content.motion if content.motion[topic]]
     true = sorted((one for one in moving if _TRUTH.search(one) and content.kind(one) in POSES), key=rank)
@@ -181,9 +183,8 @@ def _guessed(content: BagContent) -> BagSettings:
     named = {name for edge in content.edges for name in edge}
     usual = next((name for name in ("base_link", "base_footprint") if name in named), "")
     base = content.frames.get(odometry, "") or usual
-    first = next((content.frames.get(topic, "") for topic in sighted if content.kind(topic) not in _PICTURES), "")
-    base = base or first
     plain = [topic for topic in sighted if content.kind(topic) not in _PICTURES]
+    base = base or next((content.frames.get(topic, "") for topic in plain), "")
     chosen = plain or [one for one in sighted if content.mount(base, content.frames.get(one, "")) is not None]
     sensors = {name: _sensor(content, topic) for topic, name in _short(chosen).items()}
     return BagSettings(odometry, true[0] if true else "", base, "header", sensors)
@@ -201,8 +202,8 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
     seen, frame = content.seen[topic], content.frames.get(topic, "")
     pixels = any(np.isfinite(one.corners[0]) or np.isfinite(one.pixel[0]) for one in seen)
     same = [one for one in content.cameras if content.frames[one] == frame]
-    near = sorted(content.cameras, key=lambda one: -len(_common(one, topic)))
-    camera = next(iter(sorted(same, key=lambda one: -len(_common(one, topic)))), near[0] if near else "")
+    alike = {one: len(commonprefix([one, topic])) for one in same or content.cameras}  # noqa: RUF071  'cam_left/...'
+    camera = max(alike, key=lambda one: alike[one], default="")
     identity = "id"
     if content.kind(topic) in ("Detection3DArray", "Detection2DArray"):
         boxed = any(np.isfinite(one.size[0]) for one in seen)
@@ -210,11 +211,6 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
     # the node apriltag_ros works on rectified images; TagSLAM's detector on the others
     rectified = content.kind(topic) == "AprilTagDetectionArray" or "rect" in topic
     return BagSensor(topic, frame, camera if pixels else "", rectified and pixels, identity)
-
-
-def _common(a: str, b: str) -> str:
-    count = next((k for k, (one, other) in enumerate(zip(a, b, strict=False)) if one != other), min(len(a), len(b)))
-    return a[:count]
 
 
 def _parsed(path: Path, content: BagContent, guessed: BagSettings) -> BagSettings:

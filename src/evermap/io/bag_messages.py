@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.geometry import se3
-from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, stamp_of
+from evermap.io.rosbag import MOST_HAMMING, Handler, Topic, pose_of, scan, seconds, stamp_of
 from evermap.types import FloatArray
 from evermap.valid import is_covariance
 
@@ -143,7 +143,7 @@ def _said(message: Any) -> tuple[float, str]:
         if hasattr(one, "header"):
             return stamp_of(one), str(one.header.frame_id)
         if hasattr(one, "timestamp"):
-            return float(one.timestamp.sec) + 1e-9 * float(one.timestamp.nanosec), str(one.frame_id)
+            return seconds(one.timestamp), str(one.frame_id)
     return float("nan"), ""
 
 

@@ -198,10 +198,7 @@ def _mount(reader: TomlReader, section: str, content: dict[str, Any]) -> tuple[f
             raise reader.error(section, "qw", "qx, qy, qz, qw are not a unit quaternion", hint="scalar last")
         return tuple(se3.normalised(np.concatenate([at, quaternion])).tolist())
     turns = [reader.number(section, key, content.get(key, 0.0), -2 * pi, 2 * pi) for key in _ANGLES]
-    pose = np.array([*at, 0.0, 0.0, 0.0, 1.0])
-    for axis in (2, 1, 0):
-        pose = se3.compose(pose, se3.exp(np.eye(6)[3 + axis] * turns[axis]))
-    return tuple(pose.tolist())
+    return (*at, *se3.from_angles(turns)[3:].tolist())
 
 
 def _tags(reader: TomlReader) -> tuple[float, dict[int, float]]:

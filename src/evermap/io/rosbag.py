@@ -155,9 +155,14 @@ def ros2_types() -> Any:
     return types
 
 
+def seconds(stamp: Any) -> float:
+    """Return a time of ROS in seconds."""
+    return float(stamp.sec) + 1e-9 * float(stamp.nanosec)
+
+
 def stamp_of(message: Any) -> float:
     """Return the stamp [s] in the header of a message."""
-    return float(message.header.stamp.sec) + 1e-9 * float(message.header.stamp.nanosec)
+    return seconds(message.header.stamp)
 
 
 def _unpacked(path: Path, folder: Path) -> Path:

@@ -119,10 +119,7 @@ def tags_of_fiducials(data: bytes, path: Path) -> Table:
         if len(values) != 7 or not all(map(math.isfinite, values)) or not name.is_integer():
             problem = "is not a tag of fiducial_slam"
             raise InputError(problem, path=path, line=number, hint=f"{' '.join(_FIDUCIAL)}, angles in degrees")
-        pose = np.array([*values[:3], 0.0, 0.0, 0.0, 1.0])
-        for axis in (2, 1, 0):
-            pose = se3.compose(pose, se3.exp(np.eye(6)[3 + axis] * math.radians(values[3 + axis])))
-        rows.append((name, *pose, math.nan))
+        rows.append((name, *values[:3], *se3.from_angles(np.radians(values[3:6]))[3:], math.nan))
         lines.append(number)
     return _table(path, rows, lines)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from evermap.errors import DataError, InputError
+from evermap.geometry import se3
 from evermap.io.assemble import check_forward, last_of_equal
 from evermap.io.files import unpacked, write_atomic
 from evermap.io.rows import Rows, parse_rows
@@ -29,8 +30,7 @@ def write_tum(trajectory: Trajectory, path: str | Path) -> Path:
             for stamp, row in zip(trajectory.stamp_s.tolist(), pose.tolist(), strict=True)
         ]
         return write_atomic(path, "".join(lines))
-    half = pose[:, 2] / 2.0
-    columns = (trajectory.stamp_s, *pose[:, :2].T, np.sin(half), np.cos(half))
+    columns = (trajectory.stamp_s, *se3.from_plane(pose)[:, [0, 1, 5, 6]].T)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     lines = [f"{stamp!r} {x!r} {y!r} 0 0 0 {qz!r} {qw!r}\n" for stamp, x, y, qz, qw in rows]
     return write_atomic(path, "".join(lines))

@@ -15,8 +15,9 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self, TypedDict, Unpack
@@ -426,11 +427,7 @@ def write_run(
         drawn = _draw(recording, result, evaluation, timing) if draw or tell else ()
         if draw:
             _write_figures(folder, drawn)
-        remarks = []
-        if _choose(asked.get("scene"), wanted, "rerun", default=False):
-            remarks += _write_scene(folder, recording, result, evaluation, must=asked.get("scene") is True)
-        if _choose(asked.get("mcap"), wanted, "mcap", default=False):
-            remarks += _write_mcap(folder, recording, result, must=asked.get("mcap") is True)
+        remarks = _write_extras(folder, recording, result, evaluation, asked, wanted)
         measured, settings = metrics_dict(evaluation), _plain(config)
         summary = summary_dict(recording, result, measured, config=settings, info=info, timing=timing, warnings=remarks)
         summary = folder.finish(summary, *(["report.html"] if tell else []))
@@ -503,31 +500,32 @@ def _write_figures(folder: RunFolder, figures: Sequence[NamedFigure]) -> None:
             save_svg(named.figure, folder.path(f"figures/{named.name}.svg"))
 
 
-def _write_scene(
-    folder: RunFolder, recording: AnyRecording, result: SlamResult, evaluation: Evaluation, *, must: bool
+def _write_extras(
+    folder: RunFolder, recording: AnyRecording, result: SlamResult, evaluation: Evaluation, asked: Asked, wanted: Any
 ) -> list[str]:
-    """Writes the scene; where it is only a default and cannot be written, a remark says so."""
+    """Writes what other programs show, where it is asked for."""
+    remarks: list[str] = []
+    if _choose(asked.get("scene"), wanted, "rerun", default=False):
+        from evermap.viz.rerun_scene import write_scene
+
+        scene = partial(write_scene, recording, result, folder.path("scene.rrd"), evaluation=evaluation)
+        remarks += _if_installed("scene.rrd", scene, must=asked.get("scene") is True)
+    if _choose(asked.get("mcap"), wanted, "mcap", default=False):
+        from evermap.runs.mcap import write_mcap
+
+        messages = partial(write_mcap, recording, result, folder.path("run.mcap"))
+        remarks += _if_installed("run.mcap", messages, must=asked.get("mcap") is True)
+    return remarks
+
+
+def _if_installed(name: str, write: Callable[[], object], *, must: bool) -> list[str]:
+    """Writes a file for which a package may be missing; where it is only a default, a remark says so then."""
     from evermap.errors import MissingExtraError
-    from evermap.viz.rerun_scene import write_scene
 
     try:
-        write_scene(recording, result, folder.path("scene.rrd"), evaluation=evaluation)
+        write()
     except MissingExtraError as error:
         if must:
             raise
-        return [f"scene.rrd was left out: {error.one_line()}"]
-    return []
-
-
-def _write_mcap(folder: RunFolder, recording: AnyRecording, result: SlamResult, *, must: bool) -> list[str]:
-    """Writes the messages, as `_write_scene` does the scene."""
-    from evermap.errors import MissingExtraError
-    from evermap.runs.mcap import write_mcap
-
-    try:
-        write_mcap(recording, result, folder.path("run.mcap"))
-    except MissingExtraError as error:
-        if must:
-            raise
-        return [f"run.mcap was left out: {error.one_line()}"]
+        return [f"{name} was left out: {error.one_line()}"]
     return []

@@ -151,13 +151,7 @@ def _motion(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[
 
 def in_space(pose: FloatArray) -> FloatArray:
     """Return poses (N, 3) in the plane as poses (N, 7) in space; those in space as they are."""
-    if pose.shape[1] == 7:
-        return pose
-    twist = np.zeros((len(pose), 6))
-    twist[:, 5] = pose[:, 2]
-    found = se3.exp(twist)
-    found[:, :2] = pose[:, :2]
-    return found
+    return pose if pose.shape[1] == 7 else se3.from_plane(pose)
 
 
 def ros_covariance(trajectory: Trajectory) -> FloatArray:
@@ -317,8 +311,6 @@ def _where(landmarks: Landmarks) -> dict[int, FloatArray]:
 def _pointing(at: FloatArray, along: FloatArray) -> FloatArray:
     """A pose (7,) whose x points along a unit vector (3,)."""
     yaw, pitch = math.atan2(along[1], along[0]), -math.asin(float(np.clip(along[2], -1.0, 1.0)))
-    pose = se3.compose(
-        se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, yaw])), se3.exp(np.array([0.0, 0.0, 0.0, 0.0, pitch, 0.0]))
-    )
+    pose = se3.from_angles([0.0, pitch, yaw])
     pose[:3] = at
     return pose

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evermap.errors import MissingExtraError
+from evermap.geometry import se3
 from evermap.geometry.group import group_of
 from evermap.metrics.consistency import chi2_interval, comparable_nis
 from evermap.metrics.summary import Evaluation, compare_with_truth
@@ -206,10 +207,7 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
     group = group_of(pose_truth_map)
     poses = group.compose(pose_truth_map, trajectory.pose_world_robot[rows])
     stamps, at = trajectory.stamp_s[rows], poses[:, : group.point_dim]
-    quaternion = poses[:, 3:]
-    if group.point_dim == 2:
-        half = 0.5 * poses[:, 2]
-        quaternion = np.column_stack([np.zeros((len(rows), 2)), np.sin(half), np.cos(half)])
+    quaternion = (poses if group.point_dim == 3 else se3.from_plane(poses))[:, 3:]
     places = rr.Transform3D.columns(translation=_flat(at), quaternion=quaternion)
     stream.send_columns("world/robot", [_time(stamps, clock)], places)
     half, ahead = scale * np.array([0.17, 0.12, 0.06]), scale * np.array([0.4, 0.0, 0.0])

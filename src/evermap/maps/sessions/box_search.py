@@ -208,9 +208,9 @@ def _floor(covariance_m2: FloatArray) -> FloatArray:
 
 def in_space(motion: FloatArray, own_m: FloatArray, there_m: FloatArray) -> FloatArray:
     """Return a motion (3,) on the floor as one in space (7,), with the difference in height of points (K, 3)."""
-    half = 0.5 * motion[2]
-    height_m = float(np.median(there_m[:, 2] - own_m[:, 2]))
-    return np.array([motion[0], motion[1], height_m, 0.0, 0.0, np.sin(half), np.cos(half)])
+    pose = se3.from_plane(motion)
+    pose[2] = np.median(there_m[:, 2] - own_m[:, 2])
+    return pose
 
 
 def _alike(seen: SeenBoxes, known: MapBoxes) -> BoolArray:
