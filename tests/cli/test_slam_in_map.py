@@ -18,6 +18,7 @@ from evermap.cli.main import app
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.io import read_tum, write_native
+from evermap.io.landmarks import write_map_csv
 from evermap.maps.store import open_store
 from evermap_studies.sim import BuildingConfig, BuildingSimulation, SimulatedSensor, simulate_building
 
@@ -207,6 +208,20 @@ def test_several_sessions_in_one_call(
     result = run("slam", recordings[0], recordings[1])
     assert result.exit_code == 2
     assert "several recordings are sessions of a map (try: --map FILE" in result.stderr
+
+
+def test_of_several_sessions_the_first_that_is_read_begins_with_the_survey(
+    recordings: list[Path], building: BuildingSimulation, tmp_path: Path
+) -> None:
+    survey = building.sessions[0].true_landmarks
+    assert survey is not None
+    write_map_csv(survey, tmp_path / "survey.csv")
+    map_file = tmp_path / "building.evermap"
+    given = (tmp_path / "nothing", *recordings[:2], "--map", map_file, "--prior-map", tmp_path / "survey.csv")
+    result = run("slam", *given, "--out", tmp_path / "week", *KNOWN_METRE, *QUICK)
+    assert "1 of 3 sessions were refused" in result.stderr
+    with open_store(map_file) as store:
+        assert [len(store.load(number).places) >= len(survey) for number in (1, 2, 3)] == [True] * 3
 
 
 def test_a_session_of_another_place_is_refused(copy: Path, building: BuildingSimulation, tmp_path: Path) -> None:

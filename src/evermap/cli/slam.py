@@ -203,17 +203,17 @@ def slam(
     def known(recording: AnyRecording) -> Landmarks | None:
         return None if prior_map is None else shifted(_prior_landmarks(prior_map, prior_sigma, recording), shifts)
 
-    options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime, None)
+    options = None if map_file is None else MapOptions(map_file, prior or [], localize, realtime)
     inputs = [*paths, config, None if prior_map == "truth" else prior_map, map_file]
     how: _How = {"as_json": as_json, "force": force, "inputs": inputs}
-    work = partial(_estimate, robot=robot, config=chosen, options=options, realtime=realtime, how=how)
+    work = partial(_estimate, robot=robot, config=chosen, known=known, options=options, realtime=realtime, how=how)
     if len(paths) == 1:
-        work(paths[0], out, known=known)
+        work(paths[0], out)
     else:
-        _each(paths, out, lambda number, path, folder: work(path, folder, known=_nothing if number else known))
+        _each(paths, out, work)
 
 
-def _each(paths: Sequence[Path], out: Path | None, work: Callable[[int, Path, Path | None], None]) -> None:
+def _each(paths: Sequence[Path], out: Path | None, work: Callable[..., None]) -> None:
     """Work on several recordings; one that is refused stops none of the others.
 
     Raises:
@@ -223,16 +223,12 @@ def _each(paths: Sequence[Path], out: Path | None, work: Callable[[int, Path, Pa
     for number, path in enumerate(paths):
         say(f"session {number + 1} of {len(paths)}: {path}")
         try:
-            work(number, path, None if out is None else out / default_out(path.resolve().name).name)
+            work(path, None if out is None else out / default_out(path.resolve().name).name, later=number > 0)
         except EvermapError as error:
             refused.append(str(path))
             fail(error.one_line())
     if refused:
         raise DataError(f"{len(refused)} of {len(paths)} sessions were refused: {', '.join(refused)}")
-
-
-def _nothing(_: AnyRecording) -> None:
-    """A map begins with a survey once."""
 
 
 def _estimate(
@@ -245,8 +241,9 @@ def _estimate(
     options: MapOptions | None,
     realtime: bool,
     how: _How,
+    later: bool = False,
 ) -> None:
-    """Read a recording, run, and write the folder."""
+    """Read a recording, run, and write the folder; `later` as in `MapOptions`."""
     from evermap.io import read_recording
     from evermap.runs.folder import check_replaceable
 
@@ -258,7 +255,7 @@ def _estimate(
         check_replaceable(out, force=how["force"], inputs=how["inputs"])
     landmarks = known(recording)
     if options is not None:
-        run_in_map(recording, config, options._replace(survey=landmarks), out, **how)
+        run_in_map(recording, config, options._replace(survey=landmarks, later=later), out, **how)
     else:
         run_and_write(recording, config, out, prior=landmarks, realtime=realtime, **how)
 
@@ -405,6 +402,7 @@ class MapOptions(NamedTuple):
         localize: only localise; the map stays.
         realtime: at the recording's pace.
         survey: landmarks that a new map begins with.
+        later: of several sessions this is not the first: it needs the survey only if none before it began the map.
     """
 
     map_file: Path
@@ -412,6 +410,7 @@ class MapOptions(NamedTuple):
     localize: bool
     realtime: bool
     survey: Landmarks | None = None
+    later: bool = False
 
 
 def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out: Path, **how: Unpack[_How]) -> None:
@@ -423,7 +422,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     from evermap.runs.sessions import at_time, begin_map, enter_session
     from evermap.types import SpatialRecording
 
-    map_file, priors, localize, realtime, _ = options
+    map_file, priors, localize, realtime, *_ = options
     in_space = isinstance(recording, SpatialRecording)
     if realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
@@ -438,7 +437,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     with opened as store:
         start = time.perf_counter()
         entered: Entered | None = None
-        if options.survey is not None:
+        if options.survey is not None and not (options.later and len(store.load().places)):
             begin_map(store, options.survey, recording, command_line())
         with progress_bar(recording.name) as progress:
             if localize:
