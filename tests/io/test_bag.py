@@ -132,6 +132,17 @@ def test_clocks_that_differ_are_told_and_can_be_given_up(tmp_path: Path) -> None
     assert recording.frames.stamp_s[0] == pytest.approx(START_S + 0.01, abs=1e-6)
 
 
+def test_a_check_of_a_bag_tells_what_its_reader_tells(tmp_path: Path) -> None:
+    late = CliRunner().invoke(app, ["check", str(write(tmp_path / "drive", "aruco", late_s=1.0, mounted=False))])
+    assert late.exit_code == 0, late.output
+    assert "by sensor      camera 50" in late.stdout
+    assert "recorded 1 s later after their stamps" in late.stderr
+    assert "no fixed transform from 'base_link' to 'camera_optical'" in late.stderr
+    sizeless = CliRunner().invoke(app, ["check", str(write(tmp_path / "other", "tags"))])
+    assert sizeless.exit_code == 2
+    assert "does not say how large its tags are" in sizeless.stderr
+
+
 def test_a_sensor_without_a_transform_is_told_and_can_be_mounted(tmp_path: Path) -> None:
     bag = write(tmp_path / "drive", "aruco", mounted=False)
     recording = read_bag(bag)

@@ -14,9 +14,7 @@ EXIT_NOT_USABLE = 2
 
 
 def check(
-    input: Annotated[
-        Path, typer.Argument(metavar="INPUT", help="Folder in the native format, or MRCLAM zip or folder.")
-    ],
+    input: Annotated[Path, typer.Argument(metavar="INPUT", help="Folder in the native format, zip or ROS bag.")],
     robot: Robot = None,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -25,19 +23,20 @@ def check(
 ) -> None:
     """Tell whether a recording can be used, and what is odd.
 
-    Looked at are units, signs, clocks, gaps, rates, identities, limits and coverage. Exit code 0: usable, perhaps
-    with warnings; 2: it is not, in one line.
+    Looked at are units, signs, clocks, gaps, jumps, rates, identities, limits and coverage. Exit code 0: usable,
+    perhaps with warnings; 2: it is not, in one line.
 
     \b
     Examples:
       evermap check my-recording
       evermap check MRCLAM_Dataset6.zip --robot 1 --json
+      evermap check monday.mcap
     """
     chosen = configured(config, settings, within="slam.check", show=show_config)
-    from evermap.io import read_planar
+    from evermap.io import read_recording
     from evermap.slam.check import check_recording
 
-    found = check_recording(read_planar(input, robot=robot), chosen)
+    found = check_recording(read_recording(input, robot=robot), chosen)
     if as_json:
         print_json(found.as_dict())
     else:
@@ -56,21 +55,30 @@ def _rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
     """What was found, one line a table of the recording and a little more."""
     odometry, frames = contents["odometry"], contents["frames"]
     detections, landmarks = contents["detections"], contents["landmarks"]
-    ranges, bearings = detections["range_m"], detections["bearing_rad"]
     rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.3g} Hz"
-    beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} bearings"
-    return [
-        ("odometry", f"{odometry['rows']:,} rows in {odometry['duration_s']:,.1f} s at {odometry['rate_hz']:.3g} Hz"),
-        ("longest gap", f"{odometry['longest_gap_s']:.3g} s"),
-        (
-            "way",
-            f"{odometry['way_m']:,.1f} m, up to {odometry['fastest_mps']:.3g} m/s; {odometry['turned_rad']:.1f} rad",
-        ),
-        ("frames", f"{frames['count']:,}{rate}, {frames['with_detections']:,} with detections"),
+    rows = [("odometry", "none")]
+    if odometry:
+        driven = f"{odometry['rows']:,} rows in {odometry['duration_s']:,.1f} s at {odometry['rate_hz']:.3g} Hz"
+        way = f"{odometry['way_m']:,.1f} m, up to {odometry['fastest_mps']:.3g} m/s; {odometry['turned_rad']:.1f} rad"
+        rows = [("odometry", driven), ("longest gap", f"{odometry['longest_gap_s']:.3g} s"), ("way", way)]
+    unlisted = "" if frames["complete"] else "; those without are not listed"
+    rows += [
+        ("frames", f"{frames['count']:,}{rate}, {frames['with_detections']:,} with detections{unlisted}"),
         ("blind for", f"at most {frames['longest_blind_s']:.3g} s"),
         ("detections", f"{detections['count']:,}, {detections['without_identity']:,} without identity"),
-        ("ranges", f"{ranges[0]:.3g} to {ranges[2]:.3g} m, half of them below {ranges[1]:.3g} m"),
-        ("bearings", f"{bearings[0]:.3g} to {bearings[2]:.3g} rad, half of them below {bearings[1]:.3g} rad"),
+    ]
+    if "by_sensor" in detections:
+        rows += [("by sensor", ", ".join(f"{name} {count:,}" for name, count in detections["by_sensor"].items()))]
+        kinds = ("with_orientation", "with_corners", "with_size", "without_range")
+        rows += [("of them", ", ".join(f"{detections[kind]:,} {kind.replace('_', ' ')}" for kind in kinds))]
+    for kind, unit in (("range", "m"), ("bearing", "rad")):
+        if low_middle_high := detections.get(f"{kind}_{unit}"):
+            low, middle, high = low_middle_high
+            rows += [(f"{kind}s", f"{low:.3g} to {high:.3g} {unit}, half of them below {middle:.3g} {unit}")]
+    aside = "bearings" if "bearing_rad" in detections else "tags"
+    beyond = f"{detections['beyond_range_max']:,} ranges, {detections['outside_view']:,} {aside}"
+    return [
+        *rows,
         ("beyond limits", beyond),
         ("landmarks", f"{landmarks['count']:,}, {landmarks['seen_once']:,} of them seen once"),
     ]

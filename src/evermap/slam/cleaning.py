@@ -12,7 +12,7 @@ import numpy as np
 
 from evermap.config import CleaningConfig
 from evermap.errors import DataError
-from evermap.slam.check import LEAST_STEP_S, clock_steps
+from evermap.slam.mistakes import LEAST_STEP_S, clock_steps
 from evermap.types import UNKNOWN, BoolArray, Detections, FloatArray, Frames, IntArray, Odometry, Recording, rows_of
 from evermap.valid import LATEST_S
 
@@ -73,15 +73,22 @@ def _odometry(odometry: Odometry, settings: CleaningConfig, remarks: list[str]) 
     possible = np.all(np.abs(velocity) <= settings.fastest, axis=0)
     _remark(remarks, "odometry rows that no robot can drive left out", int(np.sum(~possible)))
     odometry, velocity = rows_of(odometry, possible), velocity[:, possible]
-    if len(odometry) < 3:
-        return odometry
-    step_s = np.diff(odometry.stamp_s)
+    spike = spikes(odometry.stamp_s, velocity, settings)
+    _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
+    return rows_of(odometry, ~spike)
+
+
+def spikes(stamp_s: FloatArray, velocity: FloatArray, settings: CleaningConfig) -> BoolArray:
+    """Return (N,) which velocities (K, N) differ from those around them by more than a robot can accelerate."""
+    if len(stamp_s) < 3:
+        return np.zeros(len(stamp_s), dtype=np.bool_)
+    step_s = np.diff(stamp_s)
     step_s = np.minimum(np.append(step_s, np.inf), np.insert(step_s, 0, np.inf))
     step_s = np.maximum(step_s, np.median(step_s))  # rows that are stamped when they arrive may come in bursts
     usual = np.stack([running_median(column, settings.around) for column in velocity])
-    spike = np.any(np.abs(velocity - usual) > np.maximum(settings.hardest * step_s, settings.sharpest), axis=0)
-    _remark(remarks, "odometry rows with a spike left out", int(np.sum(spike)))
-    return rows_of(odometry, ~spike)
+    return np.asarray(
+        np.any(np.abs(velocity - usual) > np.maximum(settings.hardest * step_s, settings.sharpest), axis=0)
+    )
 
 
 def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]) -> Detections:

@@ -106,7 +106,7 @@ def prepare_space(
         other=some.other,
         other_log_odds=some.other_log_odds,
         share=np.ones(len(used)),
-        ray=_without_range(recording)[used],
+        ray=without_range(recording)[used],
         oriented=oriented,
         symmetries=symmetries,
         mount=np.array([sensor.mount_robot_sensor for sensor in recording.sensors]),
@@ -237,8 +237,17 @@ def _where(recording: SpatialRecording, usable: BoolArray) -> tuple[_Where, Bool
     return found, broken | (usable & near)
 
 
-def _without_range(recording: SpatialRecording) -> BoolArray:
-    """(M,) detections of which only the direction was seen."""
+def positions_of(recording: SpatialRecording) -> FloatArray:
+    """Return (M, 3) positions in the sensor's frame, of tags by their corners where none is given; nan where neither
+    tells.
+    """
+    given = recording.detections.position_sensor_m
+    absent = np.asarray(np.isnan(given).any(axis=1))
+    return np.where(absent[:, None], _where(recording, absent)[0].measured[:, :3], given) if absent.any() else given
+
+
+def without_range(recording: SpatialRecording) -> BoolArray:
+    """Return (M,) detections of which only the direction was seen."""
     at, covariance = recording.detections.position_sensor_m, recording.detections.covariance_sensor_m2
     along = np.einsum("mi,mij,mj->m", at, covariance, at)  # nan where nothing is stated
     return np.asarray(along > ANY_RANGE_M2 * (at**2).sum(axis=1))
@@ -250,7 +259,7 @@ def _with_ranges(recording: SpatialRecording, where: _Where, usable: BoolArray) 
     The covariance keeps what was seen across; the range itself is hardly believed. Returns (M,) those that could not.
     """
     given, blind = recording.detections, np.zeros(len(usable), dtype=np.bool_)
-    rays = np.flatnonzero(usable & _without_range(recording))
+    rays = np.flatnonzero(usable & without_range(recording))
     if not len(rays):
         return blind
     if recording.odometry is None:

@@ -1,0 +1,430 @@
+"""How readings would have to be changed to make landmarks stand still: the mistakes that recordings are made with.
+
+Two readings of one landmark, a few seconds apart, and the odometry between them say the same thing twice: where the
+landmark is the second time. The difference is taken in the logarithm of the range and in the bearing, in space in the
+direction, which no unit of length can make small by itself. A mistake (ranges in millimetres, bearings clockwise, a
+clock that is three seconds late) is undone on trial; it is likely where almost all pairs that can tell the two apart
+come nearer by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass
+from itertools import pairwise
+from math import inf, log, pi
+from typing import TypeAlias
+
+import numpy as np
+
+from evermap.config import CheckConfig
+from evermap.geometry import se2, se3
+from evermap.slam.space.intake import positions_of, without_range
+from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Odometry, Recording, SpatialRecording
+
+USUAL = CheckConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """How readings would have to be changed to undo a mistake, and its name.
+
+    Attributes:
+        code, message: as in `slam.check.Finding`.
+        lengths: factor on all ranges, or its inverse on all speeds, which is the same.
+        bearing, offset_rad: a bearing becomes `bearing * b + offset_rad`.
+        turn, forward: factors on the turn rate and the forward speed.
+        delay_s: odometry stamps are so much later than the motion.
+        turned: quaternion that turns positions in the sensor's frame.
+    """
+
+    code: str
+    message: str
+    lengths: float = 1.0
+    bearing: float = 1.0
+    offset_rad: float = 0.0
+    turn: float = 1.0
+    forward: float = 1.0
+    delay_s: float = 0.0
+    turned: tuple[float, ...] = tuple(se3.NO_TURN)
+
+    def after(self, other: Mistake) -> Mistake:
+        """Return both, the other one undone first."""
+        return Mistake(
+            self.code,
+            self.message,
+            self.lengths * other.lengths,
+            self.bearing * other.bearing,
+            self.bearing * other.offset_rad + self.offset_rad,
+            self.turn * other.turn,
+            self.forward * other.forward,
+            self.delay_s + other.delay_s,
+            tuple(se3.compose((0.0, 0.0, 0.0, *self.turned), (0.0, 0.0, 0.0, *other.turned))[3:].tolist()),
+        )
+
+
+HONEST = Mistake("", "")
+_LENGTHS = (
+    ("range_m", "ranges", "millimetres", 1e-3), ("range_m", "ranges", "centimetres", 1e-2),
+    ("range_m", "ranges", "feet", 0.3048), ("range_m", "ranges", "inches", 0.0254),
+    ("forward_mps", "speeds", "km/h", 3.6), ("forward_mps", "speeds", "millimetres per second", 1e3),
+    ("forward_mps", "speeds", "centimetres per second", 1e2), ("forward_mps", "speeds", "miles an hour", 1 / 0.44704),
+    ("forward_mps", "speeds", "feet per second", 1 / 0.3048),
+)  # fmt: skip
+"""Commoner units first: odometers that are some per cent off cannot tell km/h from feet per second."""
+_LENGTHS_IN_SPACE = tuple(
+    (field, what, unit, factor ** (-1 if field == "odometry" else 1))
+    for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2), ("feet", 0.3048), ("inches", 0.0254))
+    for field, what in (("detections", "positions"), ("odometry", "poses of the robot"))
+)
+_UNITS, _UNITS_IN_SPACE = (
+    tuple(
+        Mistake("length-unit", f"{what} seem to be in {unit}, not in metres ({field})", lengths=factor)
+        for field, what, unit, factor in lengths
+    )
+    for lengths in (_LENGTHS, _LENGTHS_IN_SPACE)
+)
+_ANGLES = (
+    Mistake("bearing-unit", "bearings seem to be in degrees, not in radians (bearing_rad)", bearing=pi / 180),
+    Mistake("turn-unit", "turn rates seem to be in degrees, not in radians a second (angular_radps)", turn=pi / 180),
+    Mistake(
+        "bearing-sign",
+        "bearings, or turn rates, seem to have the wrong sign: counter-clockwise is positive, from x ahead to y on the "
+        "left (bearing_rad, angular_radps)",
+        bearing=-1.0,
+    ),
+    Mistake(
+        "turn-sign",
+        "turn rates, or bearings, seem to have the wrong sign: counter-clockwise is positive (angular_radps, "
+        "bearing_rad)",
+        turn=-1.0,
+    ),
+    Mistake(
+        "forward-sign",
+        "the robot seems to drive the other way than it says: forward speeds have the wrong sign (forward_mps), or the "
+        "sensor looks backwards ([mount] theta_rad)",
+        forward=-1.0,
+    ),
+    *(
+        Mistake(
+            "bearing-axis",
+            f"bearings seem to be {side} from another axis: they count from x ahead (bearing_rad, x_m and y_m, or "
+            "[mount] theta_rad)",
+            bearing=sign,
+            offset_rad=offset,
+        )
+        for sign in (1.0, -1.0)
+        for offset, side in ((pi / 2, "90 degrees off,"), (-pi / 2, "90 degrees off,"))
+    ),
+)
+_AXES = tuple(
+    Mistake(
+        "mount-axes",
+        f"detections seem to be in a frame with {seen} although the mount is that of one with {stated}: "
+        "[mount], or the frame_id of their messages",
+        turned=turned,
+    )
+    for seen, stated, turned in (
+        ("x ahead and z up", "z ahead and y down", (0.5, -0.5, 0.5, 0.5)),
+        ("z ahead and y down", "x ahead and z up", (-0.5, 0.5, -0.5, 0.5)),
+    )
+)
+_DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
+LEAST_STEP_S = 0.4
+"""Smaller steps of one clock against the other are the calibration's, which has a delay."""
+_FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
+
+
+def _late(delay_s: float) -> Mistake:
+    side = "later" if delay_s > 0 else "earlier"
+    message = (
+        f"odometry stamps seem to be {abs(delay_s):.1f} s {side} than those of the detections: two clocks, or one of "
+        "them stamped on arrival"
+    )
+    return Mistake("clock", message, delay_s=delay_s)
+
+
+def _longer(factor: float, why: str) -> Mistake:
+    told = 1.0 / factor
+    how = f"{told:.3g} times too long" if told > 1 else f"{factor:.3g} times too short"
+    return Mistake("length-unit", f"ranges seem to be {how} for the way driven: {why}", lengths=factor)
+
+
+def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: CheckConfig) -> Mistake | None:
+    """Return the mistake that explains most of what is left, if it surely explains anything.
+
+    Args:
+        pairs: of sightings.
+        undone: what was found already.
+        told: codes of mistakes that are not looked for.
+        settings: what is sure.
+    """
+    before = pairs.residual(undone)
+    candidates = [*pairs.units, *pairs.angles, *(_longer(factor, pairs.why_longer) for factor in _FACTORS)]
+    candidates += [_late(side * delay_s) for delay_s in _DELAYS_S for side in (1.0, -1.0)]
+    scored = [
+        (loss, mistake)
+        for mistake in candidates
+        if mistake.code not in told
+        for loss in [_nearer(pairs, before, pairs.residual(mistake.after(undone)), settings)]
+        if loss is not None
+    ]
+    if not scored:
+        return None
+    least, best = min(scored, key=lambda pair: pair[0])
+
+    def left(mistake: Mistake) -> float:
+        return _loss(pairs.residual(mistake.after(undone)), settings)
+
+    if best.code == "clock":
+        near_s = [best.delay_s + 0.1 * step for step in range(-5, 6)]
+        return min(map(_late, near_s), key=left)
+    if best.code == "length-unit":  # a unit that has a name is likelier than a factor that has none
+        gain = _loss(before, settings) - least
+        named = [
+            mistake
+            for loss, mistake in scored
+            if mistake in pairs.units and abs(log(mistake.lengths / best.lengths)) < 0.3 and loss < least + 0.1 * gain
+        ]
+        if named:
+            return named[0]
+        near = [_longer(best.lengths * 10.0 ** (0.01 * step), pairs.why_longer) for step in range(-10, 11)]
+        return min(near, key=left)
+    return best
+
+
+def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: CheckConfig) -> float | None:
+    """Loss of the residuals (K, P) after undoing a mistake, if almost all pairs that tell come nearer by it."""
+    was, now = off(before), off(after)
+    apart = off(pairs.difference(after, before))
+    telling = apart > max(settings.fits, settings.apart * min(float(np.median(was)), float(np.median(now))))
+    if np.sum(telling) < settings.fewest or np.mean(now[telling] < was[telling]) < settings.agreed:
+        return None
+    loss = _loss(after, settings)
+    return loss if len(was) * (_loss(before, settings) - loss) > settings.gain else None
+
+
+def _loss(residual: FloatArray, settings: CheckConfig) -> float:
+    """Mean Cauchy loss of residuals (K, P): one wrong identity costs little."""
+    return float(np.mean(np.log1p((np.minimum(off(residual), 10.0) / settings.fits) ** 2)))
+
+
+def off(residual: FloatArray) -> FloatArray:
+    """Return (P,) by how much the two readings of pairs differ, of residuals (K, P)."""
+    return np.asarray(np.linalg.norm(residual, axis=0))
+
+
+def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
+    """Return what tells of mistakes; None where hardly any landmark is seen twice while there is odometry."""
+    first, second = _pairs(recording, settings)
+    if len(first) < settings.fewest:
+        return None
+    return (SpatialPairs if isinstance(recording, SpatialRecording) else PlanarPairs)(recording, first, second)  # type: ignore[arg-type]
+
+
+def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, IntArray]:
+    """Rows of detections: two of the same landmark each, within a few seconds and within the odometry's time."""
+    detections = recording.detections
+    stamp_s = recording.frames.stamp_s[detections.frame]
+    known = detections.landmark_id != UNKNOWN
+    if isinstance(recording, SpatialRecording):
+        known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)
+    if not known.any() or recording.odometry is None or len(recording.odometry) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    odometry_s = recording.odometry.stamp_s
+    known &= (stamp_s >= odometry_s[0]) & (stamp_s <= odometry_s[-1])
+    rows = np.flatnonzero(known)
+    rows = rows[np.lexsort((stamp_s[rows], detections.landmark_id[rows]))]
+    landmark = np.unique(detections.landmark_id[rows], return_inverse=True)[1]
+    time_s = stamp_s[rows]
+    spread_s = (np.ptp(time_s) if len(rows) else 0.0) + 4.0 * settings.lags_s[-1]
+    place = landmark * spread_s + time_s - (time_s.min() if len(rows) else 0.0)
+    chosen = []
+    for lag_s in settings.lags_s:
+        later = np.searchsorted(place, place + lag_s)
+        found = np.flatnonzero(later < len(rows))
+        found = found[place[later[found]] - place[found] <= 2.0 * lag_s]
+        found = found[np.linspace(0, len(found) - 1, min(len(found), settings.most_pairs)).astype(np.int64)]
+        chosen.append(np.stack([rows[found], rows[later[found]]]))
+    first, second = np.concatenate(chosen, axis=1)
+    return first, second
+
+
+class PlanarPairs:
+    """Pairs of sightings of a landmark each, and what odometry says of them."""
+
+    units, angles = _UNITS, _ANGLES
+    why_longer = "another unit of ranges or speeds (range_m, forward_mps)"
+    speeds = "forward_mps, angular_radps"
+
+    def __init__(self, recording: Recording, first: IntArray, second: IntArray) -> None:
+        detections = recording.detections
+        self._odometry = recording.odometry
+        self._mount = np.array(recording.sensor.mount_robot_sensor, dtype=np.float64)
+        stamp_s = recording.frames.stamp_s[detections.frame]
+        self._stamp_s = stamp_s[first], stamp_s[second]
+        self._range_m = detections.range_m[first], detections.range_m[second]
+        self._bearing_rad = detections.bearing_rad[first], detections.bearing_rad[second]
+        self._tracks: dict[tuple[float, float], FloatArray] = {}
+        self._motions: dict[tuple[float, float, float], tuple[FloatArray, FloatArray]] = {}
+
+    @property
+    def still(self) -> bool:
+        """Whether the robot never moves, by its odometry."""
+        return not any(np.abs(column).max() >= 1e-9 for column in _velocity(self._odometry))
+
+    @staticmethod
+    def difference(after: FloatArray, before: FloatArray) -> FloatArray:
+        """Return (2, P) by how much residuals differ."""
+        return np.stack([after[0] - before[0], se2.wrap(after[1] - before[1])])
+
+    def residual(self, mistake: Mistake) -> FloatArray:
+        """Return (2, P) second reading minus what the first one and the odometry predict: log range, and bearing."""
+        start, stop = self._poses(mistake.forward, mistake.turn, mistake.delay_s)
+        metres = np.array([1.0 / mistake.lengths, 1.0 / mistake.lengths, 1.0])
+        mount = self._mount * metres
+        motion = se2.between(se2.compose(start * metres, mount), se2.compose(stop * metres, mount))
+        bearing = [mistake.bearing * each + mistake.offset_rad for each in self._bearing_rad]
+        range_m = self._range_m
+        seen = np.stack([range_m[0] * np.cos(bearing[0]), range_m[0] * np.sin(bearing[0])], axis=1)
+        x, y = se2.transform(se2.inverse(motion), seen).T
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            far = np.log(range_m[1]) - np.log(np.maximum(np.hypot(x, y), 1e-12))
+        return np.stack([np.nan_to_num(far, posinf=inf), se2.wrap(bearing[1] - np.arctan2(y, x))])
+
+    def _poses(self, forward: float, turn: float, delay_s: float) -> tuple[FloatArray, FloatArray]:
+        """(P, 3) poses of the robot at the first and at the second sighting, by odometry."""
+        if (forward, turn) not in self._tracks:
+            self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
+        if (forward, turn, delay_s) not in self._motions:
+            track, stamps = self._tracks[forward, turn], self._odometry.stamp_s
+            first, second = (
+                np.stack([np.interp(stamp_s + delay_s, stamps, column) for column in track], axis=1)
+                for stamp_s in self._stamp_s
+            )
+            self._motions[forward, turn, delay_s] = first, second
+        return self._motions[forward, turn, delay_s]
+
+
+class SpatialPairs:
+    """The same in space."""
+
+    units, angles = _UNITS_IN_SPACE, _AXES
+    why_longer = "another unit of detections or odometry, or a wrong size of tags (tag_size_m)"
+    speeds = "odometry"
+
+    def __init__(self, recording: SpatialRecording, first: IntArray, second: IntArray) -> None:
+        assert recording.odometry is not None
+        detections, self._odometry = recording.detections, recording.odometry
+        mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])
+        stamp_s = recording.frames.stamp_s[detections.frame]
+        self._stamp_s = stamp_s[first], stamp_s[second]
+        self._mount = mount[detections.sensor[first]], mount[detections.sensor[second]]
+        position = positions_of(recording)
+        self._seen = position[first], position[second]
+        self._motions: dict[float, FloatArray] = {}
+
+    @property
+    def still(self) -> bool:
+        """Whether the robot never moves, by its odometry."""
+        return bool(np.ptp(self._odometry.pose_world_robot, axis=0).max() < 1e-9)
+
+    @staticmethod
+    def difference(after: FloatArray, before: FloatArray) -> FloatArray:
+        """Return (4, P) by how much residuals differ."""
+        return after - before
+
+    def residual(self, mistake: Mistake) -> FloatArray:
+        """Return (4, P) second sighting minus what the first one and the odometry predict: log range, and direction."""
+        metres = np.array([*3 * [1.0 / mistake.lengths], 1.0, 1.0, 1.0, 1.0])
+        start, stop = (mount * metres for mount in self._mount)
+        motion = se3.compose(se3.inverse(stop), se3.compose(se3.inverse(self._motion(mistake.delay_s) * metres), start))
+        turned = np.array([0.0, 0.0, 0.0, *mistake.turned])
+        seen, again = (se3.transform(turned, each) for each in self._seen)
+        expected = se3.transform(motion, seen)
+        far = [np.maximum(np.linalg.norm(each, axis=1), 1e-12) for each in (again, expected)]
+        return np.vstack([np.log(far[0]) - np.log(far[1]), (again / far[0][:, None] - expected / far[1][:, None]).T])
+
+    def _motion(self, delay_s: float) -> FloatArray:
+        """(P, 7) motions of the robot from the first sighting to the second, by odometry."""
+        if delay_s not in self._motions:
+            stamp_s, pose = self._odometry.stamp_s, self._odometry.pose_world_robot
+            first, second = (se3.interpolate(stamp_s, pose, one_s + delay_s) for one_s in self._stamp_s)
+            self._motions[delay_s] = se3.between(first, second)
+        return self._motions[delay_s]
+
+
+Pairs: TypeAlias = PlanarPairs | SpatialPairs
+
+
+def _velocity(odometry: Odometry) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps
+
+
+def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[FloatArray, FloatArray]:
+    """Return from when on the odometry's clock is ahead of the detections', and by how much.
+
+    Piecewise constant, by dynamic programming (Viterbi 1967): in every second a pair of sightings has a Cauchy loss, on
+    the scale of the usual residual, at each delay, and a step costs `settings.gain`.
+
+    Args:
+        recording: valid; its truth is not looked at.
+        settings: how much readings must gain by a step.
+
+    Returns:
+        (K,) stamps of frames, the first -inf, and (K,) delays that hold from then on [s].
+    """
+    first, second = _pairs(recording, settings)
+    if len(first) < settings.fewest:
+        return np.array([-inf]), np.zeros(1)
+    pairs = PlanarPairs(recording, first, second)
+    delays_s = np.concatenate([[0.0, 0.5, -0.5], _DELAYS_S, np.negative(_DELAYS_S)])
+    far = np.stack([np.minimum(off(pairs.residual(_late(delay_s))), 10.0) for delay_s in delays_s])
+    until_s = recording.frames.stamp_s[recording.detections.frame[second]]
+    begin_s, second_of = np.unique(np.floor(until_s), return_inverse=True)
+    usual, path = settings.fits, np.zeros(len(begin_s), dtype=np.int64)
+    for _ in range(2):  # what is usual shows at the right delays only
+        usual = max(settings.fits, float(np.median(far[path[second_of], np.arange(len(first))])))
+        # a sighting is in two pairs
+        loss = 0.5 * np.log1p((far / usual) ** 2)
+        path = _cheapest(np.stack([np.bincount(second_of, row, len(path)) for row in loss], axis=1), settings.gain)
+    begin = np.flatnonzero(np.diff(path, prepend=-1))
+    since_s, delay_s = [-inf], [0.0]
+    for row, (start, stop) in enumerate(pairwise([*begin.tolist(), len(path)])):
+        mine = (second_of >= start) & (second_of < stop)
+        near_s = delays_s[path[start]] + 0.1 * np.arange(-5, 6)
+        left = [_loss(pairs.residual(_late(delay))[:, mine], settings) for delay in near_s]
+        found = float(near_s[int(np.argmin(left))])
+        if row == 0:
+            delay_s[0] = found
+        elif abs(found - delay_s[-1]) > LEAST_STEP_S:
+            since_s.append(float(begin_s[start]))
+            delay_s.append(found)
+    return np.array(since_s), np.array(delay_s)
+
+
+def _cheapest(loss: FloatArray, step: float) -> IntArray:
+    """(T,) options, one for each row of a table of losses (T, D), of which each change costs `step`."""
+    total, came = loss[0].copy(), np.zeros(loss.shape, dtype=np.int64)
+    every = np.arange(loss.shape[1])
+    for row in range(1, len(loss)):
+        best = int(np.argmin(total))
+        changed = total > total[best] + step
+        came[row] = np.where(changed, best, every)
+        total = np.where(changed, total[best] + step, total) + loss[row]
+    path = np.full(len(loss), np.argmin(total), dtype=np.int64)
+    for row in range(len(loss) - 1, 0, -1):
+        path[row - 1] = came[row, path[row]]
+    return path
+
+
+def _dead_reckoned(odometry: Odometry, forward: float, turn: float) -> FloatArray:
+    """(3, N) x, y and unwrapped heading at the odometry's stamps, with factors on speed and turn rate."""
+    step_s = np.diff(odometry.stamp_s)
+    turned = np.append(0.0, np.cumsum(turn * odometry.angular_radps[:-1] * step_s))
+    heading = turned[:-1] + 0.5 * np.diff(turned)
+    ahead = forward * odometry.forward_mps[:-1] * step_s
+    aside = odometry.lateral_mps[:-1] * step_s
+    x = np.append(0.0, np.cumsum(ahead * np.cos(heading) - aside * np.sin(heading)))
+    y = np.append(0.0, np.cumsum(ahead * np.sin(heading) + aside * np.cos(heading)))
+    return np.stack([x, y, turned])
