@@ -16,6 +16,7 @@ import json
 import random
 import shutil
 import sqlite3
+import struct
 import sys
 import tempfile
 import traceback
@@ -25,7 +26,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -190,6 +191,28 @@ def _spots(document: Any) -> Iterator[tuple[Any, Any]]:
     for key in keys:
         yield document, key
         yield from _spots(document[key])
+
+
+def edit_bag(data: bytes, dice: random.Random) -> bytes:
+    """Numbers, lengths and texts in the messages of a bag, and bytes anywhere."""
+    if dice.random() < 0.4:
+        return flip(data, dice)
+    content = bytearray(data)
+    for _ in range(dice.choice((1, 1, 3, 10, 100))):
+        at = dice.randrange(len(content) - 8)
+        match dice.randrange(4):
+            case 0:
+                number = dice.choice(NASTY_NUMBERS)
+                packed = struct.pack("<d", float(number) if abs(number) < 2**1023 else float("inf"))
+                content[at : at + 8] = packed
+            case 1:
+                content[at : at + 4] = struct.pack("<I", dice.choice((0, 1, 7, 255, 2**16, 2**31, 2**32 - 1)))
+            case 2:  # two messages, or parts of them, exchanged
+                other, count = dice.randrange(len(content) - 8), dice.choice((8, 64, 500))
+                content[at : at + count] = content[other : other + count].ljust(len(content[at : at + count]), b"\0")
+            case _:
+                content[at] = dice.choice(b"/_.aZ0\0\xff")
+    return bytes(content)
 
 
 def edit_parquet(data: bytes, dice: random.Random) -> bytes:
@@ -483,6 +506,9 @@ def kinds(folder: Path) -> dict[str, Callable[[], Kind]]:
         "landmarks-parquet": lambda: Kind(".parquet", (_landmarks(folder, ".parquet"),), edit_parquet, _read_landmarks),
         "landmarks-geojson": lambda: Kind(".geojson", (_landmarks(folder, ".geojson"),), edit_json, _read_landmarks),
         "recording-zip": lambda: Kind(".zip", (_recording(folder),), edit_zip, _read_recording),
+        "bags-ros1": lambda: Kind(".bag", _bags(folder, "{}.bag"), edit_bag, _read_bag),
+        "bags-mcap": lambda: Kind(".mcap", _bags(folder, "{}"), edit_bag, _read_bag),
+        "bags-sqlite": lambda: Kind(".db3", _bags(folder, "{}_sqlite"), edit_bag, _read_bag),
         "tum": lambda: Kind(".tum", (_TUM,), edit_text, _read_tum),
         "priors": lambda: Kind(".txt", _PRIORS, edit_text, _read_prior),
     }  # fmt: skip
@@ -570,6 +596,21 @@ def _recording(folder: Path) -> bytes:
         for path in sorted(where.iterdir()):
             archive.writestr(path.name, b"\n".join(path.read_bytes().split(b"\n")[:60]) + b"\n")
     return sink.getvalue()
+
+
+def _bags(folder: Path, name: str) -> tuple[bytes, ...]:
+    """A drive past two tags with every kind of detector."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "io"))
+    from bags import DETECTORS, write  # type: ignore[import-not-found, unused-ignore]
+
+    found = []
+    for detector in DETECTORS:
+        if detector in ("aruco", "scene") and name.endswith("_sqlite"):  # of types that such a bag does not hold
+            continue
+        path = write(folder / name.format(detector), detector)
+        file = path if path.is_file() else next(one for one in path.iterdir() if one.suffix in (".mcap", ".db3"))
+        found.append(file.read_bytes())
+    return tuple(found)
 
 
 def _models(folder: Path) -> tuple[bytes, ...]:
@@ -662,6 +703,21 @@ def _read_recording(path: Path) -> Any:
     return plain(read_recording(path))
 
 
+def _read_bag(path: Path) -> Any:
+    from evermap import check_recording
+    from evermap.io import read_recording
+    from evermap.io.bag import bag_settings, settings_path
+
+    beside = settings_path(path)
+    beside.unlink(missing_ok=True)
+    text = bag_settings(path)
+    if "AprilTagDetectionArray" in text:
+        beside.write_text(text + "[tags]\nsize_m = 0.2\n", encoding="utf-8")
+    recording = replace(read_recording(path), name="", source="")
+    with np.errstate(all="ignore"):
+        return text, plain(recording), plain(check_recording(recording))
+
+
 def _read_tum(path: Path) -> Any:
     from evermap.io import read_tum
 
@@ -677,7 +733,7 @@ def _read_prior(path: Path) -> Any:
 def main() -> int:
     """Run what was asked for; the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("kind", nargs="*", help="kinds of files; all if none is named")
+    parser.add_argument("kind", nargs="*", help="kinds of files, or how their names begin; all if none is named")
     parser.add_argument("--files", type=int, default=1500, help="mutated files of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--verbose", action="store_true", help="show every defect")
@@ -688,7 +744,8 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as where:
         folder = Path(where)
         made = kinds(folder)
-        for name in asked.kind or made:
+        chosen = [name for name in made if name.startswith(tuple(asked.kind) or "")]
+        for name in chosen:
             (folder / name).mkdir()
             counts = run(made[name](), asked.files, asked.seed, folder / name, verbose=asked.verbose)
             print(f"{name:<20} {asked.files:>6} " + " ".join(f"{counts[column]:>9}" for column in columns), flush=True)

@@ -12,7 +12,7 @@ FILES = 40
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
-    "tum", "priors",
+    "bags-ros1", "bags-mcap", "bags-sqlite", "tum", "priors",
 ]  # fmt: skip
 
 

@@ -233,6 +233,11 @@ def test_mutated_bags_are_read_or_refused(tmp_path: Path) -> None:
     assert refused > 20
 
 
+def test_types_that_nothing_defines_are_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no definition of the messages of /camera/seen, aruco_msgs/msg/ArucoMarkers"):
+        read_bag(write(tmp_path / "drive_sqlite", "aruco"))
+
+
 def test_settings_are_written_beside_the_bag_once(tmp_path: Path) -> None:
     bag = write(tmp_path / "drive", "tags")
     run = CliRunner().invoke

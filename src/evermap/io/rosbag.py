@@ -136,7 +136,13 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
             wanted = handlers(topics)
             held = [one for one in bag.connections if one.topic in wanted]
             for one, received_ns, raw in bag.messages(connections=held) if held else ():
-                wanted[one.topic](bag.deserialize(raw, one.msgtype), 1e-9 * received_ns)
+                try:
+                    message = bag.deserialize(raw, one.msgtype)
+                except KeyError as error:
+                    problem = f"holds no definition of the messages of {one.topic}, {one.msgtype}"
+                    hint = "record it as MCAP, which holds the types of its messages"
+                    raise InputError(problem, path=path, hint=hint) from error
+                wanted[one.topic](message, 1e-9 * received_ns)
     except InputError:
         raise
     except Exception as error:  # the package has no error that all of its errors are
