@@ -40,7 +40,7 @@ def check(
     if as_json:
         print_json(found.as_dict())
     else:
-        print_table(found.name, _rows(found.contents))
+        print_table(found.name, content_rows(found.contents))
     for remark in found.warnings:
         warn(remark)
     for finding in found.findings:
@@ -51,8 +51,8 @@ def check(
         say("nothing odd found")
 
 
-def _rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
-    """What was found, one line a table of the recording and a little more."""
+def content_rows(contents: dict[str, dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return what a recording holds, one line a table and a little more."""
     odometry, frames = contents["odometry"], contents["frames"]
     detections, landmarks = contents["detections"], contents["landmarks"]
     rate = "" if frames["rate_hz"] is None else f" at {frames['rate_hz']:.3g} Hz"

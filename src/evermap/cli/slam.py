@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, TypedDict, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypedDict, Unpack
 
 import typer
 
@@ -325,17 +325,24 @@ def _write(
     if how["as_json"]:
         print_json(summary)
         return
-    twice = {"orientation_rmse_deg"} if summary["metrics"]["heading_rmse_deg"] is not None else set()  # in the plane
-    rows = [
-        (label, form.format(summary[section][key]))
-        for section, key, label, form in _ROWS
-        if summary[section].get(key) is not None and key not in twice
-    ]
+    rows = main_numbers(summary)
     files = (out / name for name in ("report.html", "summary.json"))
     rows += [(file.stem, str(file)) for file in files if file.is_file()]
     print_table(recording.name or "run", rows)
     for finding in [*explanations(result), *grew(info.grown)]:
         echo(finding)
+
+
+def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return the main numbers of a run's summary, with what they are called."""
+    twice = (
+        {"orientation_rmse_deg"} if summary["metrics"].get("heading_rmse_deg") is not None else set()
+    )  # in the plane
+    return [
+        (label, form.format(summary[section][key]))
+        for section, key, label, form in _ROWS
+        if summary[section].get(key) is not None and key not in twice
+    ]
 
 
 def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:

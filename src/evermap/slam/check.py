@@ -79,7 +79,7 @@ class Check:
             found = findings_in_space(recording, settings)
         else:
             found = findings(recording, identities=not settings.unknown_ids, settings=settings.check)
-        return cls(recording.name, recording.source, _contents(recording), found, recording.warnings)
+        return cls(recording.name, recording.source, contents(recording), found, recording.warnings)
 
     @property
     def usable(self) -> bool:
@@ -162,8 +162,8 @@ _CAUSES = {
 }
 
 
-def _contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
-    """Rates, gaps, ways and coverage, in numbers."""
+def contents(recording: AnyRecording) -> dict[str, dict[str, Any]]:
+    """Return rates, gaps, ways and coverage of a valid recording, in numbers."""
     frames, detections = recording.frames, recording.detections
     known = detections.landmark_id != UNKNOWN
     of_landmark = np.unique(detections.landmark_id[known], return_counts=True)[1]
