@@ -39,7 +39,7 @@ RULES = {
         "errors interrupts types config geometry stamps survival valid io metrics existence tracking viz maps pipeline"
     ),
     "cli": (
-        "errors interrupts plugins types config geometry stamps survival io existence tracking viz slam "
+        "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
         "maps pipeline runs"
     ),
 }

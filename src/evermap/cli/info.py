@@ -28,7 +28,7 @@ _TABLES = {
 _KNOWN = "a recording, ROS bag, living map, run folder, landmarks, trajectory (.tum), table or file of lifetimes"
 
 
-class Told(NamedTuple):
+class Described(NamedTuple):
     """What is told of a path: its kind, everything for programs, and lines for people."""
 
     kind: str
@@ -62,7 +62,7 @@ def info(
         warn(remark)
 
 
-def _told(path: Path, robot: int | None) -> Told:
+def _told(path: Path, robot: int | None) -> Described:
     """Ask what understands the path; the cheapest question first.
 
     Raises:
@@ -99,7 +99,7 @@ def _summary(path: Path) -> dict[str, Any] | None:
     return content
 
 
-def _run(path: Path, summary: dict[str, Any]) -> Told:
+def _run(path: Path, summary: dict[str, Any]) -> Described:
     from evermap.cli.slam import main_numbers
 
     folder = path if path.is_dir() else path.parent
@@ -120,12 +120,12 @@ def _run(path: Path, summary: dict[str, Any]) -> Told:
     ]
     picked = ("command", "input", "evermap", "recording", "metrics", "counts", "changes", "accepted", "timing")
     facts = {name: summary[name] for name in picked if name in summary}
-    return Told(
+    return Described(
         "run", {**facts, "files": files, "missing": missing, "remarks": len(summary.get("warnings") or ())}, rows
     )
 
 
-def _recording(path: Path, robot: int | None) -> Told:
+def _recording(path: Path, robot: int | None) -> Described:
     from evermap.cli.check import content_rows
     from evermap.io import list_robots, read_recording, reader_for
     from evermap.slam.check import contents
@@ -147,7 +147,7 @@ def _recording(path: Path, robot: int | None) -> Told:
     except EvermapError as error:
         if not topics:
             raise
-        return Told("bag", {**facts, "warnings": [error.one_line()]}, rows, topics)
+        return Described("bag", {**facts, "warnings": [error.one_line()]}, rows, topics)
     found = contents(recording)
     truth = 0 if recording.truth is None else len(recording.truth)
     survey = 0 if recording.true_landmarks is None else len(recording.true_landmarks)
@@ -161,7 +161,7 @@ def _recording(path: Path, robot: int | None) -> Told:
         ("truth", f"{truth:,} poses, {survey:,} landmarks"),
         ("clock", recording.clock.value),
     ]
-    return Told("bag" if topics else "recording", facts, rows, topics)
+    return Described("bag" if topics else "recording", facts, rows, topics)
 
 
 def _topics(path: Path) -> dict[str, tuple[str, int]]:
@@ -171,7 +171,7 @@ def _topics(path: Path) -> dict[str, tuple[str, int]]:
     return {name: (one.kind, one.messages) for name, one in scan(path, lambda _: {}).items()}
 
 
-def _map(path: Path) -> Told:
+def _map(path: Path) -> Described:
     from evermap.cli.map_content import life_dicts, revision_dict, revision_row
     from evermap.maps.store import open_store
     from evermap.stamps import stamp_text
@@ -204,16 +204,16 @@ def _map(path: Path) -> Told:
         **_landmark_facts(landmarks),
         "lifetimes": lives,
     }
-    return Told("living map", facts, rows)
+    return Described("living map", facts, rows)
 
 
-def _landmarks(path: Path) -> Told:
+def _landmarks(path: Path) -> Described:
     from evermap.io import read_landmarks
 
     landmarks = read_landmarks(path)
     facts = {**_landmark_facts(landmarks), "frame": landmarks.frame, "clock": landmarks.clock.value}
     rows = [("landmarks", f"{len(landmarks):,}"), *_landmark_rows(landmarks), ("frame", landmarks.frame)]
-    return Told("landmarks", facts, rows)
+    return Described("landmarks", facts, rows)
 
 
 def _landmark_facts(landmarks: Landmarks) -> dict[str, Any]:
@@ -242,7 +242,7 @@ def _landmark_rows(landmarks: Landmarks) -> list[tuple[str, str]]:
     return [("classes", classes or "-"), ("extent", f"{size}{turned}")]
 
 
-def _trajectory(path: Path) -> Told:
+def _trajectory(path: Path) -> Described:
     import numpy as np
 
     from evermap.io import read_tum
@@ -252,10 +252,10 @@ def _trajectory(path: Path) -> Told:
     first, last = float(found.stamp_s[0]), float(found.stamp_s[-1])
     facts = {"poses": len(found), "from_s": first, "to_s": last, "way_m": float(step.sum())}
     rows = [("poses", f"{len(found):,}"), ("lasts", f"{last - first:,.1f} s"), ("way", f"{step.sum():,.1f} m")]
-    return Told("trajectory", facts, rows)
+    return Described("trajectory", facts, rows)
 
 
-def _table(path: Path) -> Told:
+def _table(path: Path) -> Described:
     from evermap.io.columns import read_columns
     from evermap.valid import STAMP_S
 
@@ -275,10 +275,10 @@ def _table(path: Path) -> Told:
             labels = table.labels(name)[0]
             facts[name] = len(labels)
             rows.append((name.removesuffix("_id"), f"{len(labels):,} different"))
-    return Told("table", facts, rows)
+    return Described("table", facts, rows)
 
 
-def _json(path: Path) -> Told:
+def _json(path: Path) -> Described:
     """Lifetimes; else landmarks as GeoJSON or as WPILib has them."""
     from evermap.existence.models import load_models, read_model_file
     from evermap.survival.text import prior_text
@@ -292,7 +292,7 @@ def _json(path: Path) -> Told:
     rows = [("model", kind), ("per", models.per)]
     rows += [(f"stay of {name or 'all'}", _half(found)) for name, found in half_s.items()]
     stays = {name: {"stay": prior_text(life.stay), "half_gone_s": half_s[name]} for name, life in lives}
-    return Told("lifetimes", {"model": kind, "per": models.per, "stays": stays}, rows)
+    return Described("lifetimes", {"model": kind, "per": models.per, "stays": stays}, rows)
 
 
 def _half(half_gone_s: float | None, stays: int | None = None) -> str:
@@ -312,7 +312,7 @@ def _document(path: Path) -> dict[str, Any]:
     return document if isinstance(document, dict) else {}
 
 
-_BY_ENDING: Mapping[str, Callable[[Path], Told]] = {
+_BY_ENDING: Mapping[str, Callable[[Path], Described]] = {
     ".tum": _trajectory, ".csv": _table, ".parquet": _table, ".pq": _table, ".geojson": _landmarks, ".json": _json,
     ".yaml": _landmarks, ".yml": _landmarks, "map.txt": _landmarks,
 }  # fmt: skip
