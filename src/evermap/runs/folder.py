@@ -460,6 +460,7 @@ def _plain(config: Any) -> Any:
 def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
     from evermap.io.landmarks import write_map_geojson, write_map_parquet
     from evermap.io.tum import write_tum
+    from evermap.runs.object_changes import object_changes_text
 
     write_tum(result.trajectory, folder.path("trajectory.tum"))
     write_tum(result.online, folder.path("online.tum"))
@@ -469,6 +470,7 @@ def _write_estimates(folder: RunFolder, result: SlamResult) -> None:
         write_map_geojson(alternative.landmarks, folder.path(f"alternative_{rank}.geojson"))
     _write_innovations(result.innovations, folder.path("innovations.parquet"))
     folder.path("changes.jsonl").write_text(changes_text(map(change_dict, result.changes)), encoding="utf-8")
+    folder.path("object_changes.csv").write_text(object_changes_text(result), encoding="utf-8")
     if result.followed is not None:
         from evermap.runs.track.tables import track_files
 

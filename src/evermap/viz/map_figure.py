@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.geometry.group import PLANE, Group, group_of
+from evermap.geometry.group import Group, group_of
 from evermap.metrics.summary import Evaluation
 from evermap.types import AnyRecording, BoolArray, ChangeKind, FloatArray, Landmarks, MapChange, SlamResult
 from evermap.viz.change_words import near_alternatives, probability, what
@@ -316,15 +317,15 @@ def moves(result: SlamResult, pose_truth_map: FloatArray) -> list[Move]:
         pose_truth_map: (3,) or (7,) from the map's frame to that of the picture.
     """
     found = []
-    for number, (change, before, after) in enumerate(
-        _places((result.landmarks, result.gone), result.changes, pose_truth_map)
-    ):
+    drawn = partial(group_of(pose_truth_map).transform, pose_truth_map)
+    for number, (change, _, before, after) in enumerate(places_of((result.landmarks, result.gone), result.changes)):
         label = f"{what(change)}, {probability(change.probability)}"
-        found.append(Move(change, before, after, label, GROUP_COLOURS[number % len(GROUP_COLOURS)], alternative=False))
+        colour = GROUP_COLOURS[number % len(GROUP_COLOURS)]
+        found.append(Move(change, drawn(before), drawn(after), label, colour, alternative=False))
     for other in near_alternatives(result)[:_MAX_ALTERNATIVES]:
-        for number, (change, before, after) in enumerate(_places((other.landmarks,), other.changes, pose_truth_map)):
+        for number, (change, _, before, after) in enumerate(places_of((other.landmarks,), other.changes)):
             label = f"and {what(change)}" if number else f"or: {what(change)}, {probability(other.probability)}"
-            found.append(Move(change, before, after, label, MUTED, alternative=True))
+            found.append(Move(change, drawn(before), drawn(after), label, MUTED, alternative=True))
     return found
 
 
@@ -379,11 +380,13 @@ def _change_mark(kind: ChangeKind, colour: str) -> dict[str, Any]:
     return {"marker": "D", "mfc": PAPER, "mec": colour, "mew": 1.1, "ms": 4.0}
 
 
-def _places(
-    known: Sequence[Landmarks], changes: Sequence[MapChange], pose_truth_map: FloatArray
-) -> list[tuple[MapChange, FloatArray, FloatArray]]:
-    """(change, before, after) by time: undone one after the other from the last, for some landmarks move twice."""
-    group = group_of(pose_truth_map)
+def places_of(
+    known: Sequence[Landmarks], changes: Sequence[MapChange]
+) -> list[tuple[MapChange, list[int], FloatArray, FloatArray]]:
+    """Return changes by time, each with the landmarks whose places are known, those before it and those after it.
+
+    They are undone one after the other from the last, for some landmarks move twice.
+    """
     place = {name: at for some in known for name, at in zip(some.landmark_id.tolist(), some.position_m, strict=True)}
     found = []
     by_time = sorted(changes, key=lambda change: change.stamp_to_s)
@@ -397,9 +400,9 @@ def _places(
         elif not np.all(np.isfinite(change.displacement_m)):  # it was nowhere before
             before = after
         else:
-            turn = change.rotation_rad if group is PLANE else None  # in space nobody knows about which axis
+            turn = change.rotation_rad if after.shape[1] == 2 else None  # in space nobody knows about which axis
             step = np.array(change.displacement_m)
             before = after - step if turn is None else se2.move_together(after, -step, -turn)
             place |= zip(ids, before, strict=True)
-        found.append((change, group.transform(pose_truth_map, before), group.transform(pose_truth_map, after)))
+        found.append((change, ids, before, after))
     return found[::-1]
