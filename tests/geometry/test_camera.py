@@ -183,6 +183,18 @@ def test_corners_of_no_square_have_no_pose() -> None:
     assert square_poses(np.zeros((0, 4, 2)), np.zeros(0), PINHOLE).pose.shape == (2, 0, 7)
 
 
+def test_damaged_corners_spoil_no_other_tag() -> None:
+    random = np.random.default_rng(0)
+    square = np.array([[270.0, 190.0], [370.0, 190.0], [370.0, 290.0], [270.0, 290.0]])
+    corner = np.tile(square.ravel(), (500, 1))
+    damaged = random.random(corner.shape) < 0.5
+    corner[damaged] = random.choice([1e308, -1e308, 1e100, -1e30, 1e18, 1e8, 5e-324, 0.0, np.nan], damaged.sum())
+    corner[0] = square.ravel()
+    with np.errstate(all="ignore"):
+        found = square_poses(corner.reshape(-1, 4, 2), np.full(500, 0.2), PINHOLE)
+    np.testing.assert_array_equal(found.pose[:, 0], square_poses(square[None], np.array([0.2]), PINHOLE).pose[:, 0])
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("recording", "size", "camera"),

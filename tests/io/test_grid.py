@@ -9,7 +9,7 @@ import pytest
 
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se3
-from evermap.io.grid import write_grid
+from evermap.io.grid import write_grid, write_speed_mask
 from evermap.io.yaml import parse_yaml
 from evermap.types import Landmarks
 
@@ -53,6 +53,31 @@ def test_boxes_as_they_are_turned(tmp_path: Path) -> None:
     for along, across, inside in ((1.9, 0.4, True), (-1.9, -0.4, True), (2.2, 0.0, False), (0.0, 0.7, False)):
         x, y, _ = se3.transform(np.concatenate([[1.0, 2.0, 0.4], turned[0, 3:]]), np.array([along, across, 0.0]))
         assert at(grid, x, y) == (1.0 if inside else 0.0)
+
+
+def limit_of(path: Path, x: float, y: float) -> float:
+    """Per cent of the greatest speed that Nav2's speed filter sets: 0 is no limit, as is what is out of bounds."""
+    value = round(100.0 * at(grid_of(path), x, y))
+    limit = 100.0 - 1.0 * value if value else 0.0
+    return limit if 0.0 <= limit <= 100.0 else 0.0
+
+
+def test_the_speed_mask_slows_where_the_map_may_be_wrong(tmp_path: Path) -> None:
+    landmarks = Landmarks.at([1, 2, 3, 4], [[0.0, 0.0], [4.0, 0.0], [4.5, 0.0], [9.0, 0.0]])
+    path = write_speed_mask(landmarks, np.array([0.001, 0.3, 0.62, 1.0]), tmp_path / "speed.yaml", radius_m=0.8)
+    assert path.read_text().startswith("# Mask of Nav2's speed filter; its CostmapFilterInfo: type 1, base 100.0")
+    assert limit_of(path, 0.0, 0.0) == 0.0  # what is sure sets no limit
+    assert limit_of(path, 3.4, 0.0) == 70.0
+    assert limit_of(path, 4.2, 0.3) == 38.0  # the slowest of both
+    assert limit_of(path, 6.5, 0.0) == 0.0
+    assert limit_of(path, 9.0, 0.7) == 10.0  # a limit of 0 would be none
+
+
+def test_every_per_cent_arrives(tmp_path: Path) -> None:
+    landmarks = Landmarks.at(range(91), [[3.0 * k, 0.0] for k in range(91)])
+    path = write_speed_mask(landmarks, np.arange(91) / 100.0, tmp_path / "s.yaml", cell_m=0.5, radius_m=1.0)
+    grid = grid_of(path)
+    assert [round(100.0 * at(grid, 3.0 * k, 0.0)) for k in range(91)] == list(range(91))
 
 
 def test_what_cannot_be_drawn(tmp_path: Path) -> None:

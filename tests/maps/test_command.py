@@ -200,6 +200,27 @@ def test_an_edit_is_a_revision_that_can_be_reverted(site: Path) -> None:
         assert members.pinned[members.landmark_id == free] == [pinned]
 
 
+def test_export_for_nav2(site: Path, tmp_path: Path) -> None:
+    told = said("export", site, "--out", tmp_path / "speed.yaml", "--speed-mask", "--ahead", "3d", "--cell-m", 0.5)
+    living = MAPS[2]
+    now, then = living.landmarks(), living.landmarks(at=living.stamp_s + 3 * 86_400.0)
+    wrong = np.where(now.p_exists >= 0.5, 1.0 - then.p_exists, then.p_exists)
+    assert told["p_wrong"] == {str(k): p for k, p in zip(now.landmark_id.tolist(), wrong.tolist(), strict=True)}
+    assert (tmp_path / "speed.pgm").is_file()
+    sure = int(np.argmax(now.p_exists))
+    ends = now.position_m[sure, :2] + np.array([[-1.0, 0.0], [1.0, 0.0]])
+    nodes = [
+        {"type": "Feature", "properties": {"id": k}, "geometry": {"type": "Point", "coordinates": at}}
+        for k, at in enumerate(ends.tolist())
+    ]
+    line = {"type": "LineString", "coordinates": ends.tolist()}
+    way = {"type": "Feature", "properties": {"id": 9, "startid": 0, "endid": 1}, "geometry": line}
+    (tmp_path / "in.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [*nodes, way]}))
+    told = said("export", site, "--out", tmp_path / "open.geojson", "--route-graph", tmp_path / "in.geojson")
+    assert told["closed"] == [9]
+    assert len(json.loads((tmp_path / "open.geojson").read_text())["features"]) == 2
+
+
 @pytest.mark.parametrize("ending", ["parquet", "geojson", "csv"])
 def test_export_reads_back_as_the_map(site: Path, tmp_path: Path, ending: str) -> None:
     out = tmp_path / f"map.{ending}"
@@ -289,6 +310,9 @@ def test_gc_prunes_old_revisions(site: Path, tmp_path: Path) -> None:
             ("export", "SITE", "--out", "map.png"),
             "map.png: field '--out': cannot write a '.png' file (try: map.parquet",
         ),
+        (("export", "SITE", "--out", "s.csv", "--speed-mask"), "s.csv: field '--speed-mask': is an image"),
+        (("export", "SITE", "--out", "s.csv", "--route-graph", "g"), "s.csv: field '--route-graph': is written as Geo"),
+        (("export", "SITE", "--out", "s.json", "--route-graph", "no"), "no: cannot be read: No such file"),
         (("show", "SITE", "--figure", "map.pdf"), "cannot draw a '.pdf' file"),
         (("show", "SITE", "--ahead", "3"), "'3' has no unit"),
     ],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,6 +15,7 @@ from evermap.errors import ConfigError
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
+    from evermap.types import Landmarks
 
 app = typer.Typer(
     name="map",
@@ -147,27 +148,63 @@ def diff(
         say(f"no difference between revisions {found.a} and {found.b}")
 
 
+_ExportOut = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for a grid.",
+        show_default=False,
+    ),
+]
+_ExportLifetimes = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.json", help="Where to write how long things stay, by class.", show_default=False),
+]
+_PLeast = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1.0,
+        help="Leave out what exists with a smaller probability.",
+        show_default="0.5; 0 for Nav2's speed mask and route graph",
+    ),
+]
+_SpeedMask = Annotated[
+    bool, typer.Option("--speed-mask", help="Write --out FILE.yaml as the mask of Nav2's speed filter.")
+]
+_RouteGraph = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="IN.geojson",
+        help="Write this route graph of Nav2 to --out, without edges that are blocked.",
+        show_default=False,
+    ),
+]
+_MapAge = Annotated[str, typer.Option(help="With --speed-mask: how old the map will be when it is used.")]
+_CellM = Annotated[float, typer.Option(min=1e-3, max=1e3, help="Edge of a cell of the grid [m].")]
+_RadiusM = Annotated[
+    float | None,
+    typer.Option(
+        min=0.0,
+        max=1e3,
+        help="Radius around a landmark in the grid, clearance of an edge [m].",
+        show_default="0.25; 1 for the speed mask; 0.5 for the route graph",
+    ),
+]
+
+
 @app.command("export")
 def export(
     file: MapFile,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Where to write the landmarks: .parquet, .geojson, .csv, or .yaml for an occupancy grid.",
-            show_default=False,
-        ),
-    ] = None,
-    lifetimes: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.json", help="Where to write how long things stay, by class.", show_default=False),
-    ] = None,
+    out: _ExportOut = None,
+    lifetimes: _ExportLifetimes = None,
     revision: _AtRevision = None,
-    p_least: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="Leave out what exists with a smaller probability.")
-    ] = 0.5,
-    cell_m: Annotated[float, typer.Option(min=1e-3, max=1e3, help="Edge of a cell of the grid [m].")] = 0.05,
-    radius_m: Annotated[float, typer.Option(min=0.0, max=1e3, help="Radius around a landmark in the grid [m].")] = 0.25,
+    p_least: _PLeast = None,
+    speed_mask: _SpeedMask = False,
+    route_graph: _RouteGraph = None,
+    ahead: _MapAge = "1d",
+    cell_m: _CellM = 0.05,
+    radius_m: _RadiusM = None,
     as_json: AsJson = False,
 ) -> None:
     """Write existing landmarks, or learned lifetimes, to a file.
@@ -179,30 +216,35 @@ def export(
       evermap map export site.evermap --out map.geojson
       evermap map export site.evermap --lifetimes lifetimes.json
       evermap map export site.evermap --out keepout.yaml --p-least 0.1
+      evermap map export site.evermap --out speed.yaml --speed-mask --ahead 12h
+      evermap map export site.evermap --out open.geojson --route-graph graph.geojson
     """
     from evermap.maps.store import open_store
     from evermap.runs.folder import check_output_file
+    from evermap.survival.durations import parse_duration_s
 
     if out is None and lifetimes is None:
         raise ConfigError("nothing to write", field="--out", hint="--out map.geojson, or --lifetimes lifetimes.json")
-    write = None if out is None else _writer(out, cell_m, radius_m)
+    ahead_s = parse_duration_s(ahead) if speed_mask else None
+    write = _writer(out, cell_m, radius_m, ahead_s, route_graph)
     for path in (out, lifetimes):
         if path is not None:
-            check_output_file(path, inputs=[file], ending=".json" if path is lifetimes else "")
+            check_output_file(path, inputs=[file, route_graph], ending=".json" if path is lifetimes else "")
     with open_store(file) as store:
         number = store.head() if revision is None else revision
         living = store.load(number)
+    if p_least is None:
+        p_least = 0.0 if speed_mask or route_graph is not None else 0.5
     landmarks = living.landmarks(p_least=p_least)
-    if write is not None:
-        write(landmarks, out)
+    told = {"out": None if out is None else str(out), "landmarks": len(landmarks), **write(living, landmarks)}
     classes = [] if lifetimes is None else _write_lifetimes(living, lifetimes)
     if as_json:
-        told = {"out": None if out is None else str(out), "landmarks": len(landmarks)}
         said = {"lifetimes": None if lifetimes is None else str(lifetimes), "classes": classes}
         print_json({"map": file, "revision": number, **told, **said})
         return
     if out is not None:
-        say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}")
+        closed = f"; {len(told['closed'])} of {told['edges']} edges are closed" if "edges" in told else ""
+        say(f"wrote {len(landmarks)} landmarks of revision {number} to {out}{closed}")
     if lifetimes is not None:
         say(f"wrote lifetimes of {len(classes)} classes to {lifetimes}; use it with: evermap slam --prior {lifetimes}")
 
@@ -252,8 +294,10 @@ def _write_lifetimes(living: LivingMap, path: Path) -> list[str]:
     return list(models)
 
 
-def _writer(out: Path, cell_m: float, radius_m: float) -> Any:
-    """What writes such a file.
+def _writer(
+    out: Path | None, cell_m: float, radius_m: float | None, ahead_s: float | None, route_graph: Path | None
+) -> Callable[[LivingMap, Landmarks], dict[str, Any]]:
+    """What writes such a file, and returns what is to be told of it.
 
     Raises:
         ConfigError: no map is written to such a file.
@@ -262,18 +306,60 @@ def _writer(out: Path, cell_m: float, radius_m: float) -> Any:
     from evermap.io.grid import write_grid
     from evermap.io.landmarks import write_map_csv
 
-    writers = {
-        ".yaml": partial(write_grid, cell_m=cell_m, radius_m=radius_m),
+    if out is None:
+        return lambda *_: {}
+    ending = out.suffix.lower()
+    if ahead_s is not None:
+        if ending != ".yaml" or route_graph is not None:
+            raise ConfigError("is an image with its YAML", path=out, field="--speed-mask", hint="--out speed.yaml")
+        return partial(_speed_mask, out, cell_m, 1.0 if radius_m is None else radius_m, ahead_s)
+    if route_graph is not None:
+        if ending not in (".geojson", ".json"):
+            raise ConfigError("is written as GeoJSON", path=out, field="--route-graph", hint="--out open.geojson")
+        return partial(_route_graph, out, route_graph, 0.5 if radius_m is None else radius_m)
+    writers: dict[str, Callable[..., Any]] = {
+        ".yaml": partial(write_grid, cell_m=cell_m, radius_m=0.25 if radius_m is None else radius_m),
         ".parquet": write_map_parquet,
         ".geojson": write_map_geojson,
         ".json": write_map_geojson,
         ".csv": write_map_csv,
     }
-    with suppress(KeyError):
-        return writers[out.suffix.lower()]
-    raise ConfigError(
-        f"cannot write a '{out.suffix}' file", path=out, field="--out", hint="map.parquet, .geojson, .csv or .yaml"
-    )
+    if ending not in writers:
+        hint = "map.parquet, .geojson, .csv or .yaml"
+        raise ConfigError(f"cannot write a '{out.suffix}' file", path=out, field="--out", hint=hint)
+
+    def write(_: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+        writers[ending](landmarks, out)
+        return {}
+
+    return write
+
+
+def _speed_mask(
+    out: Path, cell_m: float, radius_m: float, ahead_s: float, living: LivingMap, landmarks: Landmarks
+) -> dict[str, Any]:
+    """Write where to drive slowly, since the map may be wrong by then."""
+    import numpy as np
+
+    from evermap.io.grid import write_speed_mask
+
+    then = living.landmarks(at=living.stamp_s + ahead_s) if len(landmarks) else landmarks
+    p_then = then.p_exists[np.isin(then.landmark_id, landmarks.landmark_id)]
+    p_wrong = np.where(landmarks.p_exists >= 0.5, 1.0 - p_then, p_then)
+    write_speed_mask(landmarks, p_wrong, out, cell_m=cell_m, radius_m=radius_m)
+    return {
+        "ahead_s": ahead_s,
+        "p_wrong": dict(zip(map(str, landmarks.landmark_id.tolist()), p_wrong.tolist(), strict=True)),
+    }
+
+
+def _route_graph(out: Path, graph: Path, clearance_m: float, _: LivingMap, landmarks: Landmarks) -> dict[str, Any]:
+    """Write a route graph; tell which of its edges are closed, and which are doubtful."""
+    from evermap.io.route_graph import write_route_graph
+
+    edges = write_route_graph(landmarks, graph, out, clearance_m=clearance_m)
+    doubtful = {str(edge.number): edge.p_blocked for edge in edges if edge.p_blocked and not edge.closed}
+    return {"edges": len(edges), "closed": [edge.number for edge in edges if edge.closed], "doubtful": doubtful}
 
 
 for command in (verify, gc, revert, pin, unpin, delete, undelete):

@@ -64,7 +64,7 @@ def _infinitesimal(plane: FloatArray, size_m: FloatArray) -> FloatArray:
     slope = homography[:, :2, :2] - at[:, :, None] * row[:, None, :]
     turn = _to_axis(at)
     narrow = turn[:, :2, :2] - at[:, :, None] * turn[:, 2:, :2]
-    flat = np.linalg.solve(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
+    flat = _solved(np.where(np.isfinite(narrow), narrow, np.eye(2)), slope)
     gram = np.swapaxes(flat, 1, 2) @ flat
     largest = 0.5 * (_trace(gram) + np.sqrt(np.maximum(_trace(gram) ** 2 - 4.0 * _det(gram), 0.0)))
     flat = flat / np.sqrt(largest)[:, None, None]
@@ -120,7 +120,7 @@ def _position(rotation: FloatArray, plane: FloatArray, size_m: FloatArray) -> Fl
     across = np.swapaxes(matrix, 1, 2)
     normal = across @ matrix
     normal = np.where(np.isfinite(normal).all(axis=(1, 2), keepdims=True), normal, np.eye(3))
-    return np.asarray(np.linalg.solve(normal, across @ wanted)[..., 0])
+    return _solved(normal, across @ wanted)[..., 0]
 
 
 def _refined(
@@ -134,7 +134,7 @@ def _refined(
     for _ in range(_STEPS):
         diagonal = np.einsum("mii->mi", normal[rows])
         damped = normal[rows] + np.einsum("mi,ij->mij", damping[rows, None] * diagonal + 1e-12, np.eye(6))
-        step = -np.linalg.solve(damped, gradient[rows][..., None])[..., 0]
+        step = -_solved(damped, gradient[rows][..., None])[..., 0]
         going = -np.sum(gradient[rows] * step, axis=1) > 1e-10 * residual[rows] + 1e-18  # what the step would gain
         rows, step = rows[going], step[going]
         if not len(rows):
@@ -179,6 +179,17 @@ def _quaternion(rotation: FloatArray) -> FloatArray:
     best = np.argmax(np.einsum("mii->mi", outer), axis=1)
     column = outer[np.arange(len(r)), best]
     return np.asarray(column / np.linalg.norm(column, axis=1, keepdims=True))
+
+
+def _solved(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Solutions (M, K, L) of systems (M, K, K), nan of those that have none: corners that are hardly a square."""
+    try:
+        return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        found = np.full(right.shape, np.nan)
+        fine = np.linalg.slogdet(matrix)[0] != 0.0
+        found[fine] = np.linalg.solve(matrix[fine], right[fine])
+        return found
 
 
 def _trace(matrix: FloatArray) -> FloatArray:

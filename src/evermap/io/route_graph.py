@@ -1,0 +1,190 @@
+"""Route graphs as Nav2's route server reads them (GeoJSON), without the edges that a map says are blocked.
+
+Nodes are points with `id`; edges are lines with `id`, `startid` and `endid`, straight between their nodes whatever
+their coordinates are. Numbers in `metadata` are for scorers: `PenaltyScorer` adds `penalty` to the cost of an edge.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.io.files import unpacked, write_atomic
+from evermap.io.grid import Footprints
+from evermap.io.text import decode_text, reason
+from evermap.types import FloatArray, Landmarks
+
+CLOSED = 0.5
+"""From this probability on an edge is closed: something more probably stands in its way than not."""
+SAMPLES = 201
+"""Points of an edge, nearest to a landmark, that are compared with what it covers."""
+FARTHEST_M = 1e8
+_HINT = "a route graph of Nav2: points with properties.id, lines with id, startid and endid"
+
+
+class RouteEdge(NamedTuple):
+    """An edge of a graph.
+
+    Attributes:
+        number: its id.
+        ends: (2, 2) positions of its nodes [m].
+        p_blocked: probability that something stands within the clearance of it.
+    """
+
+    number: int
+    ends: FloatArray
+    p_blocked: float
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is more probably blocked than not."""
+        return self.p_blocked >= CLOSED
+
+    @property
+    def penalty_m(self) -> float:
+        """How much longer the way is on average if it is tried until it is free, p / (1 - p) times its length."""
+        return float(np.hypot(*np.diff(self.ends, axis=0)[0])) * self.p_blocked / (1.0 - self.p_blocked)
+
+
+def write_route_graph(
+    landmarks: Landmarks, graph: str | Path, path: str | Path, *, clearance_m: float = 0.5
+) -> list[RouteEdge]:
+    """Write a route graph without its blocked edges, with a penalty on the doubtful ones; return all of its edges.
+
+    What is left out is listed by id in the top-level member `evermap`, as the service of `DynamicEdgesScorer` takes it.
+
+    Args:
+        landmarks: a map in the frame of the graph; one in space is seen from above.
+        graph: the graph as it was drawn, which stays as it is.
+        path: of the file to write.
+        clearance_m: how far from an edge something may stand so that a robot cannot pass [m].
+
+    Raises:
+        InputError: no route graph; the message names the feature.
+    """
+    graph, path = Path(graph), Path(path)
+    document = _read(graph)
+    nodes = _nodes(document, graph)
+    edges, kept = list[RouteEdge](), list[dict[str, Any]]()
+    feet = Footprints.of(landmarks)
+    for number, feature in enumerate(document["features"]):
+        if feature["geometry"]["type"] == "Point":
+            kept.append(feature)
+            continue
+        edge = _edge(feature, nodes, landmarks, feet, clearance_m, graph, number)
+        edges.append(edge)
+        if not edge.closed:
+            kept.append(_doubtful(feature, edge, graph, number))
+    closed = [edge.number for edge in edges if edge.closed]
+    about = {"closed_edges": closed, "clearance_m": clearance_m, "blocked": {str(e.number): e.p_blocked for e in edges}}
+    write_atomic(path, json.dumps({**document, "evermap": about, "features": kept}, indent=1, allow_nan=False) + "\n")
+    return edges
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """The document, with a list of features that have a geometry and properties."""
+    try:
+        document = json.loads(decode_text(unpacked(path.read_bytes(), path), path), parse_constant=_refuse)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", path=path) from error
+    except json.JSONDecodeError as error:
+        raise InputError(f"not valid JSON: {error.msg}", path=path, line=error.lineno) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"not valid JSON: {reason(error)}", path=path) from None
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list):
+        raise InputError("no GeoJSON feature collection", path=path, field="features", hint=_HINT)
+    for number, feature in enumerate(features):
+        parts = [feature.get(name) if isinstance(feature, dict) else None for name in ("geometry", "properties")]
+        kind = parts[0].get("type") if isinstance(parts[0], dict) else None
+        if kind not in ("Point", "LineString", "MultiLineString") or not isinstance(parts[1], dict):
+            raise _wrong("is neither a node nor an edge", path, number)
+    return {**document}
+
+
+def _refuse(word: str) -> None:
+    raise ValueError(f"{word} is no number in JSON")
+
+
+def _nodes(document: Mapping[str, Any], path: Path) -> dict[int, tuple[float, float]]:
+    """Positions of the nodes by their ids."""
+    found: dict[int, tuple[float, float]] = {}
+    for number, feature in enumerate(document["features"]):
+        geometry, properties = feature["geometry"], feature["properties"]
+        if geometry["type"] != "Point":
+            continue
+        at = geometry.get("coordinates")
+        if not isinstance(at, list) or len(at) < 2 or not all(map(_is_number, at[:2])):
+            raise _wrong("has no coordinates x, y", path, number)
+        if max(map(abs, at[:2])) > FARTHEST_M:
+            raise _wrong("is farther than any robot drives", path, number)
+        if properties.get("frame", "map") != "map":
+            raise _wrong(f"is in the frame '{properties['frame']}', not in that of the map", path, number)
+        identity = _whole(properties, "id", path, number)
+        if identity in found:
+            raise _wrong(f"has the id {identity} of another node", path, number)
+        found[identity] = float(at[0]), float(at[1])
+    return found
+
+
+def _edge(
+    feature: Mapping[str, Any],
+    nodes: Mapping[int, tuple[float, float]],
+    landmarks: Landmarks,
+    feet: Footprints,
+    clearance_m: float,
+    path: Path,
+    number: int,
+) -> RouteEdge:
+    properties = feature["properties"]
+    ends = []
+    for name in ("startid", "endid"):
+        node = _whole(properties, name, path, number)
+        if node not in nodes:
+            raise _wrong(f"{name} {node} is no node", path, number)
+        ends.append(nodes[node])
+    way = np.array(ends)
+    step = way[1] - way[0]
+    length_m = max(float(np.hypot(*step)), 1e-9)
+    reach = np.hypot(*feet.half.T) + clearance_m
+    nearest = (feet.at - way[0]) @ step / length_m
+    p_blocked = 0.0
+    for row in np.flatnonzero((nearest >= -reach) & (nearest <= length_m + reach)):
+        along = np.clip(nearest[row] + reach[row] * np.linspace(-1.0, 1.0, SAMPLES), 0.0, length_m) / length_m
+        x, y = way[0, :, None] + step[:, None] * along
+        if feet.distance(int(row), x, y).min() <= clearance_m:
+            p_blocked = max(p_blocked, float(landmarks.p_exists[row]))
+    return RouteEdge(_whole(properties, "id", path, number), way, p_blocked)
+
+
+def _doubtful(feature: dict[str, Any], edge: RouteEdge, path: Path, number: int) -> dict[str, Any]:
+    """The feature with a penalty, added to one that it has; floats, for Nav2 reads whole numbers as another type."""
+    if not edge.p_blocked:
+        return feature
+    metadata = feature["properties"].get("metadata", {})
+    own: Any = metadata.get("penalty", 0.0) if isinstance(metadata, dict) else None
+    if not _is_number(own):
+        raise _wrong("has no number as properties.metadata.penalty", path, number)
+    told = {**metadata, "penalty": float(own) + edge.penalty_m, "p_blocked": edge.p_blocked}
+    return {**feature, "properties": {**feature["properties"], "metadata": told}}
+
+
+def _whole(properties: Mapping[str, Any], name: str, path: Path, number: int) -> int:
+    value = properties.get(name)
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
+        raise _wrong(f"has no whole number as properties.{name}", path, number)
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf
+
+
+def _wrong(problem: str, path: Path, number: int) -> InputError:
+    return InputError(problem, path=path, field=f"features[{number}]", hint=_HINT)
