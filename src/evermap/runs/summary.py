@@ -6,6 +6,7 @@ Everything outside of `timing` and `versions` is a function of the inputs and th
 from __future__ import annotations
 
 import json
+import math
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from evermap import __version__
-from evermap.types import AnyRecording, MapChange, ParameterEstimate, SlamResult, json_number
+from evermap.types import AnyRecording, ChangeKind, MapChange, ParameterEstimate, SlamResult, json_number
 
 SUMMARY_SCHEMA_VERSION = "2"
 """Of `summary.json` of all verbs and studies. 2: `config` holds sections; `version` and `input` for all."""
@@ -171,6 +172,30 @@ def change_dict(change: MapChange, *, stamp_s: float | None = None, decided_s: f
         "stamp_s": json_number(stamp_s),
         "decided_s": json_number(decided_s),
     }
+
+
+def change_of(content: Mapping[str, Any]) -> MapChange:
+    """Return the change of which `change_dict` gave these keys.
+
+    Raises:
+        LookupError, ValueError, TypeError: they are others.
+    """
+
+    def number(value: float | None) -> float:
+        return math.nan if value is None else float(value)
+
+    return MapChange(
+        landmark_ids=tuple(map(int, content["landmarks"])),
+        kind=ChangeKind(content["kind"]),
+        stamp_from_s=number(content["stamp_from_s"]),
+        stamp_to_s=number(content["stamp_to_s"]),
+        displacement_m=tuple(map(number, content["displacement_m"])),
+        rotation_rad=number(content["rotation_rad"]),
+        probability=number(content["probability"]),
+        n_hits=int(content["hits"]),
+        n_misses=int(content["misses"]),
+        names=tuple(content["names"] or ()),
+    )
 
 
 def changes_text(changes: Iterable[Mapping[str, Any]]) -> str:

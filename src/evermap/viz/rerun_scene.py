@@ -29,7 +29,7 @@ from evermap.types import (
 )
 from evermap.viz.map_figure import class_names_of, moves
 from evermap.viz.panels import box_sizes, corners_of, landmark_poses, long_gaps, moved_map
-from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, class_looks
+from evermap.viz.style import ALERT, ESTIMATE, INK, LANDMARK, MUTED, ODOMETRY, PAPER, class_looks
 from evermap.viz.track_figures import DYNAMIC, STATIC
 
 
@@ -228,7 +228,9 @@ def _send_robot(stream: Any, trajectory: Trajectory, pose_truth_map: FloatArray,
 
 
 def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Clock, scale: float) -> None:
-    """Send final positions with 2-sigma ellipses by class, each from its first sighting on; large maps in groups."""
+    """Send final positions with 2-sigma ellipses by class, each from its first sighting on, as faint as it is doubtful;
+    large maps in groups.
+    """
     import rerun as rr
 
     if len(landmarks) == 0:
@@ -237,11 +239,12 @@ def _send_landmarks(stream: Any, landmarks: Landmarks, start_s: float, clock: Cl
     points = _flat(landmarks.position_m)
     ellipses = _ellipses(points, landmarks.covariance_m2)
     looks, classes = class_looks(landmarks.class_names), class_names_of(landmarks)
-    colours = np.array([rgb(looks[name].colour) for name in classes], dtype=np.uint8)
+    p = landmarks.p_exists[:, None]
+    colours = (p * [rgb(looks[name].colour) for name in classes] + (1.0 - p) * rgb(PAPER)).astype(np.uint8)
     called = np.array(
         [
-            landmarks.names.get(name, str(name)) + (f" ({of})" if of else "")
-            for name, of in zip(landmarks.landmark_id.tolist(), classes, strict=True)
+            landmarks.names.get(name, str(name)) + (f" ({of})" if of else "") + (f" {p:.2f}" if p < 0.995 else "")
+            for name, of, p in zip(landmarks.landmark_id.tolist(), classes, landmarks.p_exists.tolist(), strict=True)
         ]
     )
     order = np.argsort(first_s, kind="stable")
