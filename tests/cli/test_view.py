@@ -1,4 +1,4 @@
-"""`evermap view`: runs and maps as rerun and MCAP show them, by their own readers, and what it says without a viewer."""
+"""`evermap view`: runs and maps as rerun and MCAP show them, by their own readers; what it says without a viewer."""
 
 from __future__ import annotations
 
