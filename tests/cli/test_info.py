@@ -97,6 +97,13 @@ def test_landmarks_tables_lifetimes_and_trajectories(place: Path) -> None:
     assert told(place / "run" / "trajectory.tum")["poses"] > 10
 
 
+def test_a_grid(place: Path) -> None:
+    assert run("map", "export", place / "site.evermap", "--out", place / "keep.yaml").exit_code == 0
+    found = told(place / "keep.yaml")
+    assert (found["kind"], found["cell_m"], found["mode"]) == ("grid", 0.05, "scale")
+    assert found["width"] * found["height"] == len((place / "keep.pgm").read_bytes().split(b"\n", 3)[3])
+
+
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -106,6 +113,8 @@ def test_landmarks_tables_lifetimes_and_trajectories(place: Path) -> None:
         ("a.json", b"{", "is no JSON"),
         ("a.evermap", b"SQLite format 3\0" + b"x" * 100, "a.evermap"),
         ("summary.json", b"[]", "no summary that evermap wrote"),
+        ("a.yaml", b"image: nothing.pgm\nresolution: 0.1\n", "a grid whose image cannot be read"),
+        ("b.yaml", b"a: [\n", "b.yaml"),
         ("a.bag", b"#ROSBAG V2.0\n", "cannot be read as a bag"),
     ],
 )

@@ -278,6 +278,27 @@ def _table(path: Path) -> Described:
     return Described("table", facts, rows)
 
 
+def _yaml(path: Path) -> Described:
+    """A grid as ROS 2's map_server has it; else tags of TagSLAM."""
+    from evermap.io.yaml import parse_yaml
+
+    document = parse_yaml(path.read_bytes(), path)
+    if not isinstance(document, dict) or "image" not in document:
+        return _landmarks(path)
+    image, cell_m = path.parent / str(document["image"]), document.get("resolution")
+    try:
+        kind, shape, *_ = image.read_bytes()[:64].split(b"\n")
+        width, height = map(int, shape.split()) if kind == b"P5" else (0, 0)
+        extent = f"{width * float(cell_m):.1f} x {height * float(cell_m):.1f} m"
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            "is a grid whose image cannot be read", path=image, hint="a PGM as evermap writes it"
+        ) from error
+    facts = {"image": str(image), "width": width, "height": height, "cell_m": cell_m, "mode": document.get("mode")}
+    rows = [("cells", f"{width:,} x {height:,} of {cell_m} m"), ("extent", extent), ("mode", str(document.get("mode")))]
+    return Described("grid", facts, rows)
+
+
 def _json(path: Path) -> Described:
     """Lifetimes; else landmarks as GeoJSON or as WPILib has them."""
     from evermap.existence.models import load_models, read_model_file
@@ -314,7 +335,7 @@ def _document(path: Path) -> dict[str, Any]:
 
 _BY_ENDING: Mapping[str, Callable[[Path], Described]] = {
     ".tum": _trajectory, ".csv": _table, ".parquet": _table, ".pq": _table, ".geojson": _landmarks, ".json": _json,
-    ".yaml": _landmarks, ".yml": _landmarks, "map.txt": _landmarks,
+    ".yaml": _yaml, ".yml": _yaml, "map.txt": _landmarks,
 }  # fmt: skip
 
 

@@ -20,7 +20,6 @@ from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.slam.cleaning import spikes
 from evermap.slam.mistakes import HONEST, USUAL, likeliest, off, pairs_of
-from evermap.slam.space.intake import positions_of, prepare_space, without_range
 from evermap.types import (
     UNKNOWN,
     AnyRecording,
@@ -255,6 +254,8 @@ def _seen_in_space(recording: SpatialRecording) -> dict[str, Any]:
 
 def _ranges(recording: SpatialRecording) -> FloatArray:
     """(M,) distances from the sensor; nan where only the direction was seen."""
+    from evermap.slam.space.intake import positions_of, without_range
+
     range_m = np.linalg.norm(positions_of(recording), axis=1)
     return np.where(without_range(recording), np.nan, range_m)
 
@@ -299,6 +300,7 @@ def _limits_in_space(recording: SpatialRecording) -> list[Finding]:
 
 def _left_out(recording: SpatialRecording, settings: SlamConfig) -> list[Finding]:
     """What the estimator cannot use. Boxes without identity are found again by where they are."""
+    from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import boxes_of, has_traffic
 
     some = recording

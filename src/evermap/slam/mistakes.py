@@ -19,7 +19,6 @@ import numpy as np
 
 from evermap.config import CheckConfig
 from evermap.geometry import se2, se3
-from evermap.slam.space.intake import positions_of, without_range
 from evermap.types import UNKNOWN, AnyRecording, FloatArray, IntArray, Odometry, Recording, SpatialRecording
 
 USUAL = CheckConfig()
@@ -228,6 +227,8 @@ def _pairs(recording: AnyRecording, settings: CheckConfig) -> tuple[IntArray, In
     stamp_s = recording.frames.stamp_s[detections.frame]
     known = detections.landmark_id != UNKNOWN
     if isinstance(recording, SpatialRecording):
+        from evermap.slam.space.intake import positions_of, without_range
+
         known &= ~without_range(recording) & np.isfinite(positions_of(recording)).all(axis=1)
     if not known.any() or recording.odometry is None or len(recording.odometry) < 2:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -314,6 +315,8 @@ class SpatialPairs:
     speeds = "odometry"
 
     def __init__(self, recording: SpatialRecording, first: IntArray, second: IntArray) -> None:
+        from evermap.slam.space.intake import positions_of
+
         assert recording.odometry is not None
         detections, self._odometry = recording.detections, recording.odometry
         mount = np.array([sensor.mount_robot_sensor for sensor in recording.sensors])

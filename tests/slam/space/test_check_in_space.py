@@ -90,8 +90,7 @@ def told(recording: SpatialRecording) -> tuple[list[str], str]:
 
 
 @pytest.mark.parametrize(("spoil", "code", "words"), MISTAKES.values(), ids=MISTAKES)
-@pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("world", [room, corridor])
+@pytest.mark.parametrize(("world", "seed"), [(room, 1), (corridor, 2)])
 def test_one_mistake_is_told_by_its_name(
     world: Callable[[int], SpatialRecording], seed: int, spoil: Spoil, code: str, words: str
 ) -> None:
@@ -100,7 +99,7 @@ def test_one_mistake_is_told_by_its_name(
     assert re.search(words, messages), messages
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_honest_recordings_raise_no_alarm(seed: int) -> None:
     for recording in (room(seed), corridor(seed), tagged_corridor(seed, odometry=False).recording):
         check = check_recording(recording)
