@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from evermap.errors import EvermapError
     from evermap.existence.one_stay import PersistenceFilter
     from evermap.io import read_recording, write_native
+    from evermap.live.engine import Engine
+    from evermap.live.spool import recover
     from evermap.maps.diff import diff
     from evermap.maps.living import LivingMap
     from evermap.maps.sessions.session import Session
@@ -45,6 +47,8 @@ _HOME = {
     "evermap.errors": ("EvermapError",),
     "evermap.existence.one_stay": ("PersistenceFilter",),
     "evermap.io": ("read_recording", "write_native"),
+    "evermap.live.engine": ("Engine",),
+    "evermap.live.spool": ("recover",),
     "evermap.maps.diff": ("diff",),
     "evermap.maps.living": ("LivingMap",),
     "evermap.maps.sessions.session": ("Session",),
@@ -76,6 +80,7 @@ _MODULE_OF = {name: module for module, names in _HOME.items() for name in names}
 __all__ = [
     "Config",
     "Detections",
+    "Engine",
     "Entered",
     "EvermapError",
     "Frames",
@@ -100,6 +105,7 @@ __all__ = [
     "parse_prior",
     "read_looks",
     "read_recording",
+    "recover",
     "run_localization",
     "run_persist",
     "run_session",

@@ -134,7 +134,7 @@ def validate(recording: Any) -> None:
     _check_frames(detections.frame, len(frames))
     for name in ("landmark_id", "class_id"):
         _check_ids(getattr(detections, name), f"detections.{name}")
-    _check_sensor(recording.sensor)
+    check_sensor(recording.sensor)
     if recording.truth is not None:
         _check_trajectory(recording.truth, "truth")
     if recording.true_landmarks is not None:
@@ -285,7 +285,8 @@ def _check_trajectory(trajectory: Trajectory, field: str) -> None:
         quantity.check_array(column, f"{field}.pose_world_robot")
 
 
-def _check_sensor(sensor: Sensor) -> None:
+def check_sensor(sensor: Sensor) -> None:
+    """Raise InputError for limits, probabilities or a mount that cannot be."""
     for low, high in (("range_min_m", "range_max_m"), ("bearing_min_rad", "bearing_max_rad")):
         if not getattr(sensor, low) < getattr(sensor, high):
             problem = f"{getattr(sensor, low)} is not below {high} = {getattr(sensor, high)}"

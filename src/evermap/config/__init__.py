@@ -24,6 +24,7 @@ from evermap.config.living import (
     FitConfig,
     GroupingConfig,
     LifetimeConfig,
+    LiveConfig,
     LivingConfig,
     LooksConfig,
     OverlayConfig,
@@ -51,6 +52,7 @@ class Config(Section):
 
     slam: SlamConfig = Field(default_factory=SlamConfig, description="the estimator")
     living: LivingConfig = Field(default_factory=LivingConfig, description="a map that lives on between sessions")
+    live: LiveConfig = Field(default_factory=LiveConfig, description="a session that is fed while the robot drives")
     sensor: SensorConfig = Field(default_factory=SensorConfig, description="corrections of the recording's sensor")
     output: OutputConfig = Field(default_factory=OutputConfig, description="what is written beside the numbers")
     persist: PersistConfig = Field(default_factory=PersistConfig, description="a table of looks")
@@ -198,6 +200,7 @@ __all__ = [
     "FitConfig",
     "GroupingConfig",
     "LifetimeConfig",
+    "LiveConfig",
     "LivingConfig",
     "LooksConfig",
     "ModesConfig",

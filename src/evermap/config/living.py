@@ -212,3 +212,24 @@ class LivingConfig(Section):
     decisions: DecisionConfig = Field(default_factory=DecisionConfig, description="what is told and forgotten")
     grouping: GroupingConfig = Field(default_factory=GroupingConfig, description="which landmarks are on one body")
     lifetimes: LifetimeConfig = Field(default_factory=LifetimeConfig, description="how lifetimes are learned")
+
+
+class LiveConfig(Section):
+    """A session that is fed while the robot drives."""
+
+    reorder_s: NotNegative = Field(
+        default=0.1, description="how much later than the newest one a reading may come, by their stamps [s]"
+    )
+    checkpoint_s: Positive = Field(
+        default=10.0, description="readings are on the disk after this time at the latest: so much a crash costs [s]"
+    )
+    revision_s: NotNegative = Field(
+        default=300.0,
+        description="while it maps, what was driven enters the map as a revision this often; 0: only at the end [s]",
+    )
+    readings_hz: Positive = Field(
+        default=300.0,
+        description="readings a second that are kept for the map, on average: of more, whole frames are left out",
+    )
+    judge_s: Positive = Field(default=5.0, description="how often it is asked what has changed [s]")
+    look_s: Positive = Field(default=0.5, description="time between two frames whose looks are asked for that [s]")

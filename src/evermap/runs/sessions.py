@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from evermap.types import AnyRecording, IntArray, Landmarks, MapChange
 
 
+class TwiceError(InputError):
+    """A session that is in the map already."""
+
+
 @dataclass(frozen=True, slots=True)
 class Entered:
     """What a session made of a stored map; nothing is committed yet.
@@ -250,7 +254,7 @@ def at_time(store: MapStore, stamp_s: float) -> LivingMap:
 def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording) -> None:
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
-            raise InputError(
+            raise TwiceError(
                 f"{recording.name}: is in the map already, as revision {number}",
                 path=store.where,
                 hint="a session is evidence once; the map stays as it was",

@@ -138,6 +138,17 @@ class LocalFilter:
         self._now += 1
         drive_on(self.pose, self.covariance, motion.increment, motion.by_states, motion.covariance)
 
+    def ahead(self, motion: Motion) -> tuple[FloatArray, FloatArray]:
+        """Return the pose (3,) after a motion, and its covariance (3, 3); the filter stays where it is."""
+        pose, covariance = self.pose.copy(), self.covariance[:AT_PLACES, :AT_PLACES].copy()
+        drive_on(pose, covariance, motion.increment, motion.by_states, motion.covariance)
+        return pose, covariance[:3, :3]
+
+    def spread(self, rows: IntArray) -> FloatArray:
+        """Return (k, 2, 2) covariance of places (k,) that are in the covariance."""
+        at = AT_PLACES + 2 * self._slot[rows][:, None] + [0, 1]
+        return np.asarray(self.covariance[at[:, :, None], at[:, None, :]])
+
     def bring(self, rows: IntArray) -> IntArray:
         """Bring known places (k,) into the covariance, in place of those used longest ago, and return their slots."""
         slots = self._slot[rows]

@@ -115,6 +115,11 @@ class Localizer:
         if start is not None:
             self._place_at(Placed(*start, NO_PLACES, np.zeros((3, 0))))
 
+    def place_at(self, stamp_s: float, pose: FloatArray, covariance: FloatArray) -> None:
+        """Say where the robot is: its pose (3,) and covariance (3, 3) at a stamp."""
+        self._stamp_s = stamp_s
+        self._place_at(Placed(pose, covariance, NO_PLACES, np.zeros((3, 0))))
+
     @property
     def states(self) -> FloatArray:
         """(9,) calibration states."""
@@ -162,6 +167,24 @@ class Localizer:
             *self._expect(seen.landmark_id),
             self._track is not None,
         )
+
+    def ahead(self, stamp_s: float, drive: Drive) -> tuple[FloatArray, FloatArray]:
+        """Return the pose (3,) at a later instant by odometry alone, and its covariance (3, 3); nan as `Located`."""
+        if self._stamp_s is None or not self._is_placed:
+            return self._filter.pose.copy(), self._filter.covariance[:3, :3].copy()
+        free, states = self._prior.free, self._filter.states
+        return self._filter.ahead(Motion.over(drive, self._stamp_s, stamp_s, states, free, self.noise))
+
+    def over(self, places: KnownPlaces, sensor: Sensor) -> Localizer:
+        """Return one that goes on from here in another state of the map."""
+        there = Localizer(places, sensor, self._prior, self.noise)
+        local, before = there._filter, self._filter
+        local.states[:] = before.states
+        local.covariance[3:, 3:] = before.covariance[3:AT_PLACES, 3:AT_PLACES]
+        there._stamp_s = self._stamp_s
+        if self._stamp_s is not None and self._is_placed and self._track is None:
+            there.place_at(self._stamp_s, before.pose.copy(), before.covariance[:3, :3].copy())
+        return there
 
     @property
     def _is_placed(self) -> bool:

@@ -141,6 +141,11 @@ class Problem:
     def __post_init__(self) -> None:
         object.__setattr__(self, "landmark_information", sparse.csr_array(self.landmark_information))
 
+    def detections_of(self, pose: int) -> IntArray:
+        """Return the rows of the detections of a pose."""
+        first, last = np.searchsorted(self.pose_row, (pose, pose + 1))
+        return np.arange(first, last)
+
     @property
     def mapped(self) -> BoolArray:
         """(L,) landmarks that a prior map holds."""

@@ -20,8 +20,8 @@ class SessionFilter(LocalFilter):
 
     Args:
         problem: the measurements; rows beyond those added are not looked at. May be exchanged between two steps for one
-            with the same frames whose coming detections belong to other places, or that has more places at the end;
-            what was added before stays as it was until `restart`.
+            whose coming detections belong to other places, or that has more frames or places at the end; what was
+            added before stays as it was until `restart`.
         noise: standard deviations.
         robust: down-weight outliers (Cauchy, decided when the detection comes).
         most: places in the covariance.
@@ -31,8 +31,6 @@ class SessionFilter(LocalFilter):
         super().__init__(problem.mount, problem.prior, most=most)
         self.problem = problem
         self._robust, self._noise = robust, noise
-        self._sigma = noise.of_detections(problem.sigma_given)
-        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self.covariance[:3, :3] = np.eye(3) / problem.start_information
         self.hold(problem.start_pose, self.states, self.covariance, NO_PLACES, self.position)
         self._old_pose = np.zeros((0, 3))
@@ -48,11 +46,10 @@ class SessionFilter(LocalFilter):
             marginals: covariances at `estimate`, where they are known already.
         """
         self.problem, self._noise, self._free = problem, noise, problem.prior.free
-        self._sigma = noise.of_detections(problem.sigma_given)
         n, room = len(estimate.pose), int(ROOM_SHARE * self._most)
         if marginals is None:
             marginals = Smoother(problem.until(n), noise, heavy=True, robust=self._robust).marginals(estimate)
-        recent = problem.landmark_row[: self._first_detection[n]][::-1]
+        recent = problem.landmark_row[: np.searchsorted(problem.pose_row, n)][::-1]
         seen, first = np.unique(recent[: 50 * self._most], return_index=True)
         rows = seen[np.argsort(first, kind="stable")][:room]
         if np.count_nonzero(estimate.known) <= room:
@@ -80,7 +77,7 @@ class SessionFilter(LocalFilter):
             row: the pose, one more than the last.
             landmark: (L, 2) positions of places, used for those that are seen for the first time.
         """
-        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        detections = self.problem.detections_of(row)
         rows = self.problem.landmark_row[detections]
         self.know_of(len(self.problem.landmark_mean))
         new = np.isnan(self.position[rows, 0])
@@ -100,7 +97,7 @@ class SessionFilter(LocalFilter):
         return Estimate(np.vstack([self._old_pose, *self._new_pose]), landmark, self.states.copy())
 
     def _readings(self, detections: IntArray) -> tuple[FloatArray, FloatArray]:
-        return self.problem.reading[detections], self._sigma[detections]
+        return self.problem.reading[detections], self._noise.of_detections(self.problem.sigma_given[detections])
 
     def _meet(self, row: int, landmark: FloatArray) -> None:
         """Put a place that is seen for the first time at its prior, given those in the covariance, or at `landmark`."""

@@ -9,6 +9,7 @@ method decides which places detections belong to: of a frame before it is used, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import count as counted
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +19,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import consensus
 from evermap.slam.calibration import CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
+from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
 from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.session_filter import SessionFilter
@@ -142,7 +144,6 @@ class StreamingSlam:
         self._job: Slices[None] | None = None
         self._disputed = False
         self._landmark = np.full((len(problem.landmark_mean), 2), np.nan)
-        self._first_detection = np.searchsorted(problem.pose_row, np.arange(len(problem.stamp_s) + 1))
         self._n_compared = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._n_surprising = np.zeros(len(problem.landmark_mean), dtype=np.int64)
         self._n_poses = 0
@@ -161,7 +162,7 @@ class StreamingSlam:
     def step(self) -> None:
         """Process the next pose: predict, compare, add, and relinearise when it is time."""
         row = self._n_poses
-        detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+        detections = self._problem.detections_of(row)
         if row > 0:
             self._filter.drive(self._filter.motion(row))
         self._assign(row, detections)
@@ -174,14 +175,59 @@ class StreamingSlam:
         self._work()
         if self._prior_map is not None and not self._aligned and self._can_align():
             self._enter_map()
+        self.online_pose[row], self.online_covariance[row] = self._told(
+            self._filter.pose, self._filter.covariance[:3, :3]
+        )
+
+    def _told(self, pose: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A pose and its covariance in metres, of the robot's front, in the frame of the first one or of the map."""
         front = self._prior.front(self._filter.states, self._problem.mount)
-        pose, covariance = from_front(self._filter.pose, self._filter.covariance[:3, :3], front)
+        pose, covariance = from_front(pose, covariance, front)
         if not self._aligned and front.any():
             pose = se2.compose(se2.inverse(front), pose)
         pose[:2] *= self._scale
         covariance[:2] *= self._scale
         covariance[:, :2] *= self._scale
-        self.online_pose[row], self.online_covariance[row] = pose, covariance
+        return pose, covariance
+
+    @property
+    def states(self) -> FloatArray:
+        """(9,) calibration states, as they are known by now."""
+        return self._filter.states.copy()
+
+    def ahead(self, stamp_s: float) -> tuple[FloatArray, FloatArray]:
+        """Return the pose (3,) at a later instant by odometry alone, as `online_pose`, and its covariance (3, 3)."""
+        problem, states = self._problem, self._filter.states
+        last_s, free = problem.stamp_s[self._n_poses - 1], problem.prior.free
+        motion = Motion.over(problem.drive, last_s, stamp_s, states, free, self._noise)
+        return self._told(*self._filter.ahead(motion))
+
+    def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return (k, 2) where landmarks of the newest pose are, in the frame of `online_pose`, and (k, 2, 2)."""
+        front = self._prior.front(self._filter.states, self._problem.mount)
+        back = np.zeros(3) if self._aligned else se2.inverse(front)
+        turn = se2.rotation(float(back[2]))
+        covariance = turn @ self._filter.spread(rows) @ turn.T
+        return se2.transform(back, self._filter.position[rows]) * self._scale, covariance * self._scale**2
+
+    def grow(self, problem: Problem) -> None:
+        """Take measurements of further poses: of a robot that drives, in a static world and without a prior map.
+
+        Args:
+            problem: all so far; rows that were there stay, new landmarks come last.
+        """
+        poses, detections = (len(rows) for rows in (self.online_pose, self.nis))
+        if len(problem.stamp_s) > poses:  # room for as many again: a frame must not cost what was before it
+            more = max(len(problem.stamp_s), 2 * poses) - poses
+            self.online_pose = np.pad(self.online_pose, ((0, more), (0, 0)), constant_values=np.nan)
+            self.online_covariance = np.pad(self.online_covariance, ((0, more), *[(0, 0)] * 2), constant_values=np.nan)
+        if len(problem.pose_row) > detections:
+            more = max(len(problem.pose_row), 2 * detections) - detections
+            self.nis = np.pad(self.nis, (0, more), constant_values=np.nan)
+        new = len(problem.landmark_mean) - len(self._landmark)
+        landmark = np.pad(self._landmark, ((0, new), (0, 0)), constant_values=np.nan) if new else self._landmark
+        self._adopt(replace(problem, prior=self._problem.prior), landmark)
+        self._filter.problem = self._problem
 
     def _plan(self, detections: IntArray) -> None:
         """Begin to relinearise if it is time."""
@@ -388,7 +434,7 @@ class StreamingSlam:
         following = SessionFilter(self._problem, self._noise, robust=self._robust)
         following.restart(estimate, self._noise, self._problem, marginals)
         landmark = estimate.landmark.copy()
-        for row in range(n, len(self.online_pose)):
+        for row in counted(n):
             if row == self._n_poses:
                 break
             following.problem = self._problem
@@ -396,7 +442,7 @@ class StreamingSlam:
                 landmark, ((0, len(self._problem.landmark_mean) - len(landmark)), (0, 0)), constant_values=np.nan
             )
             following.drive(following.motion(row))
-            detections = np.arange(self._first_detection[row], self._first_detection[row + 1])
+            detections = self._problem.detections_of(row)
             self._meet_new_landmarks(following, landmark, detections)
             following.add(row, landmark)
             yield CAUGHT_UP_MS

@@ -392,7 +392,7 @@ def judged(
     found = found_in(living, where, visit, config) if known is None else known.found
     entry = entered(living, aged.p_here, where, found, visit, config)
     seen, eye = looks(entry, visit, config)
-    now = believed(entry, seen, visit, config)
+    now = believed(entry, seen, _sensor(visit), (visit.start_s, visit.end_s), config)
     now, seen = _without_departed(entry, now, seen, visit)
     after, changes = decided(entry, now, seen, visit, config, known.classes if known is not None else None)
     after, classes = learned(after, seen, replace(entry, living=now.living), eye, config)
@@ -477,8 +477,11 @@ def _place_glimpsed(place_of: IntArray, entry: Extended, visit: Solved, near_m: 
     place_of[row[near]] = place[near]
 
 
-def believed(entry: Extended, seen: PlaceLooks, visit: Visit, config: LivingConfig) -> Believed:
-    """Return the map with the beliefs and the counts of the session."""
+def believed(
+    entry: Extended, seen: PlaceLooks, sensor: Sensor, span_s: tuple[float, float], config: LivingConfig
+) -> Believed:
+    """Return the map with the beliefs and the counts of the session, which goes from one instant to another."""
+    start_s, end_s = span_s
     living, rows = entry.living, seen.rows
     hit, missed = rows.hit, seen.counts & ~rows.hit
     places = replace(
@@ -492,7 +495,7 @@ def believed(entry: Extended, seen: PlaceLooks, visit: Visit, config: LivingConf
     np.maximum.at(last, rows.site[hit], rows.stamp_s[hit])
     sites = living.sites
     if config.existence:
-        beliefs = believe.believed(living, entry.p_start, seen, _sensor(visit), config, visit.start_s, visit.end_s)
+        beliefs = believe.believed(living, entry.p_start, seen, sensor, config, start_s, end_s)
         sites, log_evidence = believe.with_beliefs(sites, entry.p_start, beliefs), believe.said(living, beliefs)
         evidence = believe.evidence(living, beliefs)
     else:
@@ -505,8 +508,8 @@ def believed(entry: Extended, seen: PlaceLooks, visit: Visit, config: LivingConf
         since_s=np.where(arrived & ~entry.is_new, first, living.sites.since_s),
         seen_s=np.maximum(living.sites.seen_s, last),
     )
-    until_s = max(visit.end_s, living.stamp_s)
-    living = replace(living, stamp_s=until_s, session_start_s=visit.start_s, places=places, sites=sites)
+    until_s = max(end_s, living.stamp_s)
+    living = replace(living, stamp_s=until_s, session_start_s=start_s, places=places, sites=sites)
     return Believed(living, log_evidence, evidence)
 
 
@@ -634,7 +637,7 @@ def existing(visit: Visit, slam: SlamResult, config: LivingConfig) -> SlamResult
     empty = replace(empty, sightlines=replace(empty.sightlines, rules=config.sight))
     entry = extended(empty, np.zeros(0), found, config, 0.0)
     seen, _ = looks(entry, visit, config)
-    now = believed(entry, seen, visit, config).living
+    now = believed(entry, seen, _sensor(visit), (visit.start_s, visit.end_s), config).living
     judged_now = now.landmarks(p_least=0.0)
     row = np.searchsorted(judged_now.landmark_id, mapped.landmark_id)
     p_exists = judged_now.p_exists[row] if config.existence else mapped.p_exists

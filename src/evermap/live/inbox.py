@@ -1,0 +1,315 @@
+"""Readings as they arrive: checked, put in order of their stamps, kept for the map.
+
+A reading may come late by a window of time. A frame is given out when nothing that may still come is earlier than it,
+and when the odometry is known up to it: what is later than that would change a pose that was told already.
+"""
+
+from __future__ import annotations
+
+import threading
+from bisect import bisect_left, bisect_right, insort
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from evermap.errors import InputError
+from evermap.types import (
+    UNKNOWN,
+    Clock,
+    Detections,
+    FloatArray,
+    Frames,
+    IntArray,
+    Odometry,
+    Recording,
+    Sensor,
+    landmark_id_of,
+)
+from evermap.valid import (
+    ANGULAR_RADPS,
+    BEARING_RAD,
+    FORWARD_MPS,
+    LATERAL_MPS,
+    RANGE_M,
+    SIGMA_BEARING_RAD,
+    SIGMA_RANGE_M,
+    STAMP_S,
+)
+
+SILENT_S = 1.0
+"""A frame does not wait longer for odometry."""
+BEFORE_S = 5.0
+"""Odometry before a frame that is given out with it: more than clocks of one robot are apart."""
+BURST_S = 10.0
+"""Time over which readings are counted where there are too many."""
+
+
+class Frame(NamedTuple):
+    """A look of the sensor.
+
+    Attributes:
+        stamp_s: when.
+        rows: (M, 6) id, range, bearing, class, and both sigmas, nan where none is given.
+    """
+
+    stamp_s: float
+    rows: FloatArray
+
+    @property
+    def landmark_id(self) -> IntArray:
+        """(M,) what was seen."""
+        return self.rows[:, 0].astype(np.int64)
+
+
+class Inbox:
+    """What was fed. Every method may be called from any thread.
+
+    Args:
+        about: name, sensor, clock and classes of the recording that is made of the readings.
+        reorder_s: how much later than the newest one a reading may come.
+        readings_hz: detections a second that are kept, on average.
+    """
+
+    def __init__(self, about: Recording, reorder_s: float, readings_hz: float) -> None:
+        self._lock = threading.Lock()
+        self._about, self._reorder_s, self._readings_hz = about, reorder_s, readings_hz
+        self._odometry: list[tuple[float, float, float, float]] = []
+        self._pending: list[Frame] = []
+        self._kept: list[Frame] = []
+        self._room = readings_hz * BURST_S
+        self.newest_s = self.odometry_s = self.settled_s = -np.inf
+        """Newest stamp of all, of the odometry, and of the frames that were given out."""
+        self.first_s = np.inf
+        """First stamp of the odometry."""
+        self.n_late = self.n_repeated = self.n_thinned = 0
+        """Readings that came too late, odometry of a stamp that was there, and frames that are not kept for the map."""
+        self._classes: list[str] = list(about.class_names)
+        self._texts: dict[int, str] = dict(about.landmark_names)
+        self._written = 0, 0
+
+    def odometry(self, stamp_s: float, velocity: tuple[float, float, float]) -> None:
+        """Add velocities, forward, lateral and turn, which hold from a stamp on.
+
+        Raises:
+            InputError: no finite numbers, or the stamp is before frames that were processed.
+        """
+        for quantity, value in zip((STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True):
+            _check(quantity, value)
+        row = float(stamp_s), *(float(part) for part in velocity)
+        with self._lock:
+            self._refuse_late(row[0], "odometry")
+            at = bisect_left(self._odometry, row[:1])
+            if at < len(self._odometry) and self._odometry[at][0] == row[0]:
+                self.n_repeated += 1
+                return
+            self._odometry.insert(at, row)  # type: ignore[arg-type]
+            self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0])
+            self.newest_s = max(self.newest_s, row[0])
+
+    def detections(self, stamp_s: float, columns: Sequence[Any]) -> None:
+        """Add a look: ids (or texts), ranges, bearings, classes by name, and both sigmas; None where not given.
+
+        Raises:
+            InputError: values that cannot be, or the stamp is before frames that were processed.
+        """
+        _check(STAMP_S, stamp_s)
+        frame = Frame(float(stamp_s), self._rows(*columns))
+        with self._lock:
+            self._refuse_late(frame.stamp_s, "detections")
+            at = bisect_left(self._pending, frame.stamp_s, key=lambda one: one.stamp_s)
+            if at < len(self._pending) and self._pending[at].stamp_s == frame.stamp_s:  # two messages of one look
+                frame = Frame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
+            insort(self._pending, frame, key=lambda one: one.stamp_s)
+            self.newest_s = max(self.newest_s, frame.stamp_s)
+
+    def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[Frame, FloatArray, bool]]:
+        """Take out the frames before which nothing can come any more.
+
+        Args:
+            delay_s: how much later than the frames odometry is needed.
+            everything: all that there are; nothing will come any more.
+
+        Returns:
+            Frame, odometry (n, 4) from some seconds before it until the newest, and whether it is kept for the map.
+        """
+        found = []
+        with self._lock:
+            hold_s = max(self._reorder_s, delay_s)
+            while self._pending:
+                stamp_s = self._pending[0].stamp_s
+                silent = self.newest_s >= stamp_s + hold_s + SILENT_S
+                if not (everything or silent or self.odometry_s >= stamp_s + hold_s):
+                    break
+                frame = self._pending.pop(0)
+                before_s, self.settled_s = self.settled_s, stamp_s
+                found.append((frame, self._window(min(stamp_s, max(before_s, self.first_s))), self._keep(frame, before_s)))
+        return found
+
+    def window(self) -> FloatArray:
+        """Return odometry (n, 4) of the last seconds."""
+        with self._lock:
+            return self._window(self.settled_s)
+
+    def written(self, *, last: bool = False) -> Recording:
+        """Return what is kept and was not asked for before, as far as nothing can come in between; the `last` time all
+        odometry that there is.
+        """
+        with self._lock:
+            until = len(self._odometry) if last else bisect_right(self._odometry, (self.settled_s, np.inf))
+            odometry, frames = self._odometry[self._written[0] : until], self._kept[self._written[1] :]
+            self._written = until, len(self._kept)
+            classes, texts = tuple(self._classes), dict(self._texts)
+        return _recorded(self._about, odometry, frames, classes, texts)
+
+    def cut(self, name: str) -> None:
+        """Begin another recording after the last frame that was given out; its odometry begins some seconds before."""
+        with self._lock:
+            first = bisect_left(self._odometry, (self.settled_s - BEFORE_S,))
+            self._odometry = self._odometry[max(first - 1, 0) :]
+            self._kept, self._written = [], (0, 0)
+            self._about = replace(self._about, name=name)
+
+    def __len__(self) -> int:
+        """Frames that are kept."""
+        return len(self._kept)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory of the readings, about."""
+        with self._lock:
+            frames = sum(one.rows.nbytes + 200 for one in (*self._kept, *self._pending))
+            return frames + 190 * len(self._odometry)
+
+    def _window(self, stamp_s: float) -> FloatArray:
+        first = max(bisect_left(self._odometry, (stamp_s - BEFORE_S,)) - 1, 0)
+        return np.array(self._odometry[first:]).reshape(-1, 4)
+
+    def _keep(self, frame: Frame, before_s: float) -> bool:
+        """Whether there is room for a frame's readings: a bucket that fills with time."""
+        since_s = min(frame.stamp_s - before_s, BURST_S)
+        self._room = min(self._room + self._readings_hz * since_s, self._readings_hz * BURST_S)
+        if self._room < 0.0:
+            self.n_thinned += 1
+            return False
+        self._room -= len(frame.rows)
+        self._kept.append(frame)
+        return True
+
+    def _refuse_late(self, stamp_s: float, what: str) -> None:
+        if stamp_s > self.settled_s:
+            return
+        self.n_late += 1
+        problem = (
+            f"{what} of {stamp_s:.3f} s came too late: frames until {self.settled_s:.3f} s are processed, the newest "
+            f"reading is of {self.newest_s:.3f} s"
+        )
+        raise InputError(problem, field="stamp_s", hint="one clock for all readings, or a larger live.reorder_s")
+
+    def _rows(self, ids: Any, ranges: Any, bearings: Any, classes: Any, *sigmas: Any) -> FloatArray:
+        names = [ids] if isinstance(ids, str) else list(ids)
+        rows = np.full((len(names), 6), np.nan)
+        rows[:, 0] = [self._number(name) for name in names]
+        if classes is None:
+            rows[:, 3] = UNKNOWN
+        else:
+            rows[:, 3] = [self._class(name) for name in _column(list(classes), len(names), "class_name")]
+        given = zip((1, 2, 4, 5), (RANGE_M, BEARING_RAD, SIGMA_RANGE_M, SIGMA_BEARING_RAD), strict=True)
+        for (column, quantity), values in zip(given, (ranges, bearings, *sigmas), strict=True):
+            if values is None and column > 2:
+                continue
+            told = np.asarray(_column([] if values is None else values, len(names), quantity.name), dtype=np.float64)
+            quantity.check_array(told, quantity.name)
+            rows[:, column] = told
+        return rows
+
+    def _number(self, name: Any) -> int:
+        if isinstance(name, str):
+            number = landmark_id_of(name)
+            self._texts[number] = name
+            return number
+        if isinstance(name, float) and not name.is_integer():
+            raise InputError(f"{name} is not an identity", field="landmark_id", hint="whole numbers, or texts")
+        if not UNKNOWN <= int(name) <= 2**53:
+            raise InputError(f"{name} is not an identity", field="landmark_id", hint="from 0; -1: unknown")
+        return int(name)
+
+    def _class(self, name: str | None) -> int:
+        if not name:
+            return UNKNOWN
+        if name not in self._classes:
+            self._classes.append(str(name))
+        return self._classes.index(name)
+
+
+def joined(parts: Sequence[Recording]) -> Recording:
+    """Return one recording of consecutive parts."""
+    def all_of(tables: Sequence[Any], **columns: Any) -> Any:
+        names = [item.name for item in fields(tables[0]) if isinstance(getattr(tables[0], item.name), np.ndarray)]
+        found = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
+        return replace(tables[-1], **{**found, **columns})
+
+    first = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
+    frame = np.concatenate([part.detections.frame + k for part, k in zip(parts, first, strict=True)])
+    return replace(
+        parts[-1],
+        odometry=all_of([part.odometry for part in parts]),
+        frames=all_of([part.frames for part in parts]),
+        detections=all_of([part.detections for part in parts], frame=frame.astype(np.int64)),
+    )
+
+
+def _recorded(
+    about: Recording,
+    odometry: list[tuple[float, float, float, float]],
+    frames: list[Frame],
+    classes: tuple[str, ...],
+    texts: dict[int, str],
+) -> Recording:
+    stamp_s, *velocity = (np.ascontiguousarray(column) for column in np.array(odometry).reshape(-1, 4).T)
+    rows = np.concatenate([np.zeros((0, 6)), *(one.rows for one in frames)])
+    count = [len(one.rows) for one in frames]
+    name, range_m, bearing_rad, kind, sigma_range, sigma_bearing = (np.ascontiguousarray(column) for column in rows.T)
+    return replace(
+        about,
+        odometry=Odometry(stamp_s, *velocity, about.clock),
+        frames=Frames(np.array([one.stamp_s for one in frames]), clock=about.clock),
+        detections=Detections(
+            np.repeat(np.arange(len(frames)), count),
+            name.astype(np.int64),
+            range_m,
+            bearing_rad,
+            kind.astype(np.int64),
+            sigma_range,
+            sigma_bearing,
+            np.zeros(len(rows), dtype=np.int64),
+        ),
+        class_names=classes,
+        landmark_names=texts,
+    )
+
+
+def about(name: str, sensor: Sensor, clock: Clock, class_names: tuple[str, ...]) -> Recording:
+    """Return a recording without readings."""
+    none, no = np.zeros(0), np.zeros(0, dtype=np.int64)
+    nothing = Detections(no, no, none, none, no, none, none, no)
+    odometry, frames = Odometry(none, none, none, none, clock), Frames(none, clock=clock)
+    return Recording(name, odometry, frames, nothing, sensor, clock=clock, class_names=class_names)
+
+
+def _check(quantity: Any, value: Any) -> None:
+    try:
+        told = np.array([value], dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{value!r} is not a number", field=quantity.name, hint=quantity.hint) from None
+    try:
+        quantity.check_array(told, quantity.name)
+    except InputError as error:
+        raise InputError(error.problem.removeprefix("row 0: "), field=quantity.name, hint=error.hint) from None
+
+
+def _column(values: Any, count: int, field: str) -> Any:
+    if len(values) != count:
+        raise InputError(f"{len(values)} values for {count} detections", field=field, hint="one for each detection")
+    return values

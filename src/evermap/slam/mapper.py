@@ -1,0 +1,166 @@
+"""A place that nobody knows, mapped while the robot drives: `StreamingSlam`, fed frame by frame.
+
+What it says of a frame is what the stream of the whole recording says of it, but for rounding: landmarks are numbered
+as they come.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import sparse
+
+from evermap.config import SlamConfig
+from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.intake import FIRST_POSE_INFORMATION
+from evermap.slam.localize import FrameSightings, Located
+from evermap.slam.problem import Drive, Noise, Problem, padded
+from evermap.slam.streaming import StreamingSlam
+from evermap.types import UNKNOWN, FloatArray, IntArray, Sensor
+
+
+class Growing:
+    """Rows that are added at the end, at a constant cost each on average.
+
+    Args:
+        shape: of a row.
+        kind: type of its numbers.
+    """
+
+    def __init__(self, *shape: int, kind: Any = np.float64) -> None:
+        self._data = np.zeros((64, *shape), dtype=kind)
+        self._count = 0
+
+    @property
+    def rows(self) -> Any:
+        """All rows; they stay as they are when others are added at the end."""
+        return self._data[: self._count]
+
+    def add(self, rows: Any, at: int | None = None) -> None:
+        """Put rows at the end, or in place of those from row `at` on."""
+        first = self._count if at is None else at
+        count = first + len(rows)
+        if count > len(self._data):
+            grown = np.zeros((2 * count, *self._data.shape[1:]), dtype=self._data.dtype)
+            grown[:first] = self._data[:first]
+            self._data = grown
+        self._data[first:count] = rows
+        self._count = count
+
+
+class Mapper:
+    """Feed frames in order with `step`.
+
+    Args:
+        sensor: its mount.
+        prior: of the calibration states.
+        noise: where the noise levels start.
+        settings: `robust` and `estimate_noise`.
+    """
+
+    def __init__(self, sensor: Sensor, prior: CalibrationPrior, noise: Noise, settings: SlamConfig) -> None:
+        self._stamps, self._odometry = Growing(), Growing(4)
+        self._pose_row, self._landmark_row = Growing(kind=np.int64), Growing(kind=np.int64)
+        self._reading, self._sigma = Growing(2), Growing(2)
+        self._row: dict[int, int] = {}
+        self._problem = Problem(
+            stamp_s=self._stamps.rows,
+            drive=Drive.from_rows(np.zeros(1), np.zeros((1, 3))),
+            pose_row=self._pose_row.rows,
+            landmark_row=self._landmark_row.rows,
+            reading=self._reading.rows,
+            sigma_given=self._sigma.rows,
+            mount=np.array(sensor.mount_robot_sensor, dtype=np.float64),
+            prior=prior,
+            start_pose=np.zeros(3),
+            start_information=FIRST_POSE_INFORMATION,
+            landmark_mean=np.zeros((0, 2)),
+            landmark_information=sparse.csr_array((0, 0)),
+        )
+        robust, learns = settings.robust, settings.estimate_noise
+        self._slam = StreamingSlam(self._problem, noise, prior, robust=robust, estimate_noise=learns)
+
+    @property
+    def states(self) -> FloatArray:
+        """(9,) calibration states."""
+        return self._slam.states
+
+    def drive(self, odometry: FloatArray) -> None:
+        """Take odometry as in `step`, of a frame that is left out."""
+        at = int(np.searchsorted(self._odometry.rows[:, 0], odometry[0, 0]))
+        self._odometry.add(odometry, at)
+
+    def step(self, stamp_s: float, odometry: FloatArray, seen: FrameSightings) -> Located:
+        """Process a frame; one without a known landmark only tells where odometry has led.
+
+        Args:
+            stamp_s: of the frame, on the clock of the odometry, later than the last one.
+            odometry: (n, 4) stamps and velocities since the last frame at least; in place of what was given from their
+                first stamp on.
+            seen: its detections.
+
+        Returns:
+            Without places: the map is what is estimated.
+        """
+        self.drive(odometry)
+        known = np.flatnonzero((seen.landmark_id != UNKNOWN) & np.all(np.isfinite(seen.reading), axis=1))
+        if len(known):
+            self._grow(stamp_s, seen, known)
+            self._slam.step()
+            at = len(self._stamps.rows) - 1
+            pose, covariance = self._slam.online_pose[at].copy(), self._slam.online_covariance[at].copy()
+        else:
+            pose, covariance = self.ahead(stamp_s, odometry)
+        none, nothing = np.zeros(0, dtype=np.int64), np.full(len(seen.landmark_id), np.nan)
+        place = np.full(len(nothing), UNKNOWN, dtype=np.int64)
+        no = none.astype(np.bool_)
+        return Located(pose, covariance, place, nothing, nothing, none, np.zeros(0), no, lost=bool(np.isnan(pose[0])))
+
+    def ahead(self, stamp_s: float, odometry: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the pose (3,) at a later instant by odometry alone, and its covariance (3, 3); nan before any frame.
+
+        Args:
+            stamp_s: the instant.
+            odometry: as in `step`.
+        """
+        if not len(self._stamps.rows):
+            return np.full(3, np.nan), np.full((3, 3), np.nan)
+        self.drive(odometry)
+        self._told()
+        return self._slam.ahead(stamp_s)
+
+    def landmarks(self, landmark_id: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return which of some landmarks of the newest frame are known, (k, 2) where they are, and (k, 2, 2)."""
+        known = np.array([name for name in landmark_id.tolist() if name in self._row], dtype=np.int64)
+        rows = np.array([self._row[name] for name in known.tolist()], dtype=np.int64)
+        return known, *self._slam.places(rows)
+
+    def _grow(self, stamp_s: float, seen: FrameSightings, known: IntArray) -> None:
+        names = seen.landmark_id[known].tolist()
+        for name in names:
+            self._row.setdefault(name, len(self._row))
+        self._pose_row.add(np.full(len(known), len(self._stamps.rows)))
+        self._stamps.add([stamp_s])
+        self._landmark_row.add([self._row[name] for name in names])
+        self._reading.add(seen.reading[known])
+        self._sigma.add(seen.sigma_given[known])
+        self._told()
+
+    def _told(self) -> None:
+        """Tell the stream what there is by now."""
+        rows, new = self._odometry.rows, len(self._row) - len(self._problem.landmark_mean)
+        information = self._problem.landmark_information
+        self._problem = replace(
+            self._problem,
+            stamp_s=self._stamps.rows,
+            drive=Drive.from_rows(rows[:, 0], rows[:, 1:]),
+            pose_row=self._pose_row.rows,
+            landmark_row=self._landmark_row.rows,
+            reading=self._reading.rows,
+            sigma_given=self._sigma.rows,
+            landmark_mean=np.zeros((len(self._row), 2)),
+            landmark_information=padded(information, new) if new else information,
+        )
+        self._slam.grow(self._problem)
