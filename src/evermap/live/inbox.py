@@ -95,7 +95,9 @@ class Inbox:
         Raises:
             InputError: no finite numbers, or the stamp is before frames that were processed.
         """
-        for quantity, value in zip((STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True):
+        for quantity, value in zip(
+            (STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True
+        ):
             _check(quantity, value)
         row = float(stamp_s), *(float(part) for part in velocity)
         with self._lock:
@@ -144,7 +146,9 @@ class Inbox:
                     break
                 frame = self._pending.pop(0)
                 before_s, self.settled_s = self.settled_s, stamp_s
-                found.append((frame, self._window(min(stamp_s, max(before_s, self.first_s))), self._keep(frame, before_s)))
+                found.append(
+                    (frame, self._window(min(stamp_s, max(before_s, self.first_s))), self._keep(frame, before_s))
+                )
         return found
 
     def window(self) -> FloatArray:
@@ -170,6 +174,11 @@ class Inbox:
             self._odometry = self._odometry[max(first - 1, 0) :]
             self._kept, self._written = [], (0, 0)
             self._about = replace(self._about, name=name)
+
+    @property
+    def name(self) -> str:
+        """Name of the recording."""
+        return self._about.name
 
     def __len__(self) -> int:
         """Frames that are kept."""
@@ -245,6 +254,7 @@ class Inbox:
 
 def joined(parts: Sequence[Recording]) -> Recording:
     """Return one recording of consecutive parts."""
+
     def all_of(tables: Sequence[Any], **columns: Any) -> Any:
         names = [item.name for item in fields(tables[0]) if isinstance(getattr(tables[0], item.name), np.ndarray)]
         found = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
@@ -267,13 +277,13 @@ def _recorded(
     classes: tuple[str, ...],
     texts: dict[int, str],
 ) -> Recording:
-    stamp_s, *velocity = (np.ascontiguousarray(column) for column in np.array(odometry).reshape(-1, 4).T)
+    stamp_s, forward_mps, lateral_mps, angular_radps = _columns(np.array(odometry).reshape(-1, 4))
     rows = np.concatenate([np.zeros((0, 6)), *(one.rows for one in frames)])
     count = [len(one.rows) for one in frames]
-    name, range_m, bearing_rad, kind, sigma_range, sigma_bearing = (np.ascontiguousarray(column) for column in rows.T)
+    name, range_m, bearing_rad, kind, sigma_range, sigma_bearing = _columns(rows)
     return replace(
         about,
-        odometry=Odometry(stamp_s, *velocity, about.clock),
+        odometry=Odometry(stamp_s, forward_mps, lateral_mps, angular_radps, about.clock),
         frames=Frames(np.array([one.stamp_s for one in frames]), clock=about.clock),
         detections=Detections(
             np.repeat(np.arange(len(frames)), count),
@@ -288,6 +298,10 @@ def _recorded(
         class_names=classes,
         landmark_names=texts,
     )
+
+
+def _columns(rows: FloatArray) -> list[FloatArray]:
+    return [np.ascontiguousarray(column) for column in rows.T]
 
 
 def about(name: str, sensor: Sensor, clock: Clock, class_names: tuple[str, ...]) -> Recording:

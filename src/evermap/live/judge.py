@@ -59,7 +59,9 @@ class Judge:
         self._mount = np.array(sensor.mount_robot_sensor, dtype=np.float64)
         self._classes = lives_of(living, config.living)
         self._table = living.landmarks()
-        self._glances: list[_Glance] = [] if before is None else [one for one in before._glances if one.stamp_s > living.stamp_s]
+        self._glances: list[_Glance] = (
+            [] if before is None else [one for one in before._glances if one.stamp_s > living.stamp_s]
+        )
         self._known: set[tuple[Any, ...]] = set()
         self._found: list[MapChange] = []
         self._after: tuple[LivingMap, Vicinity | None] = living, None
@@ -95,8 +97,8 @@ class Judge:
         if len(whole.places) > config.whole_places:
             vicinity = _around(whole, glances, self._sensor, config)
             living = vicinity.part
-        after, changes = judged_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
-        changes, judged = _with_moves(changes, glances), after.landmarks()
+        after, told = judged_so_far(living, _sighted(living, glances), self._sensor, config, self._classes)
+        changes, judged = _with_moves(told, glances), after.landmarks()
         with self._lock:
             self._after = after, vicinity
             at = np.searchsorted(self._table.landmark_id, judged.landmark_id)
@@ -151,8 +153,8 @@ def _with_moves(changes: Sequence[MapChange], glances: Sequence[_Glance]) -> lis
         mine = np.isin(names, change.landmark_ids)
         if change.kind is ChangeKind.VANISHED and np.count_nonzero(mine) >= MIN_SIGHTINGS:
             x, y = np.median(away_m[mine], axis=0).tolist()
-            found = {"kind": ChangeKind.MOVED, "displacement_m": (x, y), "n_hits": int(np.count_nonzero(mine))}
-            told.append(replace(change, **found))
+            n_hits = int(np.count_nonzero(mine))
+            told.append(replace(change, kind=ChangeKind.MOVED, displacement_m=(x, y), n_hits=n_hits))
         else:
             told.append(change)
     return told

@@ -18,7 +18,7 @@ from evermap.slam.intake import FIRST_POSE_INFORMATION
 from evermap.slam.localize import FrameSightings, Located
 from evermap.slam.problem import Drive, Noise, Problem, padded
 from evermap.slam.streaming import StreamingSlam
-from evermap.types import UNKNOWN, FloatArray, IntArray, Sensor
+from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor
 
 
 class Growing:
@@ -87,10 +87,11 @@ class Mapper:
         """(9,) calibration states."""
         return self._slam.states
 
-    def drive(self, odometry: FloatArray) -> None:
-        """Take odometry as in `step`, of a frame that is left out."""
+    def drive(self, odometry: FloatArray) -> int:
+        """Take odometry as in `step`, of a frame that is left out; returns the row of its first."""
         at = int(np.searchsorted(self._odometry.rows[:, 0], odometry[0, 0]))
         self._odometry.add(odometry, at)
+        return at
 
     def step(self, stamp_s: float, odometry: FloatArray, seen: FrameSightings) -> Located:
         """Process a frame; one without a known landmark only tells where odometry has led.
@@ -104,7 +105,7 @@ class Mapper:
         Returns:
             Without places: the map is what is estimated.
         """
-        self.drive(odometry)
+        at = self.drive(odometry)
         known = np.flatnonzero((seen.landmark_id != UNKNOWN) & np.all(np.isfinite(seen.reading), axis=1))
         if len(known):
             self._grow(stamp_s, seen, known)
@@ -112,30 +113,25 @@ class Mapper:
             at = len(self._stamps.rows) - 1
             pose, covariance = self._slam.online_pose[at].copy(), self._slam.online_covariance[at].copy()
         else:
-            pose, covariance = self.ahead(stamp_s, odometry)
+            driven = self._odometry.rows[at:]
+            pose, covariance = self.ahead(stamp_s, Drive.from_rows(driven[:, 0], driven[:, 1:]))
         none, nothing = np.zeros(0, dtype=np.int64), np.full(len(seen.landmark_id), np.nan)
         place = np.full(len(nothing), UNKNOWN, dtype=np.int64)
         no = none.astype(np.bool_)
         return Located(pose, covariance, place, nothing, nothing, none, np.zeros(0), no, lost=bool(np.isnan(pose[0])))
 
-    def ahead(self, stamp_s: float, odometry: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the pose (3,) at a later instant by odometry alone, and its covariance (3, 3); nan before any frame.
-
-        Args:
-            stamp_s: the instant.
-            odometry: as in `step`.
-        """
+    def ahead(self, stamp_s: float, drive: Drive) -> tuple[FloatArray, FloatArray]:
+        """Return the pose (3,) at a later instant by odometry alone, and its covariance; nan before any frame."""
         if not len(self._stamps.rows):
             return np.full(3, np.nan), np.full((3, 3), np.nan)
-        self.drive(odometry)
-        self._told()
-        return self._slam.ahead(stamp_s)
+        return self._slam.ahead(stamp_s, drive)
 
-    def landmarks(self, landmark_id: IntArray) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Return which of some landmarks of the newest frame are known, (k, 2) where they are, and (k, 2, 2)."""
-        known = np.array([name for name in landmark_id.tolist() if name in self._row], dtype=np.int64)
-        rows = np.array([self._row[name] for name in known.tolist()], dtype=np.int64)
-        return known, *self._slam.places(rows)
+    def landmarks(self, landmark_id: IntArray, p_exists: float) -> Landmarks:
+        """Return those of some landmarks of the newest frame that are known, each with a probability that it exists."""
+        known = [name for name in np.unique(landmark_id).tolist() if name in self._row]
+        position, covariance = self._slam.places(np.array([self._row[name] for name in known], dtype=np.int64))
+        found = Landmarks.at(known, position, frame="first_pose")
+        return replace(found, covariance_m2=covariance, p_exists=np.full(len(known), p_exists))
 
     def _grow(self, stamp_s: float, seen: FrameSightings, known: IntArray) -> None:
         names = seen.landmark_id[known].tolist()

@@ -21,7 +21,7 @@ from evermap.slam.calibration import CalibrationPrior, from_front, needed
 from evermap.slam.method import Explanation, Method, Static
 from evermap.slam.motion import Motion
 from evermap.slam.noise import Extrapolation, NoiseFit, refine_noise
-from evermap.slam.problem import Estimate, Marginals, Noise, Problem, independent
+from evermap.slam.problem import Drive, Estimate, Marginals, Noise, Problem, independent
 from evermap.slam.session_filter import SessionFilter
 from evermap.slam.smoother import COST_SLACK, Smoother
 from evermap.slam.sparse.system import Slices, exhausted
@@ -195,11 +195,11 @@ class StreamingSlam:
         """(9,) calibration states, as they are known by now."""
         return self._filter.states.copy()
 
-    def ahead(self, stamp_s: float) -> tuple[FloatArray, FloatArray]:
+    def ahead(self, stamp_s: float, drive: Drive) -> tuple[FloatArray, FloatArray]:
         """Return the pose (3,) at a later instant by odometry alone, as `online_pose`, and its covariance (3, 3)."""
         problem, states = self._problem, self._filter.states
         last_s, free = problem.stamp_s[self._n_poses - 1], problem.prior.free
-        motion = Motion.over(problem.drive, last_s, stamp_s, states, free, self._noise)
+        motion = Motion.over(drive, last_s, stamp_s, states, free, self._noise)
         return self._told(*self._filter.ahead(motion))
 
     def places(self, rows: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -1,0 +1,159 @@
+"""A robot that drives for an hour with the live engine: latency of a step, memory, share of a core.
+
+Landmarks stand in a disc, a hundred always in view, in a map of 1,000 or 10,000; detections come 30 times a second,
+odometry 50 times. What it takes of a core is its time, that of the processes that enter sessions included, over the
+time that was driven. Fed as fast as it takes the readings, what is done beside the steps is done beside more of them:
+latencies are those of `--paced`.
+
+    python -m benchmarks.live                                 # an hour each: memory, share of a core
+    python -m benchmarks.live --minutes 6 --size 1000 --paced # latency
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import evermap as em
+from evermap.config import Config
+from evermap.geometry import se2
+from evermap.maps.living import LivingMap
+from evermap.maps.store import Provenance, RevisionKind, open_store
+from evermap.maps.vicinity import in_chunks
+from evermap.types import Clock, FloatArray, IntArray, Landmarks, Sensor
+
+SIZES = (1_000, 10_000)
+IN_VIEW = 100
+RANGE_M = 6.0
+RADIUS_M, SPEED_MPS = 10.0, 1.0
+FRAME_S, ODOMETRY_S = 1 / 30, 1 / 50
+P_DETECT = 0.9
+SIGMA = np.array([0.05, 0.02])
+SIGMA_MAP_M = 0.03
+SENSOR = Sensor(range_max_m=RANGE_M, p_detect=P_DETECT, sigma_range_m=0.05, sigma_bearing_rad=0.02)
+WARM_UP = 60
+"""Frames at the beginning that are not timed: the start pose is searched for."""
+
+
+def survey(size: int, seed: int = 0) -> tuple[FloatArray, Landmarks]:
+    """(L, 2) where landmarks stand, and where the map has them."""
+    rng = np.random.default_rng(seed)
+    away = RANGE_M * np.sqrt((np.arange(size) + 0.5) / IN_VIEW)
+    turn = rng.uniform(-np.pi, np.pi, size)
+    landmark = np.column_stack([away * np.cos(turn), away * np.sin(turn)])
+    known = landmark + rng.normal(0.0, SIGMA_MAP_M, landmark.shape)
+    return landmark, Landmarks.at(np.arange(size), known, sigma_m=SIGMA_MAP_M)
+
+
+def frames(
+    landmark: FloatArray, seconds: float, seed: int = 1
+) -> Iterator[tuple[float, FloatArray, IntArray, FloatArray]]:
+    """Stamp, true pose, ids and readings of each frame: rounds in the middle."""
+    rng = np.random.default_rng(seed)
+    near = np.flatnonzero(np.hypot(*landmark.T) < RADIUS_M + RANGE_M)
+    for k in range(int(seconds / FRAME_S)):
+        stamp_s = k * FRAME_S
+        turned = SPEED_MPS * stamp_s / RADIUS_M
+        pose = np.array([RADIUS_M * np.cos(turned), RADIUS_M * np.sin(turned), turned + 0.5 * np.pi])
+        seen = se2.transform(se2.inverse(pose), landmark[near])
+        reading = np.column_stack([np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])])
+        rows = np.flatnonzero((np.abs(reading[:, 0] - 0.5 * RANGE_M - 0.2) < 0.5 * RANGE_M - 0.2) & (rng.random(len(near)) < P_DETECT))
+        yield stamp_s, pose, near[rows], reading[rows] + SIGMA * rng.normal(size=(len(rows), 2))
+
+
+def drive(size: int, seconds: float, *, mapping: bool, known: bool = True, paced: bool = False) -> dict[str, Any]:
+    """One row of the table; `known=False` begins without a map."""
+    landmark, surveyed = survey(size)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "site.evermap"
+        with open_store(path, create=True) as store:
+            if known:
+                living = in_chunks(LivingMap.begun(surveyed), Config().living)
+                store.commit(living, Provenance(kind=RevisionKind.EDIT), parent=store.head())
+                del living
+        engine = em.Engine(path, SENSOR, Config(), mapping=mapping, clock=Clock.RECORDING)
+        engine.warm_up()
+        row = _driven(engine, landmark, seconds, paced=paced)
+        engine.close()
+    return {"map": size if known else 0, "mapping": mapping, "minutes": seconds / 60, **row}
+
+
+def _driven(engine: em.Engine, landmark: FloatArray, seconds: float, *, paced: bool) -> dict[str, Any]:
+    rng = np.random.default_rng(2)
+    step_s, busy_s, off_m, memory, n_seen, odometry_s = [], [], [], [], [], 0.0
+    before = _cpu_s()
+    drawing = 0.0
+    last, start = time.process_time(), time.perf_counter()
+    revision, changes = 0, 0
+    for stamp_s, pose, names, reading in frames(landmark, seconds):
+        drawing += time.process_time() - last
+        if paced:
+            time.sleep(max(stamp_s - (time.perf_counter() - start), 0.0))
+        while odometry_s <= stamp_s + 0.11:  # detections come a tenth of a second late, as from a camera
+            slip = rng.normal(size=2) * [0.02, 0.01]
+            engine.odometry(odometry_s, SPEED_MPS + slip[0], 0.0, SPEED_MPS / RADIUS_M + slip[1])
+            odometry_s += ODOMETRY_S
+        engine.detections(stamp_s, names, reading[:, 0], reading[:, 1])
+        began, busy = time.perf_counter(), time.thread_time()
+        now = engine.step()
+        step_s.append(time.perf_counter() - began)
+        busy_s.append(time.thread_time() - busy)
+        revision, changes = now.revision, changes + len(now.changes)
+        n_seen.append(len(now.in_view))
+        if now.frame == "prior_map" and len(now.online):
+            off_m.append(np.hypot(*(now.online.pose_world_robot[-1, :2] - pose[:2])))
+        if len(step_s) % 1800 == 0:
+            memory.append((_memory_mb(), engine.n_bytes / 1e6))
+        last = time.process_time()
+    ms = 1e3 * np.array(step_s[WARM_UP:])
+    return {
+        "in_view": float(np.mean(n_seen[WARM_UP:])),
+        "median_ms": float(np.median(ms)),
+        "p99_ms": float(np.quantile(ms, 0.99)),
+        "p999_ms": float(np.quantile(ms, 0.999)),
+        "max_ms": float(ms.max()),
+        "own_p99_ms": 1e3 * float(np.quantile(busy_s[WARM_UP:], 0.99)),
+        "core": (_cpu_s() - before - drawing) / seconds,
+        "rmse_cm": 100 * float(np.sqrt(np.mean(np.square(off_m[WARM_UP:])))) if len(off_m) > WARM_UP else float("nan"),
+        "memory_mb": [round(memory[0][0]), round(memory[len(memory) // 2][0]), round(memory[-1][0])] if memory else [],
+        "readings_mb": max((one[1] for one in memory), default=float("nan")),
+        "revision": revision,
+        "changes": changes,
+    }
+
+
+def _cpu_s() -> float:
+    own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
+
+
+def _memory_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def main() -> None:
+    """Print a row for each map."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--size", type=int, nargs="*", default=list(SIZES))
+    parser.add_argument("--localize", action="store_true", help="the map stays as it is")
+    parser.add_argument("--unknown", action="store_true", help="begin without a map")
+    parser.add_argument("--paced", action="store_true", help="as fast as the robot drives, not as fast as it goes")
+    given = parser.parse_args()
+    for size in given.size:
+        known, paced = not given.unknown, given.paced
+        row = drive(size, 60 * given.minutes, mapping=not given.localize, known=known, paced=paced)
+        shown = (f"{value:.3g}" if isinstance(value, float) else str(value) for value in row.values())
+        print(" ".join(f"{name}={value}" for name, value in zip(row, shown, strict=True)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,197 @@
+"""What is done beside the steps of an engine: readings to the disk, sessions into the map, threads and processes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from evermap.config import Config
+from evermap.errors import EvermapError, InputError
+from evermap.live.inbox import Inbox
+from evermap.live.spool import Brought, Spool, enter_waiting
+from evermap.maps.living import LivingMap
+from evermap.maps.store import open_store
+from evermap.runs.sessions import Entered
+from evermap.types import MapChange
+
+
+@dataclass
+class Told:
+    """What the next step tells, and changes that were told since the newest revision."""
+
+    changes: list[MapChange] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    known: set[tuple[Any, ...]] = field(default_factory=set)
+
+    def add(self, changes: Sequence[MapChange]) -> None:
+        """Add changes that were not told."""
+        for change in changes:
+            if (key := (change.kind, change.landmark_ids)) not in self.known:
+                self.known.add(key)
+                self.changes.append(change)
+
+    def taken(self) -> tuple[tuple[MapChange, ...], tuple[str, ...]]:
+        """Return changes and warnings, once."""
+        changes, warnings = tuple(self.changes), tuple(self.warnings)
+        self.changes, self.warnings = [], []
+        return changes, warnings
+
+
+class Keeper:
+    """The sessions of a map file, of which one is being driven.
+
+    Args:
+        path: the map; None for a map in memory, of which nothing is kept.
+        config: settings.
+        inbox: the readings.
+        told: what the engine tells.
+        threads: False does everything at once.
+    """
+
+    def __init__(self, path: Path | None, config: Config, inbox: Inbox, told: Told, *, threads: bool) -> None:
+        self._path, self._config, self._inbox, self._told = path, config, inbox, told
+        self._pool = ThreadPoolExecutor(2, "evermap-live") if threads else None
+        self._jobs: dict[str, Future[None]] = {}
+        self._spool: Spool | None = None
+        self._child: subprocess.Popen[str] | None = None
+        self._tried: list[Path] = []
+        self._written_s = time.monotonic()
+        self._name, self._n_sessions = inbox.name, 1
+        self.revision = 0
+        """Newest one that was read."""
+
+    @property
+    def file(self) -> Path:
+        """The map.
+
+        Raises:
+            InputError: it is in memory.
+        """
+        if self._path is None:
+            raise InputError("a map in memory stays as it is", field="map", hint="a file, or mapping=False")
+        return self._path
+
+    def feed(self) -> None:
+        """Feed the map from here on; what a process that was killed has left is entered first."""
+        if self._spool is not None:
+            return
+        self._spool = Spool(self.file)
+        for brought in enter_waiting(self.file):
+            self._told.warnings.append(f"recovered from {brought.name}, whose process ended before it was entered")
+            self._take(brought)
+        self._spool.settle(self._config)
+
+    def load(self, *, create: bool, tell: bool) -> LivingMap:
+        """Read the newest map; with `tell`, what has changed since the one before is told."""
+        with open_store(self.file, create=create) as store:
+            head, before = store.head(), self.revision
+            if tell:
+                self._told.add([change for number in range(before + 1, head + 1) for change in store.changes(number)])
+                self._told.known.clear()
+            self.revision = head
+            return store.load(head)
+
+    def beside(self, name: str, job: Callable[[], None]) -> None:
+        """Do something beside the steps, unless it is still being done."""
+        before = self._jobs.get(name)
+        if self._pool is None:
+            job()
+        elif before is None or before.done():
+            self._jobs[name] = self._pool.submit(job)
+
+    def collect(self) -> bool:
+        """Take what was done beside the steps; returns whether sessions were entered."""
+        for name, job in list(self._jobs.items()):
+            if not job.done():
+                continue
+            del self._jobs[name]
+            if (error := job.exception()) is not None:
+                if not isinstance(error, EvermapError | OSError):
+                    raise error
+                self._told.warnings.append(f"{name}: {error}")
+        if self._child is None or self._child.poll() is None:
+            return False
+        child, self._child = self._child, None
+        for line in [] if child.stdout is None else child.stdout.read().splitlines():
+            self._take(Brought(**json.loads(line)))
+        if child.returncode:
+            self._told.warnings.append(f"entering a session ended with code {child.returncode}; its readings wait")
+        return True
+
+    def write_if_due(self) -> None:
+        """Put readings on the disk if it is time."""
+        if self._spool is not None and time.monotonic() >= self._written_s + self._config.live.checkpoint_s:
+            self._written_s = time.monotonic()
+            self.beside("write", self._write)
+
+    def end_session(self) -> None:
+        """End the session of the readings so far: it waits to be entered."""
+        if self._spool is None or not len(self._inbox):
+            return
+        if "write" in self._jobs:
+            self._jobs.pop("write").result()
+        self._write(last=True)
+        self._spool.finish()
+        self._n_sessions += 1
+        self._inbox.cut(f"{self._name} {self._n_sessions}")
+
+    def enter_if_waiting(self) -> bool:
+        """Enter sessions that wait, beside the steps; returns whether that is done already."""
+        waiting = [] if self._spool is None or self._child is not None else self._spool.waiting()
+        if not waiting or waiting == self._tried:
+            return False
+        self._tried = waiting
+        if self._pool is None:
+            self.enter(self.file)
+            return True
+        assert self._spool is not None
+        self._child = self._spool.enter_beside()
+        return False
+
+    def enter(self, file: Path) -> Entered | None:
+        """Enter sessions that wait, now; returns what the last of them made of the map."""
+        entered = None
+        for brought in enter_waiting(file):
+            self._take(brought)
+            entered = brought.entered or entered
+        return entered
+
+    def wait(self, lock: threading.RLock) -> None:
+        """Wait for what is done beside the steps, which may need the lock."""
+        while self._child is not None or self._jobs:
+            if self._child is not None:
+                self._child.wait()
+            lock.release()
+            try:
+                for job in list(self._jobs.values()):
+                    job.exception()
+            finally:
+                lock.acquire()
+            self.collect()
+
+    def close(self) -> None:
+        """Let others feed the map; the readings that wait are entered by the next that does."""
+        if self._pool is not None:
+            self._pool.shutdown()
+        if self._spool is not None:
+            if len(self._inbox):
+                self._write(last=True)
+            self._spool.close()
+            self._spool = None
+
+    def _write(self, *, last: bool = False) -> None:
+        if self._spool is not None:
+            part = self._inbox.written(last=last)
+            if len(part.odometry) or len(part.frames):
+                self._spool.write(part)
+
+    def _take(self, brought: Brought) -> None:
+        if brought.problem:
+            self._told.warnings.append(f"{brought.name}: not entered: {brought.problem}")
