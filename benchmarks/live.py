@@ -80,18 +80,21 @@ def drive(size: int, seconds: float, *, mapping: bool, known: bool = True, paced
                 del living
         engine = em.Engine(path, SENSOR, Config(), mapping=mapping, clock=Clock.RECORDING)
         engine.warm_up()
+        before = _cpu_s()
         row = _driven(engine, landmark, seconds, paced=paced)
-        engine.close()
+        engine.close()  # waits for sessions that are being entered
+        row["core"] = (_cpu_s() - before - row.pop("drawing_s")) / seconds
+        with open_store(path) as store:
+            row["revision"] = store.head()
     return {"map": size if known else 0, "mapping": mapping, "minutes": seconds / 60, **row}
 
 
 def _driven(engine: em.Engine, landmark: FloatArray, seconds: float, *, paced: bool) -> dict[str, Any]:
     rng = np.random.default_rng(2)
     step_s, busy_s, off_m, memory, n_seen, odometry_s = [], [], [], [], [], 0.0
-    before = _cpu_s()
     drawing = 0.0
     last, start = time.process_time(), time.perf_counter()
-    revision, changes = 0, 0
+    changes = 0
     for stamp_s, pose, names, reading in frames(landmark, seconds):
         drawing += time.process_time() - last
         if paced:
@@ -105,7 +108,7 @@ def _driven(engine: em.Engine, landmark: FloatArray, seconds: float, *, paced: b
         now = engine.step()
         step_s.append(time.perf_counter() - began)
         busy_s.append(time.thread_time() - busy)
-        revision, changes = now.revision, changes + len(now.changes)
+        changes += len(now.changes)
         n_seen.append(len(now.in_view))
         if now.frame == "prior_map" and len(now.online):
             off_m.append(np.hypot(*(now.online.pose_world_robot[-1, :2] - pose[:2])))
@@ -120,11 +123,10 @@ def _driven(engine: em.Engine, landmark: FloatArray, seconds: float, *, paced: b
         "p999_ms": float(np.quantile(ms, 0.999)),
         "max_ms": float(ms.max()),
         "own_p99_ms": 1e3 * float(np.quantile(busy_s[WARM_UP:], 0.99)),
-        "core": (_cpu_s() - before - drawing) / seconds,
+        "drawing_s": drawing,
         "rmse_cm": 100 * float(np.sqrt(np.mean(np.square(off_m[WARM_UP:])))) if len(off_m) > WARM_UP else float("nan"),
         "memory_mb": [round(memory[0][0]), round(memory[len(memory) // 2][0]), round(memory[-1][0])] if memory else [],
         "readings_mb": max((one[1] for one in memory), default=float("nan")),
-        "revision": revision,
         "changes": changes,
     }
 

@@ -26,7 +26,7 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
 from evermap.runs.sessions import Entered
 from evermap.slam.intake import beliefs
-from evermap.slam.known_places import KnownPlaces
+from evermap.slam.known_places import ENOUGH, KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
@@ -88,6 +88,7 @@ class Engine:
         self._last: Frame | None = None
         self._online: list[tuple[float, FloatArray, FloatArray]] = []
         self._session_s = self._judged_s = -math.inf
+        self._met: set[int] = set()
         self._mapping = mapping
         if mapping:
             self._keeper.feed()
@@ -258,6 +259,7 @@ class Engine:
         self._online.append((frame.stamp_s, located.pose, located.covariance))
         if self._judge is not None:
             self._judge.look(frame, located, self._filter.states)
+            self._met.update(frame.landmark_id[located.p_inlier > 0.5].tolist())
 
     def _begin(self, stamp_s: float) -> None:
         """Choose the filter: in a map the robot is localised, a place without one is mapped."""
@@ -281,9 +283,10 @@ class Engine:
             if now_s - self._session_s >= IDLE_S:
                 self._inbox.cut(self._inbox.name)
                 self._session_s = now_s
-        elif 0.0 < live.revision_s <= now_s - self._session_s:
+        elif 0.0 < live.revision_s <= now_s - self._session_s and self._can_be_found:
             self._keeper.end_session()
             self._session_s = now_s
+            self._met.clear()
         else:
             self._keeper.write_if_due()
         if self._keeper.enter_if_waiting():
@@ -291,6 +294,11 @@ class Engine:
         if self._judge is not None and now_s - self._judged_s >= live.judge_s:
             self._judged_s = now_s
             self._keeper.beside("judge", self._judge.judge)
+
+    @property
+    def _can_be_found(self) -> bool:
+        """Whether the session so far shows enough of the map to be entered; one that explores goes on until it does."""
+        return len(self._met) >= ENOUGH if isinstance(self._filter, Localizer) else self._keeper.n_sessions == 1
 
     def _go_on(self) -> None:
         """Go on in the newest map, from where the robot is."""

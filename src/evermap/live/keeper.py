@@ -63,7 +63,7 @@ class Keeper:
         self._child: subprocess.Popen[str] | None = None
         self._tried: list[Path] = []
         self._written_s = time.monotonic()
-        self._name, self._n_sessions = inbox.name, 1
+        self._name, self.n_sessions = inbox.name, 1
         self.revision = 0
         """Newest one that was read."""
 
@@ -139,8 +139,8 @@ class Keeper:
             self._jobs.pop("write").result()
         self._write(last=True)
         self._spool.finish()
-        self._n_sessions += 1
-        self._inbox.cut(f"{self._name} {self._n_sessions}")
+        self.n_sessions += 1
+        self._inbox.cut(f"{self._name} {self.n_sessions}")
 
     def enter_if_waiting(self) -> bool:
         """Enter sessions that wait, beside the steps; returns whether that is done already."""

@@ -68,6 +68,7 @@ class Spool:
         for part in self.folder.glob("*.part"):
             part.rename(part.with_suffix(".readings"))
         self._file: IO[bytes] | None = None
+        self._number = 0
 
     def settle(self, config: Config) -> None:
         """Have sessions entered with other settings from here on."""
@@ -76,8 +77,9 @@ class Spool:
     def write(self, recording: Recording) -> None:
         """Put a part of the present session on the disk."""
         if self._file is None:
-            number = 1 + max((int(path.stem) for path in self.folder.glob("[0-9]*.*") if path.is_file()), default=0)
-            self._file = (self.folder / f"{number:06d}.part").open("ab")
+            there = (int(path.stem) for path in self.folder.glob("[0-9]*.readings"))
+            self._number = 1 + max(self._number, *there, 0)
+            self._file = (self.folder / f"{self._number:06d}.part").open("ab")
         data = pack_recording(recording)
         self._file.write(len(data).to_bytes(8, "little") + data)
         self._file.flush()

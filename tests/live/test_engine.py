@@ -1,0 +1,355 @@
+"""The live engine against the recordings' own entry points: the same maps, the same poses, whatever the order."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from feeding import AT_THE_END, SESSIONS, assert_equal, engine, entered, fed, messages, online, send, stored
+
+import evermap as em
+from evermap.config import Config
+from evermap.errors import ConfigError, InputError
+from evermap.maps.living import LivingMap
+from evermap.maps.store import open_store
+from evermap.maps.store.measured import RECORDING, unpack_recording
+from evermap.types import ChangeKind, Clock, Landmarks, Sensor
+
+
+@pytest.fixture(scope="module")
+def two_sessions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of two sessions, as recordings enter."""
+    path = tmp_path_factory.mktemp("map") / "site.evermap"
+    for recording in SESSIONS[:2]:
+        entered(path, recording)
+    return path
+
+
+def copied(path: Path, to: Path) -> Path:
+    there = to / path.name
+    there.write_bytes(path.read_bytes())
+    return there
+
+
+def test_a_recording_fed_live_gives_the_map_and_the_poses_of_its_replay_bit_by_bit(tmp_path: Path) -> None:
+    """The online poses of a place that nobody knows differ by rounding: landmarks are numbered as they come."""
+    for number, recording in enumerate(SESSIONS[:3]):
+        before = stored(tmp_path / "replay.evermap") if number else LivingMap()
+        with engine(tmp_path / "live.evermap", recording) as live:
+            steps = list(fed(live, recording))
+            made = live.save()
+        assert made is not None
+        assert_equal(stored(tmp_path / "live.evermap"), entered(tmp_path / "replay.evermap", recording))
+        if number:
+            replayed, off = em.run_localization(recording, before, AT_THE_END).online, 1e-12
+        else:
+            replayed, off = em.run_session(recording, None, AT_THE_END).slam.online, 1e-6
+        ours = online(steps)
+        both, mine, theirs = np.intersect1d(ours.stamp_s, replayed.stamp_s, return_indices=True)
+        assert len(both) >= len(replayed) - 2  # the last frames are processed by `save`
+        np.testing.assert_allclose(ours.pose_world_robot[mine], replayed.pose_world_robot[theirs], rtol=0, atol=off)
+        np.testing.assert_allclose(ours.covariance[mine], replayed.covariance[theirs], rtol=1e-5, atol=off)
+        assert steps[-1].frame == ("prior_map" if number else "first_pose")
+    with open_store(tmp_path / "live.evermap") as store:
+        assert [revision.provenance.recording for revision in store.log()] == [one.name for one in SESSIONS[:3]]
+
+
+def test_out_of_order_within_the_window_is_in_order(tmp_path: Path, two_sessions: Path) -> None:
+    recording = SESSIONS[2]
+    step_s = 0.08 * np.random.default_rng(0).random(len(messages(recording)))
+    late = sorted(zip(step_s, messages(recording), strict=True), key=lambda pair: pair[0] + pair[1][0])
+    found = []
+    for name, order in (("in", messages(recording)), ("out", [message for _, message in late])):
+        path = copied(two_sessions, tmp_path / name) if (tmp_path / name).mkdir() is None else two_sessions
+        with engine(path, recording) as live:
+            steps = list(fed(live, recording, order))
+            assert live.late == 0
+        found.append((online(steps), stored(path)))
+    (one, map_one), (other, map_other) = found
+    assert_equal(map_one, map_other)
+    both, mine, theirs = np.intersect1d(one.stamp_s, other.stamp_s, return_indices=True)
+    assert len(both) > 0.9 * len(recording.frames)
+    np.testing.assert_array_equal(one.pose_world_robot[mine], other.pose_world_robot[theirs])
+
+
+def test_two_threads_feed_while_a_third_steps(tmp_path: Path, two_sessions: Path) -> None:
+    recording, path = SESSIONS[2], copied(two_sessions, tmp_path)
+    live = engine(path, recording, Config(live={"revision_s": 0.0, "reorder_s": 1e3}), beside=True)
+    streams = [[one for one in messages(recording) if one[1] == kind] for kind in ("odometry", "frame")]
+    done = threading.Event()
+
+    def feed(stream: list) -> None:
+        for message in stream:
+            send(live, recording, message)
+
+    def step() -> None:
+        while not done.is_set():
+            live.step()
+            time.sleep(0.001)
+
+    feeders = [threading.Thread(target=feed, args=(stream,)) for stream in streams]
+    stepper = threading.Thread(target=step)
+    for thread in (stepper, *feeders):
+        thread.start()
+    for thread in feeders:
+        thread.join()
+    done.set()
+    stepper.join()
+    live.save()
+    live.close()
+    replay = copied(two_sessions, tmp_path / "replay") if (tmp_path / "replay").mkdir() is None else path
+    assert_equal(stored(path), entered(replay, recording))
+
+
+def test_revisions_within_a_session_are_the_sessions_of_its_parts(tmp_path: Path) -> None:
+    """The map changes while the robot drives, which goes on in it; what waits is bounded by what a part holds."""
+    recording = SESSIONS[0]
+    config = Config(live={"revision_s": 15.0})
+    with engine(tmp_path / "live.evermap", recording, config) as live:
+        steps, waiting = [], []
+        for now in fed(live, recording):
+            steps.append(now)
+            waiting.append(live.n_bytes)
+    assert {one.frame for one in steps} == {"first_pose", "prior_map"}
+    assert steps[-1].revision >= 2
+    assert not steps[-1].lost
+    assert max(waiting[len(waiting) // 2 :]) < 1.3 * max(waiting[: len(waiting) // 2])
+    with open_store(tmp_path / "live.evermap") as store:
+        kept = sorted((item.revision, item) for item in store.attachments() if item.name == RECORDING)
+        parts = [unpack_recording(store.attached(item)) for _, item in kept]
+    assert sum(len(part.detections) for part in parts) == len(recording.detections)
+    for part in parts:
+        last = entered(tmp_path / "parts.evermap", part, config)
+    assert_equal(stored(tmp_path / "live.evermap"), last)
+    assert recording.truth is not None
+    pose = online([one for one in steps if one.frame == "prior_map"])
+    at = np.searchsorted(recording.truth.stamp_s, pose.stamp_s).clip(0, len(recording.truth.stamp_s) - 1)
+    first = recording.truth.pose_world_robot[np.searchsorted(recording.truth.stamp_s, recording.frames.stamp_s[0])]
+    turned = np.array([[np.cos(first[2]), np.sin(first[2])], [-np.sin(first[2]), np.cos(first[2])]])
+    true = (recording.truth.pose_world_robot[at, :2] - first[:2]) @ turned.T
+    assert np.median(np.hypot(*(pose.pose_world_robot[:, :2] - true).T)) < 0.5
+
+
+def test_mapping_and_localising_are_switched_without_a_restart(tmp_path: Path, two_sessions: Path) -> None:
+    recording, path = SESSIONS[2], copied(two_sessions, tmp_path)
+    half = len(messages(recording)) // 2
+    with engine(path, recording, mapping=False) as live:
+        steps = list(fed(live, recording, messages(recording)[:half]))
+        assert live.n_bytes > 0
+        live.mapping = True
+        steps += list(fed(live, recording, messages(recording)[half:]))
+    assert not any(one.lost for one in steps[len(steps) // 2 :])
+    with open_store(path) as store:
+        assert store.head() == 3
+        kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+        part = unpack_recording(store.attached(kept[3]))
+    assert part.frames.stamp_s[0] > recording.frames.stamp_s[len(recording.frames) // 3]
+    assert part.odometry.stamp_s[0] < part.frames.stamp_s[0]
+
+
+def still(seconds: float, seen: bool, sensor: Sensor = Sensor(range_max_m=8.0)) -> em.Engine:  # noqa: B008
+    """A robot that stands before four landmarks of its map, of which the last one is seen, or is not."""
+    at = np.array([[3.0, 0.0], [3.0, 2.0], [4.0, -2.0], [2.5, 1.0]])
+    living = LivingMap.begun(replace(Landmarks.at(np.arange(4), at, sigma_m=0.02), clock=Clock.RECORDING))
+    live = em.Engine(living, sensor, Config(), mapping=False, clock=Clock.RECORDING, beside=False)
+    for stamp_s in np.arange(0.0, seconds, 0.1):
+        live.odometry(stamp_s, 0.0)
+        rows = [0, 1, 2, 3] if seen or stamp_s < 20.0 else [0, 1, 2]
+        live.detections(stamp_s, rows, np.hypot(*at[rows].T), np.arctan2(at[rows, 1], at[rows, 0]))
+        live.step()
+    return live
+
+
+def test_what_is_missed_is_doubted_and_told_while_the_robot_stands_there() -> None:
+    changes = []
+    at = np.array([[3.0, 0.0], [3.0, 2.0], [4.0, -2.0], [2.5, 1.0]])
+    living = LivingMap.begun(replace(Landmarks.at(np.arange(4), at, sigma_m=0.02), clock=Clock.RECORDING))
+    live = em.Engine(living, Sensor(range_max_m=8.0), mapping=False, clock=Clock.RECORDING, beside=False)
+    p_exists = []
+    for stamp_s in np.arange(0.0, 90.0, 0.1):
+        live.odometry(stamp_s, 0.0)
+        rows = [0, 1, 2, 3] if stamp_s < 20.0 else [0, 1, 2]
+        live.detections(stamp_s, rows, np.hypot(*at[rows].T), np.arctan2(at[rows, 1], at[rows, 0]))
+        now = live.step()
+        changes += now.changes
+        p_exists.append(now.in_view.p_exists[now.in_view.landmark_id == 3])
+    assert [(change.kind, change.landmark_ids) for change in changes] == [(ChangeKind.VANISHED, (3,))]
+    assert p_exists[-1] < 0.2 < 0.8 < p_exists[190]
+    assert 20.0 < changes[0].stamp_to_s < 25.0
+    told = live.landmarks()
+    assert told.p_exists[3] < 0.2
+    assert len(live.landmarks(within=(2.0, -1.0, 3.5, 3.0))) == 3
+
+
+def test_a_frame_without_detections_is_a_look() -> None:
+    """The map's landmarks are seen for a while, then none is: everything is expected, and nothing comes."""
+    at = np.array([[3.0, 0.0], [3.0, 2.0], [4.0, -2.0], [2.5, 1.0]])
+    living = LivingMap.begun(replace(Landmarks.at(np.arange(4), at, sigma_m=0.02), clock=Clock.RECORDING))
+    believed = {}
+    for empty in (True, False):
+        live = em.Engine(living, Sensor(range_max_m=8.0), mapping=False, clock=Clock.RECORDING, beside=False)
+        for stamp_s in np.arange(0.0, 60.0, 0.1):
+            live.odometry(stamp_s, 0.0)
+            if stamp_s < 20.0:
+                live.detections(stamp_s, [0, 1, 2, 3], np.hypot(*at.T), np.arctan2(at[:, 1], at[:, 0]))
+            elif empty:
+                live.detections(stamp_s)
+            live.step()
+        believed[empty] = live.landmarks().p_exists
+    assert (believed[True] < believed[False]).all()
+
+
+CHILD = """
+import sys, time
+sys.path[:0] = [{here!r}]
+from feeding import SESSIONS, engine, messages, send
+from evermap.config import Config
+live = engine({path!r}, SESSIONS[2], Config(live={{"revision_s": 0.0, "checkpoint_s": 0.2}}), beside=True)
+for message in messages(SESSIONS[2]):
+    send(live, SESSIONS[2], message)
+    if message[1] == "frame":
+        live.step()
+        time.sleep(0.01)
+        print(message[0], flush=True)
+time.sleep(60)
+"""
+
+
+def test_what_was_driven_before_a_kill_is_in_the_map_of_the_next_engine(tmp_path: Path, two_sessions: Path) -> None:
+    """All but what came since the last checkpoint: a fifth of a second here, and some for the disk."""
+    path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
+    code = CHILD.format(here=str(Path(__file__).parent), path=str(path))
+    child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    for _ in range(150):
+        last_s = float(child.stdout.readline())
+    with pytest.raises(ConfigError, match="another process feeds this map"):
+        engine(path, recording)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    with open_store(path) as store:
+        assert store.head() == 2
+    live = engine(path, SESSIONS[3])
+    assert any("recovered" in warning for warning in live.step().warnings)
+    live.close()
+    with open_store(path) as store:
+        assert store.head() == 3
+        kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+        part = unpack_recording(store.attached(kept[3]))
+    frames = len(part.frames)
+    np.testing.assert_array_equal(part.frames.stamp_s, recording.frames.stamp_s[:frames])
+    seen = recording.detections.frame < frames
+    np.testing.assert_array_equal(part.detections.range_m, recording.detections.range_m[seen])
+    assert part.frames.stamp_s[-1] > last_s - 12.0  # of the recording, which is fed twenty times as fast
+    assert em.recover(path) == ()
+
+
+def test_a_part_that_a_crash_cut_off_is_left_out(tmp_path: Path, two_sessions: Path) -> None:
+    path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
+    live = engine(path, recording, Config(live={"checkpoint_s": 1e-9, "revision_s": 0.0}))
+    for _ in fed(live, recording):
+        pass
+    live.close()
+    (left,) = path.with_name("site.evermap.live").glob("*.readings")
+    left.write_bytes(left.read_bytes()[:-1000])
+    (brought,) = em.recover(path)
+    assert brought.revision == 3
+    assert brought.entered is not None
+    assert 0.8 * len(recording.frames) < len(brought.entered.session.recording.frames) <= len(recording.frames)
+
+
+def test_a_session_that_is_of_another_place_is_set_aside(tmp_path: Path, two_sessions: Path) -> None:
+    path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
+    ids = recording.detections.landmark_id
+    strange = replace(recording, detections=replace(recording.detections, landmark_id=np.where(ids >= 0, ids + 900, ids)))
+    with engine(path, strange) as live:
+        for _ in fed(live, strange):
+            pass
+        assert live.save() is None
+        assert "cannot localise in the map" in live.step().warnings[0]
+    (aside,) = path.with_name("site.evermap.live").glob("aside-*")
+    assert len(em.read_recording(aside).frames) == len(recording.frames)
+    with open_store(path) as store:
+        assert store.head() == 2
+
+
+def test_more_readings_than_the_map_needs_are_thinned(tmp_path: Path, two_sessions: Path) -> None:
+    path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
+    with engine(path, recording, Config(live={"readings_hz": 5.0, "revision_s": 0.0})) as live:
+        steps = list(fed(live, recording))
+        made = live.save()
+    assert made is not None
+    kept = made.session.recording
+    assert len(kept.detections) < 0.5 * len(recording.detections)
+    assert len(online(steps)) > 0.9 * len(recording.frames)  # poses are told of all
+
+
+@pytest.mark.parametrize(
+    ("say", "told"),
+    [
+        (lambda live: live.odometry(float("nan"), 1.0), "stamp_s': nan where a finite number"),
+        (lambda live: live.odometry(1.0, float("inf")), "forward_mps': inf where a finite number"),
+        (lambda live: live.odometry(1e12, 1.0), "not in milli- or nanoseconds"),
+        (lambda live: live.odometry("soon", 1.0), "'soon' is not a number"),
+        (lambda live: live.detections(1.0, [1], [float("nan")], [0.0]), "range_m': row 0: nan"),
+        (lambda live: live.detections(1.0, [1], [-1.0], [0.0]), "greater than zero"),
+        (lambda live: live.detections(1.0, [1, 2], [1.0], [0.0, 0.0]), "1 values for 2 detections"),
+        (lambda live: live.detections(1.0, [1.5], [1.0], [0.0]), "1.5 is not an identity"),
+        (lambda live: live.detections(1.0, [-2], [1.0], [0.0]), "-2 is not an identity"),
+        (lambda live: setattr(live, "mapping", True), "a map in memory stays as it is"),
+        (lambda live: live.save(), "a map in memory stays as it is"),
+    ],
+)
+def test_mistakes_are_one_line(say, told: str) -> None:
+    live = em.Engine(LivingMap(), Sensor(range_max_m=8.0), mapping=False)
+    with pytest.raises(InputError) as caught:
+        say(live)
+    line = caught.value.one_line()
+    assert told in line
+    assert "try: " in line
+    assert "\n" not in line
+
+
+def test_mistakes_of_the_beginning_are_one_line(tmp_path: Path) -> None:
+    for sensor, told in (("no.toml", "No such file"), (3, "a Sensor is needed"), (Sensor(5.0, 1.0), "is not below")):
+        with pytest.raises(InputError, match=told):
+            em.Engine(LivingMap(), sensor, mapping=False)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="stays as it is"):
+        em.Engine(LivingMap(), Sensor(range_max_m=8.0))
+    with pytest.raises(ConfigError, match="unknown_ids"):
+        em.Engine(tmp_path / "m.evermap", Sensor(range_max_m=8.0), Config(slam={"unknown_ids": True}))
+    with pytest.raises(InputError):
+        em.Engine(tmp_path / "none.evermap", Sensor(range_max_m=8.0), mapping=False)
+
+
+def test_a_stamp_that_runs_backwards_beyond_the_window_is_refused_and_counted() -> None:
+    live = still(30.0, seen=True)
+    with pytest.raises(InputError, match=r"odometry of 3.000 s came too late.*\(try: one clock"):
+        live.odometry(3.0, 1.0)
+    with pytest.raises(InputError, match="detections of 3.000 s came too late"):
+        live.detections(3.0)
+    assert live.late == 2
+    assert not live.step().lost
+
+
+def test_a_recording_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:
+    """MRCLAM 6, robot 3, a map that nobody knew: three revisions while it drives, and the robot stays localised."""
+    recording = em.read_recording(shared_data / "mrclam" / "MRCLAM_Dataset6.zip", robot=3)
+    with engine(tmp_path / "site.evermap", recording, Config()) as live:
+        steps = list(fed(live, recording))
+    assert steps[-1].revision >= 2
+    in_map = [one for one in steps if one.frame == "prior_map"]
+    assert np.mean([one.lost for one in in_map]) < 0.02
+    ours = online(in_map)
+    whole = em.run_slam(recording).trajectory
+    both, mine, theirs = np.intersect1d(ours.stamp_s, whole.stamp_s, return_indices=True)
+    assert len(both) > 1000
+    gap_m = ours.pose_world_robot[mine, :2] - whole.pose_world_robot[theirs, :2]
+    assert np.sqrt((gap_m**2).sum(axis=1).mean()) < 0.15
