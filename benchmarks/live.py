@@ -64,7 +64,9 @@ def frames(
         pose = np.array([RADIUS_M * np.cos(turned), RADIUS_M * np.sin(turned), turned + 0.5 * np.pi])
         seen = se2.transform(se2.inverse(pose), landmark[near])
         reading = np.column_stack([np.hypot(*seen.T), np.arctan2(seen[:, 1], seen[:, 0])])
-        rows = np.flatnonzero((np.abs(reading[:, 0] - 0.5 * RANGE_M - 0.2) < 0.5 * RANGE_M - 0.2) & (rng.random(len(near)) < P_DETECT))
+        rows = np.flatnonzero(
+            (np.abs(reading[:, 0] - 0.5 * RANGE_M - 0.2) < 0.5 * RANGE_M - 0.2) & (rng.random(len(near)) < P_DETECT)
+        )
         yield stamp_s, pose, near[rows], reading[rows] + SIGMA * rng.normal(size=(len(rows), 2))
 
 

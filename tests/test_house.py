@@ -13,8 +13,8 @@ MODULES = {
 }
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
-MOST_MODULES = 271
-MOST_LINES = 65_103
+MOST_MODULES = 276
+MOST_LINES = 65_660
 LONGEST_FUNCTION = 60
 """Lines; kernels may be longer."""
 MOST_ARGUMENTS = 8
@@ -43,7 +43,7 @@ VERBS = frozenset(
     stretch strip sum summarise support suppress swap switch take tell test tie time trace track train transform
     translate triangulate trim truncate try turn undo unite unpack unpin update use validate verify visit wait walk
     warm warn wash watch weigh whiten widen wrap write yield
-    bridge broadcast commit correlate
+    bridge broadcast commit correlate feed
     """.split()  # noqa: SIM905
 )
 """First words of docstrings, in the imperative. Add a verb where it is missing."""

@@ -38,9 +38,10 @@ RULES = {
     "runs": (
         "errors interrupts types config geometry stamps survival valid io metrics existence tracking viz maps pipeline"
     ),
+    "live": "errors types config valid io maps runs slam",
     "cli": (
         "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
-        "maps pipeline runs"
+        "maps pipeline runs live"
     ),
 }
 

@@ -14,7 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from evermap import __version__, interrupts, plugins
-from evermap.cli import bench, check, convert, info, persist, reproduce, slam, survival, track, view
+from evermap.cli import bench, check, convert, info, live, persist, reproduce, slam, survival, track, view
 from evermap.cli import map as living_map
 from evermap.cli.options import Verb
 from evermap.cli.terminal import fail, say, warn
@@ -94,6 +94,7 @@ app = typer.Typer(
 app.command("check")(check.check)
 app.command("info")(info.info)
 app.command("slam", help=slam.HELP)(slam.slam)
+app.command("live")(live.live)
 app.command("persist", help=persist.HELP)(persist.persist)
 app.command("track", help=track.HELP)(track.track)
 app.command("view")(view.view)

@@ -18,9 +18,9 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.errors import ConfigError
-from evermap.live.inbox import Frame, Inbox
+from evermap.live.inbox import Inbox, LiveFrame
 from evermap.live.judge import Judge, warm_up
-from evermap.live.keeper import Keeper, Told
+from evermap.live.keeper import Keeper, News
 from evermap.live.now import Now, recording_of, trajectory_of
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.believe import aged
@@ -30,9 +30,10 @@ from evermap.slam.known_places import ENOUGH, KnownPlaces
 from evermap.slam.localize import FrameSightings, Localizer, Located
 from evermap.slam.mapper import Mapper
 from evermap.slam.problem import Drive
-from evermap.types import Clock, FloatArray, Landmarks, Sensor
+from evermap.types import Clock, FloatArray, IntArray, Landmarks, Sensor
 from evermap.valid import check_sensor
 
+Numbers = Sequence[float] | FloatArray
 IDLE_S = 60.0
 """Odometry that is kept where nothing is mapped, at least."""
 
@@ -79,13 +80,13 @@ class Engine:
         check_sensor(self._sensor)
         live = self._config.live
         self._inbox = Inbox(recording, live.reorder_s, live.readings_hz)
-        self._lock, self._told = threading.RLock(), Told()
+        self._lock, self._told = threading.RLock(), News()
         path = None if isinstance(map, LivingMap) else Path(map)
         self._keeper = Keeper(path, self._config, self._inbox, self._told, threads=beside)
         self._filter: Localizer | Mapper | None = None
         self._judge: Judge | None = None
         self._located: Located | None = None
-        self._last: Frame | None = None
+        self._last: LiveFrame | None = None
         self._online: list[tuple[float, FloatArray, FloatArray]] = []
         self._session_s = self._judged_s = -math.inf
         self._met: set[int] = set()
@@ -137,13 +138,13 @@ class Engine:
     def detections(
         self,
         stamp_s: float,
-        landmark_id: Sequence[int | str] = (),
-        range_m: Sequence[float] = (),
-        bearing_rad: Sequence[float] = (),
+        landmark_id: Sequence[int | str] | IntArray = (),
+        range_m: Numbers = (),
+        bearing_rad: Numbers = (),
         *,
         class_name: Sequence[str | None] | None = None,
-        sigma_range_m: Sequence[float] | None = None,
-        sigma_bearing_rad: Sequence[float] | None = None,
+        sigma_range_m: Numbers | None = None,
+        sigma_bearing_rad: Numbers | None = None,
     ) -> None:
         """Take what the sensor saw in a frame; one in which it saw nothing is one, too: what was expected is missed.
 
@@ -235,7 +236,7 @@ class Engine:
         finally:
             self.close()
 
-    def _process(self, frame: Frame, odometry: FloatArray, *, kept: bool) -> None:
+    def _process(self, frame: LiveFrame, odometry: FloatArray, *, kept: bool) -> None:
         """A frame through the filter; before any odometry it says nothing."""
         if frame.stamp_s < self._inbox.first_s or not len(odometry):
             return

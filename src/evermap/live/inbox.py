@@ -46,7 +46,7 @@ BURST_S = 10.0
 """Time over which readings are counted where there are too many."""
 
 
-class Frame(NamedTuple):
+class LiveFrame(NamedTuple):
     """A look of the sensor.
 
     Attributes:
@@ -76,8 +76,8 @@ class Inbox:
         self._lock = threading.Lock()
         self._about, self._reorder_s, self._readings_hz = about, reorder_s, readings_hz
         self._odometry: list[tuple[float, float, float, float]] = []
-        self._pending: list[Frame] = []
-        self._kept: list[Frame] = []
+        self._pending: list[LiveFrame] = []
+        self._kept: list[LiveFrame] = []
         self._room = readings_hz * BURST_S
         self.newest_s = self.odometry_s = self.settled_s = -np.inf
         """Newest stamp of all, of the odometry, and of the frames that were given out."""
@@ -117,16 +117,16 @@ class Inbox:
             InputError: values that cannot be, or the stamp is before frames that were processed.
         """
         _check(STAMP_S, stamp_s)
-        frame = Frame(float(stamp_s), self._rows(*columns))
+        frame = LiveFrame(float(stamp_s), self._rows(*columns))
         with self._lock:
             self._refuse_late(frame.stamp_s, "detections")
             at = bisect_left(self._pending, frame.stamp_s, key=lambda one: one.stamp_s)
             if at < len(self._pending) and self._pending[at].stamp_s == frame.stamp_s:  # two messages of one look
-                frame = Frame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
+                frame = LiveFrame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
             insort(self._pending, frame, key=lambda one: one.stamp_s)
             self.newest_s = max(self.newest_s, frame.stamp_s)
 
-    def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[Frame, FloatArray, bool]]:
+    def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[LiveFrame, FloatArray, bool]]:
         """Take out the frames before which nothing can come any more.
 
         Args:
@@ -134,7 +134,7 @@ class Inbox:
             everything: all that there are; nothing will come any more.
 
         Returns:
-            Frame, odometry (n, 4) from some seconds before it until the newest, and whether it is kept for the map.
+            LiveFrame, odometry (n, 4) from some seconds before it until the newest, and whether it is kept for the map.
         """
         found = []
         with self._lock:
@@ -195,7 +195,7 @@ class Inbox:
         first = max(bisect_left(self._odometry, (stamp_s - BEFORE_S,)) - 1, 0)
         return np.array(self._odometry[first:]).reshape(-1, 4)
 
-    def _keep(self, frame: Frame, before_s: float) -> bool:
+    def _keep(self, frame: LiveFrame, before_s: float) -> bool:
         """Whether there is room for a frame's readings: a bucket that fills with time."""
         since_s = min(frame.stamp_s - before_s, BURST_S)
         self._room = min(self._room + self._readings_hz * since_s, self._readings_hz * BURST_S)
@@ -273,7 +273,7 @@ def joined(parts: Sequence[Recording]) -> Recording:
 def _recorded(
     about: Recording,
     odometry: list[tuple[float, float, float, float]],
-    frames: list[Frame],
+    frames: list[LiveFrame],
     classes: tuple[str, ...],
     texts: dict[int, str],
 ) -> Recording:

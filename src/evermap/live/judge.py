@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.config import Config, LivingConfig
-from evermap.live.inbox import Frame
+from evermap.live.inbox import LiveFrame
 from evermap.maps.living import LivingMap
 from evermap.maps.sessions.looks import Sighting
 from evermap.maps.sessions.so_far import judged_so_far, lives_of
@@ -72,7 +72,7 @@ class Judge:
         after, vicinity = self._after
         return after if vicinity is None else vicinity.put_back(after)
 
-    def look(self, frame: Frame, located: Located, states: FloatArray) -> None:
+    def look(self, frame: LiveFrame, located: Located, states: FloatArray) -> None:
         """Take what was seen of the map in a frame, with (9,) calibration states; of many frames some."""
         if located.lost or not len(located.expected):
             return
@@ -87,7 +87,7 @@ class Judge:
             self._glances.append(glance)
 
     def judge(self) -> None:
-        """Work out what the looks say."""
+        """Ask what the looks say."""
         with self._lock:
             glances = self._glances[:]
         if len(glances) < 2:

@@ -23,7 +23,7 @@ from evermap.types import MapChange
 
 
 @dataclass
-class Told:
+class News:
     """What the next step tells, and changes that were told since the newest revision."""
 
     changes: list[MapChange] = field(default_factory=list)
@@ -55,7 +55,7 @@ class Keeper:
         threads: False does everything at once.
     """
 
-    def __init__(self, path: Path | None, config: Config, inbox: Inbox, told: Told, *, threads: bool) -> None:
+    def __init__(self, path: Path | None, config: Config, inbox: Inbox, told: News, *, threads: bool) -> None:
         self._path, self._config, self._inbox, self._told = path, config, inbox, told
         self._pool = ThreadPoolExecutor(2, "evermap-live") if threads else None
         self._jobs: dict[str, Future[None]] = {}
@@ -99,7 +99,7 @@ class Keeper:
             return store.load(head)
 
     def beside(self, name: str, job: Callable[[], None]) -> None:
-        """Do something beside the steps, unless it is still being done."""
+        """Run something beside the steps, unless it still runs."""
         before = self._jobs.get(name)
         if self._pool is None:
             job()

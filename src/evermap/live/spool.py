@@ -71,7 +71,7 @@ class Spool:
         self._number = 0
 
     def settle(self, config: Config) -> None:
-        """Have sessions entered with other settings from here on."""
+        """Keep the settings that sessions are entered with from here on."""
         (self.folder / "config.toml").write_text(to_toml(config), encoding="utf-8")
 
     def write(self, recording: Recording) -> None:

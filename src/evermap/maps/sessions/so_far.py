@@ -20,8 +20,8 @@ from evermap.maps.sessions.session import believed
 from evermap.types import MapChange, Sensor
 
 SETTLED_S = 10.0
-"""What is missed so shortly before or after a sighting is hidden, not gone, and teaches lines of sight: twice as long as
-something stands before a clique. A whole session takes much longer, for it knows what was seen again."""
+"""What is missed so shortly before or after a sighting is hidden, not gone, and teaches lines of sight: twice as long
+as something stands before a clique. A whole session takes much longer, for it knows what was seen again."""
 
 
 def judged_so_far(
