@@ -52,12 +52,12 @@ class Config(Section):
 
     slam: SlamConfig = Field(default_factory=SlamConfig, description="the estimator")
     living: LivingConfig = Field(default_factory=LivingConfig, description="a map that lives on between sessions")
-    live: LiveConfig = Field(default_factory=LiveConfig, description="a session that is fed while the robot drives")
     sensor: SensorConfig = Field(default_factory=SensorConfig, description="corrections of the recording's sensor")
     output: OutputConfig = Field(default_factory=OutputConfig, description="what is written beside the numbers")
     persist: PersistConfig = Field(default_factory=PersistConfig, description="a table of looks")
     track: TrackConfig = Field(default_factory=TrackConfig, description="a table of detections")
     survival: SurvivalConfig = Field(default_factory=SurvivalConfig, description="a table of lifetimes")
+    live: LiveConfig = Field(default_factory=LiveConfig, description="a session that is fed while the robot drives")
 
 
 def load_config(

@@ -1,6 +1,6 @@
 """The engine of a robot that drives: `Engine` takes readings as they come, and tells what the robot may know by then.
 
-In a map the localiser of `run_localization` says where the robot is, in a place that nobody knows the stream of a
+In a map the localiser of `run_localization` says where the robot is, in an unmapped place the stream of a
 session; both frame by frame, as over a recording. What was driven is entered by `run_session`, in a process of its own
 while the robot drives on, and the engine goes on in the map that comes of it.
 """

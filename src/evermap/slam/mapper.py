@@ -1,4 +1,4 @@
-"""A place that nobody knows, mapped while the robot drives: `StreamingSlam`, fed frame by frame.
+"""An unmapped place, mapped while the robot drives: `StreamingSlam`, fed frame by frame.
 
 What it says of a frame is what the stream of the whole recording says of it, but for rounding: landmarks are numbered
 as they come.
