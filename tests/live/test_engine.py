@@ -47,6 +47,8 @@ def test_a_recording_fed_live_gives_the_map_and_the_poses_of_its_replay_bit_by_b
             steps = list(fed(live, recording))
             made = live.save()
         assert made is not None
+        if number:  # mapping uses landmarks that the map lacks, too
+            steps = list(fed(engine(before, recording, mapping=False), recording))
         assert_equal(stored(tmp_path / "live.evermap"), entered(tmp_path / "replay.evermap", recording))
         if number:
             replayed, off = em.run_localization(recording, before, AT_THE_END).online, 1e-12

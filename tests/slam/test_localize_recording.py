@@ -16,9 +16,11 @@ from evermap.io.mrclam import read_mrclam
 from evermap.pipeline import run_slam
 from evermap.sensing.visibility import WORTH_A_LOOK
 from evermap.slam.calibration import CalibrationPrior
+from evermap.slam.known_places import KnownPlaces
+from evermap.slam.localize import FrameSightings, Localizer
 from evermap.slam.localize_recording import localize
 from evermap.slam.noise import START
-from evermap.slam.problem import Noise
+from evermap.slam.problem import Drive, Noise
 from evermap.types import Landmarks, Recording, SlamResult, Trajectory
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -213,3 +215,46 @@ def test_real_robots_among_surveyed_barrels(robot, shared_data):
     assert np.degrees(np.sqrt((wrong[:, 2] ** 2).mean())) < 3.0
     nees = np.einsum("ni,ni->n", wrong, np.linalg.solve(result.online.covariance, wrong[..., None])[..., 0])
     assert 1.0 < nees.mean() < 6.0
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_landmarks_that_the_map_lacks_hold_the_pose_where_they_were_seen_first(seed):
+    """In a map of half a building; in a map of all of it they change nothing."""
+    recording = building(seed, patrol_s=120.0, faults=0.01).sessions[0]
+    assert recording.true_landmarks is not None
+    every = surveyed(recording.true_landmarks)
+    half = some_rows(every, every.position_m[:, 0] < np.median(every.position_m[:, 0]))
+    off, nees = {}, {}
+    for name, landmarks in (("all", every), ("half", half)):
+        for learn in (False, True):
+            run = stepped(recording, landmarks, learn=learn)
+            gap = error(recording, run)
+            off[name, learn] = rmse(gap)
+            nees[name, learn] = np.median(np.einsum("ni,nij,nj->n", gap, np.linalg.inv(run.covariance), gap))
+    assert off["all", True] == off["all", False]
+    assert off["half", True] < 0.5 * off["half", False]
+    assert nees["half", True] < 2.37  # the median of three degrees of freedom
+
+
+def stepped(recording: Recording, landmarks: Landmarks, *, learn: bool) -> Trajectory:
+    """The localiser's poses."""
+    places = KnownPlaces.of(
+        landmarks.landmark_id, landmarks.position_m, landmarks.covariance_m2, np.full(len(landmarks), 0.95)
+    )
+    localizer = Localizer(places, recording.sensor, prior(), noise(recording), learn=learn)
+    odometry, frames, seen = recording.odometry, recording.frames, recording.detections
+    start_s = odometry.stamp_s[0]
+    velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
+    drive = Drive.from_rows(odometry.stamp_s - start_s, velocity)
+    found = []
+    for frame, stamp_s in enumerate(frames.stamp_s):
+        rows = seen.frame == frame
+        reading, unsaid = np.column_stack([seen.range_m, seen.bearing_rad])[rows], np.full((rows.sum(), 2), np.nan)
+        located = localizer.step(stamp_s - start_s, drive, FrameSightings(seen.landmark_id[rows], reading, unsaid))
+        if np.isfinite(located.pose[0]):
+            found.append((stamp_s, located.pose, located.covariance))
+    stamps, pose, covariance = zip(*found, strict=True)
+    run = Trajectory(np.array(stamps), np.array(pose), np.array(covariance), "prior_map")
+    assert recording.truth is not None
+    known = (run.stamp_s >= recording.truth.stamp_s[0]) & (run.stamp_s <= recording.truth.stamp_s[-1])
+    return some_rows(run, known)

@@ -109,6 +109,8 @@ class Engine:
             elif self._mapping and not mapping:
                 self._keeper.end_session()
             self._mapping, self._session_s = mapping, self._inbox.settled_s
+            if isinstance(self._filter, Localizer):
+                self._filter.learn = mapping
 
     @property
     def living(self) -> LivingMap:
@@ -268,7 +270,7 @@ class Engine:
         prior, noise = beliefs(self._sensor, self._config.slam)
         if len(self._living.places):
             places = self._places(self._living, stamp_s)
-            self._filter = Localizer(places, self._sensor, prior, noise)
+            self._filter = Localizer(places, self._sensor, prior, noise, learn=self._mapping)
             self._judge = Judge(self._living, places, self._sensor, self._config)
         else:
             self._filter = Mapper(self._sensor, prior, noise, self._config.slam)
@@ -314,7 +316,7 @@ class Engine:
             if isinstance(before, Localizer):
                 self._filter = before.over(places, self._sensor)
             else:
-                self._filter = Localizer(places, self._sensor, *beliefs(self._sensor, config.slam))
+                self._filter = Localizer(places, self._sensor, *beliefs(self._sensor, config.slam), learn=True)
                 if (here := self._located) is not None and self._last is not None and np.isfinite(here.pose[0]):
                     self._filter.place_at(self._last.stamp_s - self._inbox.first_s, here.pose, here.covariance)
             self._living, self._judge = living, judge

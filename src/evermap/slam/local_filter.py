@@ -185,6 +185,26 @@ class LocalFilter:
         self._enter(row, given, gain, spread)
         self.position[row] = place
 
+    def sight(self, row: int, place: FloatArray, by_pose: FloatArray, spread: FloatArray) -> None:
+        """Put a place where a sighting from the newest pose says, in a map whose places are only considered.
+
+        It is as wrong as the pose is now, and stays there: the pose is held by it, but gets no better than it was.
+
+        Args:
+            row: of all places, behind those of the map.
+            place: (2,) where it is.
+            by_pose: (2, 12) its derivatives by the pose and the calibration states.
+            spread: (2, 2) covariance by the reading's own noise.
+        """
+        self.know_of(row + 1)
+        self._make_room(1)
+        self._enter(row, NO_PLACES, NO_GAIN, spread)
+        own = slice(AT_PLACES + 2 * int(self._slot[row]), AT_PLACES + 2 * int(self._slot[row]) + 2)
+        across = by_pose @ self.covariance[:AT_PLACES]
+        self.covariance[own], self.covariance[:, own] = across, across.T
+        self.covariance[own, own] = across[:, :AT_PLACES] @ by_pose.T + spread
+        self.position[row] = place
+
     def compare(
         self, rows: IntArray, reading: FloatArray, sigma: FloatArray, own: FloatArray = NOWHERE
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -248,9 +268,11 @@ class LocalFilter:
         stays[leaving] = False
         kept = np.flatnonzero(stays)
         position = self.position[self._row[kept]]
-        for slot in leaving.tolist() if not self._considered else ():
+        for slot in leaving.tolist():
             row = int(self._row[slot])
-            near = kept[_nearest(position, self.position[row], NEIGHBOURS)]
+            if self._considered and row < len(self._given_position):
+                continue
+            near = kept[_nearest(position, self.position[row], 0 if self._considered else NEIGHBOURS)]
             at = columns(np.append(slot, near))
             rows = self._row[near]
             self._left[row] = Ties(

@@ -23,6 +23,7 @@ from evermap.slam.known_places import LEAST_BELIEF, KnownPlaces, LocalTrack, Nei
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
 from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive, Noise
+from evermap.slam.streaming import sighted_at
 from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Sensor
 
 MOST_CONSIDERED = 256
@@ -88,6 +89,7 @@ class Localizer:
         prior: of the calibration states.
         noise: standard deviations of detections and odometry; they are not estimated.
         start: (3,) pose and (3, 3) covariance at the first frame, where these are known.
+        learn: hold the pose by landmarks that the map lacks, too, where they were seen first; else they are not used.
     """
 
     def __init__(
@@ -98,6 +100,7 @@ class Localizer:
         noise: Noise,
         *,
         start: tuple[FloatArray, FloatArray] | None = None,
+        learn: bool = False,
     ) -> None:
         self.places = places
         self._field, self._prior, self.noise = NominalField(sensor), prior, noise
@@ -111,6 +114,10 @@ class Localizer:
         self._stamp_s: float | None = None
         self._filter = LocalFilter(self._mount, prior, most=MOST_CONSIDERED, considered=True)
         self._agreed: dict[int, tuple[float, bool]] = {}
+        self.learn = learn
+        """Whether landmarks that the map lacks are used."""
+        self._new: dict[int, int] = {}
+        """Rows of landmarks that the map lacks, behind those of its places."""
         self._track: LocalTrack | None = LocalTrack(self._mount)
         if start is not None:
             self._place_at(Placed(*start, NO_PLACES, np.zeros((3, 0))))
@@ -142,22 +149,23 @@ class Localizer:
             stamp_s: of the frame, on the clock of `drive`, not before the last one.
             drive: odometry since the last frame at least; nothing that is later than the frame by more than the delay
                 is looked at.
-            seen: its detections; those of unknown identity, or of landmarks that the map lacks, are not used.
+            seen: its detections; those of unknown identity are not used.
         """
         states = self._filter.states
         if self._stamp_s is not None:
             self._drive(Motion.over(drive, self._stamp_s, stamp_s, states, self._prior.free, self.noise))
         self._stamp_s = stamp_s
         first, last = self.places.rows_of(seen.landmark_id)
-        usable = (last > first) & np.all(np.isfinite(seen.reading), axis=1) & (seen.landmark_id != UNKNOWN)
-        used = np.flatnonzero(usable)[:MOST_CONSIDERED]
+        named = np.all(np.isfinite(seen.reading), axis=1) & (seen.landmark_id != UNKNOWN)
+        used = np.flatnonzero(named & (last > first))[:MOST_CONSIDERED]
         if self._track is not None:
             self._track.see(stamp_s, seen.landmark_id[used], seen.reading[used], states)
             self._search(stamp_s)
-        place = np.full(len(usable), UNKNOWN, dtype=np.int64)
-        nis, p_inlier = np.full((2, len(usable)), np.nan)
-        if self._is_placed and len(used):
-            place[used], nis[used], p_inlier[used] = self._update(stamp_s, first[used], last[used], seen, used)
+        place = np.full(len(named), UNKNOWN, dtype=np.int64)
+        nis, p_inlier = np.full((2, len(named)), np.nan)
+        new = np.flatnonzero(named & (last == first) & self.learn)[: max(MOST_CONSIDERED - len(used), 0)]
+        if self._is_placed and len(used) + len(new):
+            place[used], nis[used], p_inlier[used] = self._update(stamp_s, first[used], last[used], seen, used, new)
         return Located(
             self._filter.pose.copy(),
             self._filter.covariance[:3, :3].copy(),
@@ -177,7 +185,7 @@ class Localizer:
 
     def over(self, places: KnownPlaces, sensor: Sensor) -> Localizer:
         """Return one that goes on from here in another state of the map."""
-        there = Localizer(places, sensor, self._prior, self.noise)
+        there = Localizer(places, sensor, self._prior, self.noise, learn=self.learn)
         local, before = there._filter, self._filter
         local.states[:] = before.states
         local.covariance[3:, 3:] = before.covariance[3:AT_PLACES, 3:AT_PLACES]
@@ -214,6 +222,8 @@ class Localizer:
     def _place_at(self, placed: Placed) -> None:
         """Begin anew at a pose; what is known of the calibration stays."""
         local, places = self._filter, self.places
+        self._new.clear()
+        self._log_p = self._log_p[: len(places)]
         alone = np.zeros((AT_PLACES, AT_PLACES))
         alone[3:, 3:] = self.states_covariance
         local.hold(placed.pose, self.states, alone, NO_PLACES, places.position_m)
@@ -223,25 +233,47 @@ class Localizer:
         follows = placed.by_places @ covariance[at]
         covariance[:3, AT_PLACES:], covariance[AT_PLACES:, :3] = follows[:, AT_PLACES:], follows[:, AT_PLACES:].T
         covariance[:3, :3] = placed.covariance + follows[:, at] @ placed.by_places.T
-        self._believed[:] = self._log_p
+        self._believed = self._log_p.copy()
         self._track = None
         self._agreed.clear()
 
     def _update(
-        self, stamp_s: float, first: IntArray, last: IntArray, seen: FrameSightings, used: IntArray
+        self, stamp_s: float, first: IntArray, last: IntArray, seen: FrameSightings, used: IntArray, new: IntArray
     ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Place, innovation and weight of the detections `used`."""
-        reading = np.ascontiguousarray(seen.reading[used])
-        sigma = self.noise.of_detections(seen.sigma_given[used])
-        row = self._chosen(first, last, reading, sigma)
+        """Place, innovation and weight of the detections `used`; `new` ones are of landmarks that the map lacks."""
+        met = np.array([m for m in new.tolist() if int(seen.landmark_id[m]) in self._new], dtype=np.int64)
+        rows = np.append(used, met)
+        reading = np.ascontiguousarray(seen.reading[rows])
+        sigma = self.noise.of_detections(seen.sigma_given[rows])
+        count = len(used)
+        row = self._chosen(first, last, reading[:count], sigma[:count])
+        row = np.append(row, np.array([self._new[int(seen.landmark_id[m])] for m in met], dtype=np.int64))
         self._filter.bring(row)
         log_odds = self.noise.outlier_log_odds + self._believed[row]
         nis, weight = self._filter.update(row, reading, sigma, weighing=BY_OTHERS, log_odds=log_odds)
         doubt = self._log_p[row] - self._believed[row]
         agrees = weight * (1.0 + np.exp(doubt)) > 1.0  # would be more likely there than not, if it were not doubted
         self._believed[row] = self._log_p[row] - np.clip(doubt + np.where(agrees, -DOUBT, DOUBT), 0.0, MOST_DOUBT)
-        self._judge(stamp_s, seen.landmark_id[used], agrees)
-        return row, nis, weight
+        self._judge(stamp_s, seen.landmark_id[used], agrees[:count])
+        if self.learn and self._track is None:
+            self._meet(np.setdiff1d(new, met), seen)
+        return row[:count], nis[:count], weight[:count]
+
+    def _meet(self, new: IntArray, seen: FrameSightings) -> None:
+        """Remember where landmarks stand that are seen for the first time, or where it was often doubted."""
+        filter_, known = self._filter, len(self.places)
+        doubted = self._believed[known:] <= self._log_p[known:] - MOST_DOUBT
+        self._new = {name: row for name, row in self._new.items() if not doubted[row - known]}
+        sigma = self.noise.of_detections(seen.sigma_given[new])
+        for m, (range_sigma, bearing_sigma) in zip(new.tolist(), sigma.tolist(), strict=True):
+            name, row = int(seen.landmark_id[m]), len(self._believed)
+            if name in self._new:  # twice in this frame
+                continue
+            place, by_pose, by_reading = _placed_by(filter_.pose, seen.reading[m], filter_.states, self._mount)
+            spread = by_reading @ np.diag([range_sigma**2, bearing_sigma**2]) @ by_reading.T
+            filter_.sight(row, place, by_pose, spread)
+            self._new[name] = row
+            self._log_p, self._believed = np.append(self._log_p, 0.0), np.append(self._believed, 0.0)
 
     def _chosen(self, first: IntArray, last: IntArray, reading: FloatArray, sigma: FloatArray) -> IntArray:
         """(M,) known place at which each landmark was seen: the most probable one (max-mixture, MATH.md section 5)."""
@@ -282,3 +314,24 @@ class Localizer:
         rows, p = rows[p >= HARDLY_EXPECTED], p[p >= HARDLY_EXPECTED]
         well = self._believed_there[rows] & self._field.worth_a_look(p)
         return rows, p, well & ~np.isin(self.places.landmark_id[rows], seen_id)
+
+
+STEP = 1e-6
+"""Of numerical derivatives."""
+
+
+def _placed_by(
+    pose: FloatArray, reading: FloatArray, states: FloatArray, mount: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(2,) where a reading (2,) points to, its derivatives (2, 12) by pose, in its own frame, and states, and (2, 2) by
+    the reading.
+    """
+    place = sighted_at(pose, reading, states, mount)
+    by_pose, by_reading = np.zeros((2, AT_PLACES)), np.zeros((2, 2))
+    for k, step in enumerate(STEP * np.eye(3)):
+        by_pose[:, k] = (sighted_at(se2.retract(pose, step), reading, states, mount) - place) / STEP
+    for k, step in enumerate(STEP * np.eye(len(states))[:5]):
+        by_pose[:, 3 + k] = (sighted_at(pose, reading, states + step, mount) - place) / STEP
+    for k, step in enumerate(STEP * np.eye(2)):
+        by_reading[:, k] = (sighted_at(pose, reading + step, states, mount) - place) / STEP
+    return place, by_pose, by_reading
