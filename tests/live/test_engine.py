@@ -320,6 +320,14 @@ def test_mistakes_of_the_beginning_are_one_line(tmp_path: Path) -> None:
         em.Engine(LivingMap(), Sensor(5.0, 1.0), mapping=False)
     with pytest.raises(ConfigError, match="unknown_ids"):
         em.Engine(tmp_path / "m.evermap", Sensor(range_max_m=8.0), Config(slam={"unknown_ids": True}))
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"cannot be written: .*\(try: mapping=False\)"):
+        em.Engine(tmp_path / "file" / "m.evermap", Sensor(range_max_m=8.0))
+    with pytest.raises(InputError, match="a map in space"):
+        em.Engine(LivingMap.in_space(), Sensor(range_max_m=8.0), mapping=False)
+    there = LivingMap.begun(Landmarks.at([0], [[1.0, 0.0]], sigma_m=0.1))
+    with pytest.raises(InputError, match=r"stamps count 'unix', the map's 'recording' \(try: .*clock='recording'"):
+        em.Engine(there, Sensor(range_max_m=8.0), mapping=False)
     with pytest.raises(InputError):
         em.Engine(tmp_path / "none.evermap", Sensor(range_max_m=8.0), mapping=False)
 

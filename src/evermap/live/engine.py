@@ -41,8 +41,7 @@ IDLE_S = 60.0
 class Engine:
     """Feed readings with `odometry` and `detections`, from any thread, and ask with `step`.
 
-    As a context manager it enters what was driven when the block ends; where that ends by an error, and after a crash,
-    what was driven is entered by the next engine of the map.
+    As a context manager it enters what was driven when the block ends; after an error or a crash the next engine does.
 
     Args:
         map: file of a living map, made where there is none; or a map in memory, which stays as it is.
@@ -91,9 +90,7 @@ class Engine:
         self._session_s = self._judged_s = -math.inf
         self._met: set[int] = set()
         self._mapping = mapping
-        if mapping:
-            self._keeper.feed()
-        self._living = map if isinstance(map, LivingMap) else self._keeper.load(create=mapping, tell=False)
+        self._living = self._keeper.begin(map if isinstance(map, LivingMap) else None, recording.clock, mapping=mapping)
 
     @property
     def mapping(self) -> bool:
@@ -203,8 +200,7 @@ class Engine:
         """Enter what was driven as a revision, and go on in the map that comes of it.
 
         Returns:
-            What it made of the map; None where there was nothing to enter, or it could not be localised in the map:
-            that is a warning of the next step.
+            What it made of the map; None where nothing was entered, which is a warning of the next step.
 
         Raises:
             InputError: the map is in memory.

@@ -15,11 +15,12 @@ from typing import Any
 from evermap.config import Config
 from evermap.errors import EvermapError, InputError
 from evermap.live.inbox import Inbox
+from evermap.live.now import check_fits
 from evermap.live.spool import Brought, Spool, enter_waiting
 from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap.runs.sessions import Entered
-from evermap.types import MapChange
+from evermap.types import Clock, MapChange
 
 
 @dataclass
@@ -78,6 +79,23 @@ class Keeper:
             raise InputError("a map in memory stays as it is", field="map", hint="a file, or mapping=False")
         return self._path
 
+    def begin(self, living: LivingMap | None, clock: Clock, *, mapping: bool) -> LivingMap:
+        """Return the map, of the file where it is not in memory, and feed it where that is wanted.
+
+        Raises:
+            InputError: no map, or one that cannot be driven in.
+            ConfigError: another process feeds it.
+        """
+        if mapping:
+            self.feed()
+        try:
+            living = self.load(create=mapping, tell=False) if living is None else living
+            check_fits(living, clock)
+        except EvermapError:
+            self.close()
+            raise
+        return living
+
     def feed(self) -> None:
         """Feed the map from here on; what a process that was killed has left is entered first."""
         if self._spool is not None:
@@ -113,9 +131,12 @@ class Keeper:
                 continue
             del self._jobs[name]
             if (error := job.exception()) is not None:
-                if not isinstance(error, EvermapError | OSError):
-                    raise error
-                self._told.warnings.append(f"{name}: {error}")
+                defect = (
+                    ""
+                    if isinstance(error, EvermapError | OSError)
+                    else f"a defect of evermap: {type(error).__name__}: "
+                )
+                self._told.warnings.append(f"{name}: {defect}{error}")
         if self._child is None or self._child.poll() is None:
             return False
         child, self._child = self._child, None

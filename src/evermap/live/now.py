@@ -10,6 +10,7 @@ import numpy as np
 
 from evermap.errors import InputError
 from evermap.live.inbox import about
+from evermap.maps.living import LivingMap
 from evermap.types import Clock, FloatArray, Landmarks, MapChange, Recording, Sensor, Trajectory
 
 
@@ -69,3 +70,12 @@ def recording_of(sensor: object, name: str, clock: Clock, class_names: tuple[str
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", path=path, hint="a sensor.toml") from None
     return about(said.name or name, said.sensor, said.clock, said.class_names or class_names)
+
+
+def check_fits(living: LivingMap, clock: Clock) -> None:
+    """Raise `InputError` for a map in space, or of another clock."""
+    if living.dim != 2:
+        raise InputError("a map in space", field="map", hint="a session in space is solved when it ends: enter_session")
+    if len(living.places) and living.clock != clock:
+        problem = f"stamps count '{clock}', the map's '{living.clock}'"
+        raise InputError(problem, field="clock", hint=f"evermap.Engine(..., clock='{living.clock}')")

@@ -55,12 +55,16 @@ class Spool:
 
     Raises:
         ConfigError: another process feeds the map.
+        InputError: nothing can be written beside it.
     """
 
     def __init__(self, map_file: Path) -> None:
         self.map_file, self.folder = map_file, map_file.with_name(f"{map_file.name}.live")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = (self.folder / "lock").open("a")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.folder / "lock").open("a")
+        except OSError as error:
+            raise InputError(f"cannot be written: {error.strerror}", path=self.folder, hint="mapping=False") from None
         if not _locked(self._lock):
             self._lock.close()
             hint = "one engine feeds a map; others localise in it: mapping=False"
