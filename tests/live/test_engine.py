@@ -342,6 +342,74 @@ def test_a_stamp_that_runs_backwards_beyond_the_window_is_refused_and_counted() 
     assert not live.step().lost
 
 
+def test_a_clock_that_hiccups_is_not_followed_and_one_that_is_set_is() -> None:
+    live, _ = standing(30.0, lambda _: [0, 1, 2])
+    live.odometry(86_400.0, 0.0)
+    assert live.step().stamp_s == pytest.approx(29.9)
+    for k in range(20):
+        live.odometry(30.0 + 0.1 * k, 0.0)
+        live.detections(30.0 + 0.1 * k, [0, 1], np.hypot(*MARKS[:2].T), np.arctan2(MARKS[:2, 1], MARKS[:2, 0]))
+        now = live.step()
+    assert now.stamp_s == pytest.approx(31.9)
+    assert not now.lost
+    for k in range(20):  # both streams: the robot slept
+        live.odometry(5000.0 + 0.1 * k, 0.0)
+        live.detections(5000.0 + 0.1 * k, [0, 1, 2], np.hypot(*MARKS[:3].T), np.arctan2(MARKS[:3, 1], MARKS[:3, 0]))
+        now = live.step()
+    assert now.stamp_s == pytest.approx(5001.9)
+    assert not now.lost
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_in_is_taken_or_refused_in_one_line(tmp_path: Path, two_sessions: Path, seed: int) -> None:
+    """Late, twice, never, of no time, no numbers: the drive goes on, and enters the map."""
+    rng, recording, path = np.random.default_rng(seed), SESSIONS[2], copied(two_sessions, tmp_path)
+    order = sorted(messages(recording), key=lambda one: one[0] + rng.choice([0.0, 0.05, 0.5], p=[0.9, 0.08, 0.02]))
+    lines = []
+    with engine(path, recording) as live:
+        for message in order:
+            wrong = rng.random()
+            if wrong < 0.02:
+                continue
+            try:
+                if wrong < 0.04:
+                    live.odometry(message[0], rng.choice([np.nan, np.inf, 1e9]))
+                elif wrong < 0.05:
+                    live.odometry(message[0] + rng.choice([-1e4, 1e5]), 0.1)
+                elif wrong < 0.06:
+                    live.detections(message[0] + rng.choice([-1e4, 1e5, np.nan]), [3], [1.0], [0.0])
+                elif wrong < 0.07:
+                    live.detections(message[0], [-5, 1], [1.0, 2.0], [0.0, 9.0])
+                send(live, recording, message)
+                if wrong > 0.97:
+                    send(live, recording, message)
+            except InputError as error:
+                lines.append(error.one_line())
+            now = live.step()
+        made = live.save()
+    assert len(lines) > 10
+    assert not any("\n" in line for line in lines)
+    assert not now.lost
+    assert made is not None
+    assert len(made.session.recording.frames) > 0.8 * len(recording.frames)
+
+
+def test_what_was_driven_before_an_error_in_the_block_is_entered_by_the_next(
+    tmp_path: Path, two_sessions: Path
+) -> None:
+    path, recording = copied(two_sessions, tmp_path), SESSIONS[2]
+
+    def drive() -> None:
+        with engine(path, recording) as live:
+            raise ZeroDivisionError(len(list(fed(live, recording))))
+
+    with pytest.raises(ZeroDivisionError):
+        drive()
+    with open_store(path) as store:
+        assert store.head() == 2
+    assert [brought.revision for brought in em.recover(path)] == [3]
+
+
 @pytest.mark.slow
 def test_a_recording_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:
     """MRCLAM 6, robot 3, a map that nobody knew: three revisions while it drives, and the robot stays localised."""

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -42,6 +43,8 @@ SILENT_S = 1.0
 """A frame does not wait longer for odometry."""
 BEFORE_S = 5.0
 """Odometry before a frame that is given out with it: more than clocks of one robot are apart."""
+STRAY_S = 10.0
+"""A stamp that is so much later than all others is believed when the next one says the same: a clock may hiccup."""
 BURST_S = 10.0
 """Time over which readings are counted where there are too many."""
 
@@ -83,8 +86,10 @@ class Inbox:
         """Newest stamp of all, of the odometry, and of the frames that were given out."""
         self.first_s = np.inf
         """First stamp of the odometry."""
-        self.n_late = self.n_repeated = self.n_thinned = 0
-        """Readings that came too late, odometry of a stamp that was there, and frames that are not kept for the map."""
+        self._stray: tuple[float, Callable[[], None]] | None = None
+        self.n_late = self.n_repeated = self.n_thinned = self.n_stray = 0
+        """Readings that came too late, odometry of a stamp that was there, frames that are not kept for the map, and
+        readings whose stamps were of no time."""
         self._classes: list[str] = list(about.class_names)
         self._texts: dict[int, str] = dict(about.landmark_names)
         self._written = 0, 0
@@ -99,16 +104,11 @@ class Inbox:
             (STAMP_S, FORWARD_MPS, LATERAL_MPS, ANGULAR_RADPS), (stamp_s, *velocity), strict=True
         ):
             _check(quantity, value)
-        row = float(stamp_s), *(float(part) for part in velocity)
+        forward_mps, lateral_mps, angular_radps = (float(part) for part in velocity)
+        row = float(stamp_s), forward_mps, lateral_mps, angular_radps
         with self._lock:
             self._refuse_late(row[0], "odometry")
-            at = bisect_left(self._odometry, row[:1])
-            if at < len(self._odometry) and self._odometry[at][0] == row[0]:
-                self.n_repeated += 1
-                return
-            self._odometry.insert(at, row)  # type: ignore[arg-type]
-            self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0])
-            self.newest_s = max(self.newest_s, row[0])
+            self._in_time(row[0], partial(self._put_odometry, row))
 
     def detections(self, stamp_s: float, columns: Sequence[Any]) -> None:
         """Add a look: ids (or texts), ranges, bearings, classes by name, and both sigmas; None where not given.
@@ -120,11 +120,7 @@ class Inbox:
         frame = LiveFrame(float(stamp_s), self._rows(*columns))
         with self._lock:
             self._refuse_late(frame.stamp_s, "detections")
-            at = bisect_left(self._pending, frame.stamp_s, key=lambda one: one.stamp_s)
-            if at < len(self._pending) and self._pending[at].stamp_s == frame.stamp_s:  # two messages of one look
-                frame = LiveFrame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
-            insort(self._pending, frame, key=lambda one: one.stamp_s)
-            self.newest_s = max(self.newest_s, frame.stamp_s)
+            self._in_time(frame.stamp_s, partial(self._put_frame, frame))
 
     def ready(self, delay_s: float, *, everything: bool = False) -> list[tuple[LiveFrame, FloatArray, bool]]:
         """Take out the frames before which nothing can come any more.
@@ -190,6 +186,34 @@ class Inbox:
         with self._lock:
             frames = sum(one.rows.nbytes + 200 for one in (*self._kept, *self._pending))
             return frames + 190 * len(self._odometry)
+
+    def _in_time(self, stamp_s: float, put: Callable[[], None]) -> None:
+        """Put a reading in; one whose stamp is far later than all others when the next one says the same."""
+        before, self._stray = self._stray, None
+        if stamp_s > self.newest_s + STRAY_S:  # the first one, too
+            if before is None or abs(before[0] - stamp_s) > STRAY_S:
+                self._stray = stamp_s, put
+                self.n_stray += before is not None
+                return
+            before[1]()
+        else:
+            self.n_stray += before is not None
+        put()
+        self.newest_s = max(self.newest_s, stamp_s)
+
+    def _put_odometry(self, row: tuple[float, float, float, float]) -> None:
+        at = bisect_left(self._odometry, row[:1])
+        if at < len(self._odometry) and self._odometry[at][0] == row[0]:
+            self.n_repeated += 1
+            return
+        self._odometry.insert(at, row)
+        self.first_s, self.odometry_s = min(self.first_s, row[0]), max(self.odometry_s, row[0])
+
+    def _put_frame(self, frame: LiveFrame) -> None:
+        at = bisect_left(self._pending, frame.stamp_s, key=lambda one: one.stamp_s)
+        if at < len(self._pending) and self._pending[at].stamp_s == frame.stamp_s:  # two messages of one look
+            frame = LiveFrame(frame.stamp_s, np.vstack([self._pending.pop(at).rows, frame.rows]))
+        insort(self._pending, frame, key=lambda one: one.stamp_s)
 
     def _window(self, stamp_s: float) -> FloatArray:
         first = max(bisect_left(self._odometry, (stamp_s - BEFORE_S,)) - 1, 0)
