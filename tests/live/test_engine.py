@@ -140,6 +140,26 @@ def test_revisions_within_a_session_are_the_sessions_of_its_parts(tmp_path: Path
     assert np.median(np.hypot(*(pose.pose_world_robot[:, :2] - true).T)) < 0.5
 
 
+def test_a_revision_is_entered_by_a_process_beside_the_steps(tmp_path: Path) -> None:
+    recording, path = SESSIONS[0], tmp_path / "site.evermap"
+    with engine(path, recording, Config(live={"revision_s": 20.0}), beside=True) as live:
+        order = messages(recording)
+        at = next(k for k, one in enumerate(order) if one[0] > recording.frames.stamp_s[0] + 25.0)
+        steps = list(fed(live, recording, order[:at]))
+        assert steps[-1].frame == "first_pose"
+        until_s = time.monotonic() + 120.0
+        while (now := live.step()).frame == "first_pose":
+            assert time.monotonic() < until_s
+            time.sleep(0.05)
+        assert now.revision == 1
+        assert np.hypot(*(now.pose_world_robot - steps[-1].pose_world_robot)[:2]) < 0.5
+        steps += list(fed(live, recording, order[at:]))
+    assert np.mean([one.lost for one in steps[-50:]]) < 0.2
+    with open_store(path) as store:
+        assert store.head() >= 1
+    assert not list(path.with_name("site.evermap.live").glob("*.readings"))
+
+
 def test_mapping_and_localising_are_switched_without_a_restart(tmp_path: Path, two_sessions: Path) -> None:
     recording, path = SESSIONS[2], copied(two_sessions, tmp_path)
     half = len(messages(recording)) // 2

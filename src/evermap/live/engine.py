@@ -77,8 +77,7 @@ class Engine:
         recording = recording_of(sensor, name, clock, tuple(class_names))
         self._sensor = self._config.sensor.applied_to(recording.sensor)
         check_sensor(self._sensor)
-        live = self._config.live
-        self._inbox = Inbox(recording, live.reorder_s, live.readings_hz)
+        self._inbox = Inbox(recording, self._config.live.reorder_s, self._config.live.readings_hz)
         self._lock, self._told = threading.RLock(), News()
         path = None if isinstance(map, LivingMap) else Path(map)
         self._keeper = Keeper(path, self._config, self._inbox, self._told, threads=beside)
@@ -89,6 +88,7 @@ class Engine:
         self._online: list[tuple[float, FloatArray, FloatArray]] = []
         self._session_s = self._judged_s = -math.inf
         self._met: set[int] = set()
+        self._in_view = Landmarks.at([], np.zeros((0, 2)), frame="first_pose")
         self._mapping = mapping
         self._living = self._keeper.begin(map if isinstance(map, LivingMap) else None, recording.clock, mapping=mapping)
 
@@ -121,7 +121,7 @@ class Engine:
 
     @property
     def n_bytes(self) -> int:
-        """Memory of the readings that wait to enter the map, about."""
+        """Memory of the readings that are kept, about."""
         return self._inbox.n_bytes
 
     def odometry(
@@ -255,10 +255,13 @@ class Engine:
                 return
             located = self._filter.step(frame.stamp_s - start_s, driven, seen)
         self._located, self._last = located, frame
+        if isinstance(self._filter, Mapper):
+            self._in_view = self._filter.landmarks(frame.landmark_id, self._config.living.decisions.new_clique_p)
         self._online.append((frame.stamp_s, located.pose, located.covariance))
         if self._judge is not None:
             self._judge.look(frame, located, self._filter.states)
             self._met.update(frame.landmark_id[located.p_inlier > 0.5].tolist())
+            self._in_view = self._judge.in_view(located)
 
     def _begin(self, stamp_s: float) -> None:
         """Choose the filter: in a map the robot is localised, a place without one is mapped."""
@@ -302,13 +305,15 @@ class Engine:
     def _go_on(self) -> None:
         """Go on in the newest map, from where the robot is."""
         before, config = self._filter, self._config
-        living = self._keeper.load(create=True, tell=before is not None)
+        living, changes = self._keeper.load(create=True)
         if before is None or not len(living.places):
             self._living = living
             return
         places = self._places(living, self._inbox.settled_s)
         judge = Judge(living, places, self._sensor, config, self._judge)
         with self._lock:
+            self._told.add([*(self._judge.told() if self._judge is not None else ()), *changes])
+            self._told.known.clear()
             if isinstance(before, Localizer):
                 self._filter = before.over(places, self._sensor)
             else:
@@ -322,7 +327,6 @@ class Engine:
         in_map = not isinstance(filter_, Mapper)
         frame = "prior_map" if in_map else "first_pose"
         pose, covariance = np.full(3, math.nan), np.full((3, 3), math.nan)
-        in_view = Landmarks.at([], np.zeros((0, 2)), frame=frame)
         if located is not None and filter_ is not None and self._last is not None:
             pose, covariance = located.pose, located.covariance
             if stamp_s > self._last.stamp_s:
@@ -330,10 +334,6 @@ class Engine:
                 pose, covariance = filter_.ahead(
                     stamp_s - self._inbox.first_s, Drive.from_rows(driven[:, 0], driven[:, 1:])
                 )
-            if isinstance(filter_, Mapper):
-                in_view = filter_.landmarks(self._last.landmark_id, self._config.living.decisions.new_clique_p)
-            elif self._judge is not None:
-                in_view = self._judge.in_view(located)
         online, self._online = self._online, []
         changes, warnings = self._told.taken()
         return Now(
@@ -343,7 +343,7 @@ class Engine:
             frame=frame,
             lost=located is None or located.lost or bool(np.isnan(pose[0])),
             online=trajectory_of(online, frame, self._living.clock),
-            in_view=in_view,
+            in_view=self._in_view,
             changes=changes,
             revision=self._keeper.revision,
             warnings=warnings,

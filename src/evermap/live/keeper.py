@@ -89,7 +89,7 @@ class Keeper:
         if mapping:
             self.feed()
         try:
-            living = self.load(create=mapping, tell=False) if living is None else living
+            living = self.load(create=mapping)[0] if living is None else living
             check_fits(living, clock)
         except EvermapError:
             self.close()
@@ -106,15 +106,13 @@ class Keeper:
             self._take(brought)
         self._spool.settle(self._config)
 
-    def load(self, *, create: bool, tell: bool) -> LivingMap:
-        """Read the newest map; with `tell`, what has changed since the one before is told."""
+    def load(self, *, create: bool) -> tuple[LivingMap, list[MapChange]]:
+        """Read the newest map, and what has changed since the revision that was read before."""
         with open_store(self.file, create=create) as store:
             head, before = store.head(), self.revision
-            if tell:
-                self._told.add([change for number in range(before + 1, head + 1) for change in store.changes(number)])
-                self._told.known.clear()
+            changes = [change for number in range(before + 1, head + 1) for change in store.changes(number)]
             self.revision = head
-            return store.load(head)
+            return store.load(head), changes
 
     def beside(self, name: str, job: Callable[[], None]) -> None:
         """Run something beside the steps, unless it still runs."""
@@ -140,7 +138,7 @@ class Keeper:
         if self._child is None or self._child.poll() is None:
             return False
         child, self._child = self._child, None
-        for line in [] if child.stdout is None else child.stdout.read().splitlines():
+        for line in child.communicate()[0].splitlines():
             self._take(Brought(**json.loads(line)))
         if child.returncode:
             self._told.warnings.append(f"entering a session ended with code {child.returncode}; its readings wait")
