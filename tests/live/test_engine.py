@@ -430,6 +430,31 @@ def test_what_was_driven_before_an_error_in_the_block_is_entered_by_the_next(
     assert [brought.revision for brought in em.recover(path)] == [3]
 
 
+WARM = """
+import gc, sys
+sys.path[:0] = [{here!r}]
+from feeding import SESSIONS, engine, fed
+from numba.core.dispatcher import Dispatcher
+def compiled():
+    kernels = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
+    return {{(one.py_func.__module__, one.py_func.__qualname__, str(kind)) for one in kernels for kind in one.signatures}}
+live = engine({path!r}, SESSIONS[{number}])
+live.warm_up()
+before = compiled()
+assert len(list(fed(live, SESSIONS[{number}]))) > 100
+live.close()
+print(sorted(compiled() - before))
+"""
+
+
+@pytest.mark.parametrize("number", [0, 2])
+def test_after_warm_up_no_step_waits_for_a_kernel(tmp_path: Path, two_sessions: Path, number: int) -> None:
+    path = copied(two_sessions, tmp_path) if number else tmp_path / "new.evermap"
+    code = WARM.format(here=str(Path(__file__).parent), path=str(path), number=number)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 @pytest.mark.slow
 def test_a_recording_of_a_real_robot(tmp_path: Path, shared_data: Path) -> None:
     """MRCLAM 6, robot 3, a map that nobody knew: three revisions while it drives, and the robot stays localised."""
