@@ -437,7 +437,7 @@ from feeding import SESSIONS, engine, fed
 from numba.core.dispatcher import Dispatcher
 def compiled():
     kernels = [one for one in gc.get_objects() if isinstance(one, Dispatcher)]
-    return {{(one.py_func.__module__, one.py_func.__qualname__, str(kind)) for one in kernels for kind in one.signatures}}
+    return {{(str(one.py_func), str(kind)) for one in kernels for kind in one.signatures}}
 live = engine({path!r}, SESSIONS[{number}])
 live.warm_up()
 before = compiled()
