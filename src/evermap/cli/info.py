@@ -289,7 +289,7 @@ def _yaml(path: Path) -> Described:
     try:
         kind, shape, *_ = image.read_bytes()[:64].split(b"\n")
         width, height = map(int, shape.split()) if kind == b"P5" else (0, 0)
-        extent = f"{width * float(cell_m):.1f} x {height * float(cell_m):.1f} m"
+        extent = f"{width * float(str(cell_m)):.1f} x {height * float(str(cell_m)):.1f} m"
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             "is a grid whose image cannot be read", path=image, hint="a PGM as evermap writes it"
