@@ -12,7 +12,7 @@ import evermap
 from evermap.cli.main import app
 from evermap.errors import InputError
 
-VERBS = ["demo", "simulate", "check", "slam", "persist", "track", "convert", "bench"]
+VERBS = ["demo", "simulate", "check", "info", "slam", "live", "persist", "track", "view", "convert", "bench"]
 GROUPS = {
     "map": ["log", "show", "diff", "export", "why", "verify", "gc", "revert", "pin", "unpin", "delete", "undelete"],
     "survival": ["plot", "fit", "learn"],

@@ -31,8 +31,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def save(what: Path, out: Path) -> str:
-    done = run("view", what, "--save", out)
+    done = run("view", what, "--save", out, "--json")
     assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["out"] == str(out)
     return str(done.stderr)
 
 

@@ -35,7 +35,9 @@ def live(
         bool, typer.Option("--json", help="Print poses and changes as they come, one JSON object a line.")
     ] = False,
 ) -> None:
-    """Localise and map while the robot drives, and tell what has changed as it becomes certain.
+    """Localise and map while the robot drives.
+
+    What has changed is told as it becomes certain.
 
     What was driven enters the map every few minutes (live.revision_s) and at the end; after a crash, when the map is
     fed again.

@@ -11,7 +11,8 @@ from typing import Annotated
 
 import typer
 
-from evermap.cli.terminal import say, warn
+from evermap.cli.options import AsJson
+from evermap.cli.terminal import print_json, say, warn
 from evermap.errors import ConfigError, InputError
 
 
@@ -25,8 +26,11 @@ def view(
             show_default=False,
         ),
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
-    """Open a map or a run in the rerun viewer: landmarks with their beliefs, path, changes, on a timeline.
+    """Look at a map or a run in the rerun viewer.
+
+    Landmarks with their beliefs, the path and what changed, on a timeline.
 
     \b
     Examples:
@@ -42,8 +46,12 @@ def view(
         raise InputError("no such map or run", path=path, hint="check the path")
     if save is not None:
         check_output_file(save, inputs=[path], ending=save.suffix)
-        for remark in write_view(path, save):
+        remarks = write_view(path, save)
+        for remark in remarks:
             warn(remark)
+        if as_json:
+            print_json({"view": str(path), "out": str(save), "warnings": list(remarks)})
+            return
         say(f"wrote {save}; open it with: {'rerun' if save.suffix == '.rrd' else 'Foxglove'}")
         return
     from evermap.viz.rerun_scene import require_rerun
