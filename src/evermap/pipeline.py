@@ -75,16 +75,18 @@ def _run_in_space(
 
     from evermap.maps.sessions.session import existing
     from evermap.maps.sessions.spatial import SpatialVisit
+    from evermap.slam.association.in_space import identified_in_space
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.result import concluded_in_space
     from evermap.slam.space.solve import solve_space
 
-    if has_traffic(recording):
-        with threadpool_limits(limits=1, user_api="blas"):
-            return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
-    intake = prepare_space(recording, config.slam.space)
     with threadpool_limits(limits=1, user_api="blas"):
+        if config.slam.unknown_ids:
+            recording = identified_in_space(recording, config.slam.space, prior_map)
+        if has_traffic(recording):
+            return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
+        intake = prepare_space(recording, config.slam.space)
         visit = SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
         return existing(visit, concluded_in_space(recording, intake, visit.solved), config.living)
 

@@ -278,7 +278,7 @@ def run_and_write(
 
     if isinstance(recording, SpatialRecording):
         traffic = has_traffic(recording)
-        warm_up(lambda: compile_kernels(in_space=True, traffic=traffic))
+        warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=config.slam.unknown_ids))
     else:
         search = may_search(len(recording.frames.stamp_s), in_map=prior is not None)
         warm_up(lambda: compile_kernels(search=search, unknown_ids=config.slam.unknown_ids))
@@ -434,7 +434,9 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
     if realtime and (in_space or not localize):
         raise ConfigError("a session is solved when it ends", field="realtime", hint="--localize")
     if config.slam.unknown_ids and in_space:
-        raise ConfigError("is for the plane", field="slam.unknown_ids", hint="leave out --unknown-ids")
+        raise ConfigError(
+            "in a map is for the plane", field="slam.unknown_ids", hint="leave out --unknown-ids, or --map"
+        )
     said = priors_of(*priors_by_class(priors))
     unknown = config.slam.unknown_ids
     warm_up(lambda: compile_kernels(unknown_ids=unknown, sessions=not localize, localize=localize, in_space=in_space))

@@ -58,7 +58,7 @@ def warm_up(
     if in_space:
         if traffic:
             of_the_tracker()
-        run_slam(_flight(0.0))
+        run_slam(_flight(0.0), Config(slam={"unknown_ids": unknown_ids}))
         return
     if localize:
         of_the_localizer()

@@ -28,6 +28,36 @@ ABOUT = 3
 """Frames before and after one in which a landmark was seen, in which it should have been seen, too."""
 
 
+def seen_together(
+    frame: IntArray, landmark_row: IntArray, n_frames: int, n_landmarks: int
+) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Return (L, L) frames in which two landmarks were both seen, and those in which one of them was, and the other one
+    some frames before or after.
+
+    Args:
+        frame: (M,) of detections, in the order of time.
+        landmark_row: (M,) their landmarks, `NOBODY` for none.
+        n_frames: how many there are.
+        n_landmarks: how many there are.
+    """
+
+    def seen(before: int) -> sparse.csr_array:
+        """(N, L) which landmarks were seen so many frames before each."""
+        at, inside = frame + before, landmark_row >= 0
+        inside &= (at >= 0) & (at < n_frames)
+        ones = np.ones(int(inside.sum()))
+        found = sparse.csr_array((ones, (at[inside], landmark_row[inside])), shape=(n_frames, n_landmarks))
+        found.data[:] = 1.0
+        return found
+
+    each, about = seen(0), seen(-ABOUT)
+    for before in range(1 - ABOUT, ABOUT + 1):
+        about = about + seen(before)
+    about.data[:] = 1.0
+    together, once = sparse.csr_array(each.T @ each), sparse.csr_array(each.T @ about)
+    return together, sparse.csr_array(once + once.T - 2.0 * together)
+
+
 @dataclass(frozen=True, slots=True)
 class Assignment:
     """Detections, each of one landmark or of nobody, and an estimate of poses, landmarks and states.
@@ -73,29 +103,11 @@ class Assignment:
     @property
     def together(self) -> sparse.csr_array:
         """(L, L) frames in which two landmarks were both seen."""
-        each = self._seen_in(0)
-        return sparse.csr_array(each.T @ each)
+        return self.seen_together()[0]
 
-    @property
-    def in_turn(self) -> sparse.csr_array:
-        """(L, L) frames in which one of two landmarks was seen, and the other one some frames before or after."""
-        each = self._seen_in(0)
-        about = self._seen_in(-ABOUT)
-        for by in range(1 - ABOUT, ABOUT + 1):
-            about = about + self._seen_in(by)
-        about.data[:] = 1.0
-        once = sparse.csr_array(each.T @ about)
-        return sparse.csr_array(once + once.T - 2.0 * self.together)
-
-    def _seen_in(self, frames: int) -> sparse.csr_array:
-        """(N, L) which landmarks were seen so many frames before each."""
-        seen = self.landmark_row >= 0
-        at, row = self.measured.pose_row[seen] + frames, self.landmark_row[seen]
-        inside = (at >= 0) & (at < len(self.measured.stamp_s))
-        shape = (len(self.measured.stamp_s), self.n_landmarks)
-        found = sparse.csr_array((np.ones(int(inside.sum())), (at[inside], row[inside])), shape=shape)
-        found.data[:] = 1.0
-        return found
+    def seen_together(self) -> tuple[sparse.csr_array, sparse.csr_array]:
+        """Return `seen_together` of these."""
+        return seen_together(self.measured.pose_row, self.landmark_row, len(self.measured.stamp_s), self.n_landmarks)
 
     @property
     def shared_variance(self) -> FloatArray:

@@ -16,7 +16,7 @@ from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import propose_merges
+from evermap.slam.association.merging import Differences, Solution, propose_merges
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
 from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
@@ -285,7 +285,7 @@ class Associator:
             now = solved.assignment
             self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings)
             pairs = propose_merges(
-                now, solved.marginals, density=density, probability=P_MERGE, among=_latest(now, recent),
+                compared(now, solved.marginals, density), probability=P_MERGE, among=_latest(now, recent),
                 last=recent is None, refused=refused,
             )  # fmt: skip
             if not pairs and now.n_landmarks <= MOST_LAID:
@@ -325,6 +325,32 @@ class Associator:
         self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
         cost = smoother.under(self.noise, heavy=False).cost(estimate)
         return _Solved(replace(assignment, estimate=estimate), marginals, cost)
+
+
+def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
+    """Return the landmarks of an assignment at its optimum, as `propose_merges` wants them."""
+    place, kind = assignment.estimate.landmark, assignment.of_class
+
+    def differences(younger: IntArray, older: IntArray) -> Differences:
+        rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
+        u, o = both[: len(younger)], both[len(younger) :]
+        joint = marginals.joint(rows)
+        at = np.arange(len(joint))
+        joint[at, at] += np.repeat(assignment.shared_variance[rows], 2)
+        blocks = joint.reshape(len(rows), 2, len(rows), 2)
+        cross = blocks[u, :, o, :]
+        own = blocks[u, :, u, :] + blocks[o, :, o, :] - cross - cross.transpose(0, 2, 1)
+
+        def together(some: IntArray) -> FloatArray:
+            difference = joint[:, se2.xy_rows(u[some])] - joint[:, se2.xy_rows(o[some])]
+            return difference[se2.xy_rows(u[some])] - difference[se2.xy_rows(o[some])]
+
+        return Differences(place[younger] - place[older], own, np.full(len(u), math.log(density)), together)
+
+    return Solution(
+        place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
+        *assignment.seen_together(), lambda one, other: alike(kind[one], kind[other]),
+    )  # fmt: skip
 
 
 def _latest(assignment: Assignment, count: int | None) -> BoolArray:
@@ -399,8 +425,13 @@ def landmark_density(place: FloatArray, sightings: IntArray) -> float:
     Those that are seen twice under two numbers are not counted twice: the number is `(sum s)^2 / sum s^2` of the
     `sightings` (L,), where all are seen alike that of the landmarks.
     """
+    return effective_number(sightings) / _area_m2(place)
+
+
+def effective_number(sightings: IntArray) -> float:
+    """Return how many landmarks there are, by their sightings (L,): `(sum s)^2 / sum s^2`, at least `FEWEST`."""
     squares = float((sightings.astype(float) ** 2).sum())
-    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), FEWEST) / _area_m2(place)
+    return max(float(sightings.sum()) ** 2 / max(squares, 1.0), FEWEST)
 
 
 PSEUDO_SIGHTINGS = 100.0

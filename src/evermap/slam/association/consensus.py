@@ -23,6 +23,8 @@ MOST_SEEDS = 80
 LARGEST_SET = 32
 IMPLIED_M2 = 1e-7
 """Variance of a difference that a set of pairs fixes."""
+LEAST_M2 = 1e-12
+"""No variance is less, by rounding."""
 FREE = 2
 """Pairs that fix how one map lies over another."""
 
@@ -32,16 +34,19 @@ class Candidates:
     """P pairs that may be one.
 
     Attributes:
-        difference: (P, 2) of the two places.
-        covariance: (2 P, 2 P) of all differences together.
+        difference: (P, D) of the two places, in the plane or in space.
+        covariance: (D P, D P) of all differences together.
         log_density: (P,) of the difference and all else that speaks against it, were they two.
         conflict: (P, P) pairs that cannot both be one.
+        ends: (P, 2) the two landmarks of each, counted from 0: what follows from other pairs is no evidence. None where
+            no pair can follow from others.
     """
 
     difference: FloatArray
     covariance: FloatArray
     log_density: FloatArray
     conflict: BoolArray
+    ends: IntArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +73,27 @@ def consensus(candidates: Candidates, *, gate: float, loose: float) -> Consensus
         loose: the same of the first `FREE` pairs, which fix how the maps lie.
     """
     count = len(candidates.difference)
+    ends = np.arange(2 * count).reshape(count, 2) if candidates.ends is None else candidates.ends
     every = (
         np.ascontiguousarray(candidates.difference),
         np.ascontiguousarray(candidates.covariance),
         candidates.log_density,
         np.ascontiguousarray(candidates.conflict),
+        np.ascontiguousarray(ends),
     )
     if not count:
         return Consensus(np.zeros(0, dtype=np.int64), 0.0, np.zeros(0))
     alone = np.array([_grown(np.array([k]), -1, 1, gate, loose, *every)[1] for k in range(count)])
     seeds = np.argsort(-alone, kind="stable")[:MOST_SEEDS]
-    sets, evidence = _all_grown(seeds, gate, loose, *every)
+    sets, evidence, label = _all_grown(seeds, gate, loose, *every)
     if evidence.max() <= 0.0:
         return Consensus(np.zeros(0, dtype=np.int64), 0.0, np.zeros(0))
     top = int(np.argmax(evidence))
     best = sets[top][sets[top] >= 0]
     margin = np.full(len(best), evidence[top])  # over all being two
     for m, pair in enumerate(best.tolist()):
-        without = evidence[~(sets == pair).any(axis=1)]
-        _, rest = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, *every)
+        without = evidence[label[:, ends[pair, 0]] != label[:, ends[pair, 1]]]
+        _, rest, _ = _grown(np.delete(best, m), pair, LARGEST_SET, gate, loose, *every)
         margin[m] = evidence[top] - max(0.0, rest, without.max(initial=0.0))
     return Consensus(best, float(evidence[top]), margin)
 
@@ -107,15 +114,19 @@ def _all_grown(
     covariance: FloatArray,
     log_density: FloatArray,
     conflict: Any,
-) -> tuple[IntArray, FloatArray]:
-    """Sets (K, LARGEST_SET) grown from seeds (K,), -1 where they end, and the evidence (K,) of each."""
+    ends: IntArray,
+) -> tuple[IntArray, FloatArray, IntArray]:
+    """Sets (K, LARGEST_SET) grown from seeds (K,), -1 where they end, the evidence (K,) of each, and (K, L) which
+    landmarks are one in it: those of one label.
+    """
     sets, evidence = np.full((len(seeds), LARGEST_SET), -1), np.zeros(len(seeds))
+    label = np.empty((len(seeds), ends.max() + 1), dtype=np.int64)
     for k in range(len(seeds)):
-        found, evidence[k] = _grown(
-            seeds[k : k + 1], -1, LARGEST_SET, gate, loose, difference, covariance, log_density, conflict
+        found, evidence[k], label[k] = _grown(
+            seeds[k : k + 1], -1, LARGEST_SET, gate, loose, difference, covariance, log_density, conflict, ends
         )
         sets[k, : len(found)] = found
-    return sets, evidence
+    return sets, evidence, label
 
 
 @kernel
@@ -129,73 +140,106 @@ def _grown(
     covariance: FloatArray,
     log_density: FloatArray,
     conflict: Any,
-) -> tuple[IntArray, float]:
-    """Grow a set from pairs `start`, without the `forbidden` one, to at most `most`; returns it and its evidence."""
+    ends: IntArray,
+) -> tuple[IntArray, float, IntArray]:
+    """Grow a set from pairs `start` to at most `most`, in which the `forbidden` one is none; returns it, its evidence,
+    and labels of landmarks.
+    """
     count = len(difference)
     room = max(min(most, LARGEST_SET), len(start))
     chosen, evidence = np.empty(room, dtype=np.int64), 0.0
     open_ = np.ones(count, dtype=np.bool_)
+    label = np.arange(ends.max() + 1)
     if forbidden >= 0:
         open_[forbidden] = False
-    rest, own = difference.copy(), np.empty((count, 3))
+    dim = difference.shape[1]
+    rest, own, root, z = difference.copy(), np.empty((count, dim, dim)), np.empty((dim, dim)), np.empty(dim)
     for k in range(count):
-        own[k, 0], own[k, 1] = covariance[2 * k, 2 * k], covariance[2 * k, 2 * k + 1]
-        own[k, 2] = covariance[2 * k + 1, 2 * k + 1]
-    white = np.zeros((count, 2, 2 * room))
+        own[k] = covariance[dim * k : dim * k + dim, dim * k : dim * k + dim]
+    white = np.zeros((count, dim, dim * room))
     n = 0
     while n < room:
         best, most_gained = -1, 0.0
         if n < len(start):
             best = start[n]
-            most_gained = _gain(own[best], rest[best])[0] - log_density[best]
+            most_gained = _gain(own[best], rest[best], root, z)[0] - log_density[best]
         else:
             for k in range(count):
                 # what follows from the set, as the third pair of three landmarks, is no evidence
-                if open_[k] and own[k, 0] > IMPLIED_M2 and own[k, 2] > IMPLIED_M2:
-                    gain, squared = _gain(own[k], rest[k])
+                if open_[k] and _least_variance(own[k]) > IMPLIED_M2:
+                    gain, squared = _gain(own[k], rest[k], root, z)
                     if squared <= (loose if n < FREE else gate) and gain - log_density[k] > most_gained:
                         best, most_gained = k, gain - log_density[k]
         if best < 0:
             break
         evidence += most_gained
         chosen[n] = best
-        # the lower root of its covariance, given those before
-        a = np.sqrt(max(own[best, 0], 1e-12))
-        b = own[best, 1] / a
-        c = np.sqrt(max(own[best, 2] - b * b, 1e-12))
-        z0 = rest[best, 0] / a
-        z1 = (rest[best, 1] - b * z0) / c
+        _gain(own[best], rest[best], root, z)  # leaves the lower root of its covariance, given those before
         open_[best] = False
+        one, other = label[ends[best, 0]], label[ends[best, 1]]
+        label[label == other] = one
         for k in range(count):
-            if conflict[best, k]:
+            one, other = label[ends[k, 0]], label[ends[k, 1]]
+            if conflict[best, k] or one == other:
                 open_[k] = False
+            elif forbidden >= 0:
+                a, b = label[ends[forbidden, 0]], label[ends[forbidden, 1]]
+                if (a == one and b == other) or (a == other and b == one):
+                    open_[k] = False
         n += 1
         if n == room:
             break
+        known = dim * (n - 1)
         for k in range(count):
             if not open_[k] and n >= len(start):
                 continue
-            for row in range(2):
-                x, y = covariance[2 * k + row, 2 * best], covariance[2 * k + row, 2 * best + 1]
-                for m in range(2 * (n - 1)):
-                    x -= white[k, row, m] * white[best, 0, m]
-                    y -= white[k, row, m] * white[best, 1, m]
-                x /= a
-                y = (y - b * x) / c
-                white[k, row, 2 * n - 2], white[k, row, 2 * n - 1] = x, y
-                rest[k, row] -= x * z0 + y * z1
-            x0, y0 = white[k, 0, 2 * n - 2], white[k, 0, 2 * n - 1]
-            x1, y1 = white[k, 1, 2 * n - 2], white[k, 1, 2 * n - 1]
-            own[k, 0] -= x0 * x0 + y0 * y0
-            own[k, 1] -= x0 * x1 + y0 * y1
-            own[k, 2] -= x1 * x1 + y1 * y1
-    return chosen[:n], evidence
+            for row in range(dim):
+                explained = 0.0
+                for a in range(dim):
+                    value = covariance[dim * k + row, dim * best + a]
+                    for m in range(known):
+                        value -= white[k, row, m] * white[best, a, m]
+                    for b in range(a):
+                        value -= root[a, b] * white[k, row, known + b]
+                    white[k, row, known + a] = value / root[a, a]
+                    explained += white[k, row, known + a] * z[a]
+                rest[k, row] -= explained
+            for row in range(dim):
+                for column in range(dim):
+                    explained = 0.0
+                    for a in range(dim):
+                        explained += white[k, row, known + a] * white[k, column, known + a]
+                    own[k, row, column] -= explained
+    return chosen[:n], evidence, label
 
 
 @kernel
-def _gain(own: FloatArray, rest: FloatArray) -> tuple[float, float]:
-    """Log density of a difference at zero, and its squared distance."""
-    a, b, d = max(own[0], 1e-12), own[1], max(own[2], 1e-12)
-    det = max(a * d - b * b, 1e-20)
-    squared = (d * rest[0] ** 2 - 2.0 * b * rest[0] * rest[1] + a * rest[1] ** 2) / det
-    return -0.5 * (squared + np.log(det)) - np.log(2.0 * np.pi), squared
+def _least_variance(own: FloatArray) -> float:
+    """Smallest number on a diagonal."""
+    least = np.inf
+    for a in range(len(own)):
+        least = min(least, float(own[a, a]))
+    return least
+
+
+@kernel
+def _gain(own: FloatArray, rest: FloatArray, root: FloatArray, z: FloatArray) -> tuple[float, float]:
+    """Log density of a difference at zero, and its squared distance; `root` becomes the lower root of the covariance,
+    `z` the whitened difference.
+    """
+    squared, log_det = 0.0, 0.0
+    for a in range(len(rest)):
+        left = rest[a]
+        for b in range(a + 1):
+            value = own[a, b]
+            for c in range(b):
+                value -= root[a, c] * root[b, c]
+            if b < a:
+                root[a, b] = value / root[b, b]
+                left -= root[a, b] * z[b]
+            else:
+                root[a, a] = np.sqrt(max(value, LEAST_M2))
+        z[a] = left / root[a, a]
+        squared += z[a] * z[a]
+        log_det += 2.0 * np.log(root[a, a])
+    return -0.5 * (squared + log_det + len(rest) * np.log(2.0 * np.pi)), squared

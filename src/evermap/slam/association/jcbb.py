@@ -22,6 +22,8 @@ from scipy.special import gammaincinv
 from evermap.slam.kernels import kernel
 from evermap.types import BoolArray, FloatArray, IntArray
 
+NEGLIGIBLE = 25.0
+"""Nats by which sets of no weight fall short of the best."""
 MAX_NODES = 200_000
 """Nodes of the tree that are visited at most; a tenth of a second."""
 
@@ -33,11 +35,13 @@ class Pairings:
     Attributes:
         source: (K,) detection, or landmark of a local map, counted from 0.
         target: (K,) landmark that it may be.
-        innovation: (K, 2) measured minus predicted.
-        covariance: (2 K, 2 K) of all innovations together.
+        innovation: (K, D) measured minus predicted, in the plane or in space.
+        covariance: (D K, D K) of all innovations together.
         log_density_new: (K,) of the innovation, were it a landmark not met before.
         n_sources: how many sources there are, with pairings or not.
         followed: (K,) whose place beside the robot is known as well as it is measured; None where that is not asked.
+        log_det_least: (K,) of the covariance of an innovation by itself, given all others, at least; lets sets of many
+            detections be weighed without those of no weight. None where that is not known.
     """
 
     source: IntArray
@@ -47,6 +51,7 @@ class Pairings:
     log_density_new: FloatArray
     n_sources: int
     followed: BoolArray | None = None
+    log_det_least: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +70,9 @@ class Matching:
 
 
 @functools.cache
-def gates(n: int, confidence: float) -> FloatArray:
-    """Return (n + 1,) chi-square quantiles with 2 k degrees of freedom for k = 0..n pairings."""
-    bounds: FloatArray = np.append(0.0, 2.0 * gammaincinv(np.arange(1, n + 1), confidence))
+def gates(n: int, confidence: float, dim: int = 2) -> FloatArray:
+    """Return (n + 1,) chi-square quantiles with `dim` k degrees of freedom for k = 0..n pairings."""
+    bounds: FloatArray = np.append(0.0, 2.0 * gammaincinv(0.5 * dim * np.arange(1, n + 1), confidence))
     bounds.setflags(write=False)
     return bounds
 
@@ -93,15 +98,21 @@ def pairing_probability(
 
 def _arguments(
     pairings: Pairings, confidence: float
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> tuple[IntArray, IntArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     first: IntArray = np.searchsorted(pairings.source, np.arange(pairings.n_sources + 1))
+    dim, rest = pairings.innovation.shape[1], np.full(pairings.n_sources + 1, np.inf)
+    if pairings.log_det_least is not None:
+        most, own = np.zeros(pairings.n_sources + 1), -0.5 * (pairings.log_det_least + dim * np.log(2.0 * np.pi))
+        np.maximum.at(most, pairings.source, own - pairings.log_density_new)
+        rest = most[::-1].cumsum()[::-1].copy()
     return (
         first,
         pairings.target,
         np.ascontiguousarray(pairings.innovation),
         np.ascontiguousarray(pairings.covariance),
         pairings.log_density_new,
-        gates(pairings.n_sources, confidence),
+        gates(pairings.n_sources, confidence, pairings.innovation.shape[1]),
+        rest,
     )
 
 
@@ -114,13 +125,13 @@ def _extend(
     Returns:
         What the squared distance and the log determinant gain.
     """
-    gain, log_det = 0.0, 0.0
-    for a in range(2):
-        row = 2 * n + a
+    gain, log_det, dim = 0.0, 0.0, innovation.shape[1]
+    for a in range(dim):
+        row = dim * n + a
         rest = innovation[k, a]
         for col in range(row + 1):
-            other, b = (chosen[col // 2], col % 2) if col < 2 * n else (k, col - 2 * n)
-            value = covariance[2 * k + a, 2 * other + b]
+            other, b = (chosen[col // dim], col % dim) if col < dim * n else (k, col - dim * n)
+            value = covariance[dim * k + a, dim * other + b]
             for m in range(col):
                 value -= factor[row, m] * factor[col, m]
             if col < row:
@@ -142,15 +153,17 @@ def _search(
     covariance: FloatArray,
     log_density_new: FloatArray,
     gate: FloatArray,
+    rest: FloatArray,
     weigh_all: bool,
     max_nodes: int,
 ) -> tuple[Any, float, FloatArray, float, bool]:
     """Depth first over the tree whose level is a source and whose branches are its pairings, and none.
 
-    With `weigh_all` every compatible set is visited and adds its weight to the pairings in it; without, branches that
-    cannot become better than the best set so far are cut.
+    With `weigh_all` every compatible set is visited and adds its weight to the pairings in it, but for those of no
+    weight: `rest` (n_sources + 1,) is what the sources from each level on can add. Without, branches that cannot become
+    better than the best set so far are cut.
     """
-    n_sources, n_pairings = len(first) - 1, len(target)
+    n_sources, n_pairings, dim = len(first) - 1, len(target), innovation.shape[1]
     remaining = np.zeros(n_sources + 1, dtype=np.int64)  # sources from here on that have any pairing
     for level in range(n_sources - 1, -1, -1):
         remaining[level] = remaining[level + 1] + (1 if first[level + 1] > first[level] else 0)
@@ -159,7 +172,7 @@ def _search(
     chosen = np.zeros(n_sources, dtype=np.int64)  # in order of choice
     count = np.zeros(n_sources + 1, dtype=np.int64)
     distance, score = np.zeros(n_sources + 1), np.zeros(n_sources + 1)
-    factor, white = np.zeros((2 * n_sources, 2 * n_sources)), np.zeros(2 * n_sources)
+    factor, white = np.zeros((dim * n_sources, dim * n_sources)), np.zeros(dim * n_sources)
     best, best_count, best_distance = np.full(n_sources, -1, dtype=np.int64), 0, 0.0
     weight, total, top = np.zeros(n_pairings), 0.0, 0.0
     level, nodes = 0, 0
@@ -204,7 +217,11 @@ def _search(
             picked[level] = chosen[n] = k
             count[level + 1] = n + 1
             distance[level + 1] = distance[level] + gain
-            score[level + 1] = score[level] - 0.5 * (gain + log_det) - np.log(2.0 * np.pi) - log_density_new[k]
+            score[level + 1] = (
+                score[level] - 0.5 * (gain + log_det) - 0.5 * dim * np.log(2.0 * np.pi) - log_density_new[k]
+            )
+        if weigh_all and score[level + 1] + rest[level + 1] < top - NEGLIGIBLE:
+            continue
         if not weigh_all:
             reach = count[level + 1] + remaining[level + 1]
             if reach < best_count or (reach == best_count and best_count > 0 and distance[level + 1] >= best_distance):

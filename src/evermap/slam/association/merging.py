@@ -7,6 +7,8 @@ compared only. `consensus` weighs the candidates of a group of landmarks at the 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
@@ -14,11 +16,8 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
-from evermap.geometry import se2
-from evermap.slam.association.assignment import Assignment, alike
 from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
 from evermap.slam.association.jcbb import gates
-from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
 
 CONFIDENCE = 0.999
@@ -45,55 +44,81 @@ IN_TURN_NATS, MOST_IN_TURN_NATS = 0.2, 10.0
 chance, and at most: one may hide the other."""
 
 
+@dataclass(frozen=True, slots=True)
+class Differences:
+    """K pairs of landmarks, in D numbers.
+
+    Attributes:
+        gap: (K, D) by which the two differ.
+        covariance: (K, D, D) of each, with what sightings from one place share.
+        log_density: (K,) of the gap, were they two.
+        joint: covariance (D P, D P) of some rows (P,) together.
+    """
+
+    gap: FloatArray
+    covariance: FloatArray
+    log_density: FloatArray
+    joint: Callable[[IntArray], FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """L landmarks at an optimum, in the plane or in space, as they are compared with each other.
+
+    Attributes:
+        place: (L, 2 or 3).
+        covariance: (L, 2, 2) or (L, 3, 3) of each by itself.
+        differences: of pairs, rows (K,) of the younger ones and (K,) of the older ones.
+        sightings, last_seen_s: (L,) detections of each, stamp of the last.
+        together, in_turn: (L, L) frames, see `seen_together`.
+        alike: which of two rows (K,) of landmarks may be one, whatever their places.
+    """
+
+    place: FloatArray
+    covariance: FloatArray
+    differences: Callable[[IntArray, IntArray], Differences]
+    sightings: IntArray
+    last_seen_s: FloatArray
+    together: sparse.csr_array
+    in_turn: sparse.csr_array
+    alike: Callable[[IntArray, IntArray], BoolArray]
+
+
 def propose_merges(
-    assignment: Assignment,
-    marginals: Marginals,
-    *,
-    density: float,
-    probability: float,
-    among: BoolArray,
-    last: bool,
-    refused: set[tuple[int, int]],
+    solution: Solution, *, probability: float, among: BoolArray, last: bool, refused: set[tuple[int, int]]
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
 
     Args:
-        assignment: at its optimum.
-        marginals: covariances at it.
-        density: landmarks a square metre that one expects.
+        solution: the landmarks.
         probability: least posterior probability.
         among: (L,) landmarks that are looked up among all.
         last: True where no later frames will tell more.
         refused: pairs that are not looked at.
     """
-    sightings = assignment.sightings
-    seen = sightings >= MIN_SIGHTINGS
+    seen = solution.sightings >= MIN_SIGHTINGS
     sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen)
     if len(sources) < 1 or len(targets) < 2:
         return []
-    younger, older = _near(assignment.estimate.landmark, marginals.landmark, sources, targets)
+    younger, older = _near(solution.place, solution.covariance, sources, targets)
     kept = np.array([(int(u), int(o)) not in refused for u, o in zip(younger, older, strict=True)], dtype=bool)
+    kept &= solution.alike(younger, older)
     younger, older = younger[kept], older[kept]
     merges: list[tuple[int, int]] = []
-    together, in_turn = assignment.together, assignment.in_turn
-    kind = assignment.of_class
-    kept = alike(kind[younger], kind[older])
-    younger, older = younger[kept], older[kept]
-    order = sources[np.argsort(assignment.last_seen_s[sources], kind="stable")[::-1]]
+    order = sources[np.argsort(solution.last_seen_s[sources], kind="stable")[::-1]]
     for begin in range(0, len(order), GROUP):
         mine = np.isin(younger, order[begin : begin + GROUP])
         # a pair of two sources is looked at once, with the source that comes first
         later = order[begin + GROUP :]
         mine |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
         if mine.any():
-            pairs = younger[mine], older[mine]
-            merges += _agreed(assignment, marginals, pairs, (together, in_turn), density, probability, last=last)
+            merges += _agreed(solution, younger[mine], older[mine], probability, last=last)
     return sorted(set(merges))
 
 
 def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets: IntArray) -> tuple[IntArray, IntArray]:
     """Different pairs (younger, older) of a source and a target that may be one for all that their own spreads say."""
-    spread = np.sqrt(2.0 * np.linalg.eigvalsh(covariance)[:, 1])
+    spread = np.sqrt(2.0 * np.linalg.eigvalsh(covariance)[:, -1])
     gate = math.sqrt(LOOSE_GATE)
     tree = KDTree(place[targets])
     count = min(MOST_NEAR + 1, len(targets))
@@ -107,43 +132,26 @@ def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets:
 
 
 def _agreed(
-    assignment: Assignment,
-    marginals: Marginals,
-    pairs: tuple[IntArray, IntArray],
-    seen: tuple[sparse.csr_array, sparse.csr_array],
-    density: float,
-    probability: float,
-    *,
-    last: bool,
+    solution: Solution, younger: IntArray, older: IntArray, probability: float, *, last: bool
 ) -> list[tuple[int, int]]:
-    """Pairs (younger, older) of a group that are one for certain, with how often two were seen together and in turn."""
-    younger, older = pairs
-    rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
-    u, o = both[: len(younger)], both[len(younger) :]
-    joint = marginals.joint(rows)
-    at = np.arange(len(joint))
-    joint[at, at] += np.repeat(assignment.shared_variance[rows], 2)
-    gap = assignment.estimate.landmark[younger] - assignment.estimate.landmark[older]
-    blocks = joint.reshape(len(rows), 2, len(rows), 2)
-    cross = blocks[u, :, o, :]
-    own = blocks[u, :, u, :] + blocks[o, :, o, :] - cross - cross.transpose(0, 2, 1)
+    """Pairs (younger, older) of a group that are one for certain."""
+    found = solution.differences(younger, older)
+    gap, own = found.gap, found.covariance
     squared = np.einsum("ki,ki->k", gap, np.linalg.solve(own, gap[..., None])[..., 0])
-    seen_together, in_turn = (_entries(each, younger, older) for each in seen)
-    against = math.log(density) + DOUBLE_NATS * seen_together - np.minimum(IN_TURN_NATS * in_turn, MOST_IN_TURN_NATS)
+    together, in_turn = (_entries(each, younger, older) for each in (solution.together, solution.in_turn))
+    against = found.log_density + DOUBLE_NATS * together - np.minimum(IN_TURN_NATS * in_turn, MOST_IN_TURN_NATS)
     alone = -0.5 * (squared + np.log(np.linalg.det(own))) - against
-    inside = np.flatnonzero((squared < LOOSE_GATE) & (seen_together < 3))
+    inside = np.flatnonzero((squared < LOOSE_GATE) & (together < 3))
     inside = inside[np.argsort(-alone[inside], kind="stable")[:MOST_PAIRS]]
     if not len(inside):
         return []
-    u, o, younger, older = u[inside], o[inside], younger[inside], older[inside]
-    difference = joint[:, se2.xy_rows(u)] - joint[:, se2.xy_rows(o)]
-    covariance = difference[se2.xy_rows(u)] - difference[se2.xy_rows(o)]
-    conflict = _conflicts(younger, older, seen[0])
-    found: Consensus = consensus(
-        Candidates(gap[inside], covariance, against[inside], conflict), gate=gates(1, CONFIDENCE)[1], loose=LOOSE_GATE
-    )
-    least = math.log(probability / (1.0 - probability)) if last or len(found.pairs) > FREE else FEW_NATS
-    sure = found.pairs[found.margin >= least]
+    younger, older = younger[inside], older[inside]
+    conflict = _conflicts(younger, older, solution.together)
+    ends = np.unique(np.column_stack([younger, older]), return_inverse=True)[1].reshape(-1, 2)
+    candidates = Candidates(gap[inside], found.joint(inside), against[inside], conflict, ends)
+    best: Consensus = consensus(candidates, gate=gates(1, CONFIDENCE, gap.shape[1])[1], loose=LOOSE_GATE)
+    least = math.log(probability / (1.0 - probability)) if last or len(best.pairs) > FREE else FEW_NATS
+    sure = best.pairs[best.margin >= least]
     return [(int(younger[k]), int(older[k])) for k in sure]
 
 

@@ -66,11 +66,23 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
     inside = (squared < gate) & (score > 0.0)
     seen, row, score = seen[inside], row[inside], score[inside]
+    return replace(assignment, landmark_row=most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks))
+
+
+def most_probable(seen: IntArray, row: IntArray, score: FloatArray, frame: IntArray, n_landmarks: int) -> IntArray:
+    """Return (M,) the landmark that each detection most probably is of, `NOBODY` for none; one a landmark and frame.
+
+    Args:
+        seen: (K,) detections.
+        row: (K,) landmarks that they may be of.
+        score: (K,) log odds of each against being new.
+        frame: (M,) of all detections.
+        n_landmarks: how many there are.
+    """
     weight = np.exp(np.minimum(score, 500.0))
-    share = weight / (1.0 + np.bincount(seen, weight, len(sigma))[seen])
-    order = np.lexsort((-score, problem.pose_row[seen]))
-    taken = _given(seen[order], row[order], problem.pose_row, share[order] > P_OWN, len(sigma), assignment.n_landmarks)
-    return replace(assignment, landmark_row=taken)
+    share = weight / (1.0 + np.bincount(seen, weight, len(frame))[seen])
+    order = np.lexsort((-score, frame[seen]))
+    return _given(seen[order], row[order], frame, share[order] > P_OWN, len(frame), n_landmarks)
 
 
 @kernel
@@ -95,25 +107,44 @@ def with_overlooked(assignment: Assignment) -> Assignment:
         return assignment
     at, sigma = assignment.points()[left], problem.sigma_given[left]
     wide = np.hypot(sigma[:, 0], problem.reading[left, 0] * sigma[:, 1])
-    tree = KDTree(at)
     row, places = assignment.landmark_row.copy(), [assignment.estimate.landmark]
-    free, count = np.ones(len(left), dtype=bool), assignment.n_landmarks
-    near = [np.array(tree.query_ball_point(at[k], 3.0 * wide[k]), dtype=np.int64) for k in range(len(left))]
-    for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
-        mine = near[k][free[near[k]] & alike(assignment.kind[left[near[k]]], assignment.kind[left[k]])]
-        mine = mine[np.unique(problem.pose_row[left[mine]], return_index=True)[1]]
-        if not free[k] or len(mine) < MIN_SIGHTINGS:
-            continue
-        weight = 1.0 / wide[mine] ** 2
-        middle = (weight[:, None] * at[mine]).sum(axis=0) / weight.sum()
-        mine = mine[np.hypot(*(at[mine] - middle).T) < 3.0 * wide[mine]]
-        if len(mine) < MIN_SIGHTINGS:
-            continue
-        row[left[mine]], free[mine] = count, False
-        places.append(middle[None])
-        count += 1
+    for mine in lying_together(at, wide, assignment.kind[left], problem.pose_row[left]):
+        row[left[mine]] = assignment.n_landmarks + len(places) - 1
+        places.append(_middle(at[mine], wide[mine])[None])
     estimate = replace(assignment.estimate, landmark=np.concatenate(places))
     return replace(assignment, landmark_row=row, estimate=estimate)
+
+
+def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntArray) -> list[IntArray]:
+    """Return groups of detections that lie together in `MIN_SIGHTINGS` frames or more, one of each frame.
+
+    Args:
+        at: (M, D) places in the world.
+        wide: (M,) their standard deviations.
+        kind: (M,) classes.
+        frame: (M,) frames.
+    """
+    free, found = np.ones(len(at), dtype=bool), []
+    tree = KDTree(at)
+    near = [np.array(tree.query_ball_point(at[k], 3.0 * wide[k]), dtype=np.int64) for k in range(len(at))]
+    for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
+        mine = near[k][free[near[k]] & alike(kind[near[k]], kind[k])]
+        mine = mine[np.unique(frame[mine], return_index=True)[1]]
+        if not free[k] or len(mine) < MIN_SIGHTINGS:
+            continue
+        off = np.linalg.norm(at[mine] - _middle(at[mine], wide[mine]), axis=1)
+        mine = mine[off < 3.0 * wide[mine]]
+        if len(mine) < MIN_SIGHTINGS:
+            continue
+        free[mine] = False
+        found.append(mine)
+    return found
+
+
+def _middle(at: FloatArray, wide: FloatArray) -> FloatArray:
+    """Weighted mean of places."""
+    weight = 1.0 / wide**2
+    return np.asarray((weight[:, None] * at).sum(axis=0) / weight.sum())
 
 
 def likely_real(assignment: Assignment) -> BoolArray:
