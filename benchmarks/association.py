@@ -3,6 +3,10 @@
 Precision and recall are those of pairs: of two detections that are given to one landmark, and of two that are of one.
 Truth of association is the recording's own identities.
 
+    python -m benchmarks.association space
+
+does the same in space, and
+
     python -m benchmarks.association sessions
 
 enters sessions of one world after the other into a map, with identities and without. Since nothing says which of two
@@ -34,8 +38,20 @@ from evermap.maps.living import LivingMap
 from evermap.maps.sessions.session import Session
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association.identify import identified
+from evermap.slam.association.in_space import identified_in_space
 from evermap.slam.intake import beliefs
-from evermap.types import UNKNOWN, ChangeKind, FloatArray, IntArray, Recording, SlamResult, Trajectory, rows_of
+from evermap.types import (
+    UNKNOWN,
+    ChangeKind,
+    FloatArray,
+    IntArray,
+    Recording,
+    SlamResult,
+    SpatialRecording,
+    Trajectory,
+    rows_of,
+)
+from evermap_studies.building.study import story_of
 from evermap_studies.demo.truth import truth_of
 from evermap_studies.lifelong.runs import SIMULATED
 from evermap_studies.lifelong.world import recorded_world, simulated_world
@@ -48,6 +64,8 @@ PARKS = 3
 DATASETS = (3, 6)
 """Those with true poses."""
 ROBOTS = (1, 2, 3, 4, 5)
+BUILDINGS, DRIVES = 3, 3
+"""In space."""
 METRICS: dict[str, tuple[str, float, str]] = {
     "association_dlr_precision": ("higher", 0.01, "pairs of detections given to one landmark that are of one, DLR"),
     "association_dlr_recall": ("higher", 0.02, "pairs of detections of one landmark that are given to one, DLR"),
@@ -107,13 +125,30 @@ def recordings(folder: Path = FOLDER, *, parks: int = PARKS) -> Iterator[Recordi
                 continue
 
 
-def score(recording: Recording, config: Config | None = None) -> Score:
+def recordings_in_space(folder: Path = FOLDER) -> Iterator[SpatialRecording]:
+    """Read TagSLAM, where there is odometry, and simulate drives through buildings."""
+    if (folder / "tagslam").is_dir():
+        read = read_recording(folder / "tagslam" / "test_11")
+        assert isinstance(read, SpatialRecording)
+        yield read
+    for seed in range(BUILDINGS):
+        for day, patrol in enumerate(story_of(seed, DRIVES).patrols):
+            truth = patrol.recording.truth
+            assert truth is not None
+            truth = replace(truth, clock=patrol.recording.clock)
+            yield replace(patrol.recording, truth=truth, name=f"building {seed}, day {day}")
+
+
+def score(recording: Recording | SpatialRecording, config: Config | None = None) -> Score:
     """Run a recording with and without its identities."""
     config = config or Config()
     named = em.run_slam(recording, config)
-    assert isinstance(recording, Recording)
     began = time.process_time()
-    found = identified(recording, *beliefs(recording.sensor, config.slam))
+    found: Recording | SpatialRecording
+    if isinstance(recording, SpatialRecording):
+        found = identified_in_space(recording, config.slam.space)
+    else:
+        found = identified(recording, *beliefs(recording.sensor, config.slam))
     associated = time.process_time()
     nameless = em.run_slam(found, config)
     ended = time.process_time()
@@ -270,7 +305,7 @@ def _planar(path: Path, **options: Any) -> Recording:
     return recording
 
 
-def _truth(recording: Recording, named: SlamResult) -> Trajectory:
+def _truth(recording: Recording | SpatialRecording, named: SlamResult) -> Trajectory:
     """The truth of the poses, or what the identities lead to."""
     if recording.truth is not None:
         return recording.truth
@@ -278,7 +313,7 @@ def _truth(recording: Recording, named: SlamResult) -> Trajectory:
 
 
 def main(names: Sequence[str] = ()) -> None:
-    """Print one line as soon as it is known; names are beginnings of those wanted, or 'sessions' and such."""
+    """Print one line as soon as it is known; names are beginnings of those wanted, after 'space' or 'sessions'."""
     if names and names[0] == "sessions":
         for world in worlds():
             for unknown_ids in (False, True) if not names[1:] or world.name.startswith(tuple(names[1:])) else ():
@@ -286,7 +321,10 @@ def main(names: Sequence[str] = ()) -> None:
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
         return
-    for recording in recordings():
+    in_space = bool(names) and names[0] == "space"
+    if in_space:
+        names = names[1:]
+    for recording in recordings_in_space() if in_space else recordings():
         if not names or recording.name.startswith(tuple(names)):
             print(_line(score(recording)), flush=True)
 

@@ -80,3 +80,16 @@ def test_landmarks_at_one_distance_from_each_other_are_in_doubt() -> None:
 def test_nothing_to_compare() -> None:
     none = Candidates(np.zeros((0, 2)), np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0), dtype=bool))
     assert len(consensus(none, gate=GATE, loose=LOOSE).pairs) == 0
+
+
+def test_what_follows_from_other_pairs_is_neither_evidence_nor_a_rival() -> None:
+    """Three landmarks in space that are one: two pairs say it all, and each of them is certain."""
+    place = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.01], [0.0, 0.03, 0.0]])
+    ends = np.array([[1, 0], [2, 0], [2, 1]])
+    by = np.kron(np.eye(3)[ends[:, 0]] - np.eye(3)[ends[:, 1]], np.eye(3))
+    made = Candidates(
+        place[ends[:, 0]] - place[ends[:, 1]], 4e-4 * by @ by.T, np.full(3, np.log(0.01)), np.zeros((3, 3), bool), ends
+    )
+    found = consensus(made, gate=16.3, loose=LOOSE)
+    assert len(found.pairs) == 2
+    np.testing.assert_array_less(8.0, found.margin)

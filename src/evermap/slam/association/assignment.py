@@ -42,7 +42,7 @@ def seen_together(
     """
 
     def seen(before: int) -> sparse.csr_array:
-        """(N, L) which landmarks were seen so many frames before each."""
+        """Return (N, L) which landmarks were seen so many frames before each."""
         at, inside = frame + before, landmark_row >= 0
         inside &= (at >= 0) & (at < n_frames)
         ones = np.ones(int(inside.sum()))
