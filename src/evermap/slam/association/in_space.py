@@ -419,7 +419,7 @@ class SpatialAssociator:
         differences = _Differing(solved, SHARED_M**2 + (SHARED_SHARE * middle) ** 2, np.log(self._density * like))
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
-            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), may_be,
+            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), may_be, at_once=True,
         )  # fmt: skip
 
     def _properties(self, row: IntArray) -> IntArray:
