@@ -38,7 +38,7 @@ RULES = {
     "runs": (
         "errors interrupts types config geometry stamps survival valid io metrics existence tracking viz maps pipeline"
     ),
-    "live": "errors types config valid io maps runs slam",
+    "live": "errors types config geometry valid io maps runs slam",
     "cli": (
         "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
         "maps pipeline runs live"
@@ -46,9 +46,23 @@ RULES = {
 }
 
 # loaded by the functions that need them, never by starting up
-HEAVY = ("numba", "gtsam", "matplotlib", "scipy", "pyarrow", "pandas", "evo", "rerun", "pydantic", "rich", "numpy")
+HEAVY = (
+    "numba",
+    "gtsam",
+    "matplotlib",
+    "scipy",
+    "pyarrow",
+    "pandas",
+    "evo",
+    "rerun",
+    "zenoh",
+    "foxglove",
+    "pydantic",
+    "rich",
+    "numpy",
+)
 # what one may import of the core without loading any of these
-LAZY_EVERYWHERE = ("numba", "gtsam", "matplotlib", "pyarrow", "pandas", "evo", "rerun")
+LAZY_EVERYWHERE = ("numba", "gtsam", "matplotlib", "pyarrow", "pandas", "evo", "rerun", "zenoh", "foxglove")
 
 
 def part_of(path: Path) -> str:

@@ -29,6 +29,7 @@ _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 _open = {"held": 0, "watched": 0}
 _former: dict[int, Any] = {}
 _came: list[int] = []
+_stops: set[int] = {signal.SIGINT}
 _cleanups: list[Callable[[], object]] = []
 _kept: dict[str, str] = {}
 _exit_code: list[int] = []
@@ -64,14 +65,30 @@ class held(_Block):  # noqa: N801 (used as a function)
 class watched(_Block):  # noqa: N801 (used as a function)
     """A loop that says where it may be stopped. A second Ctrl-C does not wait for that, and one that came too late
     for it is delivered at the end.
+
+    Args:
+        also: signals that stop it as Ctrl-C does.
     """
 
     kind = "watched"
 
+    def __init__(self, *also: int) -> None:
+        self._also = also
+
+    def __enter__(self) -> Self:
+        _stops.update(self._also)
+        return super().__enter__()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        _stops.difference_update(self._also)
+        super().__exit__(kind, error, traceback)
+
     def stop_if_asked(self) -> None:
         """Raise `KeyboardInterrupt` if Ctrl-C came: here nothing is half done."""
-        if signal.SIGINT in _came:
-            _came.remove(signal.SIGINT)
+        for number in _stops & set(_came):
+            _came.remove(number)
             raise KeyboardInterrupt
 
     def sleep(self, seconds: float) -> None:
@@ -95,7 +112,7 @@ def _take_over() -> None:
 
 
 def _remember(number: int, frame: FrameType | None) -> None:
-    waits = _open["held"] or (number == signal.SIGINT and number not in _came)
+    waits = _open["held"] or (number in _stops and number not in _came)
     if not waits:
         _former[number](number, frame)
     elif number not in _came:
@@ -110,7 +127,7 @@ def _deliver() -> None:
         for number, handler in _former.items():
             signal.signal(number, handler)
         _former.clear()
-    due = [number for number in _came if not _open["watched"] or number != signal.SIGINT]
+    due = [number for number in _came if not _open["watched"] or number not in _stops]
     for number in due:
         _came.remove(number)
         signal.raise_signal(number)

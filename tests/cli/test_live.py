@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+import signal
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
+import evermap as em
 from evermap.cli.main import app
-from evermap.io import write_native
+from evermap.io import read_recording, write_native
 from evermap.maps.store import open_store
+from evermap.maps.store.measured import RECORDING, unpack_recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
 QUICK = ["--set", "output.figures=false", "--set", "output.report=false", "--set", "output.rerun=false"]
@@ -61,6 +67,16 @@ def test_a_replay_enters_what_slam_enters_and_tells_poses_and_changes(tmp_path: 
         (["--replay", "{0}", "--map", "m.evermap", "--set", "live.reorder=1"], "live.reorder_s"),
         (["--replay", "{0}", "--map", "m.evermap", "--set", "reorder_s=-1"], "live.reorder_s"),
         (["--replay", "{0}"], "--map"),
+        (["--map", "m.evermap"], "no robot (try: --zenoh tcp/localhost:7447"),
+        (["--zenoh", "tcp/localhost:7447"], "a living map is needed"),
+        (["--map", "m.evermap", "--zenoh", "tcp/localhost:7447"], "--sensor sensor.toml"),
+        (["--map", "m.evermap", "--zenoh", "nonsense", "--sensor", "{0}/sensor.toml"], "--zenoh"),
+        (["--map", "m.evermap", "--foxglove", "nonsense", "--sensor", "{0}/sensor.toml"], "no server at nonsense"),
+        (["--map", "m.evermap", "--foxglove", "0", "--sensor", "none.toml"], "none.toml"),
+        (
+            ["--map", "m.evermap", "--foxglove", "0", "--sensor", "{0}/sensor.toml", "--topics", "none.toml"],
+            "none.toml",
+        ),
     ],
 )
 def test_mistakes_are_one_line(
@@ -71,3 +87,44 @@ def test_mistakes_are_one_line(
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert told in result.stderr
+
+
+def started(*arguments: str | Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "evermap", "live", *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", [signal.SIGKILL, signal.SIGTERM])
+def test_a_robot_over_zenoh_and_the_end_of_the_bridge(tmp_path: Path, sessions: list[Path], end: int) -> None:
+    """By the defaults: a kill costs ten seconds at most, and a polite end nothing."""
+    pytest.importorskip("zenoh", reason="the extra live is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    path = tmp_path / "site.evermap"
+    for session in sessions[:2]:
+        assert run("live", "--replay", session, "--map", path).exit_code == 0
+    bridge = started("--map", path, "--sensor", sessions[2] / "sensor.toml", "--zenoh", f"listen={where}", "--json")
+    robot = started("--replay", sessions[2], "--zenoh", where)
+    assert bridge.stdout is not None
+    told = [json.loads(bridge.stdout.readline()) for _ in range(110)]
+    last_s = max(line["stamp_s"] for line in told if "stamp_s" in line)
+    bridge.send_signal(end)
+    robot.send_signal(signal.SIGTERM)
+    _, said = bridge.communicate(timeout=120)
+    assert robot.wait(timeout=20) == 0
+    assert bridge.returncode == (0 if end == signal.SIGTERM else -end)
+    if end == signal.SIGTERM:
+        assert "entering what was driven" in said
+    else:
+        with open_store(path) as store:
+            assert store.head() == 2
+        (brought,) = em.recover(path)
+        assert brought.revision == 3
+    with open_store(path) as store:
+        assert store.head() == 3
+        kept = {item.revision: item for item in store.attachments() if item.name == RECORDING}
+        entered = unpack_recording(store.attached(kept[3]))
+    assert entered.frames.stamp_s[-1] > last_s - (10.0 if end == signal.SIGKILL else 0.5)
+    assert entered.frames.stamp_s[0] < read_recording(sessions[2]).frames.stamp_s[0] + 3.0

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,73 +18,225 @@ import typer
 from evermap.cli.options import ConfigFile, Robot, Settings, configured
 from evermap.cli.terminal import echo, print_table, say, warm_up, warn
 from evermap.errors import ConfigError
+from evermap.interrupts import kept, watched
 
 if TYPE_CHECKING:
+    from evermap.config import Config
+    from evermap.live.engine import Engine
+    from evermap.live.feed import Reading
     from evermap.live.now import Now
-    from evermap.types import MapChange
+    from evermap.live.ros import Listener
+    from evermap.live.wires import Mailbox, Wire
+    from evermap.types import AnyRecording, MapChange, Sensor
 
 EVERY_S = 0.5
 """Time between two lines of progress."""
 
 
+MapFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--map", metavar="FILE", help="Living map, made where there is none; without it, only --replay is sent."
+    ),
+]
+Replay = Annotated[Path | None, typer.Option(metavar="INPUT", help="A recording or bag, as a robot that is not there.")]
+SensorFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="What sees landmarks, as in the sensor.toml of a recording.")
+]
+ZenohEndpoint = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ENDPOINT", help="ROS 2 over Zenoh: tcp/localhost:7447, listen=tcp/0.0.0.0:7447, or FILE.json5."
+    ),
+]
+FoxglovePort = Annotated[
+    str | None, typer.Option(metavar="[HOST:]PORT", help="Serve Foxglove's WebSocket there, as 8765.")
+]
+Topics = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Which topics are what, as slam --init-bag writes it.")
+]
+OnlyLocalize = Annotated[bool, typer.Option("--localize", help="Only localise; the map stays as it is.")]
+Paced = Annotated[bool, typer.Option("--realtime", help="Replay at the pace of the recording.")]
+Lines = Annotated[bool, typer.Option("--json", help="Print poses and changes as they come, one JSON object a line.")]
+
+
 def live(
-    map_file: Annotated[Path, typer.Option("--map", metavar="FILE", help="Living map, made where there is none.")],
-    replay: Annotated[Path, typer.Option(metavar="INPUT", help="A recording, as a robot that is not there.")],
+    map_file: MapFile = None,
+    replay: Replay = None,
+    sensor: SensorFile = None,
+    zenoh: ZenohEndpoint = None,
+    foxglove: FoxglovePort = None,
+    topics: Topics = None,
     robot: Robot = None,
     config: ConfigFile = None,
     settings: Settings = None,
-    localize: Annotated[bool, typer.Option("--localize", help="Only localise; the map stays as it is.")] = False,
-    realtime: Annotated[bool, typer.Option("--realtime", help="At the pace of the recording.")] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print poses and changes as they come, one JSON object a line.")
-    ] = False,
+    localize: OnlyLocalize = False,
+    realtime: Paced = False,
+    as_json: Lines = False,
 ) -> None:
     """Localise and map while the robot drives.
 
-    What has changed is told as it becomes certain.
+    What has changed is told as it becomes certain; pose, frames, map and changes are sent to all who are connected.
 
-    What was driven enters the map every few minutes (live.revision_s) and at the end; after a crash, when the map is
-    fed again.
+    What was driven enters the map every few minutes (live.revision_s) and at the end, also by Ctrl-C; after a crash,
+    when the map is fed again.
 
     \b
     Examples:
       evermap live --replay tuesday --map building.evermap
       evermap live --replay tuesday --map building.evermap --localize --realtime --json
+      evermap live --map building.evermap --sensor sensor.toml --zenoh tcp/localhost:7447 --foxglove 8765
+      evermap live --replay tuesday --zenoh listen=tcp/localhost:7447
     """
-    from evermap.io import read_recording
-    from evermap.live.engine import Engine
-    from evermap.live.feed import replayed, run_live
-    from evermap.types import Recording
+    from evermap.live.wires import Mailbox, wires_of
 
     chosen = configured(config, settings, within="live")
-    recording = read_recording(replay, robot=robot)
-    if not isinstance(recording, Recording):
+    connected = zenoh is not None or foxglove is not None
+    if map_file is None and (replay is None or not connected):
+        raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
+    if replay is None and not connected:
         raise ConfigError(
-            "is in space, where a session is solved when it ends", field="replay", hint="evermap slam --map"
+            "no robot", field="zenoh", hint="--zenoh tcp/localhost:7447, --foxglove 8765, or --replay INPUT"
         )
-    about: dict[str, Any] = {
-        "clock": recording.clock,
-        "class_names": recording.class_names,
-        "name": recording.name,
-    }
-    # what is replayed faster than it was driven cannot wait for what is done beside it
-    engine = Engine(map_file, recording.sensor, chosen, mapping=not localize, beside=realtime, **about)
-    warm_up(engine.warm_up)
-    shown = _Shown(float(recording.frames.stamp_s[0]), as_json=as_json)
-    with engine:
-        run_live(engine, replayed(recording, paced=realtime), shown.tell, warn)
-        if not localize:
-            engine.save()
-        shown.tell(engine.step())
-    shown.finish(map_file)
+    if map_file is not None and replay is None and sensor is None:
+        raise ConfigError("it is not known what the sensor sees", field="sensor", hint="--sensor sensor.toml")
+    recording = None if replay is None else _recording(replay, robot)
+    mailbox = Mailbox() if replay is None else None
+    wires = wires_of(zenoh, foxglove, mailbox)
+    try:
+        if map_file is None:
+            assert recording is not None
+            _be_the_robot(recording, wires)
+            return
+        drive = _Drive(map_file, chosen, sensor, topics, mailbox, recording)
+        drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
+    finally:
+        for wire in wires:
+            wire.close()
+
+
+def _recording(path: Path, robot: int | None) -> AnyRecording:
+    from evermap.io import read_recording
+
+    return read_recording(path, robot=robot)
+
+
+def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
+    """Send the messages of a robot that drives as in a recording, at its pace."""
+    from evermap.live.ros import play
+
+    with watched(signal.SIGTERM) as watch:
+        say(f"{recording.name}: /odom, /detections and /tf_static as they came; Ctrl-C ends it")
+        try:
+            count = play(recording, wires, watch.stop_if_asked)
+        except KeyboardInterrupt:
+            say("stopped before the recording ended")
+        else:
+            say(f"sent {count} messages")
+
+
+class _Drive:
+    """A drive: an engine, what feeds it, and who is told."""
+
+    def __init__(
+        self,
+        map_file: Path,
+        config: Config,
+        sensor: Path | None,
+        topics: Path | None,
+        mailbox: Mailbox | None,
+        recording: AnyRecording | None,
+    ) -> None:
+        self._map_file, self._config, self._sensor, self._topics = map_file, config, sensor, topics
+        self._mailbox, self._recording = mailbox, recording
+        self._listener: Listener | None = None
+
+    def run(self, wires: Sequence[Wire], *, localize: bool, realtime: bool, as_json: bool) -> None:
+        """Drive until the recording ends, or until it is stopped."""
+        from evermap.live.feed import run_live
+
+        # what is replayed faster than it was driven cannot wait for what is done beside it
+        engine = self._engine(mapping=not localize, beside=realtime or self._recording is None)
+        shown = _Shown(as_json=as_json, mailbox=self._mailbox)
+        with engine:
+            readings = self._readings(engine, shown, realtime=realtime)
+            warm_up(engine.warm_up)
+            kept(self._map_file, f"what was driven enters {self._map_file} when it is fed again")
+            with self._teller(engine, wires) as tell:
+
+                def told(now: Now) -> None:
+                    tell(now)
+                    shown.tell(now)
+
+                with watched(signal.SIGTERM) as watch:
+                    try:
+                        run_live(engine, _until_stopped(readings, watch), told, shown.refused)
+                    except KeyboardInterrupt:
+                        say("stopped" if localize else "stopped; entering what was driven")
+                if not localize:
+                    engine.save()
+                told(engine.step())
+        shown.finish(self._map_file)
+
+    def _engine(self, *, mapping: bool, beside: bool) -> Engine:
+        from evermap.live.engine import Engine
+        from evermap.types import Recording
+
+        recording = self._recording
+        about: dict[str, Any] = {"name": datetime.now(UTC).strftime("live %Y-%m-%d %H:%M:%S")}
+        sensor: Sensor | Path | None = self._sensor
+        if isinstance(recording, Recording):
+            about = {"clock": recording.clock, "class_names": recording.class_names, "name": recording.name}
+            sensor = recording.sensor
+        elif sensor is None:
+            problem = "is in space, where a session is solved when it ends"
+            raise ConfigError(problem, field="replay", hint="evermap slam --map; in the plane with --sensor FILE")
+        return Engine(self._map_file, sensor, self._config, mapping=mapping, beside=beside, **about)
+
+    def _readings(self, engine: Engine, shown: _Shown, *, realtime: bool) -> Iterator[Reading | None]:
+        from evermap.live.feed import replayed
+        from evermap.live.ros import Listener, heard, spoken
+        from evermap.types import Recording
+
+        if isinstance(self._recording, Recording):
+            return replayed(self._recording, paced=realtime)
+        self._listener = Listener(engine.sensor, engine.numbered, self._topics, say)
+        if self._recording is not None:
+            return spoken(self._recording, self._listener, shown.refused, paced=realtime)
+        assert self._mailbox is not None
+        return heard(self._mailbox, self._listener, shown.refused)
+
+    @contextmanager
+    def _teller(self, engine: Engine, wires: Sequence[Wire]) -> Iterator[Callable[[Now], None]]:
+        """What sends what is known, where somebody is connected."""
+        if not wires:
+            yield lambda _: None
+            return
+        from evermap.live.ros import Teller
+
+        for wire in wires:
+            if wire.about:
+                say(wire.about)
+        teller = Teller(engine, wires)
+        try:
+            yield lambda now: teller.tell(now, self._listener)
+        finally:
+            teller.close()
+
+
+def _until_stopped(readings: Iterator[Reading | None], watch: watched) -> Iterator[Reading | None]:
+    for reading in readings:
+        watch.stop_if_asked()
+        yield reading
 
 
 class _Shown:
     """What is told: a line of progress on the terminal, poses and changes as JSON lines."""
 
-    def __init__(self, start_s: float, *, as_json: bool) -> None:
+    def __init__(self, *, as_json: bool, mailbox: Mailbox | None) -> None:
         self._json, self._last_s, self._n_changes, self._n_frames = as_json, 0.0, 0, 0
-        self._start_s = start_s
+        self._mailbox, self._start_s = mailbox, math.nan
+        self._n_refused, self._refused_s = 0, -math.inf
         self._before: tuple[float, float, float] | None = None
         self._now: Now | None = None
 
@@ -91,6 +247,8 @@ class _Shown:
         for text in now.warnings:
             warn(text)
         self._now = now
+        if math.isnan(self._start_s):
+            self._start_s = now.stamp_s
         self._n_frames += len(now.online)
         self._n_changes += len(now.changes)
         if self._json:
@@ -105,6 +263,13 @@ class _Shown:
             self._last_s = time.monotonic()
             typer.echo(f"\r\x1b[K{self._line(now)}", err=True, nl=False)
 
+    def refused(self, line: str) -> None:
+        """Say why a reading was not taken, not more often than lines of progress."""
+        self._n_refused += 1
+        if time.monotonic() > self._refused_s + EVERY_S:
+            self._refused_s = time.monotonic()
+            warn(line)
+
     def finish(self, map_file: Path) -> None:
         """Show what came of it."""
         if sys.stderr.isatty():
@@ -116,19 +281,28 @@ class _Shown:
             ("changes", str(self._n_changes)),
             ("map", f"{map_file}, revision {self._now.revision}"),
         ]
+        rows += [("readings that were refused", str(self._n_refused))] if self._n_refused else []
+        rows += [("messages that were lost", str(self._n_lost))] if self._n_lost else []
         print_table("live", rows)
         if self._now.lost:
             say("where the robot is was not known at the end")
 
+    @property
+    def _n_lost(self) -> int:
+        return 0 if self._mailbox is None else self._mailbox.n_lost
+
     def _line(self, now: Now) -> str:
         """Pose, speed, landmarks, changes."""
+        if math.isnan(now.stamp_s):
+            return "waiting for odometry and detections"
         x, y, theta = now.pose_world_robot.tolist()
         before, self._before = self._before, (now.stamp_s, x, y)
         speed = math.nan
         if before is not None and now.stamp_s > before[0]:
             speed = math.hypot(x - before[1], y - before[2]) / (now.stamp_s - before[0])
         place = "searching" if now.lost else f"x {x:.2f} m  y {y:.2f} m  heading {math.degrees(theta):.0f} deg"
-        return f"{place}  {speed:.1f} m/s  {len(now.in_view)} landmarks in view  {self._n_changes} changes"
+        lost = f"  {self._n_lost} messages lost" if self._n_lost else ""
+        return f"{place}  {speed:.1f} m/s  {len(now.in_view)} landmarks in view  {self._n_changes} changes{lost}"
 
 
 def _pose(now: Now) -> dict[str, Any]:

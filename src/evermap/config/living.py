@@ -221,7 +221,7 @@ class LiveConfig(Section):
         default=0.1, description="how much later than the newest one a reading may come, by their stamps [s]"
     )
     checkpoint_s: Positive = Field(
-        default=10.0, description="readings are on the disk after this time at the latest: so much a crash costs [s]"
+        default=5.0, description="readings go to the disk this often: a crash costs so much, and some tenths more [s]"
     )
     revision_s: NotNegative = Field(
         default=300.0,

@@ -15,7 +15,7 @@ with the bag from then on. ROS need not be installed.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os.path import commonprefix
 from pathlib import Path
@@ -129,10 +129,10 @@ def read_bag(path: str | Path, robot: int | None = None) -> SpatialRecording:
     if robot is not None:
         raise InputError(f"there is no robot {robot}: a bag is of one", path=path, hint="leave it out")
     content, stated = scanned(path), settings_path(path)
-    settings = _guessed(content)
+    settings = guessed_settings(content)
     if not stated.is_file():
         return _recording(path, content, settings, guessed=True)
-    return _recording(path, content, _parsed(stated, content, settings), guessed=False)
+    return _recording(path, content, stated_settings(stated, content, settings), guessed=False)
 
 
 def bag_settings(path: str | Path) -> str:
@@ -143,7 +143,7 @@ def bag_settings(path: str | Path) -> str:
         MissingExtraError: `rosbags` is not installed.
     """
     content = scanned(Path(path))
-    settings = _guessed(content)
+    settings = guessed_settings(content)
     sections: dict[str, dict[str, Any]] = {"bag": {key: getattr(settings, key) for key in _TEXTS}}
     for name, one in settings.sensors.items():
         given: dict[str, Any] = {key: getattr(one, key) for key in _OF_SENSOR}
@@ -167,8 +167,8 @@ _HEAD = """\
 """
 
 
-def _guessed(content: BagContent) -> BagSettings:
-    """What topics seem to be, by their types and names."""
+def guessed_settings(content: BagContent) -> BagSettings:
+    """Return what topics seem to be, by their types and names."""
 
     def rank(topic: str) -> tuple[bool, int, bool, int]:
         kind = (*POSES, *TWISTS).index(content.kind(topic))
@@ -213,9 +213,22 @@ def _sensor(content: BagContent, topic: str) -> BagSensor:
     return BagSensor(topic, frame, camera if pixels else "", rectified and pixels, identity)
 
 
-def _parsed(path: Path, content: BagContent, guessed: BagSettings) -> BagSettings:
-    """The settings in a file; what it leaves out is as guessed."""
-    reader = TomlReader(path.read_bytes(), path)
+def stated_settings(path: Path, content: BagContent, guessed: BagSettings, *, whole: bool = True) -> BagSettings:
+    """Return the settings in a file; what it leaves out is as guessed.
+
+    Args:
+        path: the file.
+        content: of the bag.
+        guessed: what its topics seem to be.
+        whole: topics that the content lacks are errors; else they may come yet.
+
+    Raises:
+        InputError: the file is missing or wrong, or names a topic that is not there.
+    """
+    try:
+        reader = TomlReader(path.read_bytes(), path)
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror}", path=path, hint="evermap slam --init-bag BAG") from None
     reader.expect(("bag", "camera", "tags"), reader.document, section=None)
     given = reader.section("bag", _TEXTS)
     for key, value in given.items():
@@ -224,39 +237,33 @@ def _parsed(path: Path, content: BagContent, guessed: BagSettings) -> BagSetting
     if given.get("clock", "header") not in ("header", "receive"):
         raise reader.error("bag", "clock", f"no clock '{given['clock']}'", hint='"header" or "receive"')
     for key in ("odometry", "truth"):
-        if given.get(key):
+        if given.get(key) and whole:
             _check_topic(reader, "bag", key, given[key], content.motion, "poses or velocities")
     settings = replace(guessed, **given)
     if "camera" not in reader.document:
         return settings
     rig = cameras(reader, Settings(), SpatialSensor(), tuple(_OF_SENSOR))
     as_guessed = {one.topic: one for one in guessed.sensors.values()}
-    sensors = {
-        one.name: _parsed_sensor(reader, one, reader.document["camera"][one.name], content, as_guessed)
-        for one in rig.sensors
-    }
+    sensors = {one.name: _parsed_sensor(reader, one, content if whole else None, as_guessed) for one in rig.sensors}
     return replace(settings, sensors=sensors, rig=rig)
 
 
 def _parsed_sensor(
-    reader: TomlReader,
-    stated: SpatialSensor,
-    given: Mapping[str, Any],
-    content: BagContent,
-    guessed: Mapping[str, BagSensor],
+    reader: TomlReader, stated: SpatialSensor, content: BagContent | None, guessed: Mapping[str, BagSensor]
 ) -> BagSensor:
-    section = f"camera.{stated.name}"
+    section, given = f"camera.{stated.name}", reader.document["camera"][stated.name]
     for key, kind in _OF_SENSOR.items():
         if key in given and not isinstance(given[key], kind):
             wanted = "a text" if kind is str else "true or false"
             raise reader.error(section, key, f"must be {wanted}, not {type(given[key]).__name__}")
     topic = given.get("topic", "")
-    _check_topic(reader, section, "topic", topic, content.seen, "detections")
-    if given.get("camera_info"):
-        _check_topic(reader, section, "camera_info", given["camera_info"], content.cameras, "calibration")
+    if content is not None:
+        _check_topic(reader, section, "topic", topic, content.seen, "detections")
+        if given.get("camera_info"):
+            _check_topic(reader, section, "camera_info", given["camera_info"], content.cameras, "calibration")
     if given.get("identity", "id") not in ("id", "class", "none"):
         raise reader.error(section, "identity", f"no identity '{given['identity']}'", hint='"id", "class" or "none"')
-    sensor = guessed.get(topic) or _sensor(content, topic)
+    sensor = guessed.get(topic) or (BagSensor(topic) if content is None else _sensor(content, topic))
     own = {key: given[key] for key in _OF_SENSOR if key in given}
     return replace(sensor, **own, stated=stated, stated_mount="mount" in given)
 
@@ -278,9 +285,9 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
         read = ", ".join(one.topic for one in settings.sensors.values())
         moved = f"odometry {settings.odometry}" if settings.odometry else "no odometry"
         warnings.append(f"topics as guessed: detections {read}; {moved} (`--init-bag` writes them to be edited)")
-    sensors = tuple(_mounted(path, content, settings, name, warnings) for name in settings.sensors)
+    sensors = tuple(mounted_sensor(path, content, settings, name, warnings) for name in settings.sensors)
     _tell_late(content, settings, warnings)
-    stamps = [_stamps(content, one.topic, settings.clock) for one in settings.sensors.values()]
+    stamps = [stamps_of(content, one.topic, settings.clock) for one in settings.sensors.values()]
     looked = np.unique(np.concatenate(stamps))
     looked = looked[np.diff(looked, prepend=-np.inf) > SAME_STAMP_S]
     clock = Clock.UNIX if looked[0] > SINCE_1970_S else Clock.RECORDING
@@ -290,16 +297,8 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     labels = tuple(sorted({one.label for _, one in seen} - {""}))
     stamp_s = np.array([stamps[k][one.look] for k, one in seen])
     frame = np.clip(np.searchsorted(looked, stamp_s + SAME_STAMP_S) - 1, 0, None)
-    found = spatial_detections(
-        np.asarray(frame, dtype=np.int64),
-        sensor=np.array([k for k, _ in seen], dtype=np.int64),
-        landmark_id=_identities(seen, settings, names),
-        class_id=np.array([labels.index(one.label) if one.label else UNKNOWN for _, one in seen], dtype=np.int64),
-        score=np.array([one.score for _, one in seen]),
-        size_m=np.array([one.size for _, one in seen]).reshape(-1, 3),
-    )
-    found = _placed(path, found, seen, sensors, settings)
-    detections = with_tag_poses(found, sensors, warnings)
+    frame = np.asarray(frame, dtype=np.int64)
+    detections = detections_of(path, settings, sensors, (seen, frame, labels, names), warnings)
     finite = np.asarray(np.isfinite(detections.position_sensor_m).all(axis=1))
     if not finite.all():
         warnings.append(f"{counted(int((~finite).sum()), 'detection')} without a finite position left out")
@@ -320,8 +319,40 @@ def _recording(path: Path, content: BagContent, settings: BagSettings, *, guesse
     return finish_recording(recording, warnings=warnings)
 
 
-def _stamps(content: BagContent, topic: str, clock: str) -> FloatArray:
-    """(K,) of a topic's messages; those without a stamp of their own have the time at which they were recorded."""
+def detections_of(
+    path: Path,
+    settings: BagSettings,
+    sensors: tuple[SpatialSensor, ...],
+    seen: tuple[list[tuple[int, Seen]], IntArray, Sequence[str], dict[int, str]],
+    warnings: list[str],
+) -> SpatialDetections:
+    """Return what messages say that was seen, with poses, corners and directions.
+
+    Args:
+        path: of the bag, for errors.
+        settings: how its topics are read.
+        sensors: of these topics.
+        seen: detections with the numbers of their sensors; (M,) frames; classes, and names by ids, which get those
+            that are texts.
+        warnings: gets what is left out.
+
+    Raises:
+        DataError: the size of a tag, or the calibration of a camera, is not known.
+    """
+    ones, frame, labels, names = seen
+    found = spatial_detections(
+        frame,
+        sensor=np.array([k for k, _ in ones], dtype=np.int64),
+        landmark_id=_identities(ones, settings, names),
+        class_id=np.array([labels.index(one.label) if one.label else UNKNOWN for _, one in ones], dtype=np.int64),
+        score=np.array([one.score for _, one in ones]),
+        size_m=np.array([one.size for _, one in ones]).reshape(-1, 3),
+    )
+    return with_tag_poses(_placed(path, found, ones, sensors, settings), sensors, warnings)
+
+
+def stamps_of(content: BagContent, topic: str, clock: str) -> FloatArray:
+    """Return stamps (K,) of a topic's messages; those without one have the time at which they were recorded."""
     header, received = np.array(content.stamps[topic]).reshape(-1, 2).T
     return np.where((header > 0.0) & (clock == "header"), header, received)
 
@@ -341,8 +372,14 @@ def _tell_late(content: BagContent, settings: BagSettings, warnings: list[str]) 
         )
 
 
-def _mounted(path: Path, content: BagContent, settings: BagSettings, name: str, warnings: list[str]) -> SpatialSensor:
-    """A sensor with its mount and calibration, as stated, or as the bag has them."""
+def mounted_sensor(
+    path: Path, content: BagContent, settings: BagSettings, name: str, warnings: list[str]
+) -> SpatialSensor:
+    """Return a sensor with its mount and calibration, as stated, or as the bag has them.
+
+    Raises:
+        InputError: a camera model that is not known.
+    """
     one = settings.sensors[name]
     sensor = SpatialSensor(name=name) if one.stated is None else one.stated
     if not one.stated_mount:
@@ -441,7 +478,7 @@ def _odometry(
     """Poses of the robot, in the order of their stamps; the last of those with the same."""
     if not topic:
         return None
-    rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), _stamps(content, topic, settings.clock)
+    rows, stamp_s = np.array(content.motion[topic], dtype=np.float64), stamps_of(content, topic, settings.clock)
     order = np.argsort(stamp_s, kind="stable")
     if content.kind(topic) in POSES:  # nobody knows how a robot is turned whose message leaves it out
         order = order[np.linalg.norm(rows[order, 3:7], axis=1) > 0.5]

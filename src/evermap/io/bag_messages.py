@@ -20,6 +20,7 @@ from evermap.valid import is_covariance
 
 POSES = ("Odometry", "PoseWithCovarianceStamped", "PoseStamped", "TransformStamped")
 TWISTS = ("TwistWithCovarianceStamped", "TwistStamped")
+FRAMES = ("TFMessage", "tfMessage")
 
 
 class Seen(NamedTuple):
@@ -81,21 +82,24 @@ def scanned(path: Path) -> BagContent:
 
     def handlers(topics: Mapping[str, Topic]) -> dict[str, Handler]:
         content.topics = dict(topics)
-        found: dict[str, Handler] = {}
-        for topic in topics:
-            kind = content.kind(topic)
-            if kind in POSES + TWISTS:
-                found[topic] = _motion_of(content, topic)
-            elif kind in _DETECTIONS:
-                found[topic] = _seen_of(content, topic, _DETECTIONS[kind])
-            elif kind == "CameraInfo":
-                found[topic] = _camera_of(content, topic)
-            elif kind in ("TFMessage", "tfMessage"):
-                found[topic] = lambda message, _: _edges_of(content, message)
-        return found
+        return {topic: handler for topic in topics if (handler := handler_of(content, topic)) is not None}
 
     scan(path, handlers)
     return content
+
+
+def handler_of(content: BagContent, topic: str) -> Handler | None:
+    """Return what adds a message of a topic to the content, and when it was received [s]; None for other kinds."""
+    kind = content.kind(topic)
+    if kind in POSES + TWISTS:
+        return _motion_of(content, topic)
+    if kind in _DETECTIONS:
+        return _seen_of(content, topic, _DETECTIONS[kind])
+    if kind == "CameraInfo":
+        return _camera_of(content, topic)
+    if kind in FRAMES:
+        return lambda message, _: _edges_of(content, message)
+    return None
 
 
 def _camera_of(content: BagContent, topic: str) -> Handler:
@@ -242,3 +246,5 @@ _DETECTIONS: dict[str, Callable[[Any, int], Iterator[Seen]]] = {
     "MarkerArray": _drawn,
     "SceneUpdate": _drawn,
 }
+KINDS = (*POSES, *TWISTS, *_DETECTIONS, "CameraInfo", *FRAMES)
+"""All types of messages that are read, without their packages."""

@@ -152,9 +152,16 @@ def scan(path: Path, handlers: Callable[[Mapping[str, Topic]], Mapping[str, Hand
 
 
 def ros2_types() -> Any:
-    """Return the message types of ROS 2 and those of `UNSTATED`, as `rosbags` has them."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    """Return the message types of ROS 2 and those of `UNSTATED`, as `rosbags` has them.
 
+    Raises:
+        MissingExtraError: `rosbags` is not installed.
+    """
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        problem = "messages of ROS need the package rosbags, which is not installed"
+        raise MissingExtraError(problem, hint="pip install 'evermap[ros]'") from None
     types = get_typestore(Stores.ROS2_HUMBLE)
     for name, text in UNSTATED.items():
         types.register(get_types_from_msg(text, name))

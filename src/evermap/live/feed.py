@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -39,10 +39,11 @@ class SensorLook(NamedTuple):
 
 
 Reading = Velocity | SensorLook
+_Stamped = TypeVar("_Stamped", bound=tuple[Any, ...])
 
 
-def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading]:
-    """Yield the readings of a recording in the order of their stamps.
+def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading | None]:
+    """Yield the readings of a recording in the order of their stamps, and None after every look.
 
     Args:
         recording: in the plane.
@@ -52,10 +53,8 @@ def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading]:
     first = np.searchsorted(seen.frame, np.arange(len(recording.frames) + 1))
     velocity = np.column_stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps])
     stamps = np.concatenate([odometry.stamp_s, recording.frames.stamp_s])
-    began_s = time.monotonic()
-    for k in np.argsort(stamps, kind="stable").tolist():
-        if paced:
-            time.sleep(max(stamps[k] - stamps.min() - (time.monotonic() - began_s), 0.0))
+    order = np.argsort(stamps, kind="stable").tolist()
+    for _, k in in_time(zip(stamps[order].tolist(), order, strict=True), paced=paced):
         if k < len(odometry):
             yield Velocity(float(stamps[k]), *velocity[k].tolist())
             continue
@@ -64,27 +63,44 @@ def replayed(recording: Recording, *, paced: bool = False) -> Iterator[Reading]:
         ids = [recording.landmark_names.get(name, name) for name in seen.landmark_id[rows].tolist()]
         sigmas = seen.sigma_range_m[rows], seen.sigma_bearing_rad[rows]
         yield SensorLook(float(stamps[k]), ids, seen.range_m[rows], seen.bearing_rad[rows], names, *sigmas)
+        yield None
+
+
+def in_time(stamped: Iterable[_Stamped], *, paced: bool, speed: float = 1.0) -> Iterator[_Stamped]:
+    """Yield what begins with a stamp [s], at once, or as fast as it came.
+
+    Args:
+        stamped: by their stamps.
+        paced: as fast as they came.
+        speed: times as fast.
+    """
+    began_s, first_s = time.monotonic(), None
+    for one in stamped:
+        if paced:
+            first_s = one[0] if first_s is None else first_s
+            time.sleep(max((one[0] - first_s) / speed - (time.monotonic() - began_s), 0.0))
+        yield one
 
 
 def run_live(
-    engine: Engine, readings: Iterable[Reading], tell: Callable[[Now], None], refused: Callable[[str], None]
+    engine: Engine, readings: Iterable[Reading | None], tell: Callable[[Now], None], refused: Callable[[str], None]
 ) -> None:
-    """Feed an engine until the readings end, with a step after every look.
+    """Feed an engine until the readings end, with a step wherever None is among them.
 
     Args:
         engine: that is fed.
-        readings: as they come.
-        tell: called with what is known after every look.
+        readings: as they come; None where no other waits.
+        tell: called with what is known after every step.
         refused: called with one line for a reading that is not taken; the others go on.
     """
     for reading in readings:
         try:
-            if isinstance(reading, Velocity):
+            if reading is None:
+                tell(engine.step())
+            elif isinstance(reading, Velocity):
                 engine.odometry(*reading)
-                continue
-            values = reading._asdict()
-            engine.detections(values.pop("stamp_s"), **values)
+            else:
+                values = reading._asdict()
+                engine.detections(values.pop("stamp_s"), **values)
         except InputError as error:
             refused(error.one_line())
-        else:
-            tell(engine.step())

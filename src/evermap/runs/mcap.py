@@ -13,11 +13,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from evermap.errors import MissingExtraError
-from evermap.geometry import se3
+from evermap.geometry import se2, se3
 from evermap.io.landmarks import labels_of
 from evermap.io.rosbag import ros2_types
 from evermap.runs.summary import change_dict
-from evermap.types import UNKNOWN, AnyRecording, FloatArray, Landmarks, SlamResult, SpatialRecording, Trajectory
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    FloatArray,
+    Landmarks,
+    MapChange,
+    Odometry,
+    SlamResult,
+    SpatialRecording,
+    Trajectory,
+)
 
 TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
@@ -33,6 +43,8 @@ TOPICS = {
 """What is in the file. Frames are `map`, `odom`, `base_link`, and those of the sensors by their names."""
 POINT_M, PLATE_M = 0.1, 0.005
 """Edge of what stands for a landmark without a size, and the thickness of a tag."""
+MARKER_ID = 2**31 - 1
+"""Largest number of a marker: of a landmark's the last bits."""
 CUBE, SPHERE = 1, 2
 """Types of `visualization_msgs/Marker`."""
 
@@ -53,18 +65,24 @@ def write_mcap(recording: AnyRecording, result: SlamResult, path: Path) -> None:
         raise MissingExtraError(
             "MCAP needs the package rosbags, which is not installed", hint="pip install 'evermap[ros]'"
         ) from None
-    ros = _Ros(ros2_types())
+    ros = Ros(ros2_types())
     with tempfile.TemporaryDirectory() as folder:
         with Writer(Path(folder) / "run", version=8, storage_plugin=StoragePlugin.MCAP) as bag:
             to = {name: bag.add_connection(name, kind, typestore=ros.types) for name, kind in TOPICS.items()}
             for stamp_s, topic, message in sorted(_messages(ros, recording, result), key=lambda one: one[0]):
                 raw = ros.types.serialize_cdr(message, TOPICS[topic])
-                bag.write(to[topic], max(round(stamp_s * 1e9), 0), raw)
+                bag.write(to[topic], nanoseconds(stamp_s), raw)
         shutil.move(next((Path(folder) / "run").glob("*.mcap")), path)
 
 
-class _Ros(NamedTuple):
-    """Messages by the names of their types."""
+def nanoseconds(stamp_s: float) -> int:
+    """Return a stamp in nanoseconds, from 0 on; seconds since 1970 keep all their bits."""
+    whole = math.floor(stamp_s)
+    return max(whole * 10**9 + round((stamp_s - whole) * 1e9), 0)
+
+
+class Ros(NamedTuple):
+    """Messages of ROS 2 by the names of their types, with what is in most of them."""
 
     types: Any
 
@@ -73,7 +91,7 @@ class _Ros(NamedTuple):
         return self.types.types[f"{package}/msg/{kind}"](*values)
 
     def time(self, stamp_s: float) -> Any:
-        nano = max(round(stamp_s * 1e9), 0)
+        nano = nanoseconds(stamp_s)
         return self.make("builtin_interfaces/Time", nano // 10**9, nano % 10**9)
 
     def header(self, stamp_s: float, frame: str) -> Any:
@@ -90,6 +108,16 @@ class _Ros(NamedTuple):
 
     def spread(self, pose: FloatArray, covariance: FloatArray) -> Any:
         return self.make("geometry_msgs/PoseWithCovariance", self.pose(pose), covariance.ravel())
+
+    def posed(self, stamp_s: float, pose: FloatArray, covariance: FloatArray) -> Any:
+        spread = self.spread(pose, covariance)
+        return self.make("geometry_msgs/PoseWithCovarianceStamped", self.header(stamp_s, "map"), spread)
+
+    def odometry(self, stamp_s: float, pose: FloatArray) -> Any:
+        still = self.make("geometry_msgs/Twist", self.vector(np.zeros(3)), self.vector(np.zeros(3)))
+        unsaid = self.make("geometry_msgs/TwistWithCovariance", still, np.zeros(36))
+        here = self.spread(pose, np.zeros((6, 6)))
+        return self.make("nav_msgs/Odometry", self.header(stamp_s, "odom"), "base_link", here, unsaid)
 
     def transforms(self, stamp_s: float, frames: list[tuple[str, str, FloatArray]]) -> Any:
         found = []
@@ -108,7 +136,7 @@ class _Ros(NamedTuple):
 _Stamped = tuple[float, str, Any]
 
 
-def _messages(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
+def _messages(ros: Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
     yield from _motion(ros, recording, result)
     yield from _detections(ros, recording)
     start_s = float(result.trajectory.stamp_s[0]) if len(result.trajectory) else 0.0
@@ -117,7 +145,7 @@ def _messages(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterato
     yield from _changes(ros, result, start_s)
 
 
-def _motion(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
+def _motion(ros: Ros, recording: AnyRecording, result: SlamResult) -> Iterator[_Stamped]:
     path, alone = result.trajectory, in_space(result.dead_reckoning.pose_world_robot)
     poses = in_space(path.pose_world_robot)
     if len(path):
@@ -125,28 +153,43 @@ def _motion(ros: _Ros, recording: AnyRecording, result: SlamResult) -> Iterator[
         yield float(path.stamp_s[0]), "/tf_static", ros.transforms(float(path.stamp_s[0]), mounts)
     known = len(alone) == len(poses)
     drift = se3.compose(poses, se3.inverse(alone)) if known else poses
-    still = ros.make("geometry_msgs/Twist", ros.vector(np.zeros(3)), ros.vector(np.zeros(3)))
-    unsaid = ros.make("geometry_msgs/TwistWithCovariance", still, np.zeros(36))
     for row, stamp_s in enumerate(path.stamp_s.tolist()):
         frames = [("map", "odom", drift[row])]
         frames.append(("odom", "base_link", alone[row] if known else se3.identity()))
         yield stamp_s, "/tf", ros.transforms(stamp_s, frames)
         if known:
-            here = ros.spread(alone[row], np.zeros((6, 6)))
-            yield (
-                stamp_s,
-                "/odom",
-                ros.make("nav_msgs/Odometry", ros.header(stamp_s, "odom"), "base_link", here, unsaid),
-            )
+            yield stamp_s, "/odom", ros.odometry(stamp_s, alone[row])
     for topic, some in (("/pose", path), ("/online_pose", result.online)):
         poses, covariances = in_space(some.pose_world_robot), ros_covariance(some)
         for stamp_s, pose, covariance in zip(some.stamp_s.tolist(), poses, covariances, strict=True):
-            message = ros.spread(pose, covariance)
-            yield (
-                stamp_s,
-                topic,
-                ros.make("geometry_msgs/PoseWithCovarianceStamped", ros.header(stamp_s, "map"), message),
-            )
+            yield stamp_s, topic, ros.posed(stamp_s, pose, covariance)
+
+
+def robot_messages(recording: AnyRecording) -> Iterator[tuple[float, str, str, bytes]]:
+    """Yield what a robot publishes that drives as in a recording: frames, odometry, detections, as time goes.
+
+    Yields:
+        Stamp [s], topic, type and serialised message.
+
+    Raises:
+        MissingExtraError: `rosbags` is not installed.
+    """
+    ros, odometry = Ros(ros2_types()), recording.odometry
+    if isinstance(odometry, Odometry):
+        velocity = np.stack([odometry.forward_mps, odometry.lateral_mps, odometry.angular_radps], axis=1)
+        poses = [se2.identity()]
+        for step in velocity[:-1] * np.diff(odometry.stamp_s)[:, None]:
+            poses.append(se2.compose(poses[-1], se2.exp(step)))
+        stamps, pose = odometry.stamp_s, in_space(np.array(poses))
+    else:
+        stamps = np.zeros(0) if odometry is None else odometry.stamp_s
+        pose = np.zeros((0, 7)) if odometry is None else odometry.pose_world_robot
+    start_s = float(min(recording.frames.stamp_s[:1].tolist() + stamps[:1].tolist(), default=0.0))
+    mounts = [("base_link", name, at) for name, at in _mounts(recording)]
+    driven = [(s, "/odom", ros.odometry(s, at)) for s, at in zip(stamps.tolist(), pose, strict=True)]
+    still = (start_s, "/tf_static", ros.transforms(start_s, mounts))
+    for stamp_s, topic, message in sorted([still, *driven, *_detections(ros, recording)], key=lambda one: one[0]):
+        yield stamp_s, topic, TOPICS[topic], bytes(ros.types.serialize_cdr(message, TOPICS[topic]))
 
 
 def in_space(pose: FloatArray) -> FloatArray:
@@ -172,14 +215,14 @@ def _mounts(recording: AnyRecording) -> list[tuple[str, FloatArray]]:
     return [("sensor", in_space(np.array([recording.sensor.mount_robot_sensor]))[0])]
 
 
-def _detections(ros: _Ros, recording: AnyRecording) -> Iterator[_Stamped]:
+def _detections(ros: Ros, recording: AnyRecording) -> Iterator[_Stamped]:
     """A message for every frame and sensor, also where nothing was seen."""
-    stamps, mounts, names = recording.frames.stamp_s, _mounts(recording), dict[int, str]()
+    stamps, mounts, names = recording.frames.stamp_s, _mounts(recording), recording.landmark_names
     if isinstance(recording, SpatialRecording):
         seen = recording.detections
         at, turn, size = seen.position_sensor_m, seen.rotation, np.nan_to_num(seen.size_m)
         sensor, score = seen.sensor, np.nan_to_num(seen.score, nan=1.0)
-        names = dict(recording.landmark_names)
+        spread = np.zeros((len(seen), 6, 6))
         ids, frames, classes = seen.landmark_id, seen.frame, seen.class_id
     else:
         flat = recording.detections
@@ -188,6 +231,9 @@ def _detections(ros: _Ros, recording: AnyRecording) -> Iterator[_Stamped]:
         at = np.stack([flat.range_m * np.cos(bearing), flat.range_m * np.sin(bearing), zero], axis=1)
         turn, size = np.full((len(flat), 4), np.nan), np.zeros((len(flat), 3))
         sensor, score = np.zeros(len(flat), dtype=np.int64), np.ones(len(flat))
+        axis = np.array([[np.cos(bearing), -np.sin(bearing)], [np.sin(bearing), np.cos(bearing)]])
+        axis = axis * np.stack([flat.sigma_range_m, flat.range_m * flat.sigma_bearing_rad])
+        spread = np.pad(np.nan_to_num(np.einsum("ikn,jkn->nij", axis, axis)), ((0, 0), (0, 4), (0, 4)))
     labels = labels_of(classes, recording.class_names)
     turn = np.where(np.isnan(turn), se3.NO_TURN, turn)
     first = np.searchsorted(frames, np.arange(len(stamps) + 1))
@@ -198,45 +244,56 @@ def _detections(ros: _Ros, recording: AnyRecording) -> Iterator[_Stamped]:
                 if sensor[row] == number:
                     pose, identity = np.append(at[row], turn[row]), int(ids[row])
                     hypothesis = ros.make("vision_msgs/ObjectHypothesis", labels[row], float(score[row]))
-                    result = ros.make(
-                        "vision_msgs/ObjectHypothesisWithPose", hypothesis, ros.spread(pose, np.zeros((6, 6)))
-                    )
+                    result = ros.make("vision_msgs/ObjectHypothesisWithPose", hypothesis, ros.spread(pose, spread[row]))
                     box = ros.make("vision_msgs/BoundingBox3D", ros.pose(pose), ros.vector(size[row]))
                     text = "" if identity == UNKNOWN else names.get(identity, str(identity))
                     found.append(ros.make("vision_msgs/Detection3D", header, [result], box, text))
             yield stamp_s, "/detections", ros.make("vision_msgs/Detection3DArray", header, found)
 
 
-def _map(ros: _Ros, landmarks: Landmarks, start_s: float) -> Iterator[_Stamped]:
+def _map(ros: Ros, landmarks: Landmarks, start_s: float) -> Iterator[_Stamped]:
     """The landmarks, each when it was first seen."""
+    seen_s = np.maximum(np.nan_to_num(landmarks.first_seen_s, nan=start_s), start_s)
+    for stamp_s, (marker, entity) in zip(seen_s.tolist(), drawn(ros, landmarks, seen_s), strict=True):
+        yield stamp_s, "/landmarks", ros.make("visualization_msgs/MarkerArray", [marker])
+        yield stamp_s, "/scene", ros.make("foxglove_msgs/SceneUpdate", [], [entity])
+
+
+def drawn(ros: Ros, landmarks: Landmarks, stamp_s: FloatArray) -> Iterator[tuple[Any, Any]]:
+    """Yield a marker and an entity of a scene for each landmark, as opaque as it probably exists.
+
+    Args:
+        ros: makes the messages.
+        landmarks: (L) what to draw.
+        stamp_s: (L,) from when on.
+    """
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import LANDMARK
 
     pose, size = poses_of(landmarks), _sizes(landmarks)
     labels = labels_of(landmarks.class_id, landmarks.class_names)
-    seen_s = np.maximum(np.nan_to_num(landmarks.first_seen_s, nan=start_s), start_s)
     none = ros.make("builtin_interfaces/Duration", 0, 0)
+    nothing = np.zeros(0, dtype=np.uint8)
+    file, picture = (ros.make("visualization_msgs/MeshFile", "", nothing), "sensor_msgs/CompressedImage")
     for row, identity in enumerate(landmarks.landmark_id.tolist()):
-        stamp_s, p = float(seen_s[row]), float(landmarks.p_exists[row])
-        name = landmarks.names.get(identity, str(identity))
+        at_s, p = float(stamp_s[row]), float(landmarks.p_exists[row])
+        name, shape = landmarks.names.get(identity, str(identity)), ros.vector(size[row])
         turned = landmarks.rotation is not None and np.isfinite(landmarks.rotation[row]).all()
         marker = ros.make(
-            "visualization_msgs/Marker", ros.header(stamp_s, "map"), labels[row], row, CUBE if turned else SPHERE, 0,
-            ros.pose(pose[row]), ros.vector(size[row]), ros.colour(rgb(LANDMARK), p, "std_msgs"), none, False, [], [],
-            "", ros.make("sensor_msgs/CompressedImage", ros.header(stamp_s, ""), "", np.zeros(0, dtype=np.uint8)), [],
-            name, "", ros.make("visualization_msgs/MeshFile", "", np.zeros(0, dtype=np.uint8)), False,
+            "visualization_msgs/Marker", ros.header(at_s, "map"), labels[row], identity & MARKER_ID,
+            CUBE if turned else SPHERE, 0, ros.pose(pose[row]), shape, ros.colour(rgb(LANDMARK), p, "std_msgs"), none,
+            False, [], [], "", ros.make(picture, ros.header(at_s, ""), "", nothing), [], name, "", file, False,
         )  # fmt: skip
-        yield stamp_s, "/landmarks", ros.make("visualization_msgs/MarkerArray", [marker])
         colour = ros.colour(rgb(LANDMARK), p, "foxglove_msgs")
-        body = ros.make(
-            f"foxglove_msgs/{'Cube' if turned else 'Sphere'}Primitive",
-            ros.pose(pose[row]),
-            ros.vector(size[row]),
-            colour,
-        )
+        body = ros.make(f"foxglove_msgs/{'Cube' if turned else 'Sphere'}Primitive", ros.pose(pose[row]), shape, colour)
         said = {"class": labels[row], "p_exists": f"{p:.4f}"}
         text = f"{name} {p:.2f}" if p < 0.995 else name
-        yield stamp_s, "/scene", _entity(ros, stamp_s, f"landmark {name}", body, said, text, pose[row])
+        yield marker, _entity(ros, at_s, entity_id(name), body, said, text, pose[row])
+
+
+def entity_id(name: str) -> str:
+    """Return what a landmark is called in a scene."""
+    return f"landmark {name}"
 
 
 def poses_of(landmarks: Landmarks) -> FloatArray:
@@ -253,9 +310,9 @@ def _sizes(landmarks: Landmarks) -> FloatArray:
 
 
 def _entity(
-    ros: _Ros, stamp_s: float, name: str, body: Any, said: Mapping[str, str], text: str, pose: FloatArray
+    ros: Ros, stamp_s: float, name: str, body: Any, said: Mapping[str, str], text: str, pose: FloatArray
 ) -> Any:
-    """A scene with one entity: a cube, a sphere or an arrow, and its name."""
+    """An entity of a scene: a cube, a sphere or an arrow, and its name."""
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import INK
 
@@ -267,44 +324,55 @@ def _entity(
     shapes = [[body] if part in kind else [] for part in ("Arrow", "Cube", "Sphere")]
     metadata = [ros.make("foxglove_msgs/KeyValuePair", key, value) for key, value in said.items()]
     lifetime = ros.make("builtin_interfaces/Duration", 0, 0)
-    entity = ros.make(
+    return ros.make(
         "foxglove_msgs/SceneEntity", ros.time(stamp_s), "map", name, lifetime, False, metadata, *shapes, [], [], [],
         [label], [],
     )  # fmt: skip
-    return ros.make("foxglove_msgs/SceneUpdate", [], [entity])
 
 
-def _changes(ros: _Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]:
+def _changes(ros: Ros, result: SlamResult, start_s: float) -> Iterator[_Stamped]:
+    there = {**where(result.gone), **where(result.landmarks)}
+    for number, change in enumerate(result.changes):
+        stamp_s = max(float(np.nan_to_num(change.stamp_to_s, nan=start_s)), start_s)
+        line, entity = told(ros, change, stamp_s, f"change {number}", there)
+        yield stamp_s, "/changes", line
+        if entity is not None:
+            yield stamp_s, "/scene", ros.make("foxglove_msgs/SceneUpdate", [], [entity])
+
+
+def told(ros: Ros, change: MapChange, stamp_s: float, name: str, there: Mapping[int, FloatArray]) -> tuple[Any, Any]:
+    """Return a change as a line and as an arrow in a scene, which is None where none of its landmarks is known.
+
+    Args:
+        ros: makes the messages.
+        change: what changed.
+        stamp_s: from when on it is shown.
+        name: of the arrow.
+        there: (3,) positions of landmarks by their ids, after the change.
+    """
     from evermap.viz.rerun_scene import rgb
     from evermap.viz.style import ALERT
 
-    there = {**_where(result.gone), **_where(result.landmarks)}
-    for number, change in enumerate(result.changes):
-        stamp_s = max(float(np.nan_to_num(change.stamp_to_s, nan=start_s)), start_s)
-        line = json.dumps(change_dict(change), allow_nan=False)
-        yield stamp_s, "/changes", ros.make("std_msgs/String", line)
-        at = [there[identity] for identity in change.landmark_ids if identity in there]
-        if not at:
-            continue
-        moved = np.zeros(3)
-        moved[: len(change.displacement_m)] = np.nan_to_num(change.displacement_m)
-        length = float(np.linalg.norm(moved))
-        along = moved / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
-        pose = _pointing(np.mean(at, axis=0) - moved, along)
-        colour = ros.colour(rgb(ALERT), change.probability, "foxglove_msgs")
-        shaft = max(length - POINT_M, 0.0) if length > 0.0 else 2.0 * POINT_M
-        arrow = ros.make(
-            "foxglove_msgs/ArrowPrimitive", ros.pose(pose), shaft, 0.3 * POINT_M, POINT_M, 0.6 * POINT_M, colour
-        )
-        text = f"{change.kind.value} {', '.join(change.labels)} {change.probability:.2f}"
-        yield (
-            stamp_s,
-            "/scene",
-            _entity(ros, stamp_s, f"change {number}", arrow, {"kind": change.kind.value}, text, pose),
-        )
+    line = ros.make("std_msgs/String", json.dumps(change_dict(change), allow_nan=False))
+    at = [there[identity] for identity in change.landmark_ids if identity in there]
+    if not at:
+        return line, None
+    moved = np.zeros(3)
+    moved[: len(change.displacement_m)] = np.nan_to_num(change.displacement_m)
+    length = float(np.linalg.norm(moved))
+    along = moved / length if length > 0.0 else np.array([0.0, 0.0, -1.0])
+    pose = _pointing(np.mean(at, axis=0) - moved, along)
+    colour = ros.colour(rgb(ALERT), change.probability, "foxglove_msgs")
+    shaft = max(length - POINT_M, 0.0) if length > 0.0 else 2.0 * POINT_M
+    arrow = ros.make(
+        "foxglove_msgs/ArrowPrimitive", ros.pose(pose), shaft, 0.3 * POINT_M, POINT_M, 0.6 * POINT_M, colour
+    )
+    text = f"{change.kind.value} {', '.join(change.labels)} {change.probability:.2f}"
+    return line, _entity(ros, stamp_s, name, arrow, {"kind": change.kind.value}, text, pose)
 
 
-def _where(landmarks: Landmarks) -> dict[int, FloatArray]:
+def where(landmarks: Landmarks) -> dict[int, FloatArray]:
+    """Return positions (3,) of landmarks by their ids."""
     return dict(zip(landmarks.landmark_id.tolist(), poses_of(landmarks)[:, :3], strict=True))
 
 
