@@ -46,7 +46,6 @@ def run_slam(
     from threadpoolctl import threadpool_limits
 
     from evermap.maps.sessions.session import existing
-    from evermap.slam.association.identify import identified
     from evermap.slam.check import odd, valid
     from evermap.slam.estimate import solve
     from evermap.slam.intake import beliefs, prepare
@@ -59,6 +58,8 @@ def run_slam(
     remarks = odd(recording, identities=not config.slam.unknown_ids, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
     if config.slam.unknown_ids:
+        from evermap.slam.association.identify import identified
+
         recording = identified(recording, prior, noise, prior_map=prior_map)
     prepared = prepare(recording, prior_map, remarks)
     # small matrices: several threads would only wait for each other, and sum in another order on another machine
@@ -75,7 +76,6 @@ def _run_in_space(
 
     from evermap.maps.sessions.session import existing
     from evermap.maps.sessions.spatial import SpatialVisit
-    from evermap.slam.association.in_space import identified_in_space
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic, run_in_traffic
     from evermap.slam.space.result import concluded_in_space
@@ -83,6 +83,8 @@ def _run_in_space(
 
     with threadpool_limits(limits=1, user_api="blas"):
         if config.slam.unknown_ids:
+            from evermap.slam.association.in_space import identified_in_space
+
             recording = identified_in_space(recording, config.slam.space, prior_map)
         if has_traffic(recording):
             return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)

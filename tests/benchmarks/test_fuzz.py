@@ -9,6 +9,8 @@ import pytest
 from benchmarks import fuzz
 
 FILES = 40
+FEWER = 12
+"""Files of kinds that take long to read, in the quick tests."""
 KINDS = [
     "maps", "old-maps", "models", "config", "looks-csv", "looks-parquet", "detections-csv", "detections-parquet",
     "lifetimes-csv", "lifetimes-parquet", "landmarks-csv", "landmarks-parquet", "landmarks-geojson", "recording-zip",
@@ -20,12 +22,16 @@ def test_the_slice_has_every_kind(tmp_path: Path) -> None:
     assert list(fuzz.kinds(tmp_path)) == KINDS
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_mutated_files_give_a_line_or_what_was_written(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "files"),
+    [(name, FEWER if name.startswith("bags") else FILES) for name in KINDS]
+    + [pytest.param(name, FILES, marks=pytest.mark.slow) for name in KINDS if name.startswith("bags")],
+)
+def test_mutated_files_give_a_line_or_what_was_written(name: str, files: int, tmp_path: Path) -> None:
     kind = fuzz.kinds(tmp_path)[name]()
     folder = tmp_path / "files"
     folder.mkdir()
-    counts = fuzz.run(kind, FILES, 1, folder)
-    assert sum(counts.values()) == FILES
-    assert counts["line"] > FILES / 4
+    counts = fuzz.run(kind, files, 1, folder)
+    assert sum(counts.values()) == files
+    assert counts["line"] > files / 4
     assert not counts.keys() - {"same", "other", "line"}, counts

@@ -273,10 +273,11 @@ def run_and_write(
     from evermap.cli.warmup import warm_up as compile_kernels
     from evermap.pipeline import run_slam
     from evermap.slam.changes.joint import may_search
-    from evermap.slam.space.moving import has_traffic
     from evermap.types import SpatialRecording
 
     if isinstance(recording, SpatialRecording):
+        from evermap.slam.space.moving import has_traffic
+
         traffic = has_traffic(recording)
         warm_up(lambda: compile_kernels(in_space=True, traffic=traffic, unknown_ids=config.slam.unknown_ids))
     else:

@@ -9,10 +9,6 @@ import numpy as np
 from evermap.config import Config
 from evermap.geometry.se3 import NO_TURN
 from evermap.pipeline import run_session, run_slam
-from evermap.slam.association.consensus import warm_up as of_the_association
-from evermap.slam.localize_recording import warm_up as of_the_localizer
-from evermap.slam.warmup import warm_up as of_the_estimator
-from evermap.tracking.run import warm_up as of_the_tracker
 from evermap.types import (
     UNKNOWN,
     Detections,
@@ -57,15 +53,23 @@ def warm_up(
         return
     if in_space:
         if traffic:
+            from evermap.tracking.run import warm_up as of_the_tracker
+
             of_the_tracker()
         run_slam(_flight(0.0), Config(slam={"unknown_ids": unknown_ids}))
         return
     if localize:
+        from evermap.slam.localize_recording import warm_up as of_the_localizer
+
         of_the_localizer()
         return
+    from evermap.slam.warmup import warm_up as of_the_estimator
+
     config = Config(slam={"unknown_ids": unknown_ids})
     of_the_estimator(search=search or sessions)
     if unknown_ids:
+        from evermap.slam.association.consensus import warm_up as of_the_association
+
         of_the_association()
     if sessions:
         run_session(_drive(1e5), run_session(_drive(0.0), config=config).living, config)

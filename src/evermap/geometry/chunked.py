@@ -20,7 +20,6 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
-from scipy.spatial import cKDTree
 
 from evermap.geometry import se2
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -549,6 +548,8 @@ def _centres(chunk: IntArray, position_m: FloatArray, n_chunks: int) -> FloatArr
 
 def _pairs(centre: FloatArray, parent: IntArray) -> IntArray:
     """(Q, 2) neighbouring chunks."""
+    from scipy.spatial import cKDTree  # takes a tenth of a second, which only large maps need
+
     n = len(centre)
     real = np.flatnonzero(np.isfinite(centre[:, 0]))
     own = np.arange(n)
@@ -567,6 +568,8 @@ def _joined(new: Update, before: ChunkedCovariance) -> tuple[IntArray, IntArray]
     """(N,) chunks of the points after an update, and (C,) parents: new points join the nearest chunk, and those that
     have too many then are halved.
     """
+    from scipy.spatial import cKDTree
+
     known = new.was >= 0
     chunk = np.full(len(new.was), -1, dtype=np.int64)
     chunk[known] = before.chunk[new.was[known]]

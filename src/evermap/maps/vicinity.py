@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from evermap.config import LivingConfig
 from evermap.geometry.chunked import ChunkedCovariance, Update, of_places
@@ -108,6 +107,8 @@ def near(living: LivingMap, path_m: FloatArray, reach_m: float) -> tuple[IntArra
 
     In space (N, 3), as seen from above: sessions see what is over and under them.
     """
+    from scipy.spatial import cKDTree
+
     path_m = path_m[:, :2]
     away, _ = cKDTree(path_m).query(living.places.position_m[:, :2], distance_upper_bound=reach_m)
     site = np.searchsorted(living.sites.site_id, living.places.site_id[np.isfinite(away)])

@@ -49,6 +49,9 @@ class Mistake:
 
     def after(self, other: Mistake) -> Mistake:
         """Return both, the other one undone first."""
+        turned = self.turned
+        if other.turned != HONEST.turned:
+            turned = tuple(se3.compose((0.0, 0.0, 0.0, *self.turned), (0.0, 0.0, 0.0, *other.turned))[3:].tolist())
         return Mistake(
             self.code,
             self.message,
@@ -58,7 +61,7 @@ class Mistake:
             self.turn * other.turn,
             self.forward * other.forward,
             self.delay_s + other.delay_s,
-            tuple(se3.compose((0.0, 0.0, 0.0, *self.turned), (0.0, 0.0, 0.0, *other.turned))[3:].tolist()),
+            turned,
         )
 
 
@@ -129,6 +132,8 @@ _AXES = tuple(
     )
 )
 _DELAYS_S = (*np.arange(1.0, 10.0, 0.5).tolist(), *np.arange(10.0, 61.0, 1.0).tolist())
+AT_ONCE = 32
+"""Mistakes that are undone on trial in one go: arrays of a megabyte."""
 LEAST_STEP_S = 0.4
 """Smaller steps of one clock against the other are the calibration's, which has a delay."""
 _FACTORS = tuple(10.0**power for power in np.arange(-4.0, 4.01, 0.1) if abs(power) > 0.25)
@@ -158,59 +163,60 @@ def likeliest(pairs: Pairs, undone: Mistake, told: Container[str], settings: Che
         told: codes of mistakes that are not looked for.
         settings: what is sure.
     """
-    before = pairs.residual(undone)
+    before = pairs.residual(undone)[0]
     candidates = [*pairs.units, *pairs.angles, *(_longer(factor, pairs.why_longer) for factor in _FACTORS)]
     candidates += [_late(side * delay_s) for delay_s in _DELAYS_S for side in (1.0, -1.0)]
-    scored = [
-        (loss, mistake)
-        for mistake in candidates
-        if mistake.code not in told
-        for loss in [_nearer(pairs, before, pairs.residual(mistake.after(undone)), settings)]
-        if loss is not None
-    ]
-    if not scored:
-        return None
-    least, best = min(scored, key=lambda pair: pair[0])
+    candidates = [mistake for mistake in candidates if mistake.code not in told]
 
-    def left(mistake: Mistake) -> float:
-        return _loss(pairs.residual(mistake.after(undone)), settings)
+    def after(mistakes: list[Mistake]) -> FloatArray:
+        return pairs.residual(*(mistake.after(undone) for mistake in mistakes))
 
-    if best.code == "clock":
-        near_s = [best.delay_s + 0.1 * step for step in range(-5, 6)]
-        return min(map(_late, near_s), key=left)
-    if best.code == "length-unit":  # a unit that has a name is likelier than a factor that has none
-        gain = _loss(before, settings) - least
-        named = [
-            mistake
-            for loss, mistake in scored
-            if mistake in pairs.units and abs(log(mistake.lengths / best.lengths)) < 0.3 and loss < least + 0.1 * gain
+    losses = np.concatenate(
+        [
+            _nearer(pairs, before, after(candidates[row : row + AT_ONCE]), settings)
+            for row in range(0, len(candidates), AT_ONCE)
         ]
-        if named:
-            return named[0]
+    )
+    best, least = candidates[int(np.argmin(losses))], losses.min()
+    if least == inf:
+        return None
+    if best.code == "clock":
+        near = [_late(best.delay_s + 0.1 * step) for step in range(-5, 6)]
+    elif best.code == "length-unit":  # a unit that has a name is likelier than a factor that has none
+        gain = _loss(before, settings) - least
+        for mistake, loss in zip(candidates, losses.tolist(), strict=True):
+            alike = mistake in pairs.units and abs(log(mistake.lengths / best.lengths)) < 0.3
+            if alike and loss < least + 0.1 * gain:
+                return mistake
         near = [_longer(best.lengths * 10.0 ** (0.01 * step), pairs.why_longer) for step in range(-10, 11)]
-        return min(near, key=left)
-    return best
+    else:
+        return best
+    return near[int(np.argmin(_loss(after(near), settings)))]
 
 
-def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: CheckConfig) -> float | None:
-    """Loss of the residuals (K, P) after undoing a mistake, if almost all pairs that tell come nearer by it."""
+def _nearer(pairs: Pairs, before: FloatArray, after: FloatArray, settings: CheckConfig) -> FloatArray:
+    """(M,) loss of the residuals (M, K, P) after undoing a mistake each; inf unless almost all pairs that tell come
+    nearer by it.
+    """
     was, now = off(before), off(after)
     apart = off(pairs.difference(after, before))
-    telling = apart > max(settings.fits, settings.apart * min(float(np.median(was)), float(np.median(now))))
-    if np.sum(telling) < settings.fewest or np.mean(now[telling] < was[telling]) < settings.agreed:
-        return None
+    usual = np.fmin(np.median(was), np.median(now, axis=1))
+    telling = apart > np.fmax(settings.fits, settings.apart * usual)[:, None]
+    n_telling = telling.sum(axis=1)
+    agreed = (telling & (now < was)).sum(axis=1) >= settings.agreed * n_telling
     loss = _loss(after, settings)
-    return loss if len(was) * (_loss(before, settings) - loss) > settings.gain else None
+    gain = len(was) * (_loss(before, settings) - loss)
+    return np.where((n_telling >= settings.fewest) & agreed & (gain > settings.gain), loss, inf)
 
 
-def _loss(residual: FloatArray, settings: CheckConfig) -> float:
-    """Mean Cauchy loss of residuals (K, P): one wrong identity costs little."""
-    return float(np.mean(np.log1p((np.minimum(off(residual), 10.0) / settings.fits) ** 2)))
+def _loss(residual: FloatArray, settings: CheckConfig) -> FloatArray:
+    """Mean Cauchy loss of residuals (..., K, P): one wrong identity costs little."""
+    return np.asarray(np.log1p((np.minimum(off(residual), 10.0) / settings.fits) ** 2).mean(axis=-1))
 
 
 def off(residual: FloatArray) -> FloatArray:
-    """Return (P,) by how much the two readings of pairs differ, of residuals (K, P)."""
-    return np.asarray(np.linalg.norm(residual, axis=0))
+    """Return (..., P) by how much the two readings of pairs differ, of residuals (..., K, P)."""
+    return np.asarray(np.linalg.norm(residual, axis=-2))
 
 
 def pairs_of(recording: AnyRecording, settings: CheckConfig = USUAL) -> Pairs | None:
@@ -266,8 +272,6 @@ class PlanarPairs:
         self._stamp_s = stamp_s[first], stamp_s[second]
         self._range_m = detections.range_m[first], detections.range_m[second]
         self._bearing_rad = detections.bearing_rad[first], detections.bearing_rad[second]
-        self._tracks: dict[tuple[float, float], FloatArray] = {}
-        self._motions: dict[tuple[float, float, float], tuple[FloatArray, FloatArray]] = {}
 
     @property
     def still(self) -> bool:
@@ -276,35 +280,37 @@ class PlanarPairs:
 
     @staticmethod
     def difference(after: FloatArray, before: FloatArray) -> FloatArray:
-        """Return (2, P) by how much residuals differ."""
-        return np.stack([after[0] - before[0], se2.wrap(after[1] - before[1])])
+        """Return (M, 2, P) by how much residuals differ."""
+        apart = after - before
+        apart[:, 1] = se2.wrap(apart[:, 1])
+        return apart
 
-    def residual(self, mistake: Mistake) -> FloatArray:
-        """Return (2, P) second reading minus what the first one and the odometry predict: log range, and bearing."""
-        start, stop = self._poses(mistake.forward, mistake.turn, mistake.delay_s)
-        metres = np.array([1.0 / mistake.lengths, 1.0 / mistake.lengths, 1.0])
-        mount = self._mount * metres
-        motion = se2.between(se2.compose(start * metres, mount), se2.compose(stop * metres, mount))
-        bearing = [mistake.bearing * each + mistake.offset_rad for each in self._bearing_rad]
+    def residual(self, *mistakes: Mistake) -> FloatArray:
+        """Return (M, 2, P) second reading minus what the first and the odometry predict: log range, and bearing."""
+        motion = self._motions(mistakes)
+        motion[..., :2] /= np.array([each.lengths for each in mistakes])[:, None, None]
+        turned = np.array([(each.bearing, each.offset_rad) for each in mistakes])
+        bearing = [turned[:, :1] * each + turned[:, 1:] for each in self._bearing_rad]
         range_m = self._range_m
-        seen = np.stack([range_m[0] * np.cos(bearing[0]), range_m[0] * np.sin(bearing[0])], axis=1)
-        x, y = se2.transform(se2.inverse(motion), seen).T
+        seen = np.stack([range_m[0] * np.cos(bearing[0]), range_m[0] * np.sin(bearing[0])], axis=-1)
+        x, y = np.moveaxis(se2.transform(se2.inverse(motion), seen), -1, 0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             far = np.log(range_m[1]) - np.log(np.maximum(np.hypot(x, y), 1e-12))
-        return np.stack([np.nan_to_num(far, posinf=inf), se2.wrap(bearing[1] - np.arctan2(y, x))])
+        return np.stack([np.nan_to_num(far, posinf=inf), se2.wrap(bearing[1] - np.arctan2(y, x))], axis=1)
 
-    def _poses(self, forward: float, turn: float, delay_s: float) -> tuple[FloatArray, FloatArray]:
-        """(P, 3) poses of the robot at the first and at the second sighting, by odometry."""
-        if (forward, turn) not in self._tracks:
-            self._tracks[forward, turn] = _dead_reckoned(self._odometry, forward, turn)
-        if (forward, turn, delay_s) not in self._motions:
-            track, stamps = self._tracks[forward, turn], self._odometry.stamp_s
-            first, second = (
-                np.stack([np.interp(stamp_s + delay_s, stamps, column) for column in track], axis=1)
-                for stamp_s in self._stamp_s
-            )
-            self._motions[forward, turn, delay_s] = first, second
-        return self._motions[forward, turn, delay_s]
+    def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
+        """(M, P, 3) motions of the sensor from the first sighting to the second, by odometry."""
+        ways, way = np.unique([(each.forward, each.turn) for each in mistakes], axis=0, return_inverse=True)
+        delay_s = np.array([each.delay_s for each in mistakes])
+        motion = np.empty((len(mistakes), len(self._stamp_s[0]), 3))
+        for row, (forward, turn) in enumerate(ways.tolist()):
+            track, mine = _dead_reckoned(self._odometry, forward, turn), way == row
+            delays_s, which = np.unique(delay_s[mine], return_inverse=True)
+            at_s = np.stack(self._stamp_s)[:, None] + delays_s[:, None]
+            pose = np.stack([np.interp(at_s, self._odometry.stamp_s, column) for column in track], axis=-1)
+            sensed = se2.between(*se2.compose(pose, self._mount))
+            motion[mine] = sensed[which]
+        return motion
 
 
 class SpatialPairs:
@@ -325,7 +331,6 @@ class SpatialPairs:
         self._mount = mount[detections.sensor[first]], mount[detections.sensor[second]]
         position = positions_of(recording)
         self._seen = position[first], position[second]
-        self._motions: dict[float, FloatArray] = {}
 
     @property
     def still(self) -> bool:
@@ -334,27 +339,31 @@ class SpatialPairs:
 
     @staticmethod
     def difference(after: FloatArray, before: FloatArray) -> FloatArray:
-        """Return (4, P) by how much residuals differ."""
+        """Return (M, 4, P) by how much residuals differ."""
         return after - before
 
-    def residual(self, mistake: Mistake) -> FloatArray:
-        """Return (4, P) second sighting minus what the first one and the odometry predict: log range, and direction."""
-        metres = np.array([*3 * [1.0 / mistake.lengths], 1.0, 1.0, 1.0, 1.0])
-        start, stop = (mount * metres for mount in self._mount)
-        motion = se3.compose(se3.inverse(stop), se3.compose(se3.inverse(self._motion(mistake.delay_s) * metres), start))
-        turned = np.array([0.0, 0.0, 0.0, *mistake.turned])
+    def residual(self, *mistakes: Mistake) -> FloatArray:
+        """Return (M, 4, P) second sighting minus what the first and the odometry predict: log range, and direction."""
+        motion = self._motions(mistakes)
+        motion[..., :3] /= np.array([each.lengths for each in mistakes])[:, None, None]
+        turned = np.array([(0.0, 0.0, 0.0, *each.turned) for each in mistakes])[:, None]
         seen, again = (se3.transform(turned, each) for each in self._seen)
         expected = se3.transform(motion, seen)
-        far = [np.maximum(np.linalg.norm(each, axis=1), 1e-12) for each in (again, expected)]
-        return np.vstack([np.log(far[0]) - np.log(far[1]), (again / far[0][:, None] - expected / far[1][:, None]).T])
+        far = [np.maximum(np.linalg.norm(each, axis=-1, keepdims=True), 1e-12) for each in (again, expected)]
+        apart = [np.log(far[0]) - np.log(far[1]), again / far[0] - expected / far[1]]
+        return np.concatenate(apart, axis=-1).swapaxes(1, 2)
 
-    def _motion(self, delay_s: float) -> FloatArray:
-        """(P, 7) motions of the robot from the first sighting to the second, by odometry."""
-        if delay_s not in self._motions:
-            stamp_s, pose = self._odometry.stamp_s, self._odometry.pose_world_robot
-            first, second = (se3.interpolate(stamp_s, pose, one_s + delay_s) for one_s in self._stamp_s)
-            self._motions[delay_s] = se3.between(first, second)
-        return self._motions[delay_s]
+    def _motions(self, mistakes: tuple[Mistake, ...]) -> FloatArray:
+        """(M, P, 7) motions of the sensor from the second sighting to the first, by odometry."""
+        stamp_s, pose = self._odometry.stamp_s, self._odometry.pose_world_robot
+        delay_s, which = np.unique([each.delay_s for each in mistakes], return_inverse=True)
+        start, stop = (
+            se3.compose(
+                se3.interpolate(stamp_s, pose, (one_s + delay_s[:, None]).ravel()).reshape(len(delay_s), -1, 7), mount
+            )
+            for one_s, mount in zip(self._stamp_s, self._mount, strict=True)
+        )
+        return np.asarray(se3.between(stop, start)[which])
 
 
 Pairs: TypeAlias = PlanarPairs | SpatialPairs
@@ -382,7 +391,7 @@ def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[Fl
         return np.array([-inf]), np.zeros(1)
     pairs = PlanarPairs(recording, first, second)
     delays_s = np.concatenate([[0.0, 0.5, -0.5], _DELAYS_S, np.negative(_DELAYS_S)])
-    far = np.stack([np.minimum(off(pairs.residual(_late(delay_s))), 10.0) for delay_s in delays_s])
+    far = np.minimum(off(pairs.residual(*map(_late, delays_s))), 10.0)
     until_s = recording.frames.stamp_s[recording.detections.frame[second]]
     begin_s, second_of = np.unique(np.floor(until_s), return_inverse=True)
     usual, path = settings.fits, np.zeros(len(begin_s), dtype=np.int64)
@@ -396,7 +405,7 @@ def clock_steps(recording: Recording, settings: CheckConfig = USUAL) -> tuple[Fl
     for row, (start, stop) in enumerate(pairwise([*begin.tolist(), len(path)])):
         mine = (second_of >= start) & (second_of < stop)
         near_s = delays_s[path[start]] + 0.1 * np.arange(-5, 6)
-        left = [_loss(pairs.residual(_late(delay))[:, mine], settings) for delay in near_s]
+        left = _loss(pairs.residual(*map(_late, near_s))[..., mine], settings)
         found = float(near_s[int(np.argmin(left))])
         if row == 0:
             delay_s[0] = found

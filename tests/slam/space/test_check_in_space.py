@@ -107,6 +107,7 @@ def test_honest_recordings_raise_no_alarm(seed: int) -> None:
         assert check.usable
 
 
+@pytest.mark.slow
 @pytest.mark.data
 def test_honest_data_raise_no_alarm_and_mistakes_are_told(shared_data: Path) -> None:
     names = ["tagslam/test_11", *(f"ycbv/{name}" for name in ("0001", "0017", "0059"))]

@@ -14,7 +14,6 @@ import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from evermap.config import FitConfig
 from evermap.geometry import se2
@@ -191,6 +190,8 @@ def _misread(outcome: Outcome, n_fit: FloatArray, settings: FitConfig) -> BoolAr
         n_fit: (L,) inliers of each landmark; 0 for those that are not believed anyway.
         settings: how near, and how seldom beside the other one.
     """
+    from scipy.spatial import cKDTree
+
     seen = np.flatnonzero(n_fit > 0.0)
     near = cKDTree(outcome.graph_estimate.landmark[seen] * outcome.scale).query_pairs(settings.misread_m)
     a, b = seen[np.array(sorted(near), dtype=np.int64).reshape(-1, 2)].T

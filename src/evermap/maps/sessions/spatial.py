@@ -12,7 +12,6 @@ import functools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from evermap.config import FitConfig, LivingConfig
 from evermap.geometry import se2, se3
@@ -336,6 +335,8 @@ def names_of(intake: SpatialIntake) -> IntArray:
 
 def _numbered(intake: SpatialIntake, solved: SpatialSolved, living: LivingMap) -> SpatialSolved:
     """The session with landmarks of one identity named as the map names those that are nearest."""
+    from scipy.optimize import linear_sum_assignment
+
     number, place = solved.number.copy(), solved.optimum.estimate.place
     for row, names in enumerate(names_of(intake)):
         known = np.flatnonzero(np.isin(names, living.members.landmark_id))
