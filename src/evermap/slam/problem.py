@@ -351,8 +351,13 @@ class Marginals:
         first, last = self._held.of_factors_first[[self._n - 1, self._n - 1 + self._m]]
         return self._held.of_factors[first:last].reshape(-1, 2, 2)
 
-    def joint(self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False) -> FloatArray:
-        """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order."""
+    def joint(
+        self, landmarks: IntArray, *, poses: IntArray | None = None, states: bool = False, by: FloatArray | None = None
+    ) -> FloatArray:
+        """Return the joint covariance of some poses, some landmarks and, if wanted, the states, in this order.
+
+        With `by` (C, numbers of these, all known) that of what this matrix makes of them, (C, C).
+        """
         n = self._n
         rank = np.cumsum(self.known) - 1
         rows = np.asarray(landmarks, dtype=np.int64)
@@ -360,7 +365,7 @@ class Marginals:
         every = [np.zeros(0, dtype=np.int64) if poses is None else poses, n + rank[rows[known]]]
         if states:
             every.append(n + int(self.known.sum()) + np.arange(2))
-        found = self._solved.joint(np.concatenate(every))
+        found = self._solved.joint(np.concatenate(every), by)
         if known.all():
             return found
         n_poses = 3 * len(every[0])

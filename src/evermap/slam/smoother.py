@@ -186,9 +186,7 @@ class Smoother:
         now, structure, with_states = self.linearised(estimate), self._structure_of(estimate), marginals.with_states
         pose, place, states = with_states[: 3 * n].reshape(n, 3, 9), with_states[3 * n : -9], with_states[-9:]
         place = place.reshape(-1, 2, 9)
-        split = ODOMETRY * (n - 1)
-        driven = now.values[:split].reshape(-1, 3, 11)
-        seen = now.values[split : split + DETECTION * len(problem.pose_row)].reshape(-1, 2, 11)
+        driven, seen = now.values[: ODOMETRY * (n - 1)].reshape(-1, 3, 11), self.detections(estimate)
         of_driven = (
             np.einsum("nra,nas->nrs", driven[..., :3], pose[:-1])
             + np.einsum("nra,nas->nrs", driven[..., 3:6], pose[1:])
@@ -213,6 +211,12 @@ class Smoother:
         changes = max(float((driven[..., 6] ** 2).sum()), 1e-300)
         worth[DELAY] /= max(1.0 - jitter / changes, LEAST_CHANGE)
         return worth
+
+    def detections(self, estimate: Estimate) -> FloatArray:
+        """Return (M, 2, 11) detections linearised and whitened: by pose, place and sensor states, and the right side."""
+        begin = ODOMETRY * (len(estimate.pose) - 1)
+        values = self.linearised(estimate).values[begin : begin + DETECTION * len(self.problem.pose_row)]
+        return values.reshape(-1, 2, 11)
 
     def information(self, estimate: Estimate, poses: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return what is known of some poses, the known landmarks and the states, all other poses marginalised.

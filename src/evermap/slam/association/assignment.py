@@ -93,6 +93,14 @@ class Assignment:
         return last
 
     @property
+    def first_seen_s(self) -> FloatArray:
+        """(L,) stamp of the first detection; inf where there is none."""
+        first = np.full(self.n_landmarks, np.inf)
+        seen = self.landmark_row >= 0
+        np.minimum.at(first, self.landmark_row[seen], self.measured.stamp_s[self.measured.pose_row[seen]])
+        return first
+
+    @property
     def of_class(self) -> IntArray:
         """(L,) class of each landmark."""
         kind = np.full(self.n_landmarks, UNKNOWN)
@@ -154,6 +162,15 @@ class Assignment:
         """Return the assignment without some landmarks (L,), their detections unassigned."""
         rank = np.where(landmarks, NOBODY, np.cumsum(~landmarks) - 1)
         return self._renumbered(rank, ~landmarks)
+
+    def split(self, parts: list[IntArray]) -> Assignment:
+        """Return the assignment with a new landmark for each of some rows of detections."""
+        row, points = self.landmark_row.copy(), self.points()
+        places = [np.median(points[part], axis=0) for part in parts]
+        for number, part in enumerate(parts, self.n_landmarks):
+            row[part] = number
+        estimate = replace(self.estimate, landmark=np.vstack([self.estimate.landmark, *places]))
+        return replace(self, landmark_row=row, estimate=estimate)
 
     def merged(self, pairs: list[tuple[int, int]]) -> Assignment:
         """Return the assignment with pairs (younger, older) merged: the older's place, the detections of both."""

@@ -16,8 +16,10 @@ from evermap.geometry import se2
 from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
-from evermap.slam.association.merging import Differences, Solution, propose_merges
+from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
+from evermap.slam.association.relaying import displaced_stretches, laid
 from evermap.slam.association.revise import likely_real, reassigned, with_overlooked
+from evermap.slam.association.splitting import weighed_visits
 from evermap.slam.filter_kernels import GATED
 from evermap.slam.linearise import detection_residuals
 from evermap.slam.local_filter import NO_PLACES, LocalFilter, columns
@@ -73,6 +75,9 @@ RISE_NATS, RISE_SHARE, RISE_MOST = 7.0, 1.75, 100.0
 """By how much the cost may rise for a pair that is merged: for the difference of the two, and for the detections of the
 lesser of them, of which a quarter may become outliers; at most. Errors of sightings from one place are alike, which the
 cost does not know."""
+RELAID, STRETCHES, BEFORE = 8, 2, (8.0, 2.0, 0.0)
+SPLIT_ROUNDS, SAME_NATS = 5, 0.5
+CONTRADICTS = gates(1, 0.95)[1]
 LAST_ROUNDS = 5
 """Comparisons of every detection with the whole map at the end, at most."""
 SAME_SHARE = 0.002
@@ -81,11 +86,12 @@ SAME_SHARE = 0.002
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """An assignment at its optimum: with covariances, and with its cost, outliers decided."""
+    """An assignment at its optimum: with covariances, its cost, outliers decided, and its detections linearised."""
 
     assignment: Assignment
     marginals: Marginals
     cost: float
+    linear: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +179,8 @@ class Associator:
 
     def finish(self) -> Assignment:
         """Settle everything processed so far."""
-        solved = self._settled(self._assignment())
+        refused: set[tuple[int, int]] = set()
+        solved = self._relaid(self._contradictions_split(self._settled(self._assignment()), refused))
         for _ in range(LAST_ROUNDS):
             before = solved.assignment
             again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
@@ -181,7 +188,7 @@ class Associator:
             again = again.without(again.sightings < MIN_SIGHTINGS)
             count = min(before.n_landmarks, again.n_landmarks)
             changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
-            solved = self._settled(again)
+            solved = self._contradictions_split(self._settled(again), refused)
             if changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count:
                 break
         assignment = solved.assignment
@@ -278,8 +285,11 @@ class Associator:
 
     def _settled(self, assignment: Assignment, recent: int | None = None) -> _Solved:
         """The batch solution, all landmarks or those seen last merged with others while there is something to merge."""
-        assignment = replace(assignment, measured=self._with_sigma(assignment.measured))
-        solved = self._solved(assignment)
+        return self._all_merged(
+            self._solved(replace(assignment, measured=self._with_sigma(assignment.measured))), recent
+        )
+
+    def _all_merged(self, solved: _Solved, recent: int | None = None) -> _Solved:
         refused: set[tuple[int, int]] = set()
         for _ in range(MERGE_ROUNDS):
             now = solved.assignment
@@ -297,6 +307,57 @@ class Associator:
             if merged is not None:
                 refused.clear()
                 solved = merged
+        return solved
+
+    def _contradictions_split(
+        self, solved: _Solved, refused: set[tuple[int, int]], recent: int | None = None
+    ) -> _Solved:
+        """What was given to a landmark wrongly gets one of its own, and is merged again, if the map is better for it.
+
+        Visits that were tried without gain are in `refused`, by first detection and number.
+        """
+        for _ in range(SPLIT_ROUNDS):
+            now = solved.assignment
+            visits = weighed_visits(
+                now, solved.marginals, solved.linear, density=self._density_m2, pause_s=FORGET_S,
+                among=_latest(now, recent),
+            )  # fmt: skip
+            doubtful = (visits.evidence < math.log(P_MERGE / (1.0 - P_MERGE))) & (visits.squared > CONTRADICTS)
+            order = np.flatnonzero(doubtful)[np.argsort(visits.evidence[doubtful], kind="stable")]
+            _, first = np.unique(visits.landmark[order], return_index=True)  # one of each landmark
+            parts = [visits.rows[k] for k in order[np.sort(first)] if _key(visits.rows[k]) not in refused]
+            better = self._better_split(solved, parts, refused, recent)
+            if better is None:
+                break
+            solved = better
+        return solved
+
+    def _better_split(
+        self, solved: _Solved, parts: list[IntArray], refused: set[tuple[int, int]], recent: int | None
+    ) -> _Solved | None:
+        """With all parts split off, or with half of them, and so on, if that is better."""
+        while parts:
+            trial = self._all_merged(self._solved(solved.assignment.split(parts)), recent)
+            if _is_better(trial, solved):
+                return trial
+            if len(parts) == 1:
+                refused.add(_key(parts[0]))
+            parts = parts[: len(parts) // 2]
+        return None
+
+    def _relaid(self, solved: _Solved) -> _Solved:
+        """Stretches that lie beside where they belong laid there, if the map is better for it."""
+        for _ in range(RELAID):
+            now = solved.assignment
+            stretches = displaced_stretches(
+                now, solved.marginals, now.sightings >= MIN_SIGHTINGS, density=self._density_m2, probability=P_MERGE
+            )
+            starts = (laid(now, stretch, before) for stretch in stretches[:STRETCHES] for before in BEFORE)
+            trials = (self._all_merged(self._solved(start)) for start in starts)
+            better = next((trial for trial in trials if _is_better(trial, solved)), None)
+            if better is None:
+                break
+            solved = self._contradictions_split(better, set())
         return solved
 
     def _merged(self, solved: _Solved, pairs: list[tuple[int, int]], refused: set[tuple[int, int]]) -> _Solved | None:
@@ -324,7 +385,7 @@ class Associator:
         left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
         self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
         cost = smoother.under(self.noise, heavy=False).cost(estimate)
-        return _Solved(replace(assignment, estimate=estimate), marginals, cost)
+        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother.detections(estimate))
 
 
 def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
@@ -359,6 +420,16 @@ def _latest(assignment: Assignment, count: int | None) -> BoolArray:
     if count is None or count >= len(last):
         return np.ones(len(last), dtype=bool)
     return np.asarray(last >= np.partition(last, -count)[-count])
+
+
+def _is_better(trial: _Solved, solved: _Solved) -> bool:
+    """Whether an assignment explains the detections better, by more than landmarks that it needs beside."""
+    more = trial.assignment.n_landmarks - solved.assignment.n_landmarks
+    return solved.cost - trial.cost - FEW_NATS * more > (0.0 if more else SAME_NATS)
+
+
+def _key(rows: IntArray) -> tuple[int, int]:
+    return int(rows[0]), len(rows)
 
 
 def _partners(row: IntArray) -> IntArray:

@@ -38,7 +38,7 @@ FLATTEST = 0.05
 LOOKED_UP = 80
 """Triangles of the local map that are looked up, at most."""
 MOST_MATCHES = 30_000
-"""Matches of these that are followed, those of the rarest triangles first."""
+"""Matches of these that are followed."""
 SIDE_SIGMAS, SIDE_SLACK_M = 3.4, 0.02
 """Three lengths within both maps differ by this many standard deviations in all, and a little, in 99 of 100 cases."""
 PART_M = 5.0
@@ -57,9 +57,15 @@ REACH_M = 15.0
 
 
 class PlaceIndex:
-    """Places (P, 2) of a map with covariances (P, 2, 2) each; it keeps about 1 kB a place."""
+    """Places (P, 2) of a map with covariances (P, 2, 2) each; it keeps about 1 kB a place.
 
-    def __init__(self, position_m: FloatArray, covariance_m2: FloatArray) -> None:
+    `most_matches` of triangles are followed, those of the rarest first.
+    """
+
+    def __init__(
+        self, position_m: FloatArray, covariance_m2: FloatArray, *, most_matches: int = MOST_MATCHES
+    ) -> None:
+        self._most_matches = most_matches
         self._position, self._covariance = np.ascontiguousarray(position_m), covariance_m2
         self._tree = KDTree(self._position)
         self._sigma_m = (
@@ -116,8 +122,11 @@ class PlaceIndex:
 
     def _first(self, source: LocalMap, rows: IntArray, density: float, probability: float) -> list[tuple[int, int]]:
         """Pairs of some landmarks, wherever in the map they are."""
-        local = source.part(rows)
+        local, fewest = source.part(rows), max(3, SEEN_AGAIN * len(rows))
         motions = self.motions(local.place, local.beside_m)
+        best = se2.transform(motions[:1, None], local.place)
+        if np.isfinite(self._tree.query(best, distance_upper_bound=NEAR_M)[0]).sum() < fewest:
+            return []
         places = self.around(se2.transform(motions[:, None], local.place).reshape(-1, 2), 2.0 * NEAR_M)
         area_m2 = float(np.prod(np.ptp(self._position, axis=0)))
         elsewhere = math.log(max(1.0, area_m2 / (2.0 * math.pi * MOTION_SIGMA[0] * MOTION_SIGMA[1])))
@@ -131,7 +140,7 @@ class PlaceIndex:
             least_nats=least,
             lead_nats=LEAD_NATS,
         )
-        return [(int(rows[k]), m) for k, m in found] if len(found) >= max(3, SEEN_AGAIN * len(rows)) else []
+        return [(int(rows[k]), m) for k, m in found] if len(found) >= fewest else []
 
     def _further(
         self, source: LocalMap, mine: IntArray, theirs: IntArray, done: BoolArray, density: float, probability: float
@@ -183,7 +192,7 @@ class PlaceIndex:
         count = np.array([sum(len(each[k]) for each in looked) for k in range(len(chosen))])
         for k in np.argsort(count, kind="stable").tolist():
             total += int(count[k])
-            if total > MOST_MATCHES and mine:
+            if total > self._most_matches and mine:
                 break
             for turn, each in zip(_TURNS, looked, strict=True):
                 found = np.asarray(each[k], dtype=np.int64)

@@ -398,70 +398,73 @@ def _spread_rows(cov: FloatArray, row: FloatArray, rows: FloatArray, own: int, s
 
 @kernel
 def ways_to_border(
-    tree: Tree, stored: FloatArray, node_of: Any, wanted: Any
+    tree: Tree, stored: FloatArray, node_of: Any, wanted: Any, matrix: FloatArray
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Return columns of `L^-1` for the numbers of some variables, only the rows that any of them reaches.
+    """Return `L^-1` times a matrix that is zero but for the numbers of some variables, only the rows that it reaches.
 
     Args:
         tree: the elimination tree.
         stored: rows of the Cholesky factor, `L'`.
         node_of: (V,) front that eliminates each variable, -1 of the border.
-        wanted: (K,) variables.
+        wanted: (K,) different variables.
+        matrix: (C, numbers of these) its columns, one a row.
 
     Returns:
-        (rows, columns) of the eliminated numbers, (B, columns) of the border before it is factorised itself, and
-        (T,) the first row of each front, -1 where no variable's way passes.
+        (C, rows) of the eliminated numbers, (C, B) of the border before it is factorised itself, and (T,) the first
+        row of each front, -1 where no variable's way passes.
     """
     reached = np.full(len(tree.parent), -1)
-    columns = 0
     for v in wanted:
-        columns += tree.dim[v]
         node = node_of[v]
         while node >= 0 and reached[node] < 0:
             reached[node] = 0
             node = tree.parent[node]
-    total, largest = 0, 1
+    total, room, begin = 0, 0, np.zeros(len(tree.parent), np.int64)
     for node in range(len(tree.parent)):
-        largest = max(largest, tree.size[node])
         if reached[node] == 0:
-            reached[node] = total
+            reached[node], begin[node] = total, room
             total += tree.own[node]
+            room += tree.size[node]
     n_border = 0
     for v in tree.border:
         n_border += tree.dim[v]
-    out, rest = np.zeros((total, columns)), np.zeros((n_border, columns))
-    column = 0
-    mine, above = np.zeros(max(largest, n_border)), np.zeros(max(largest, n_border))
-    for v in wanted:
-        for a in range(tree.dim[v]):
+    out, rest, front = np.zeros((len(matrix), total)), np.zeros((len(matrix), n_border)), np.zeros(room)
+    passed = np.full(len(tree.parent), -1)
+    for c in range(len(matrix)):
+        column = 0
+        for v in wanted:
             node = node_of[v]
-            if node < 0:
-                rest[tree.in_border[v] + a, column] = 1.0
-            else:
-                mine[: tree.size[node]] = 0.0
+            for a in range(tree.dim[v]):
+                value = matrix[c, column + a]
+                if value == 0.0:
+                    continue
+                if node < 0:
+                    rest[c, tree.in_border[v] + a] = value
+                    continue
+                passed[node] = c
                 for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
                     if tree.variable[k] == v:
-                        mine[tree.at[k] + a] = 1.0
-            while node >= 0:
-                size, own = tree.size[node], tree.own[node]
-                for i in range(own):
-                    at = tree.stored[node] + i * size
-                    value = mine[i] / stored[at + i]
-                    out[reached[node] + i, column] = value
-                    if value != 0.0:
-                        for j in range(i + 1, size):
-                            mine[j] -= value * stored[at + j]
-                up = tree.parent[node]
-                above[: tree.size[up] if up >= 0 else n_border] = 0.0
-                for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
-                    for b in range(tree.dim[tree.variable[k]]):
-                        above[tree.up[k] + b] = mine[tree.at[k] + b]
-                mine, above = above, mine
-                node = up
-                if node < 0:
-                    for j in range(n_border):
-                        rest[j, column] = mine[j]
-            column += 1
+                        front[begin[node] + tree.at[k] + a] = value
+            column += tree.dim[v]
+        for node in range(len(tree.parent) - 1, -1, -1):
+            if passed[node] != c:
+                continue
+            size, own, up = tree.size[node], tree.own[node], tree.parent[node]
+            mine = front[begin[node] : begin[node] + size]
+            for i in range(own):
+                at = tree.stored[node] + i * size
+                value = mine[i] / stored[at + i]
+                out[c, reached[node] + i] = value
+                if value != 0.0:
+                    for j in range(i + 1, size):
+                        mine[j] -= value * stored[at + j]
+            above = rest[c]
+            if up >= 0:
+                above, passed[up] = front[begin[up] : begin[up] + tree.size[up]], c
+            for k in range(tree.first[node] + tree.n_own[node], tree.first[node + 1]):
+                for b in range(tree.dim[tree.variable[k]]):
+                    above[tree.up[k] + b] += mine[tree.at[k] + b]
+            mine[:] = 0.0
     return out, rest, reached
 
 
@@ -469,16 +472,16 @@ def ways_to_border(
 def columns_of_inverse(
     tree: Tree, stored: FloatArray, ways: FloatArray, reached: Any, border: FloatArray
 ) -> FloatArray:
-    """Return columns (numbers, columns) of the inverse, from those of `L^-1` and the (B, columns) of the border."""
-    out = np.empty((tree.begin[-1], ways.shape[1]))
+    """Return columns (numbers, C) of the inverse, from those (C, rows) of `L^-1` and the (B, C) of the border."""
+    out = np.empty((tree.begin[-1], len(ways)))
     right, x = np.zeros(tree.begin[-1]), np.zeros(tree.begin[-1])
-    for column in range(ways.shape[1]):
+    for column in range(len(ways)):
         for node in range(len(tree.parent)):
             for k in range(tree.first[node], tree.first[node] + tree.n_own[node]):
                 v = tree.variable[k]
                 for a in range(tree.dim[v]):
                     row = reached[node] + tree.at[k] + a
-                    right[tree.begin[v] + a] = ways[row, column] if reached[node] >= 0 else 0.0
+                    right[tree.begin[v] + a] = ways[column, row] if reached[node] >= 0 else 0.0
         back_substitute(tree, stored, right, border[:, column].copy(), x, 0, len(tree.parent))
         out[:, column] = x
     return out

@@ -101,12 +101,17 @@ class Factorised:
             yield share
         return room
 
-    def joint(self, variables: IntArray) -> FloatArray:
-        """Return the joint covariance of different variables, in their order; the cost is that of their ways up."""
-        ways, rest, _ = self._ways(variables)
-        joint = ways.T @ ways
-        if len(rest):
-            rest = solve_triangular(self._border()[0], rest, trans="T")
+    def joint(self, variables: IntArray, matrix: FloatArray | None = None) -> FloatArray:
+        """Return the joint covariance of different variables, in their order; the cost is that of their ways up.
+
+        Args:
+            variables: (K,) of them.
+            matrix: (C, numbers) of these: the (C, C) covariance of `matrix x` is returned instead.
+        """
+        ways, rest, _ = self._ways(variables, matrix)
+        joint = ways @ ways.T
+        if rest.size:
+            rest = solve_triangular(self._border()[0], rest.T, trans="T")
             joint += rest.T @ rest
         return np.asarray(joint)
 
@@ -115,40 +120,31 @@ class Factorised:
 
         It is never formed: variables are taken some at a time.
         """
-        tree = self.system.tree
-        begin = np.cumsum(tree.own) - tree.own
-        some = [variables[at : at + BATCH] for at in range(0, len(variables), BATCH)]
-        first = np.concatenate([[0], np.cumsum([tree.dim[part].sum() for part in some])]).astype(np.int64)
-        told, told_border = (
-            np.zeros((int(tree.own.sum()), matrix.shape[1])),
-            np.zeros((len(self.right), matrix.shape[1])),
-        )
+        first = np.concatenate([[0], np.cumsum(self.system.tree.dim[variables])])
+        told, told_border, reached = self._ways(variables, matrix.T)
+        border = cho_solve(self._border(), told_border.T) if told_border.size else told_border.T
         found = np.empty(matrix.shape)
-        for summing in (True, False):  # `L^-1` of all, times the matrix; then each of them, times that
-            for k, part in enumerate(some):
-                ways, rest, reached = self._ways(part)
-                rows = np.concatenate(
-                    [begin[node] + np.arange(tree.own[node]) for node in np.flatnonzero(reached >= 0)]
-                )
-                own = slice(int(first[k]), int(first[k + 1]))
-                if summing:
-                    told[rows] += ways @ matrix[own]
-                    told_border += rest @ matrix[own]
-                else:
-                    found[own] = ways.T @ told[rows]
-                    if len(rest):
-                        found[own] += rest.T @ cho_solve(self._border(), told_border)
+        for at in range(0, len(variables), BATCH):
+            some = variables[at : at + BATCH]
+            ways, rest, passed = self._ways(some)
+            own = self.system.tree.own
+            rows = [reached[node] + np.arange(own[node]) for node in np.flatnonzero(passed >= 0)]
+            found[first[at] : first[at + len(some)]] = ways @ told[:, np.concatenate(rows)].T + rest @ border
         return found
 
     def columns(self, variables: IntArray) -> FloatArray:
         """Return (numbers, n) covariance of everything with some variables; the cost is that of n solutions."""
         ways, rest, reached = self._ways(variables)
-        border = cho_solve(self._border(), rest) if len(rest) else rest
+        border = cho_solve(self._border(), rest.T) if rest.size else rest.T
         return columns_of_inverse(self.system.tree, self.rows, ways, reached, border)
 
-    def _ways(self, variables: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    def _ways(self, variables: IntArray, matrix: FloatArray | None = None) -> tuple[FloatArray, FloatArray, IntArray]:
         wanted = np.ascontiguousarray(variables, dtype=np.int64)
-        return ways_to_border(self.system.tree, self.rows, self.system.node_of, wanted)
+        if matrix is None:
+            matrix = np.eye(int(self.system.tree.dim[wanted].sum()))
+        return ways_to_border(
+            self.system.tree, self.rows, self.system.node_of, wanted, np.ascontiguousarray(matrix, dtype=np.float64)
+        )
 
     def _border(self) -> tuple[FloatArray, bool]:
         try:
