@@ -213,7 +213,7 @@ class Smoother:
         return worth
 
     def detections(self, estimate: Estimate) -> FloatArray:
-        """Return (M, 2, 11) detections linearised and whitened: by pose, place and sensor states, and the right side."""
+        """Return (M, 2, 11) detections, linearised and whitened: by pose, place, sensor states; and the right side."""
         begin = ODOMETRY * (len(estimate.pose) - 1)
         values = self.linearised(estimate).values[begin : begin + DETECTION * len(self.problem.pose_row)]
         return values.reshape(-1, 2, 11)

@@ -75,9 +75,16 @@ RISE_NATS, RISE_SHARE, RISE_MOST = 7.0, 1.75, 100.0
 """By how much the cost may rise for a pair that is merged: for the difference of the two, and for the detections of the
 lesser of them, of which a quarter may become outliers; at most. Errors of sightings from one place are alike, which the
 cost does not know."""
-RELAID, STRETCHES, BEFORE = 8, 2, (8.0, 2.0, 0.0)
-SPLIT_ROUNDS, SAME_NATS = 5, 0.5
+RELAID, STRETCHES = 8, 2
+"""Stretches that are laid where they belong, at most, and those that are tried each time, the longest first."""
+BEFORE = (8.0, 2.0, 0.0)
+"""How long before a stretch revisits may be wrong already, relative to its length; tried in this order."""
+SPLIT_ROUNDS = 5
+"""Times that contradictory visits are split off, at most."""
 CONTRADICTS = gates(1, 0.95)[1]
+"""Squared distance of a visit from what is known without it, from which it is tried by itself."""
+SAME_NATS = 0.5
+"""By how much the cost must fall for as many landmarks: less is how far the optimum was iterated."""
 LAST_ROUNDS = 5
 """Comparisons of every detection with the whole map at the end, at most."""
 SAME_SHARE = 0.002

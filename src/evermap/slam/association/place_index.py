@@ -62,9 +62,7 @@ class PlaceIndex:
     `most_matches` of triangles are followed, those of the rarest first.
     """
 
-    def __init__(
-        self, position_m: FloatArray, covariance_m2: FloatArray, *, most_matches: int = MOST_MATCHES
-    ) -> None:
+    def __init__(self, position_m: FloatArray, covariance_m2: FloatArray, *, most_matches: int = MOST_MATCHES) -> None:
         self._most_matches = most_matches
         self._position, self._covariance = np.ascontiguousarray(position_m), covariance_m2
         self._tree = KDTree(self._position)

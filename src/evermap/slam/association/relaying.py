@@ -1,9 +1,9 @@
 """Stretches of a recording that lie beside where they belong: recognised by their constellation, and laid there.
 
-Where a loop was closed wrongly, or closed by nothing since the robot had turned farther than it knew, everything met
-from then on is there twice, beside itself, and each half agrees with itself: no gate finds that. But landmarks that were
-met one after the other have the shape of others that were met long before. Such a stretch is laid over those, the poses
-since then with it, and what held it elsewhere is cut: the start of an optimum that can be compared.
+Where a loop was closed wrongly, or not closed because the robot had turned farther than it knew, everything met from
+then on is in the map twice, and each half agrees with itself: no gate finds that. But landmarks met one after the other
+have the shape of others that were met long before. Such a stretch is laid over those together with the poses since
+then, and what held it elsewhere is cut: a start from which the solver finds an optimum that can be compared.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ def displaced_stretches(
 def _with_nearest(place: FloatArray, rows: IntArray) -> IntArray:
     """Some rows, spread over all, each with the one whose place is nearest."""
     some = rows[:: max(1, len(rows) // SAMPLED)]
-    nearest = rows[KDTree(place[rows]).query(place[some], k=2)[1][:, 1]]
-    return np.unique(np.concatenate([some, nearest]))
+    nearest = np.asarray(KDTree(place[rows]).query(place[some], k=2)[1])[:, 1]
+    return np.unique(np.concatenate([some, rows[nearest]]))
 
 
 def laid(assignment: Assignment, stretch: Displaced, before: float) -> Assignment:

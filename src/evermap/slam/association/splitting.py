@@ -1,9 +1,9 @@
 """Landmarks that are two: visits whose detections contradict the rest of the recording, though the map was bent to fit.
 
-Detections that were given to a landmark wrongly pull at the map until it fits, and the residuals look well; what remains
-is the pull. With a place of its own for the detections of one visit, the optimum would put it at `d = V L' b` from that
-of the others, with `V^-1 = L' (I - A S A') L` (a score test: the factor `A x + L d = b` of these detections, the
-covariance `S` of the solution), which costs no other solution.
+Detections that were given to a landmark wrongly bend the map until it fits, and the residuals look small. If the
+detections of one visit had a landmark of their own, the optimum would put it at `d = V L' b` from that of the others,
+with `V^-1 = L' (I - A S A') L` (a score test: `A x + L d = b` are these detections, linearised and whitened, `S` the
+covariance of the solution). No other solution is needed for that.
 """
 
 from __future__ import annotations
@@ -38,7 +38,13 @@ class Visits(NamedTuple):
 
 
 def weighed_visits(
-    assignment: Assignment, marginals: Marginals, linear: FloatArray, *, among: BoolArray, density: float, pause_s: float
+    assignment: Assignment,
+    marginals: Marginals,
+    linear: FloatArray,
+    *,
+    among: BoolArray,
+    density: float,
+    pause_s: float,
 ) -> Visits:
     """Return how well each visit agrees with all that is known without it.
 
@@ -70,7 +76,7 @@ def weighed_visits(
 
 
 def _apart(linear: FloatArray, pose: IntArray, landmark: int, marginals: Marginals) -> tuple[FloatArray, FloatArray]:
-    """(2,) from the place of a visit's detections to that of the others, if they need not be one, and its covariance."""
+    """(2,) from a visit's landmark to that of the others, were they two, and its covariance (2, 2)."""
     poses, at = np.unique(pose, return_inverse=True)
     n, tie = 3 * len(poses), linear[:, :, 3:5]
     tied = np.einsum("kra,krb->kab", linear[:, :, :10], tie)
@@ -79,5 +85,5 @@ def _apart(linear: FloatArray, pose: IntArray, landmark: int, marginals: Margina
     through[n : n + 7] = tied[:, 3:].sum(axis=0)
     explained = marginals.joint(np.array([landmark]), poses=poses, states=True, by=through.T)
     information = through[n : n + 2] - explained + LEAST_M2 * np.eye(2)
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return covariance @ np.einsum("kra,kr->a", tie, linear[:, :, 10]), covariance
