@@ -105,6 +105,20 @@ def test_default_out_is_one_plain_folder(name: str, folder: str) -> None:
     assert default_out(name) == Path("evermap-out") / folder
 
 
+def test_the_first_result_argues_for_itself(template: Path, tmp_path: Path, done: tuple[Path, dict[str, Any]]) -> None:
+    """Odometry that drifts is put right, and the cart that an older map has elsewhere is told."""
+    metrics = done[1]["metrics"]
+    assert 10.0 * metrics["pose_rmse_m"] < metrics["dead_reckoning_rmse_m"]
+    result = run(
+        "slam", template, "--out", tmp_path, "--prior-map", template / "survey.csv", "--json", "--force", *QUICK
+    )
+    assert result.exit_code == 0, result.stderr
+    best = max(json.loads(result.stdout)["changes"], key=lambda change: change["probability"])
+    assert best["landmarks"] == [4]
+    assert best["probability"] > 0.8
+    assert best["displacement_m"] == pytest.approx([0.3, 1.1], abs=0.05)
+
+
 def test_prior_map_puts_the_run_into_its_frame(template: Path, tmp_path: Path) -> None:
     survey = read_recording(template).true_landmarks
     assert survey is not None

@@ -1,4 +1,7 @@
-"""Small, complete examples of the native format for `evermap slam --init`: a robot circles past three landmarks."""
+"""Small, complete examples of the native format for `evermap slam --init`.
+
+A robot goes three rounds by odometry that is a few per cent off, and a cart is not where an older map has it.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,15 @@ _BEARING_MAX_RAD = 2.2
 _SIGMA_RANGE_M = 0.03
 _SIGMA_BEARING_RAD = 0.02
 _P_DETECT = 0.9
-_LANDMARK_ID = (1, 2, 3)
-_LANDMARK_M = np.array([[2.5, -0.6], [2.2, 3.6], [-2.3, 2.0]])
-_CLASSES = ("pillar", "door", "pillar")
+_LANDMARK_ID = (1, 2, 3, 4, 5, 6)
+_LANDMARK_M = np.array([[2.5, -0.6], [2.2, 3.6], [-2.3, 2.0], [-0.6, 4.2], [0.3, -1.5], [-2.1, -0.4]])
+_CLASSES = ("pillar", "door", "pillar", "cart", "pillar", "door")
+_DURATION_S = 60.0
+_SURVEYED_M = np.where(np.array(_CLASSES)[:, None] == "cart", _LANDMARK_M - [0.3, 1.1], _LANDMARK_M)
+"""Where they were when somebody measured them: the cart has been moved since then."""
+_SPEED_READS, _TURN_READS = 1.02, 0.97
+"""Of the true ones: a wheel that is worn and a wheelbase that is a few per cent off, as on real robots."""
+_SPEED_NOISE_MPS, _TURN_NOISE_RADPS = 0.02, 0.02
 
 _SENSOR_TOML = """\
 # A recording for evermap: this folder. Replace the example rows by your own; docs/formats.md explains everything.
@@ -70,11 +79,15 @@ Optional, but worth having: every instant at which the sensor looked, also when 
 Optional: the robot's true poses, used only to say how large the errors are.""",
     "landmarks": """\
 Optional: the landmarks' true positions, for errors or with '--prior-map truth'. More columns: sigma_m, class_id.""",
+    "survey": """\
+No part of the recording: an older map, for '--prior-map survey.csv'. The cart, 4, has been moved since then.""",
 }
 
 
 def write_template(folder: str | Path, *, in_space: bool = False) -> Path:
-    """Write a commented, complete recording of 20 s that can be localised as it is; the same bytes every time.
+    """Write a commented, complete recording that can be localised as it is; the same bytes every time.
+
+    In the plane a minute, beside an older map; in space 20 s.
 
     Args:
         folder: to make.
@@ -94,16 +107,16 @@ def write_template(folder: str | Path, *, in_space: bool = False) -> Path:
 
 def _tables() -> dict[str, dict[str, Any]]:
     random = np.random.default_rng(7)
-    odometry_s = np.arange(0.0, 20.01, 0.1).round(3)
-    frame_s = np.arange(0.0, 20.01, 0.5).round(3)
-    truth_s = np.arange(0.0, 20.01, 1.0).round(3)
+    odometry_s = np.arange(0.0, _DURATION_S + 0.01, 0.1).round(3)
+    frame_s = np.arange(0.0, _DURATION_S + 0.01, 0.5).round(3)
+    truth_s = np.arange(0.0, _DURATION_S + 0.01, 1.0).round(3)
     truth = _pose_at(truth_s)
     count = len(odometry_s)
     return {
         "odometry": {
             "stamp_s": odometry_s,
-            "forward_mps": (_SPEED_MPS + 0.02 * random.standard_normal(count)).round(3),
-            "angular_radps": (_TURN_RADPS + 0.02 * random.standard_normal(count)).round(3),
+            "forward_mps": (_SPEED_READS * _SPEED_MPS + _SPEED_NOISE_MPS * random.standard_normal(count)).round(3),
+            "angular_radps": (_TURN_READS * _TURN_RADPS + _TURN_NOISE_RADPS * random.standard_normal(count)).round(3),
         },
         "detections": _detections(frame_s, random),
         "frames": {"stamp_s": frame_s},
@@ -113,13 +126,14 @@ def _tables() -> dict[str, dict[str, Any]]:
             "y_m": truth[:, 1].round(4),
             "theta_rad": truth[:, 2].round(4),
         },
-        "landmarks": {
-            "landmark_id": np.array(_LANDMARK_ID),
-            "x_m": _LANDMARK_M[:, 0],
-            "y_m": _LANDMARK_M[:, 1],
-            "class_id": list(_CLASSES),
-        },
+        "landmarks": _map(_LANDMARK_M),
+        "survey": _map(_SURVEYED_M),
     }
+
+
+def _map(position_m: FloatArray) -> dict[str, Any]:
+    x_m, y_m = position_m.T
+    return {"landmark_id": np.array(_LANDMARK_ID), "x_m": x_m, "y_m": y_m, "class_id": list(_CLASSES)}
 
 
 def _pose_at(stamp_s: FloatArray) -> FloatArray:
@@ -129,7 +143,7 @@ def _pose_at(stamp_s: FloatArray) -> FloatArray:
 
 def _detections(frame_s: FloatArray, random: np.random.Generator) -> dict[str, Any]:
     pose_world_sensor = se2.compose(_pose_at(frame_s), np.array(_MOUNT))
-    world = np.broadcast_to(_LANDMARK_M, (len(frame_s), 3, 2))
+    world = np.broadcast_to(_LANDMARK_M, (len(frame_s), *_LANDMARK_M.shape))
     offset = world - pose_world_sensor[:, None, :2]
     range_m = np.hypot(offset[..., 0], offset[..., 1])
     bearing_rad = se2.wrap(np.arctan2(offset[..., 1], offset[..., 0]) - pose_world_sensor[:, None, 2])
