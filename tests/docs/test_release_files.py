@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import configparser
+import json
 import re
+import shlex
+import tomllib
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 import evermap
+from evermap.cli.main import app
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -32,3 +38,31 @@ def test_the_citation_is_valid_and_of_this_version() -> None:
 @pytest.mark.parametrize("package", ["src/evermap", "studies/src/evermap_studies"])
 def test_a_package_says_that_it_is_typed(package: str) -> None:
     assert (REPOSITORY / package / "py.typed").is_file()
+
+
+def test_the_service_and_the_container_start_what_exists() -> None:
+    """Options, extras and files of the examples, and that they are stopped with more patience than entering takes."""
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(REPOSITORY / "examples" / "evermap-live.service", encoding="utf-8")
+    assert unit.sections() == ["Unit", "Service", "Install"]
+    binary, verb, *started = shlex.split(unit["Service"]["ExecStart"])
+    assert Path(binary).name == "evermap"
+    assert unit["Service"]["WorkingDirectory"] == f"/var/lib/{unit['Service']['StateDirectory']}"
+    assert int(unit["Service"]["TimeoutStopSec"]) >= 120
+    container = (REPOSITORY / "examples" / "Containerfile").read_text(encoding="utf-8")
+    lists = dict(re.findall(r"^(ENTRYPOINT|CMD) (.*)$", container, re.MULTILINE))
+    assert json.loads(lists["ENTRYPOINT"]) == ["evermap", "live"]
+    shown = CliRunner().invoke(app, [verb, "--help"], terminal_width=200).stdout
+    for arguments in (started, json.loads(lists["CMD"])):
+        options = [one for one in arguments if one.startswith("--")]
+        assert options
+        assert all(re.search(rf"{one}\b", shown) for one in options)
+        assert dict(zip(arguments[::2], arguments[1::2], strict=True))["--sensor"] == "sensor.toml"
+    for copied in re.findall(r"^COPY (.*) \S+$", container, re.MULTILINE):
+        assert all((REPOSITORY / name).exists() for name in copied.split())
+    extras = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for text in (container, (REPOSITORY / "examples" / "evermap-live.service").read_text(encoding="utf-8")):
+        named = re.findall(r"(?:evermap|/src)\[(\w+)\]", text)
+        assert named
+        assert set(named) <= extras["optional-dependencies"].keys()
