@@ -37,20 +37,24 @@ def wrap(angle_rad: ArrayLike) -> FloatArray:
 
 def compose(a: ArrayLike, b: ArrayLike) -> FloatArray:
     """Return `a * b`: the pose `b`, given in the frame `a`. Shapes (..., 3), broadcast."""
-    a, b = np.broadcast_arrays(np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64))
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
-    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], axis=-1)
+    pose = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    pose[..., 0] = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    pose[..., 1] = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    pose[..., 2] = wrap(a[..., 2] + b[..., 2])
+    return pose
 
 
 def inverse(a: ArrayLike) -> FloatArray:
     """Return the motion that undoes `a`. Shape (..., 3)."""
     a = np.asarray(a, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = -c * a[..., 0] - s * a[..., 1]
-    y = s * a[..., 0] - c * a[..., 1]
-    return np.stack([x, y, wrap(-a[..., 2])], axis=-1)
+    pose = np.empty(a.shape)
+    pose[..., 0] = -c * a[..., 0] - s * a[..., 1]
+    pose[..., 1] = s * a[..., 0] - c * a[..., 1]
+    pose[..., 2] = wrap(-a[..., 2])
+    return pose
 
 
 def between(a: ArrayLike, b: ArrayLike) -> FloatArray:

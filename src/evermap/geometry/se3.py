@@ -44,7 +44,11 @@ def from_angles(roll_pitch_yaw: ArrayLike) -> FloatArray:
 
 def normalised(pose: ArrayLike) -> FloatArray:
     """Return poses (..., 7) with quaternions of unit length and of one sign."""
-    pose = np.array(pose, dtype=np.float64)
+    return _normalise(np.array(pose, dtype=np.float64))
+
+
+def _normalise(pose: FloatArray) -> FloatArray:
+    """The same in place."""
     quaternion = pose[..., 3:]
     # whichever of qw, qz, qy, qx is the first that is not zero outweighs all that follow
     backwards = np.sign(quaternion) @ [1.0, 2.0, 4.0, 8.0] < 0.0
@@ -169,8 +173,9 @@ def rigid_directions(point: ArrayLike) -> FloatArray:
 
 def _pose(position: FloatArray, quaternion: FloatArray) -> FloatArray:
     lead = np.broadcast_shapes(position.shape[:-1], quaternion.shape[:-1])
-    both = np.broadcast_to(position, (*lead, 3)), np.broadcast_to(quaternion, (*lead, 4))
-    return normalised(np.concatenate(both, axis=-1))
+    pose = np.empty((*lead, 7))
+    pose[..., :3], pose[..., 3:] = position, quaternion
+    return _normalise(pose)
 
 
 def _conjugate(quaternion: FloatArray) -> FloatArray:
@@ -193,8 +198,10 @@ def _turned(quaternion: FloatArray, vector: FloatArray) -> FloatArray:
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """As `np.cross`, in a fifth of the time."""
-    x, y, z = (a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2] for k in range(3))
-    return np.stack([x, y, z], axis=-1)
+    ax, ay, az, bx, by, bz = a[..., 0], a[..., 1], a[..., 2], b[..., 0], b[..., 1], b[..., 2]
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0], out[..., 1], out[..., 2] = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    return out
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

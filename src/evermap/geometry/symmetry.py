@@ -153,11 +153,12 @@ class Symmetries:
         return found
 
     def twisted(self, pose: FloatArray, reference: FloatArray) -> FloatArray:
-        """Return poses (P, 7), turned about their axes to be as near as possible to `reference` (P, 7)."""
-        found = pose.copy()
-        for row in np.unique(self.of[self.of > 0]).tolist():
-            some = self.of == row
-            found[some] = self.kinds[row].twisted(pose[some], reference[some])
+        """Return poses (..., P, 7), turned about their axes to be as near as possible to `reference` (..., P, 7)."""
+        found = np.array(np.broadcast_to(pose, np.broadcast_shapes(pose.shape, reference.shape)))
+        for row in np.unique(self.of).tolist():
+            if self.kinds[row].axis >= 0:
+                some = self.of == row
+                found[..., some, :] = self.kinds[row].twisted(found[..., some, :], reference[..., some, :])
         return found
 
     def angle_between(self, pose: FloatArray, other: FloatArray) -> FloatArray:

@@ -93,7 +93,7 @@ def _candidates(
     where the positions of three or more put it.
     """
     seen, known = ways[:, turned], place[turned]
-    known = np.stack([alike[turned].twisted(known, se3.compose(predicted, one)) for one in seen])
+    known = alike[turned].twisted(known, se3.compose(predicted, seen))
     by_places = se3.compose(known, se3.inverse(seen)).reshape(-1, 7)
     by_all = rigid(ways[0, :, :3], place[:, :3])[None] if len(place) >= 3 else np.zeros((0, 7))
     return np.vstack([predicted[None], by_places, by_all])
