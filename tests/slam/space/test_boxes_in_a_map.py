@@ -267,10 +267,10 @@ def test_a_drive_elsewhere_is_not_placed(days: Days) -> None:
 
 def test_rows_that_look_alike_are_not_taken_for_each_other() -> None:
     """All slots of a car park are 6 m apart, and all cars of a size: from elsewhere in it, nothing tells where."""
-    street = Parking.of(7, n_slots=40, metres=200.0)
+    street = Parking.of(7, n_slots=40, metres=140.0)
     straight = np.zeros_like(street.path)
     straight[:, 0] = np.arange(len(straight)) * SPEED_MPS * STEP_S
-    slot = np.array([[20.0 + 6.0 * k, side, 0.0] for k in range(26) for side in (-5.0, 5.0)])
+    slot = np.array([[20.0 + 6.0 * k, side, 0.0] for k in range(16) for side in (-5.0, 5.0)])
     street = Parking(straight, slot, [])
     for k in range(len(slot)):
         street.spells.append(Spell(k, -1e6, 1e6, (4.2, 1.7, 1.5)))
