@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,35 +60,41 @@ def driven(
         states = default.mean + SPREAD * rng.normal(size=9)
     stamps = ODOMETRY_S * np.arange(count) - 1.0
     pose = np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]) if start is None else start.astype(float)
-    wander = 0.0
+    wander, (x, y, heading) = 0.0, pose.tolist()
     velocity, truth = np.zeros((count, 3)), np.zeros((count + 1, 3))
     truth[0] = pose
-    for k in range(count):
-        wander = 0.98 * wander + 0.15 * rng.normal()
-        home = se2.wrap(np.arctan2(-pose[1], -pose[0]) - pose[2])
-        turn = np.clip(wander + (1.5 * home if np.hypot(*pose[:2]) > 5.0 else 0.0), -1.5, 1.5)
+    drawn, sigma, scale = rng.normal(size=(count, 4)).tolist(), NOISE.odometry.tolist(), states.tolist()
+    for k, (swerve, *noise) in enumerate(drawn):  # in plain numbers, which is ten times as fast
+        wander = 0.98 * wander + 0.15 * swerve
+        home = math.remainder(math.atan2(-y, -x) - heading, 2.0 * math.pi)
+        turn = min(max(wander + (1.5 * home if math.hypot(x, y) > 5.0 else 0.0), -1.5), 1.5)
         velocity[k] = 0.6, 0.0, turn
-        v = states[6] * velocity[k, 0] - states[8] * abs(turn)
-        sigma = NOISE.odometry
         along = sigma[0] ** 2 * 0.6 + sigma[1] ** 2 * abs(turn) + FLOOR_FORWARD_M**2
         across = sigma[2] ** 2 * 0.6 + FLOOR_FORWARD_M**2
         about = sigma[3] ** 2 + sigma[4] ** 2 * abs(turn) + FLOOR_TURN_RAD**2
-        twist = np.array([v, 0.0, states[7] * turn]) * ODOMETRY_S
-        twist += np.sqrt(np.array([along, across, about]) * ODOMETRY_S) * rng.normal(size=3)
-        pose = se2.compose(pose, se2.exp(twist))
-        truth[k + 1] = pose
+        unit = [math.sqrt(each * ODOMETRY_S) * one for each, one in zip((along, across, about), noise, strict=True)]
+        ahead = (scale[6] * 0.6 - scale[8] * abs(turn)) * ODOMETRY_S + unit[0]
+        turned = scale[7] * turn * ODOMETRY_S + unit[2]
+        sinc, cosc = (math.sin(turned) / turned, (1.0 - math.cos(turned)) / turned) if turned else (1.0, 0.0)
+        right, up = sinc * ahead - cosc * unit[1], cosc * ahead + sinc * unit[1]
+        x, y = (
+            x + math.cos(heading) * right - math.sin(heading) * up,
+            y + math.sin(heading) * right + math.cos(heading) * up,
+        )
+        heading = math.remainder(heading + turned, 2.0 * math.pi)
+        truth[k + 1] = x, y, heading
     frame_s = FRAME_S * np.arange(n_frames)
-    poses = np.array([_at(truth, stamps, s + states[5]) for s in frame_s])
+    poses = _at(truth, stamps, frame_s + states[5])
     return World(
         landmark, poses, states, Drive.from_rows(stamps, velocity), frame_s,
         [_seen(rng, p, landmark, states) for p in poses],
     )  # fmt: skip
 
 
-def _at(truth: np.ndarray, stamps: np.ndarray, when: float) -> np.ndarray:
-    """Between two poses along the twist that leads from one to the other."""
-    k = int((when - stamps[0]) // ODOMETRY_S)
-    part = (when - stamps[k]) / ODOMETRY_S
+def _at(truth: np.ndarray, stamps: np.ndarray, when: np.ndarray) -> np.ndarray:
+    """Between two poses each along the twist that leads from one to the other."""
+    k = ((when - stamps[0]) // ODOMETRY_S).astype(np.int64)
+    part = ((when - stamps[k]) / ODOMETRY_S)[:, None]
     return se2.compose(truth[k], se2.exp(part * se2.log(se2.between(truth[k], truth[k + 1]))))
 
 
