@@ -60,11 +60,11 @@ def tags_of_tagslam(data: bytes, path: Path) -> Table:
         for name, body in entry.items() if isinstance(entry, dict) else ():
             if not isinstance(body, dict) or not body.get("is_static") or "pose" not in body:
                 continue
-            where = _turned(body, path, name)
+            where = pose_of(body["pose"], path, name)
             for tag in body.get("tags") or ():
                 if isinstance(tag, dict) and "pose" in tag:
                     field = f"{name}.tags"
-                    pose = se3.compose(where, _turned(tag, path, field))
+                    pose = se3.compose(where, pose_of(tag["pose"], path, field))
                     size = _number(tag.get("size", body.get("default_tag_size", math.nan)), path, field)
                     rows.append((_number(tag.get("id"), path, field), *pose, size))
     return _table(path, rows, range(1, len(rows) + 1))
@@ -124,18 +124,21 @@ def tags_of_fiducials(data: bytes, path: Path) -> Table:
     return _table(path, rows, lines)
 
 
-def _turned(content: dict[str, Any], path: Path, field: str) -> FloatArray:
-    """A pose (7,) from `pose` with `position` and a rotation vector `rotation`."""
-    parts = [content["pose"].get(part) if isinstance(content["pose"], dict) else None for part in _PARTS]
+def pose_of(content: Any, path: Path, field: str) -> FloatArray:
+    """Return the pose (7,) of TagSLAM's `pose`: a `position` and a rotation vector `rotation`.
+
+    Raises:
+        InputError: other contents, named by the file and the field that the pose is of.
+    """
+    parts = [content.get(part) if isinstance(content, dict) else None for part in ("position", "rotation")]
     if not all(isinstance(part, dict) and not {*"xyz"} - part.keys() for part in parts):
         raise InputError("needs position and rotation, with x, y and z", path=path, field=f"{field}.pose")
     at, turn = ([_number(part[axis], path, f"{field}.pose") for axis in "xyz"] for part in parts if part is not None)
+    if not np.isfinite([*at, *turn]).all():
+        raise InputError("must be finite numbers", path=path, field=f"{field}.pose")
     pose = se3.exp(np.array([0.0, 0.0, 0.0, *turn]))
     pose[:3] = at
     return pose
-
-
-_PARTS = ("position", "rotation")
 
 
 def _number(value: Any, path: Path, field: str) -> float:

@@ -24,7 +24,7 @@ from evermap.io.landmarks import landmarks_from_table
 from evermap.io.rosbag import BAG_ENDINGS, MOST_HAMMING, TagSightings, read_tag_bag
 from evermap.io.spatial import of_rig, poses, spatial_detections, with_tag_poses
 from evermap.io.table import Table, parse_csv, parse_parquet
-from evermap.io.tag_maps import map_of_survey
+from evermap.io.tag_maps import map_of_survey, pose_of
 from evermap.io.text import counted
 from evermap.io.yaml import parse_yaml
 from evermap.types import (
@@ -199,7 +199,7 @@ def _setup(files: FileSet) -> TagRig:
         sensor = SpatialSensor(
             name=name,
             mount_robot_sensor=tuple(
-                _pose(files, CAMERA_POSES, _get(files, CAMERA_POSES, pose, "pose", name)).tolist()
+                pose_of(_get(files, CAMERA_POSES, pose, "pose", name), files.path_of(CAMERA_POSES), name).tolist()
             ),
             intrinsics=(fx, fy, cx, cy),
             distortion=distortion,
@@ -212,7 +212,7 @@ def _setup(files: FileSet) -> TagRig:
         raise InputError("lists no camera", path=files.path_of(CAMERAS))
     bodies = _bodies(files, content)
     mounted = next((body for body in bodies.values() if "T_body_odom" in body), {})
-    odometry = _pose(files, SETTINGS, mounted["T_body_odom"]) if mounted else se3.identity()
+    odometry = pose_of(mounted["T_body_odom"], files.path_of(SETTINGS), "T_body_odom") if mounted else se3.identity()
     sizes, default = _sizes(files, bodies, content.get("default_body"))
     topic = next((str(body["odom_topic"]) for body in bodies.values() if "odom_topic" in body), "")
     return TagRig(tuple(sensors), tuple(topics), topic, odometry, sizes, default)
@@ -350,18 +350,6 @@ def _numbers(
         field = f"{inside}.{key}"
         raise InputError(f"must be a list of {wanted} numbers", path=files.path_of(name), field=field)
     return tuple(map(float, values))
-
-
-def _pose(files: FileSet, name: str, content: Any) -> FloatArray:
-    """A pose (7,) from a position and a rotation vector."""
-    parts = [
-        [_get(files, name, _get(files, name, content, part, "pose"), axis, f"pose.{part}") for axis in "xyz"]
-        for part in ("position", "rotation")
-    ]
-    if not all(_is_number(value) for part in parts for value in part):
-        raise InputError("x, y and z must be numbers", path=files.path_of(name), field="pose")
-    turn = se3.exp(np.array([0.0, 0.0, 0.0, *parts[1]]))
-    return np.concatenate([np.array(parts[0], dtype=np.float64), turn[3:]])
 
 
 def _is_number(value: Any) -> bool:

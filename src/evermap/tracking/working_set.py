@@ -13,7 +13,6 @@ from evermap.tracking.tracklets import Tracklets
 from evermap.types import FloatArray, IntArray
 
 SMALLEST_ROOM = 64
-MOST_CLASSES = 2**15
 UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
 """Entries of a symmetric (3, 3) that are kept."""
 

@@ -112,7 +112,7 @@ def named_in(
     landmark_id = np.full(found.assignment.n_landmarks, UNKNOWN, dtype=np.int64)
     if len(living.places):
         p_site = aged(living, config, start_s).p_here
-        member = _Session(found, living, _Stood.of(living, p_site), config).members()
+        member = _Assigned(found, living, _Stood.of(living, p_site), config).members()
         landmark_id[member >= 0] = living.members.landmark_id[member[member >= 0]]
     names = _new_names(found, recording, landmark_id, start_s)
     for row, text in names.items():
@@ -187,7 +187,7 @@ def _drifted(covariance: FloatArray, error: FloatArray, config: OverlayConfig) -
     return found
 
 
-class _Session:
+class _Assigned:
     """Landmarks of a session (K,), to be assigned to those of a map."""
 
     def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: LivingConfig) -> None:

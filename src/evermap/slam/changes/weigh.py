@@ -107,7 +107,7 @@ def weigh(
         improved = tried(*best) > tried(factor, softness)
         if improved:
             factor, softness = best
-    return _verdict(evidence, list(trials.values()), trials[factor, softness], _Seen.of(evidence, given))
+    return _verdict(evidence, list(trials.values()), trials[factor, softness], _SeenWithin.of(evidence, given))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def _try(
     return _Trial(factor, softness, comparison, hypotheses, base)
 
 
-class _Seen(NamedTuple):
+class _SeenWithin(NamedTuple):
     """First and last window (L,) in which every landmark was seen, and whether the map holds it."""
 
     first: IntArray
@@ -157,7 +157,7 @@ class _Seen(NamedTuple):
     given: BoolArray
 
     @classmethod
-    def of(cls, evidence: WindowEvidence, given: GivenMap) -> _Seen:
+    def of(cls, evidence: WindowEvidence, given: GivenMap) -> _SeenWithin:
         first = np.full(len(given.mean), np.iinfo(np.int64).max)
         last = np.full(len(given.mean), -1)
         np.minimum.at(first, evidence.landmark, evidence.window)
@@ -169,7 +169,7 @@ class _Seen(NamedTuple):
         return (self.given[members] | (self.first[members] < window)) & (self.last[members] >= window)
 
 
-def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _Seen) -> Verdict:
+def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen: _SeenWithin) -> Verdict:
     """Sum the weights of equal hypotheses over windows, kinds of motion and degrees of belief."""
     top = max(trial.score for trial in trials)
     weight: dict[_Key, float] = {}
@@ -200,7 +200,7 @@ def _verdict(evidence: WindowEvidence, trials: list[_Trial], best: _Trial, seen:
 _Key = tuple[tuple[tuple[int, ...], bool], ...]
 
 
-def _groups(hypotheses: Hypotheses, row: int, seen: _Seen) -> tuple[_Key, tuple[MovedGroup, ...]]:
+def _groups(hypotheses: Hypotheses, row: int, seen: _SeenWithin) -> tuple[_Key, tuple[MovedGroup, ...]]:
     """What stands for a hypothesis where windows and kinds of motion do not matter, and its groups."""
     label = hypotheses.label[row]
     groups = []
