@@ -32,11 +32,12 @@ RULES = {
     "existence": "errors compiled show types survival io sensing",
     "tracking": "errors compiled show types config geometry survival valid io sensing existence",
     "viz": "errors types geometry stamps survival metrics existence",
-    "slam": "errors interrupts compiled plugins types config geometry valid sensing tracking",
+    "slam": "errors interrupts compiled plugins show types config geometry valid sensing tracking",
     "maps": "errors show types config geometry stamps survival sensing existence tracking slam",
     "pipeline": "errors types config valid slam maps",
     "runs": (
-        "errors interrupts types config geometry stamps survival valid io metrics existence tracking viz maps pipeline"
+        "errors interrupts show types config geometry stamps survival valid io metrics existence tracking viz maps "
+        "pipeline"
     ),
     "live": "errors types config geometry valid io maps runs slam",
     "cli": (

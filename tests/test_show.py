@@ -13,10 +13,14 @@ import pytest
 import evermap
 from evermap import types
 from evermap.errors import MissingExtraError
+from evermap.maps.living import Evidence, LivingMap
+from evermap.maps.sessions.session import Session
 from evermap.metrics.landmarks import evaluate_landmarks
 from evermap.metrics.summary import compare_with_truth
 from evermap.metrics.trajectory import evaluate_trajectory
+from evermap.runs.sessions import Entered
 from evermap.show import LONGEST, Shown, ShownTable
+from evermap.slam.check import Check, Finding
 from evermap.survival import Exponential, PiecewiseConstantHazard, StepLifetime, Weibull
 from evermap.survival.censored import CensoredLifetimes
 from evermap.survival.hazard_regression import HazardDraws
@@ -108,6 +112,15 @@ SPATIAL = SpatialRecording(
 LIFETIMES = CensoredLifetimes.of(STAMPS[:200], np.where(IDS[:200] % 3 > 0, STAMPS[:200] + 2.0, np.inf))
 EXACT = CensoredLifetimes.of(STAMPS[1:200], STAMPS[1:200])
 EDGES = tuple(STAMPS.tolist())
+SESSION = Session(
+    LivingMap(),
+    True,
+    RECORDING,
+    RESULT,
+    (NAMED,) * N,
+    Evidence(IDS, STAMPS, WHOLE, WHOLE, STAMPS, STAMPS, STAMPS),
+    ("a reason",) * N,
+)
 OBJECTS: dict[str, Any] = {
     type(one).__name__: one
     for one in (
@@ -136,6 +149,9 @@ OBJECTS: dict[str, Any] = {
         evaluate_landmarks(LANDMARKS, LANDMARKS, np.zeros(3)),
         compare_with_truth(RECORDING, RESULT),
         PiecewiseConstantHazard(EDGES, (1.0,) * N),
+        SESSION,
+        Entered(SESSION, LivingMap(), LivingMap(), (NAMED,) * N, ("monday",) * N, 3, {"a": bytes(N)}),
+        Check("a", "b", {"frames": {"rows": N}}, (Finding("clock", "late " * N),) * N, ("a warning",) * N),
         StepLifetime.at_points(EDGES[1:], (1.0 / (N - 1),) * (N - 1)),
     )
 }

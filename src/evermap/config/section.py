@@ -38,6 +38,10 @@ class Section(BaseModel, metaclass=_RaisesOurErrors):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def __repr_args__(self) -> list[tuple[str | None, Any]]:
+        """Show what was set, of two hundred keys."""
+        return [(name, value) for name, value in super().__repr_args__() if name in self.model_fields_set]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the section as plain JSON values, for `summary.json`."""
         return self.model_dump(mode="json")

@@ -15,6 +15,7 @@ import numpy as np
 
 from evermap.errors import DataError, InputError
 from evermap.maps.store import Attachment, MapStore, Provenance, PrunedRevisionError, Revision, RevisionKind
+from evermap.show import Shown
 from evermap.types import Progress
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ class TwiceError(InputError):
 
 
 @dataclass(frozen=True, slots=True)
-class Entered:
+class Entered(Shown):
     """What a session made of a stored map; nothing is committed yet.
 
     Attributes:

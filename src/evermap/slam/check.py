@@ -18,6 +18,7 @@ import numpy as np
 from evermap.config import CheckConfig, CleaningConfig, Config, SensorConfig, SlamConfig
 from evermap.errors import DataError
 from evermap.geometry import se3
+from evermap.show import Shown
 from evermap.slam.cleaning import spikes
 from evermap.slam.mistakes import HONEST, USUAL, likeliest, off, pairs_of
 from evermap.types import (
@@ -55,7 +56,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class Check(Shown):
     """What a recording holds, and what is odd about it.
 
     Attributes:

@@ -16,6 +16,7 @@ import numpy as np
 
 from evermap.geometry import se2
 from evermap.sensing.visibility import RANGE_MARGIN_M, NominalField
+from evermap.show import Shown
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.filter_kernels import BY_OTHERS
 from evermap.slam.kernels import AT_PLACES
@@ -80,7 +81,7 @@ class Located:
     lost: bool
 
 
-class Localizer:
+class Localizer(Shown):
     """Feed frames in order with `step`.
 
     Args:
@@ -121,6 +122,10 @@ class Localizer:
         self._track: LocalTrack | None = LocalTrack(self._mount)
         if start is not None:
             self._place_at(Placed(*start, NO_PLACES, np.zeros((3, 0))))
+
+    def _facts(self) -> dict[str, object]:
+        last: dict[str, object] = {} if self._stamp_s is None else {"stamp_s": round(self._stamp_s, 6)}
+        return last | {"places": len(self.places), "considered": len(self.considered), "placed": self._is_placed}
 
     def place_at(self, stamp_s: float, pose: FloatArray, covariance: FloatArray) -> None:
         """Say where the robot is: its pose (3,) and covariance (3, 3) at a stamp."""

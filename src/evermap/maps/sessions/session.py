@@ -31,6 +31,7 @@ from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, re
 from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.sessions.witnessed import arrived, departed
 from evermap.maps.vicinity import Vicinity, cliques_of, near
+from evermap.show import Shown
 from evermap.slam import result as of_slam
 from evermap.slam.cleaning import some_frames
 from evermap.slam.estimate import Solved
@@ -68,7 +69,7 @@ STRETCH = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Session:
+class Session(Shown):
     """What a session made of a map.
 
     Attributes:
