@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -43,8 +44,6 @@ def run_slam(
         ConfigError: settings that contradict each other or the recording.
         NumericalError: no finite optimum.
     """
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions.session import existing
     from evermap.slam.check import odd, valid
     from evermap.slam.estimate import solve
@@ -62,18 +61,23 @@ def run_slam(
 
         recording = identified(recording, prior, noise, prior_map=prior_map)
     prepared = prepare(recording, prior_map, remarks)
-    # small matrices: several threads would only wait for each other, and sum in another order on another machine
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
         return existing(solved, concluded(solved), config.living)
+
+
+def _one_thread() -> AbstractContextManager[Any]:
+    """Matrices are small: threads would only wait for each other, and sum in another order on another machine."""
+    from threadpoolctl import threadpool_limits
+
+    limited: AbstractContextManager[Any] = threadpool_limits(limits=1, user_api="blas")
+    return limited
 
 
 def _run_in_space(
     recording: SpatialRecording, config: Config, prior_map: Landmarks | None, progress: Progress | None
 ) -> SlamResult:
     """The same in space: all frames are read, then solved together."""
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions.session import existing
     from evermap.maps.sessions.spatial import SpatialVisit
     from evermap.slam.space.intake import prepare_space
@@ -81,7 +85,7 @@ def _run_in_space(
     from evermap.slam.space.result import concluded_in_space
     from evermap.slam.space.solve import solve_space
 
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         if config.slam.unknown_ids:
             from evermap.slam.association.in_space import identified_in_space
 
@@ -137,11 +141,9 @@ def _bring_in_space(
     recording: SpatialRecording, living: LivingMap, config: Config, progress: Progress | None
 ) -> Session:
     """The same in space, where a session is solved within the map from the beginning."""
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions import believe, spatial
     from evermap.maps.sessions import session as steps
-    from evermap.maps.vicinity import Vicinity, cliques_of, in_chunks
+    from evermap.maps.vicinity import Vicinity, cliques_of
     from evermap.slam.space.intake import prepare_space
     from evermap.slam.space.moving import has_traffic
 
@@ -149,7 +151,7 @@ def _bring_in_space(
         return _bring_in_traffic(recording, living, config, progress)
     recording, living = steps.admitted(recording, living)
     intake = prepare_space(recording, config.slam.space)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         whole, vicinity = living, None
         if len(whole.places) > config.living.whole_places:
             vicinity = Vicinity.of(whole, cliques_of(whole, spatial.names_of(intake).ravel()), config.living)
@@ -162,26 +164,20 @@ def _bring_in_space(
             vicinity, where = steps.widened(vicinity, where, visit.path_m, visit.floor_sensor, config.living)
             living = vicinity.part
         living = visit.named(living)
-        known = steps.judged(living, where, visit, config.living)
-        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
-        after = session.living if vicinity is None else vicinity.put_back(session.living)
-        return replace(session, living=in_chunks(after, config.living))
+        return steps.judged_twice(living, where, visit, vicinity, config.living)
 
 
 def _bring_in_traffic(
     recording: SpatialRecording, living: LivingMap, config: Config, progress: Progress | None
 ) -> Session:
     """The same with boxes without identity, which get theirs from the map."""
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions import believe
     from evermap.maps.sessions import session as steps
     from evermap.maps.sessions.boxes import visited_in_traffic, without_strays
-    from evermap.maps.vicinity import in_chunks
     from evermap.slam.space.moving import take_in_traffic
 
     recording, whole = steps.admitted(recording, living)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         taken = take_in_traffic(recording, config.slam.space, config.track)
         p_site = believe.aged(whole, config.living, float(taken.recording.frames.stamp_s[0])).p_here
         visit, where = visited_in_traffic(taken, whole, p_site, config, progress)
@@ -191,11 +187,8 @@ def _bring_in_traffic(
         if where is not None and len(whole.places) > config.living.whole_places:
             vicinity, where = steps.around(living, where, visit, config.living)
             living = vicinity.part
-        known = steps.judged(living, where, visit, config.living)
-        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
-        after = session.living if vicinity is None else vicinity.put_back(session.living)
-        after = without_strays(in_chunks(after, config.living))
-        return replace(session, living=after, recording=taken.recording)
+        session = steps.judged_twice(living, where, visit, vicinity, config.living)
+        return replace(session, living=without_strays(session.living), recording=taken.recording)
 
 
 def solve_alone(recording: Recording, living: LivingMap, config: Config, *, progress: Progress | None = None) -> Solved:
@@ -222,8 +215,6 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
 
 def _solved(recording: Recording, remarks: tuple[str, ...], config: Config, progress: Progress | None = None) -> Solved:
     """The same of a clean recording whose landmarks have names."""
-    from threadpoolctl import threadpool_limits
-
     from evermap.slam.estimate import solve
     from evermap.slam.intake import beliefs, prepare
 
@@ -231,7 +222,7 @@ def _solved(recording: Recording, remarks: tuple[str, ...], config: Config, prog
     prepared = prepare(recording, remarks=remarks)
     # what moved is asked when it lies over the map
     settings = config.slam.model_copy(update={"method": "nohyp", "unknown_ids": False})
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         return solve(recording, prepared, prior, noise, settings, progress=progress)
 
 
@@ -240,15 +231,12 @@ def bring_in(alone: Solved, living: LivingMap, config: Config, *, cut: bool = Tr
 
     With `cut`, without what of it says nothing sure (`doubtful`).
     """
-    from threadpoolctl import threadpool_limits
-
     from evermap.maps.sessions import believe
     from evermap.maps.sessions import session as steps
-    from evermap.maps.vicinity import in_chunks
 
     visit = alone
     _, whole = steps.admitted(alone.recording, living)
-    with threadpool_limits(limits=1, user_api="blas"):
+    with _one_thread():
         large = len(whole.places) > config.living.whole_places
         vicinity, where = steps.near_session(whole, alone, config.living) if large else (None, None)
         living = whole if vicinity is None else vicinity.part
@@ -278,11 +266,7 @@ def bring_in(alone: Solved, living: LivingMap, config: Config, *, cut: bool = Tr
                     return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
         if where is not None and config.living.search == "joint" and not steps.fits(visit, alone, config.living):
             return steps.lost(alone, whole, config.living, steps.CONTRADICTED)
-        # judged twice: the second time by the lifetimes that the first has learned
-        known = steps.judged(living, where, visit, config.living)
-        session = steps.told(steps.judged(living, where, visit, config.living, known), where, visit)
-        after = session.living if vicinity is None else vicinity.put_back(session.living)
-        return replace(session, living=in_chunks(after, config.living))
+        return steps.judged_twice(living, where, visit, vicinity, config.living)
 
 
 def run_localization(

@@ -30,7 +30,7 @@ from evermap.maps.sessions.looks import PlaceLooks, Sighting, Watch, arrivals, l
 from evermap.maps.sessions.placing import Held, Laid, all_at_home, laid_over, refitted, unbent, with_glimpsed
 from evermap.maps.sessions.spatial import SpatialVisit
 from evermap.maps.sessions.witnessed import arrived, departed
-from evermap.maps.vicinity import Vicinity, cliques_of, near
+from evermap.maps.vicinity import Vicinity, cliques_of, in_chunks, near
 from evermap.show import Shown
 from evermap.slam import result as of_slam
 from evermap.slam.cleaning import some_frames
@@ -598,6 +598,16 @@ def told(found: Judged, where: Laid | None, visit: Visit) -> Session:
     slam = visit.concluded() if isinstance(visit, SpatialVisit) else of_slam.result(visit, frame, landmarks)
     slam = replace(slam, landmarks=landmarks, misses=found.misses, changes=changes, gone=gone)
     return Session(found.living, True, visit.recording, slam, changes, found.evidence)
+
+
+def judged_twice(
+    living: LivingMap, where: Laid | None, visit: Visit, vicinity: Vicinity | None, config: LivingConfig
+) -> Session:
+    """Return the session with the whole map after it, judged twice: the second time by the lifetimes of the first."""
+    known = judged(living, where, visit, config)
+    session = told(judged(living, where, visit, config, known), where, visit)
+    after = session.living if vicinity is None else vicinity.put_back(session.living)
+    return replace(session, living=in_chunks(after, config))
 
 
 def lost(alone: Visit, living: LivingMap, config: LivingConfig, reason: tuple[str, str]) -> Session:
