@@ -5,7 +5,11 @@ Truth of association is the recording's own identities.
 
     python -m benchmarks.association space
 
-does the same in space, and
+does the same in space,
+
+    python -m benchmarks.association mixed
+
+where some have identities: a share of the landmarks, or of the detections of each, and
 
     python -m benchmarks.association sessions
 
@@ -22,7 +26,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -59,6 +63,7 @@ from evermap_studies.partial_views.study import Settings, building_of
 from evermap_studies.sim import simulate_warehouse
 from evermap_studies.sim.park import simulate_park
 
+AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 PARKS = 3
 DATASETS = (3, 6)
@@ -194,6 +199,41 @@ class Lived:
     pose_truth_map: FloatArray | None = None
 
 
+MIXED = (
+    ("MRCLAM_Dataset6", 0.5, "detections"), ("MRCLAM_Dataset6", 0.5, "landmarks"), ("dlr", 0.1, "landmarks"),
+    ("park", 0.1, "landmarks"), ("test_11", 0.5, "landmarks"), ("test_11", 0.5, "detections"),
+)  # fmt: skip
+"""Beginnings of names, shares that keep their identities, and of what."""
+
+
+def partly_named(recording: AnyRecordingT, share: float, of: str, seed: int = 0) -> AnyRecordingT:
+    """Return a recording with the identities of some of its landmarks, or of some detections of each."""
+    true, random = recording.detections.landmark_id, np.random.default_rng(seed)
+    if of == "landmarks":
+        ids = np.unique(true[true != UNKNOWN])
+        kept = np.isin(true, ids[random.random(len(ids)) < share])
+    else:
+        kept = random.random(len(true)) < share
+    return replace(recording, detections=replace(recording.detections, landmark_id=np.where(kept, true, UNKNOWN)))
+
+
+def mixed_line(recording: Recording | SpatialRecording, share: float, of: str) -> str:
+    """Return a row of the table of a recording of which some landmarks, or detections, keep their identities."""
+    true, config, some = recording.detections.landmark_id, Config(), partly_named(recording, share, of)
+    if isinstance(some, SpatialRecording):
+        found: Recording | SpatialRecording = identified_in_space(some, config.slam.space, keep_ids=True)
+    else:
+        found = identified(some, *beliefs(some.sensor, config.slam), keep_ids=True)
+    given = found.detections.landmark_id
+    every = [em.run_slam(one, config) for one in (found, some, recording)]
+    truth = _truth(recording, every[-1])
+    off = [f"{evaluate_trajectory(one.trajectory, truth, rate_hz=RATE_HZ).rmse_m:.3f}" for one in every]
+    counts = [len(np.unique(one[one != UNKNOWN])) for one in (given, true)]
+    precision, recall = pairwise(given, true)
+    name = f"{recording.name}, {share:.0%} of the {of}"
+    return f"| {name} | {precision:.3f} | {recall:.3f} | {counts[0]} ({counts[1]}) | {' / '.join(off)} |"
+
+
 def worlds(folder: Path = FOLDER) -> Iterator[Lived]:
     """Simulate, or edit, what lives on."""
     for seed in range(2):
@@ -320,6 +360,12 @@ def main(names: Sequence[str] = ()) -> None:
                 row = lived_through(world, unknown_ids=unknown_ids)
                 cells = [f"{value:.3f}" if value < 10.0 else f"{value:.0f}" for value in row.values()]
                 print(f"| {world.name} | {'without' if unknown_ids else 'with'} | {' | '.join(cells)} |", flush=True)
+        return
+    if names and names[0] == "mixed":
+        for recording in itertools.chain(recordings(), recordings_in_space()):
+            for name, share, of in MIXED if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
+                if recording.name.startswith(name):
+                    print(mixed_line(recording, share, of), flush=True)
         return
     in_space = bool(names) and names[0] == "space"
     if in_space:

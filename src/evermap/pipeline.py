@@ -54,12 +54,13 @@ def run_slam(
     if isinstance(recording, SpatialRecording):
         return _run_in_space(recording, config, prior_map, progress)
     recording = valid(recording, config.sensor, prior_map)
-    remarks = odd(recording, identities=not config.slam.unknown_ids, settings=config.slam.check)
+    remarks = odd(recording, identities=config.slam.unknown_ids is not True, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
     if config.slam.unknown_ids:
         from evermap.slam.association.identify import identified
 
-        recording = identified(recording, prior, noise, prior_map=prior_map)
+        keep_ids = config.slam.unknown_ids == "empty"
+        recording = identified(recording, prior, noise, prior_map=prior_map, keep_ids=keep_ids)
     prepared = prepare(recording, prior_map, remarks)
     with _one_thread():
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
@@ -89,7 +90,8 @@ def _run_in_space(
         if config.slam.unknown_ids:
             from evermap.slam.association.in_space import identified_in_space
 
-            recording = identified_in_space(recording, config.slam.space, prior_map)
+            keep_ids = config.slam.unknown_ids == "empty"
+            recording = identified_in_space(recording, config.slam.space, prior_map, keep_ids=keep_ids)
         if has_traffic(recording):
             return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
         intake = prepare_space(recording, config.slam.space)
@@ -204,8 +206,8 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     anonymous = config.slam.unknown_ids
-    recording = clean(without_ids(recording) if anonymous else recording, config.slam.cleaning)
-    remarks = odd(recording, identities=not anonymous, settings=config.slam.check)
+    recording = clean(without_ids(recording) if anonymous is True else recording, config.slam.cleaning)
+    remarks = odd(recording, identities=anonymous is not True, settings=config.slam.check)
     recording, _ = admitted(recording, living)
     if anonymous:
         prior, noise = beliefs(recording.sensor, config.slam)

@@ -200,6 +200,11 @@ def test_shortcuts_are_settings() -> None:
     shown = run("slam", "--method", "viterbi", "--unknown-ids", "--show-config")
     settings = tomllib.loads(shown.stdout)["slam"]
     assert (settings["method"], settings["unknown_ids"]) == ("viterbi", True)
+    some = run("slam", "--empty-ids", "--show-config")
+    assert tomllib.loads(some.stdout)["slam"]["unknown_ids"] == "empty"
+    both = run("slam", "--empty-ids", "--unknown-ids", "--show-config")
+    assert both.exit_code == 2
+    assert "one of the two" in both.stderr
     plain = tomllib.loads(run("slam", "--show-config").stdout)["slam"]
     assert (plain["method"], plain["unknown_ids"]) == (SlamConfig().method, False)
     choices = get_args(HowMoved)[1].metavar.split("|")

@@ -82,6 +82,10 @@ HowMoved = Annotated[
 UnknownIds = Annotated[
     bool, typer.Option("--unknown-ids", help="Ignore the landmark ids of the detections; associate by geometry.")
 ]
+EmptyIds = Annotated[
+    bool,
+    typer.Option("--empty-ids", help="Associate detections with an empty landmark id by geometry; others keep theirs."),
+]
 PriorMap = Annotated[
     str | None,
     typer.Option(metavar="FILE|truth", help="Start from this landmark map, or from the recording's surveyed one."),
@@ -160,6 +164,7 @@ def slam(
     sensor_model: SensorModel = None,
     method: HowMoved = None,
     unknown_ids: UnknownIds = False,
+    empty_ids: EmptyIds = False,
     prior_map: PriorMap = None,
     prior_sigma: PriorSigma = 0.02,
     map_file: LivingMapFile = None,
@@ -183,7 +188,7 @@ def slam(
         return
     if in_space:
         raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
-    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": unknown_ids or None}
+    given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
     paths = input or []
     if not paths:
@@ -399,6 +404,13 @@ def _prior_landmarks(prior_map: str, sigma_m: float, recording: AnyRecording) ->
         class_names=survey.class_names,
         frame="prior_map",
     )
+
+
+def _associated(unknown_ids: bool, empty_ids: bool) -> bool | str | None:
+    """`slam.unknown_ids` as the two flags have it."""
+    if unknown_ids and empty_ids:
+        raise ConfigError("ignores the ids that --empty-ids keeps", field="unknown-ids", hint="one of the two")
+    return True if unknown_ids else "empty" if empty_ids else None
 
 
 class MapOptions(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Literal
 
 import numpy as np
 
@@ -32,7 +33,7 @@ PLACES = np.array([[2.0, 1.0], [3.0, -1.5], [5.0, 1.5], [4.0, 0.5]])
 def warm_up(
     *,
     search: bool = True,
-    unknown_ids: bool = False,
+    unknown_ids: bool | Literal["empty"] = False,
     sessions: bool = False,
     localize: bool = False,
     in_space: bool = False,

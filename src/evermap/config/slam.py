@@ -162,8 +162,10 @@ class SlamConfig(Section):
         default="calibrated",
         description="'calibrated' estimates sensor and odometry errors with the map, 'plain' believes all readings",
     )
-    unknown_ids: bool = Field(
-        default=False, description="ignore the identities that detections carry; associate by geometry"
+    unknown_ids: bool | Literal["empty"] = Field(
+        default=False,
+        description="associate by geometry: true ignores the identities that detections carry, 'empty' is for those "
+        "without one only",
     )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
     outlier_log_odds: float = Field(

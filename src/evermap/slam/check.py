@@ -78,7 +78,7 @@ class Check(Shown):
         if isinstance(recording, SpatialRecording):
             found = findings_in_space(recording, settings)
         else:
-            found = findings(recording, identities=not settings.unknown_ids, settings=settings.check)
+            found = findings(recording, identities=settings.unknown_ids is not True, settings=settings.check)
         return cls(recording.name, recording.source, contents(recording), found, recording.warnings)
 
     @property

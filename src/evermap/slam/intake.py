@@ -79,7 +79,7 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
     if len(pose_frame) < 2:
         raise DataError(
             f"{recording.name}: landmarks of known identity were seen in {len(pose_frame)} frames, at least 2 needed",
-            hint="check landmark ids, and that detections and odometry share one clock",
+            hint="check landmark ids (without any: slam.unknown_ids), and that detections and odometry share one clock",
         )
     landmark_id, landmark_row = np.unique(detections.landmark_id[used], return_inverse=True)
     start_s = float(odometry.stamp_s[0])

@@ -19,7 +19,7 @@ from evermap.maps.store import open_store
 from evermap.pipeline import run_localization
 from evermap.runs.sessions import enter_session
 from evermap.slam.association.constellation import LocalMap
-from evermap.types import Landmarks, rows_of
+from evermap.types import UNKNOWN, Landmarks, rows_of
 from evermap_studies.sim import BuildingSimulation, WarehouseConfig, simulate_warehouse
 
 from .buildings import FIXED, building, lived_through
@@ -118,6 +118,29 @@ def test_what_left_is_believed_in_less_and_what_an_operator_deleted_does_not_com
     assert gone not in session.recording.detections.landmark_id
     grown = np.setdiff1d(session.living.members.landmark_id, edited.members.landmark_id)
     assert len(grown) == len(np.setdiff1d(sessions[1].living.members.landmark_id, edited.members.landmark_id))
+
+
+def test_landmarks_without_a_name_keep_company_with_those_that_have_one() -> None:
+    """Every other landmark has its name in all sessions; the others get theirs from the map."""
+    one, mixed = building(0), Config(slam=FIXED.model_copy(update={"unknown_ids": "empty"}))
+    some = [
+        replace(each, detections=replace(each.detections, landmark_id=np.where(known, own, UNKNOWN)))
+        for each in one.sessions
+        for own in [each.detections.landmark_id]
+        for known in [own % 2 == 0]
+    ]
+    sessions = lived_through(some, mixed)
+    assert all(session.found for session in sessions)
+    again = wrong = 0
+    for k in range(1, len(sessions)):
+        given, own = sessions[k].recording.detections.landmark_id, some[k].detections.landmark_id
+        np.testing.assert_array_equal(given[own != UNKNOWN], own[own != UNKNOWN])
+        before, now = names(one, sessions, k - 1), names(one, sessions, k)
+        both = before.keys() & now.keys()
+        again += len(both)
+        wrong += sum(before[name] != now[name] for name in both)
+    assert again > 40
+    assert wrong <= 0.03 * again
 
 
 def test_a_large_map_that_shows_no_constellation_of_the_session_refuses_it() -> None:

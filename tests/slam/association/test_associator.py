@@ -62,7 +62,7 @@ def test_merging_and_forgetting_keep_the_detections_together() -> None:
     split[(rows == 2) & (made.problem.pose_row > 30)] = 8
     landmark = np.vstack([made.truth.landmark, made.truth.landmark[2]])
     estimate = Estimate(made.truth.pose, landmark, made.truth.states)
-    broken = Assignment(made.problem, split, estimate, np.zeros_like(split))
+    broken = Assignment(made.problem, split, estimate, np.zeros((len(split), 2), dtype=np.int64))
     np.testing.assert_array_equal(broken.merged([(8, 2)]).landmark_row, rows)
     less = broken.without(np.arange(9) == 0)
     assert less.n_landmarks == 8
@@ -106,7 +106,7 @@ def settled(made: World, row: np.ndarray) -> Assignment:
     """Assigned as told, at the true values; landmarks whose detections go astray keep their places."""
     sigma = np.tile(made.noise.detection, (len(row), 1))
     measured = replace(made.problem, sigma_given=sigma)
-    return Assignment(measured, row, made.truth, np.full(len(row), UNKNOWN))
+    return Assignment(measured, row, made.truth, np.full((len(row), 2), UNKNOWN))
 
 
 def test_detections_of_others_go_back_and_what_was_overlooked_is_a_landmark() -> None:
@@ -140,7 +140,8 @@ def test_landmarks_of_two_classes_are_two_wherever_they_are() -> None:
     made = world(2)
     true, pose = made.problem.landmark_row, made.problem.pose_row
     kind = (true == 3) & (pose % 2 == 1)  # as of two at one place
-    associator = Associator(replace(made.problem, landmark_row=np.zeros_like(true)), made.noise, kind.astype(np.int64))
+    labels = np.column_stack([kind.astype(np.int64), np.full(len(kind), UNKNOWN)])
+    associator = Associator(replace(made.problem, landmark_row=np.zeros_like(true)), made.noise, labels)
     for _ in made.problem.stamp_s:
         associator.step()
     row = associator.finish().landmark_row

@@ -86,6 +86,32 @@ def test_identities_of_the_recording_are_not_looked_at():
     np.testing.assert_array_equal(one.detections.landmark_id, other.detections.landmark_id)
 
 
+@pytest.mark.parametrize("share", [0.2, 0.5])
+def test_points_of_which_some_have_names(share):
+    recording = hall(1, n_points=40, n_frames=400, drift=0.1)
+    true = recording.detections.landmark_id
+    named = np.isin(true, np.random.default_rng(0).permutation(40)[: int(40 * share)])
+    given = np.where(named, 100 + true, UNKNOWN)
+    some = replace(recording, detections=replace(recording.detections, landmark_id=given))
+    found = identified_in_space(some, SPACE, keep_ids=True).detections.landmark_id
+    np.testing.assert_array_equal(found[named], given[named])
+    assert not np.isin(found[~named], given[named]).any()
+    real = true != UNKNOWN
+    scores = identity_scores(found[real], true[real])
+    assert scores.purity > 0.995
+    assert scores.completeness > 0.98
+    assert scores.n_landmarks == scores.n_identities
+
+
+def test_tags_that_are_not_always_read():
+    recording = tagged_corridor(0, n_tags=16, drift=0.05).recording
+    true = recording.detections.landmark_id
+    read = np.where(np.random.default_rng(0).random(len(true)) < 0.5, true, UNKNOWN)
+    some = replace(recording, detections=replace(recording.detections, landmark_id=read))
+    found = identified_in_space(some, SPACE, keep_ids=True).detections.landmark_id
+    assert np.mean(found == true) > 0.99
+
+
 def test_what_it_cannot_do_is_refused():
     recording = tagged_corridor(0, n_frames=40, odometry=False).recording
     with pytest.raises(DataError, match="need odometry"):

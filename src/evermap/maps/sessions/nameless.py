@@ -98,7 +98,7 @@ def named_in(
     """Return a recording with landmark ids by geometry: those of a map where its landmarks were met, new ones else.
 
     Args:
-        recording: with the map's class numbers; its landmark ids are not looked at.
+        recording: with the map's class numbers; detections with a landmark id keep it (see `without_ids`).
         living: the map.
         prior: of the calibration states.
         noise: where noise levels start.
@@ -107,24 +107,25 @@ def named_in(
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, prior, noise)
+    found = associated(recording, prior, noise, keep_ids=True)
     start_s = float(recording.frames.stamp_s[0])
-    landmark_id = np.full(found.assignment.n_landmarks, UNKNOWN, dtype=np.int64)
+    landmark_id = found.assignment.name
     if len(living.places):
         p_site = aged(living, config, start_s).p_here
         member = _Assigned(found, living, _Stood.of(living, p_site), config).members()
-        landmark_id[member >= 0] = living.members.landmark_id[member[member >= 0]]
+        known = (member >= 0) & (landmark_id == UNKNOWN)
+        landmark_id[known] = living.members.landmark_id[member[known]]
     names = _new_names(found, recording, landmark_id, start_s)
     for row, text in names.items():
         landmark_id[row] = landmark_id_of(text)
     texts = {landmark_id_of(text): text for text in names.values()}
-    return replace(found.named(recording, landmark_id), landmark_names=texts)
+    return replace(found.named(recording, landmark_id), landmark_names={**recording.landmark_names, **texts})
 
 
 def _new_names(found: Associated, recording: Recording, landmark_id: IntArray, start_s: float) -> dict[int, str]:
     """What new landmarks are called: class, number in the session, and when that began."""
     start = f"{start_s:.3f}".rstrip("0").rstrip(".")
-    kind, words = found.assignment.of_class, recording.class_names
+    kind, words = found.assignment.of_kind[:, 0], recording.class_names
     new = np.flatnonzero(landmark_id == UNKNOWN).tolist()
     return {row: f"{words[kind[row]] if kind[row] >= 0 else 'landmark'}-{row + 1}@{start}" for row in new}
 
@@ -193,7 +194,11 @@ class _Assigned:
     def __init__(self, found: Associated, living: LivingMap, stood: _Stood, config: LivingConfig) -> None:
         self._found, self._living, self._stood, self._overlay = found, living, stood, config.overlay
         self._local, self._beside_m = found.in_metres, config.looks.beside_m
-        self._alike = alike(found.assignment.of_class[:, None], stood.class_id[None])
+        name, known = found.assignment.name, living.members.landmark_id[stood.landmark]
+        # what has a name is the landmark with that name, and nothing else is
+        same = np.where((name == UNKNOWN)[:, None], ~np.isin(known, name), name[:, None] == known)
+        self._alike = same & alike(found.assignment.of_kind[:, None, :1], stood.class_id[None, :, None])
+        self._named = np.flatnonzero(np.isin(name, known))
         self._density = density_of_unmet(self._local.place)
 
     def members(self) -> IntArray:
@@ -262,12 +267,14 @@ class _Assigned:
         way, which an error of the odometry bends less than all.
         """
         stands, every = np.flatnonzero(self._stood.p >= EXISTS), np.arange(len(self._local.place))
-        place, best = np.full(len(every), -1, dtype=np.int64), list[tuple[int, int]]()
-        if len(stands) >= FEWEST:
+        place, named = np.full(len(every), -1, dtype=np.int64), self._named[:MOST_HELD]
+        best = self._overlaid(named, stands[self._alike[named][:, stands].any(axis=0)], None, self._alike, fewest=2)
+        if not best and len(stands) >= FEWEST:
             index = PlaceIndex(*self._about(stands)) if len(stands) > ALL_TRIED else None
             for some in _windows(every):
                 best = max(best, self._overlaid(some, stands, index, self._alike), key=len)
-        if len(best) >= FEWEST:
+            best = best if len(best) >= FEWEST else []
+        if best:
             mine, theirs = np.array(best).T
             place[mine] = theirs
         return place
@@ -298,10 +305,10 @@ class _Assigned:
         return self._stood.position_m[stands], self._stood.covariance_m2[stands] + drift_m**2 * np.eye(2)
 
     def _overlaid(
-        self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray
+        self, some: IntArray, stands: IntArray, index: PlaceIndex | None, allowed: BoolArray, *, fewest: int = FEWEST
     ) -> list[tuple[int, int]]:
         """Some landmarks of the session with places at which they surely stand, among some (S,) of all."""
-        if len(some) < FEWEST or len(stands) < FEWEST:
+        if len(some) < fewest or len(stands) < fewest:
             return []
         (at, spread), local, motions = self._about(stands), self._local.part(some), None
         area_m2 = float(np.prod(np.ptp(at, axis=0) + 10.0))

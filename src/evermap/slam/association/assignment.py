@@ -19,9 +19,42 @@ SHARED_M, SHARED_SHARE = 0.02, 0.5
 
 
 def alike(one: IntArray, other: IntArray) -> BoolArray:
-    """Return which of two classes each may be the same."""
-    same: BoolArray = (one == other) | (one == UNKNOWN) | (other == UNKNOWN)
+    """Return which labels (..., P) may be of one landmark: equal in every column, as class and name, or unknown."""
+    same: BoolArray = ((one == other) | (one == UNKNOWN) | (other == UNKNOWN)).all(axis=-1)
     return same
+
+
+def same_name(one: IntArray, other: IntArray) -> BoolArray:
+    """Return which labels (..., P) have the same name, the last column, which is known."""
+    same: BoolArray = (one[..., -1] == other[..., -1]) & (one[..., -1] != UNKNOWN)
+    return same
+
+
+def labels_of(kind: IntArray, landmark_row: IntArray, n_landmarks: int) -> IntArray:
+    """Return (L, P) labels of landmarks by those (M, P) of their detections, `UNKNOWN` where none has any."""
+    found = np.full((n_landmarks, kind.shape[1]), UNKNOWN)
+    seen = landmark_row >= 0
+    np.maximum.at(found, landmark_row[seen], kind[seen])
+    return found
+
+
+def names_of(name: IntArray, landmark_row: IntArray, n_landmarks: int) -> IntArray:
+    """Return (L,) names of landmarks, `UNKNOWN` for none: each of the one that most detections with it are of.
+
+    Args:
+        name: (M,) of detections, `UNKNOWN` for none.
+        landmark_row: (M,) their landmarks, `NOBODY` for none.
+        n_landmarks: how many there are.
+    """
+    said = (name != UNKNOWN) & (landmark_row >= 0)
+    pairs, count = np.unique(np.column_stack([name, landmark_row])[said], axis=0, return_counts=True)
+    found, used = np.full(n_landmarks, UNKNOWN), set[int]()
+    for k in np.argsort(-count, kind="stable").tolist():
+        one, row = pairs[k].tolist()
+        if found[row] == UNKNOWN and one not in used:
+            found[row] = one
+            used.add(one)
+    return found
 
 
 ABOUT = 3
@@ -66,7 +99,8 @@ class Assignment:
         measured: the measurements so far, each with its sigma; its landmark rows and landmark priors mean nothing.
         landmark_row: (M,) landmark of every detection, `NOBODY` for none; landmarks in the order they were met.
         estimate: where everything is; every landmark has a position.
-        kind: (M,) class of every detection, `UNKNOWN` where it has none; different ones are never one landmark's.
+        kind: (M, 2) class and name of every detection, `UNKNOWN` where it has none; different ones are never one
+            landmark's.
     """
 
     measured: Problem
@@ -101,17 +135,25 @@ class Assignment:
         return first
 
     @property
-    def of_class(self) -> IntArray:
-        """(L,) class of each landmark."""
-        kind = np.full(self.n_landmarks, UNKNOWN)
-        seen = self.landmark_row >= 0
-        np.maximum.at(kind, self.landmark_row[seen], self.kind[seen])
-        return kind
+    def of_kind(self) -> IntArray:
+        """(L, 2) class and name of each landmark."""
+        return labels_of(self.kind, self.landmark_row, self.n_landmarks)
 
     @property
     def together(self) -> sparse.csr_array:
         """(L, L) frames in which two landmarks were both seen."""
         return self.seen_together()[0]
+
+    @property
+    def told(self) -> IntArray:
+        """(L,) detections of each landmark that have a name."""
+        named = (self.kind[:, -1] != UNKNOWN) & (self.landmark_row >= 0)
+        return np.bincount(self.landmark_row[named], minlength=self.n_landmarks)
+
+    @property
+    def name(self) -> IntArray:
+        """(L,) name of each landmark, `UNKNOWN` for none; no two have the same."""
+        return names_of(self.kind[:, -1], self.landmark_row, self.n_landmarks)
 
     def seen_together(self) -> tuple[sparse.csr_array, sparse.csr_array]:
         """Return `seen_together` of these."""
@@ -180,6 +222,27 @@ class Assignment:
         kept = becomes == np.arange(self.n_landmarks)
         rank = np.cumsum(kept) - 1
         return self._renumbered(rank[becomes], kept)
+
+    def in_visits(self, pause_s: float) -> IntArray:
+        """Return (M,) landmarks as if each were another one whenever it is met again, but for those with a name.
+
+        Args:
+            pause_s: time without a detection that ends a visit.
+        """
+        stamp_s, found = self.measured.stamp_s[self.measured.pose_row], np.full_like(self.landmark_row, NOBODY)
+        order = np.lexsort((stamp_s, self.landmark_row))
+        order = order[self.landmark_row[order] >= 0]
+        again = (np.diff(self.landmark_row[order]) == 0) & (np.diff(stamp_s[order]) <= pause_s)
+        found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
+        name = labels_of(self.kind, found, int(found.max(initial=NOBODY)) + 1)[:, -1]
+        named = name != UNKNOWN
+        one = np.arange(len(name))
+        one[named] = len(name) + np.unique(name[named], return_inverse=True)[1]
+        seen = found >= 0
+        found[seen] = one[found[seen]]
+        _, first, rank = np.unique(found[seen], return_index=True, return_inverse=True)
+        found[seen] = np.argsort(np.argsort(first))[rank]  # in the order in which they were met
+        return found
 
     def _renumbered(self, rank: IntArray, kept: BoolArray) -> Assignment:
         row = np.full_like(self.landmark_row, NOBODY)

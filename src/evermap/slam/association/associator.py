@@ -8,12 +8,13 @@ at the end every detection is compared once more with the whole map (`revise`).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from evermap.geometry import se2
-from evermap.slam.association.assignment import NOBODY, Assignment, alike
+from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
 from evermap.slam.association.constellation import MOST_LAID, propose_constellation
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import FEW_NATS, Differences, Solution, propose_merges
@@ -50,6 +51,10 @@ P_NEW = 0.1
 """Probability of being none of the known from which it starts a landmark."""
 P_MERGE = 0.97
 """Probability from which two landmarks are one."""
+NAMED_NATS = math.log(100.0)
+"""Odds that of two landmarks with one name there is only one, for every time that it was read off the lesser,"""
+MOST_TOLD = 10
+"""at most so many times: what was read wrongly once is likely to be so again."""
 UNMET = 0.1
 """Share of landmarks that one has not met yet around those that are followed."""
 FEWEST, SMALLEST_M2 = 2.0, 20.0
@@ -121,13 +126,13 @@ class Associator:
     Args:
         problem: the measurements; its `landmark_row` is not looked at.
         noise: where the noise levels start.
-        kind: (M,) class of every detection; None where there are none.
+        kind: (M, 2) class and name of every detection, `UNKNOWN` for none; None where there are none.
     """
 
     def __init__(self, problem: Problem, noise: Noise, kind: IntArray | None = None) -> None:
         self._problem = problem
-        self._kind = np.full(len(problem.pose_row), UNKNOWN) if kind is None else kind
-        self._of_class: IntArray = np.zeros(0, dtype=np.int64)
+        self._kind = np.full((len(problem.pose_row), 2), UNKNOWN) if kind is None else kind
+        self._of_kind: IntArray = np.zeros((0, 2), dtype=np.int64)
         self._seen_s = np.zeros(0)
         self._start_noise = noise
         self.noise = replace(noise, odometry=CAUTION * noise.odometry)
@@ -184,6 +189,34 @@ class Associator:
         away = np.hypot(*(self._filter.position - pose[:2]).T)
         self._filter.bring(np.argsort(away, kind="stable")[:MOST_COMPARED])
 
+    def heed_names(self, pose: Callable[[], FloatArray]) -> None:
+        """Begin again from poses that names alone lead to, if landmarks with one name lie apart and it is better so.
+
+        Wrong matches between two that were seen by name bend the map, until those do not meet any more.
+
+        Args:
+            pose: returns (N, 3) those poses; called where they are asked for.
+        """
+        solved = self._settled(self._assignment())
+        self._go_on_from(solved)
+        now = solved.assignment
+        if not len(_twice(now)):
+            return
+        begun = replace(now, estimate=replace(now.estimate, pose=pose()))
+        row, points = begun.in_visits(FORGET_S), begun.points()
+        seen = row >= 0
+        each = np.bincount(row[seen])
+        place: FloatArray = np.column_stack([np.bincount(row[seen], x) / each for x in points[seen].T])
+        begun = replace(begun, landmark_row=row, estimate=replace(begun.estimate, landmark=place))
+        again, first = self._solved(begun), 0
+        while (later := again.assignment.n_landmarks - first) > 0:
+            again = self._all_merged(again, within=(first, later - RECENT))
+            first = again.assignment.n_landmarks - (later - RECENT)
+        # what is not merged yet has two numbers more to fit, a nat on average
+        gained = solved.cost - again.cost - (again.assignment.n_landmarks - now.n_landmarks)
+        if gained + _twice(now).sum() > _twice(again.assignment).sum():
+            self._go_on_from(again)
+
     def finish(self) -> Assignment:
         """Settle everything processed so far."""
         refused: set[tuple[int, int]] = set()
@@ -192,20 +225,20 @@ class Associator:
             before = solved.assignment
             again = reassigned(before, solved.marginals.explained_detections, density=self._density_m2)
             again = with_overlooked(again)
-            again = again.without(again.sightings < MIN_SIGHTINGS)
+            again = again.without(_seldom(again))
             count = min(before.n_landmarks, again.n_landmarks)
             changed = np.mean(_partners(before.landmark_row) != _partners(again.landmark_row))
             solved = self._contradictions_split(self._settled(again), refused)
             if changed <= SAME_SHARE and solved.assignment.n_landmarks == before.n_landmarks == count:
                 break
         assignment = solved.assignment
-        assignment = assignment.without(assignment.sightings < MIN_SIGHTINGS)
-        return assignment.without(~likely_real(assignment))
+        assignment = assignment.without(_seldom(assignment))
+        return assignment.without(~likely_real(assignment) & (assignment.told == 0))
 
     def _match(self, detections: IntArray) -> _Frame:
         """The frame's detections weighed against the landmarks known so far."""
         sigma = INFLATION * self._sighting_noise.of_detections(self._problem)
-        kind = self._kind[detections], self._of_class
+        kind = self._kind[detections], self._of_kind
         pairings = pairings_of_frame(
             self._filter, self._problem, sigma, detections, density=self._density_m2, kind=kind
         )
@@ -253,7 +286,8 @@ class Associator:
         local.update(target, problem.reading[known], frame.sigma[known], weighing=GATED)
         new = detections[frame.p_new >= P_NEW]
         self._row[new] = len(local.position) + np.arange(len(new))
-        self._of_class = np.append(self._of_class, self._kind[new])
+        self._of_kind[target] = np.maximum(self._of_kind[target], self._kind[known])
+        self._of_kind = np.vstack([self._of_kind, self._kind[new]])
         self._seen_s = np.append(self._seen_s, np.zeros(len(new)))
         self._seen_s[np.append(target, self._row[new])] = problem.stamp_s[self._done]
         at = sighted_at(local.pose, problem.reading[new], local.states, problem.mount)
@@ -263,11 +297,13 @@ class Associator:
 
     def _take_stock(self) -> None:
         """Solve everything so far, merge what is one, and go on from there."""
-        solved = self._settled(self._without_chance(self._assignment()), RECENT)
+        self._go_on_from(self._settled(self._without_chance(self._assignment()), RECENT))
+
+    def _go_on_from(self, solved: _Solved) -> None:
         assignment = solved.assignment
         self._row[: len(assignment.landmark_row)] = assignment.landmark_row
         self._pose[: self._done] = assignment.estimate.pose
-        self._of_class, self._seen_s = assignment.of_class, assignment.last_seen_s
+        self._of_kind, self._seen_s = assignment.of_kind, assignment.last_seen_s
         place = assignment.estimate.landmark
         near = np.argsort(np.hypot(*(place - assignment.estimate.pose[-1, :2]).T), kind="stable")[:MOST_COMPARED]
         self._filter.begin(assignment.estimate, solved.marginals, self._done - 1, near)
@@ -287,25 +323,32 @@ class Associator:
     def _without_chance(self, assignment: Assignment) -> Assignment:
         """Landmarks that were seen once or twice, long ago, were none."""
         age = assignment.measured.stamp_s[-1] - assignment.last_seen_s
-        few = assignment.sightings < MIN_SIGHTINGS
-        return assignment.without(few & (age > FORGET_S))
+        return assignment.without(_seldom(assignment) & (age > FORGET_S))
 
     def _settled(self, assignment: Assignment, recent: int | None = None) -> _Solved:
         """The batch solution, all landmarks or those seen last merged with others while there is something to merge."""
-        return self._all_merged(
-            self._solved(replace(assignment, measured=self._with_sigma(assignment.measured))), recent
-        )
+        assignment = replace(assignment, measured=self._with_sigma(assignment.measured))
+        return self._all_merged(self._solved(assignment), recent)
 
-    def _all_merged(self, solved: _Solved, recent: int | None = None) -> _Solved:
+    def _all_merged(
+        self, solved: _Solved, recent: int | None = None, *, within: tuple[int, int] | None = None
+    ) -> _Solved:
+        """All landmarks merged, or those seen last, or those from a row on but for so many later ones, with others that
+        are no later.
+        """
         refused: set[tuple[int, int]] = set()
         for _ in range(MERGE_ROUNDS):
             now = solved.assignment
             self._density_m2 = density = landmark_density(now.estimate.landmark, now.sightings)
+            among, known = _latest(now, recent), np.ones(now.n_landmarks, dtype=bool)
+            if within is not None:
+                known = np.arange(now.n_landmarks) < now.n_landmarks - within[1]
+                among = known & (np.arange(now.n_landmarks) >= within[0])
             pairs = propose_merges(
-                compared(now, solved.marginals, density), probability=P_MERGE, among=_latest(now, recent),
-                last=recent is None, refused=refused,
+                compared(now, solved.marginals, density, at_once=within is not None), probability=P_MERGE,
+                among=among, known=known, last=recent is None, refused=refused,
             )  # fmt: skip
-            if not pairs and now.n_landmarks <= MOST_LAID:
+            if not pairs and within is None and now.n_landmarks <= MOST_LAID:
                 honest = now.with_shared_errors(solved.marginals.shared)[: 2 * now.n_landmarks, : 2 * now.n_landmarks]
                 pairs = propose_constellation(now, honest, density=density, probability=P_MERGE, refused=refused)
             if not pairs:
@@ -395,9 +438,9 @@ class Associator:
         return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother.detections(estimate))
 
 
-def compared(assignment: Assignment, marginals: Marginals, density: float) -> Solution:
+def compared(assignment: Assignment, marginals: Marginals, density: float, *, at_once: bool = False) -> Solution:
     """Return the landmarks of an assignment at its optimum, as `propose_merges` wants them."""
-    place, kind = assignment.estimate.landmark, assignment.of_class
+    place, kind, told = assignment.estimate.landmark, assignment.of_kind, assignment.told
 
     def differences(younger: IntArray, older: IntArray) -> Differences:
         rows, both = np.unique(np.concatenate([younger, older]), return_inverse=True)
@@ -413,12 +456,30 @@ def compared(assignment: Assignment, marginals: Marginals, density: float) -> So
             difference = joint[:, se2.xy_rows(u[some])] - joint[:, se2.xy_rows(o[some])]
             return difference[se2.xy_rows(u[some])] - difference[se2.xy_rows(o[some])]
 
-        return Differences(place[younger] - place[older], own, np.full(len(u), math.log(density)), together)
+        new = math.log(density) - by_name(kind[younger], kind[older], np.minimum(told[younger], told[older]))
+        return Differences(place[younger] - place[older], own, new, together)
 
     return Solution(
         place, marginals.landmark, differences, assignment.sightings, assignment.last_seen_s,
-        *assignment.seen_together(), lambda one, other: alike(kind[one], kind[other]),
+        *assignment.seen_together(), kind, at_once,
     )  # fmt: skip
+
+
+def _twice(assignment: Assignment) -> FloatArray:
+    """(K,) evidence [nats] against landmarks with a name that another one has, too."""
+    kind, told = assignment.of_kind, assignment.told
+    one, other = np.nonzero(np.triu(same_name(kind[:, None], kind[None]), 1))
+    return by_name(kind[one], kind[other], np.minimum(told[one], told[other]))
+
+
+def by_name(one: IntArray, other: IntArray, told: IntArray) -> FloatArray:
+    """Return evidence [nats] that two are one: labels (K, P) of both, and how often the name of the lesser was read."""
+    return np.asarray(NAMED_NATS * np.minimum(told, MOST_TOLD) * same_name(one, other))
+
+
+def _seldom(assignment: Assignment) -> BoolArray:
+    """(L,) what was seen too seldom to be a landmark, and has no name."""
+    return np.asarray((assignment.sightings < MIN_SIGHTINGS) & (assignment.told == 0))
 
 
 def _latest(assignment: Assignment, count: int | None) -> BoolArray:
@@ -432,7 +493,8 @@ def _latest(assignment: Assignment, count: int | None) -> BoolArray:
 def _is_better(trial: _Solved, solved: _Solved) -> bool:
     """Whether an assignment explains the detections better, by more than landmarks that it needs beside."""
     more = trial.assignment.n_landmarks - solved.assignment.n_landmarks
-    return solved.cost - trial.cost - FEW_NATS * more > (0.0 if more else SAME_NATS)
+    gained = solved.cost - trial.cost + _twice(solved.assignment).sum() - _twice(trial.assignment).sum()
+    return bool(gained - FEW_NATS * more > (0.0 if more else SAME_NATS))
 
 
 def _key(rows: IntArray) -> tuple[int, int]:
@@ -465,7 +527,7 @@ def pairings_of_frame(
         sigma: (M, 2) standard deviations of all detections.
         detections: (n,) rows of those of the frame.
         density: landmarks a square metre that one expects where none was met before.
-        kind: (n,) classes of the detections and (L,) of the landmarks.
+        kind: (n, 2) classes and names of the detections and (L, 2) of the landmarks.
     """
     target = np.sort(local.active)
     source, target = np.repeat(np.arange(len(detections)), len(target)), np.tile(target, len(detections))
@@ -485,6 +547,7 @@ def pairings_of_frame(
     joint = h @ local.covariance @ h.T + np.diag((sigma[seen] ** 2).ravel())
     # a square metre has r dr db
     new = np.log(np.where(followed, UNMET, 1.0) * density * np.maximum(problem.reading[seen, 0], 0.1))
+    new -= NAMED_NATS * same_name(kind[0][source], kind[1][target])
     return Pairings(source, target, innovation[inside], joint, new, len(detections), followed)
 
 

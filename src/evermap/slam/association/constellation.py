@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
-from evermap.slam.association.assignment import Assignment
+from evermap.slam.association.assignment import Assignment, alike, same_name
 from evermap.slam.association.jcbb import Pairings, most_pairings
 from evermap.types import BoolArray, FloatArray, IntArray
 
@@ -274,7 +274,9 @@ def propose_constellation(
     allowed = ~apart[np.ix_(loose, root)]
     gap = place[loose][:, None] - place[root][None]
     spread = _spreads(joint, loose, root)
-    allowed &= np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < LOOSE_GATE
+    near = np.einsum("ijk,ijk->ij", gap, np.linalg.solve(spread, gap[..., None])[..., 0]) < LOOSE_GATE
+    one, other = assignment.of_kind[loose][:, None], assignment.of_kind[root][None]
+    allowed &= (near | same_name(one, other)) & alike(one, other)
     for k, m in np.argwhere(allowed):
         allowed[k, m] = _ordered(loose[k], root[m]) not in refused
     source, target = _local(place, joint, loose), _local(place, joint, root)

@@ -11,18 +11,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from evermap.slam.association.assignment import NOBODY, Assignment
+from evermap.slam.association.assignment import NOBODY, Assignment, alike
 from evermap.slam.association.associator import P_MERGE, Associator, density_of_unmet
 from evermap.slam.association.constellation import LocalMap, agreed_pairs
 from evermap.slam.association.place_index import PlaceIndex
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import prepare
-from evermap.slam.problem import Noise
+from evermap.slam.problem import Estimate, Noise, Problem
 from evermap.slam.smoother import Smoother
+from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Recording
 
 ALL_TRIED = 100
 """Landmarks of a prior map up to which every pair of them is tried; beyond, an index over constellations is asked."""
+MOST_NAMED = 100
+"""Landmarks known by name that a session is laid over a map by."""
 MAP_FLOOR_M = 1e-3
 """A prior map without uncertainty is taken to be known to a millimetre."""
 
@@ -34,12 +37,14 @@ class Associated:
     Attributes:
         landmark_row: (M,) landmark of every detection of the recording, in the order in which they were met; `NOBODY`
             where it belongs to none that was seen often enough.
+        name: (M,) identity that every detection came with, `UNKNOWN` where it has none or it was not looked at.
         assignment: of the detections that were used.
         noise: that it was solved with.
         prior: of the calibration states.
     """
 
     landmark_row: IntArray
+    name: IntArray
     assignment: Assignment
     noise: Noise
     prior: CalibrationPrior
@@ -57,79 +62,113 @@ class Associated:
         return LocalMap(place, covariance + log_sigma**2 * np.outer(place.ravel(), place.ravel()))
 
     def named(self, recording: Recording, landmark_id: IntArray) -> Recording:
-        """Return the recording with ids (L,) of its landmarks; `UNKNOWN` for detections of none."""
-        given = np.append(landmark_id, UNKNOWN)[self.landmark_row]
+        """Return the recording with ids (L,) of its landmarks where detections came without; `UNKNOWN` for none's."""
+        found = np.append(landmark_id, UNKNOWN)[self.landmark_row]
+        given = np.where(self.name == UNKNOWN, found, self.name)
         return replace(recording, detections=replace(recording.detections, landmark_id=given))
 
 
-def associated(recording: Recording, prior: CalibrationPrior, noise: Noise) -> Associated:
-    """Associate the detections of a recording by geometry; its own ids are not looked at.
+def associated(recording: Recording, prior: CalibrationPrior, noise: Noise, *, keep_ids: bool = False) -> Associated:
+    """Associate the detections of a recording by geometry.
 
     Args:
         recording: what a reader returned.
         prior: of the calibration states.
         noise: where noise levels start.
+        keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    anonymous = replace(recording.detections, landmark_id=np.zeros_like(recording.detections.landmark_id))
-    prepared = prepare(replace(recording, detections=anonymous))
+    given = recording.detections
+    prepared = prepare(replace(recording, detections=replace(given, landmark_id=np.zeros_like(given.landmark_id))))
     problem = replace(prepared.problem, prior=prior.without_scale())
-    associator = Associator(problem, noise, recording.detections.class_id[prepared.used])
+    name = given.landmark_id if keep_ids else np.full_like(given.landmark_id, UNKNOWN)
+    associator = Associator(problem, noise, np.column_stack([given.class_id, name])[prepared.used])
     for _ in problem.stamp_s:
         associator.step()
+    if keep_ids:
+        associator.heed_names(lambda: _by_names(problem, name[prepared.used], noise, prior))
     assignment = associator.finish()
-    row = np.full(len(recording.detections), NOBODY, dtype=np.int64)
+    row = np.full(len(given), NOBODY, dtype=np.int64)
     row[prepared.used] = assignment.landmark_row
-    return Associated(row, assignment, associator.noise, prior)
+    return Associated(row, name, assignment, associator.noise, prior)
+
+
+def _by_names(problem: Problem, name: IntArray, noise: Noise, prior: CalibrationPrior) -> FloatArray:
+    """(N, 3) poses by the detections with a name (M,) alone."""
+    named = name != UNKNOWN
+    names, row = np.unique(name[named], return_inverse=True)
+    landmark = np.full(len(name), NOBODY)
+    landmark[named] = row
+    start = Estimate(np.zeros((len(problem.stamp_s), 3)), np.zeros((len(names), 2)), prior.mean)
+    some = Assignment(problem, landmark, start, name[:, None]).problem()
+    slam = StreamingSlam(some, noise, prior.without_scale())
+    for _ in some.stamp_s:
+        slam.step()
+    return slam.finish().estimate.pose
 
 
 def identified(
-    recording: Recording, prior: CalibrationPrior, noise: Noise, *, prior_map: Landmarks | None = None
+    recording: Recording,
+    prior: CalibrationPrior,
+    noise: Noise,
+    *,
+    prior_map: Landmarks | None = None,
+    keep_ids: bool = False,
 ) -> Recording:
-    """Return the recording with landmark ids by geometry; its own are not looked at.
+    """Return the recording with landmark ids by geometry.
 
     Args:
         recording: what a reader returned.
         prior: of the calibration states.
         noise: where noise levels start.
         prior_map: landmarks that keep their ids where they are met again, from whatever place the robot starts in.
+        keep_ids: as of `associated`.
 
     Returns:
-        The same detections. Landmarks that are not in the prior map are numbered from 1, in the order in which they
-        were met, leaving out the map's ids; `UNKNOWN` where a detection belongs to none that was seen often enough.
+        The same detections. Landmarks without an id that are not in the prior map are numbered from 1, in the order in
+        which they were met, leaving out ids that there are; `UNKNOWN` where a detection without an id belongs to none
+        that was seen often enough.
 
     Raises:
         DataError: too few frames with detections, or too many for the memory.
     """
-    found = associated(recording, prior, noise)
-    return found.named(recording, _ids(found, prior_map))
-
-
-def _ids(found: Associated, prior_map: Landmarks | None) -> IntArray:
-    """(L,) the prior map's ids where its landmarks were met, numbers that are free for the others."""
-    known, count = np.zeros(0, dtype=np.int64), found.assignment.n_landmarks
-    met = np.full(count, UNKNOWN, dtype=np.int64)
+    found = associated(recording, prior, noise, keep_ids=keep_ids)
+    met, known = found.assignment.name, np.zeros(0, dtype=np.int64)
     if prior_map is not None:
         known = prior_map.landmark_id
-        for mine, theirs in _found_in(prior_map, found):
-            met[mine] = known[theirs]
-    free = np.setdiff1d(np.arange(1, count + len(known) + 1), known)
-    new = met == UNKNOWN
-    met[new] = free[: int(new.sum())]
-    return met
+        mine, theirs = np.array(_found_in(prior_map, found), dtype=np.int64).reshape(-1, 2).T
+        fresh = (met[mine] == UNKNOWN) & ~np.isin(known[theirs], met)
+        met[mine[fresh]] = known[theirs[fresh]]
+    return found.named(recording, numbered(met, np.append(known, found.name)))
+
+
+def numbered(landmark_id: IntArray, taken: IntArray) -> IntArray:
+    """Return ids (L,) with numbers from 1 that are not taken (K,) where there is none."""
+    new, there = landmark_id == UNKNOWN, np.unique(taken)
+    free = np.setdiff1d(np.arange(1, len(landmark_id) + len(there) + 1), there)
+    after = landmark_id.copy()
+    after[new] = free[: int(new.sum())]
+    return after
 
 
 def _found_in(prior_map: Landmarks, found: Associated) -> list[tuple[int, int]]:
-    """Landmarks of the session with rows of the prior map, by the shape of both maps alone."""
+    """Landmarks of the session with rows of the prior map, by names where two are in both, and by the shape of both."""
     trusted = np.argsort(-found.assignment.sightings, kind="stable")
     source = found.in_metres.part(trusted)
     known, density = prior_map.covariance_m2 + MAP_FLOOR_M**2 * np.eye(2), density_of_unmet(source.place)
-    if len(prior_map) > ALL_TRIED:
-        pairs = PlaceIndex(prior_map.position_m, known).pairs(source, density=density, probability=P_MERGE)
+    name = found.assignment.name[trusted]
+    named, of = (each[:MOST_NAMED] for each in np.intersect1d(name, prior_map.landmark_id, return_indices=True)[1:])
+    sure = agreed_pairs(
+        source.part(named), LocalMap(prior_map.position_m[of], block_diag(*known[of])), np.eye(len(of), dtype=bool),
+        density=density, probability=P_MERGE,
+    ) if len(of) > 1 else []  # fmt: skip
+    if sure or len(prior_map) > ALL_TRIED:
+        given = [(int(named[k]), int(of[m])) for k, m in sure]
+        pairs = PlaceIndex(prior_map.position_m, known).pairs(source, density=density, probability=P_MERGE, given=given)
     else:
         target = LocalMap(prior_map.position_m, block_diag(*known))
-        allowed = np.ones((len(trusted), len(prior_map)), dtype=bool)
+        allowed = alike(name[:, None, None], prior_map.landmark_id[None, :, None])
         pairs = agreed_pairs(source, target, allowed, density=density, probability=P_MERGE)
     return [(int(trusted[k]), m) for k, m in pairs]

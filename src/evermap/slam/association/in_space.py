@@ -18,7 +18,16 @@ import numpy as np
 from evermap.config import SpaceConfig
 from evermap.errors import ConfigError, DataError
 from evermap.geometry import se2, se3
-from evermap.slam.association.assignment import NOBODY, SHARED_M, SHARED_SHARE, alike, seen_together
+from evermap.slam.association.assignment import (
+    NOBODY,
+    SHARED_M,
+    SHARED_SHARE,
+    alike,
+    labels_of,
+    names_of,
+    same_name,
+    seen_together,
+)
 from evermap.slam.association.associator import (
     CAUTION,
     FORGET_S,
@@ -27,6 +36,7 @@ from evermap.slam.association.associator import (
     LAST_ROUNDS,
     MERGE_ROUNDS,
     MIN_SIGHTINGS,
+    NAMED_NATS,
     P_MERGE,
     P_NEW,
     RISE_MOST,
@@ -39,9 +49,10 @@ from evermap.slam.association.associator import (
     UNMET,
     effective_number,
 )
+from evermap.slam.association.identify import numbered
 from evermap.slam.association.jcbb import Pairings, gates, pairing_probability
 from evermap.slam.association.merging import Differences, Solution, in_reach, propose_merges
-from evermap.slam.association.revise import CONFIDENCE, lying_together, most_probable
+from evermap.slam.association.revise import CONFIDENCE, lying_together, may_be_of, most_probable
 from evermap.slam.space.estimate import as_seen, converged, first_places, oriented
 from evermap.slam.space.intake import SpatialIntake, prepare_space, without_range
 from evermap.slam.space.linearise import POINT, POSE
@@ -52,8 +63,6 @@ from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray, Landmarks, S
 
 FOLLOWED = 3.0 * math.log(4.0)
 """A landmark is followed as long as its place beside the robot at most doubles the standard deviations of readings."""
-NAMED_NATS = math.log(100.0)
-"""Odds that of two landmarks with one name near each other there is only one."""
 LEAST_M = 1.0
 """Landmarks spread over this much of every axis, at least: those on a wall fill no volume."""
 SHARED_RAD = 0.05
@@ -80,9 +89,9 @@ OF_DETECTIONS = (
 
 
 def identified_in_space(
-    recording: SpatialRecording, settings: SpaceConfig, prior_map: Landmarks | None = None
+    recording: SpatialRecording, settings: SpaceConfig, prior_map: Landmarks | None = None, *, keep_ids: bool = False
 ) -> SpatialRecording:
-    """Return the recording with landmark ids by geometry; its own are not looked at.
+    """Return the recording with landmark ids by geometry.
 
     Boxes (of a detector of things that may move) and detections without a range get none.
 
@@ -90,10 +99,11 @@ def identified_in_space(
         recording: as read, with odometry.
         settings: of the estimator.
         prior_map: must be None: landmarks have no identities in a map.
+        keep_ids: detections with an id keep it, those without may be of the same landmarks; else ids are ignored.
 
     Returns:
-        The same detections. Landmarks are numbered from 1, in the order in which they were met; `UNKNOWN` where a
-        detection belongs to none that was seen often enough.
+        The same detections. Landmarks without an id are numbered from 1, in the order in which they were met, leaving
+        out ids that there are; `UNKNOWN` where a detection without an id belongs to none that was seen often enough.
 
     Raises:
         ConfigError: a map is given.
@@ -110,11 +120,14 @@ def identified_in_space(
     # symmetries are those of classes, so each class is one landmark until it is known which there are
     by_class = np.where(asked, given.class_id - UNKNOWN, UNKNOWN)
     intake = prepare_space(replace(recording, detections=replace(given, landmark_id=by_class)), settings)
-    name = np.full(len(intake.used), UNKNOWN)
-    row = SpatialAssociator(intake, given.class_id[intake.used], name).finish()
-    found = np.full(len(given), UNKNOWN)
-    found[intake.used] = np.where(row == NOBODY, UNKNOWN, 1 + row)
-    return replace(recording, detections=replace(given, landmark_id=found), landmark_names={})
+    found = given.landmark_id.copy() if keep_ids else np.full(len(given), UNKNOWN)
+    kind = np.column_stack([given.class_id, found])[intake.used]
+    row = SpatialAssociator(intake, kind).finish()
+    of = names_of(kind[:, 1], row, int(row.max(initial=-1)) + 1)
+    met = np.append(numbered(of, found), UNKNOWN)[row]
+    found[intake.used] = np.where(kind[:, 1] == UNKNOWN, met, kind[:, 1])
+    names = recording.landmark_names if keep_ids else {}
+    return replace(recording, detections=replace(given, landmark_id=found), landmark_names=names)
 
 
 class _Nearby:
@@ -201,13 +214,13 @@ class SpatialAssociator:
 
     Args:
         intake: the recording, in which every class is one landmark.
-        kind: (M,) class of every detection that it uses, `UNKNOWN` for none.
-        name: (M,) identity of each, `UNKNOWN` for none: different ones are never one landmark's.
+        kind: (M, 2) class and name of every detection that it uses, `UNKNOWN` for none: different ones are never one
+            landmark's.
     """
 
-    def __init__(self, intake: SpatialIntake, kind: IntArray, name: IntArray) -> None:
+    def __init__(self, intake: SpatialIntake, kind: IntArray) -> None:
         problem = self._problem = _thinned(intake)
-        self._kind, self._name = kind, name
+        self._kind = kind
         self._noise = replace(DRIVEN, translation=CAUTION * DRIVEN.translation, rotation=CAUTION * DRIVEN.rotation)
         mount = problem.mount[problem.sensor]
         self._at = se3.transform(mount, problem.measured[:, :3])
@@ -264,8 +277,7 @@ class SpatialAssociator:
     def _match(self, near: _Nearby, view: IntArray) -> _Match:
         """A view's detections weighed against what is near."""
         source, target = (each.ravel() for each in np.indices((len(view), len(near.row))))
-        of = self._of[near.row[target]]
-        kept = alike(self._kind[view[source]], of[:, 0]) & alike(self._name[view[source]], of[:, 1])
+        kept = alike(self._kind[view[source]], self._of[near.row[target]])
         source, target = source[kept], target[kept]
         own = self._noise.position**2 * self._covariance[view]
         innovation = self._at[view[source]] - near.place[target]
@@ -282,8 +294,7 @@ class SpatialAssociator:
         # what is followed has a neighbourhood that is known; elsewhere the gate may hold another landmark by chance
         followed = log_det <= least + FOLLOWED
         new = np.log(np.where(followed, UNMET, 1.0) * self._density)
-        name = self._name[view[source]]
-        new -= np.where((name != UNKNOWN) & (name == self._of[near.row[target], 1]), NAMED_NATS, 0.0)
+        new -= NAMED_NATS * same_name(self._kind[view[source]], self._of[near.row[target]])
         pairs = Pairings(
             source, target, innovation, joint.reshape(3 * len(source), 3 * len(source)), new, len(view), None, least
         )
@@ -316,12 +327,10 @@ class SpatialAssociator:
         """Update with the certain pairings, and start landmarks where none is near enough."""
         known = view[match.source]
         self._row[known] = near.row[match.target]
-        self._of[self._row[known]] = np.maximum(
-            self._of[self._row[known]], np.column_stack([self._kind[known], self._name[known]])
-        )
+        self._of[self._row[known]] = np.maximum(self._of[self._row[known]], self._kind[known])
         new = view[match.p_new >= P_NEW]
         self._row[new] = len(self._of) + np.arange(len(new))
-        self._of = np.vstack([self._of, np.column_stack([self._kind[new], self._name[new]])])
+        self._of = np.vstack([self._of, self._kind[new]])
         near.meet(self._row[new])
         seen = np.append(known, new)
         at = np.append(match.target, len(near.row) - len(new) + np.arange(len(new)))
@@ -402,7 +411,7 @@ class SpatialAssociator:
     def _compared(self, solved: _Solved) -> Solution:
         """The landmarks as `propose_merges` wants them."""
         used, count = np.flatnonzero(solved.row >= 0), len(solved.estimate.place)
-        row, of, n = solved.row[used], self._properties(solved.row), len(self._problem.stamp_s)
+        row, of, n = solved.row[used], labels_of(self._kind, solved.row, count), len(self._problem.stamp_s)
         spread, turned = solved.smoother.spread(solved.now), solved.smoother.problem.oriented
         at = spread.own_first[n : n + count, None, None] + np.arange(3)
         own = spread.own[at + np.where(turned, 6, 3)[:, None, None] * np.arange(3)[:, None]]
@@ -411,24 +420,12 @@ class SpatialAssociator:
         middle = wide[order[np.cumsum(sightings) - sightings + sightings // 2]]
         last_s = np.zeros(count)
         np.maximum.at(last_s, row, self._problem.stamp_s[self._problem.pose_row[used]])
-
-        def may_be(one: IntArray, other: IntArray) -> BoolArray:
-            return alike(of[one, 0], of[other, 0]) & alike(of[one, 1], of[other, 1])
-
-        like = np.array([may_be(np.full(count, k), np.arange(count)).mean() for k in range(count)])
-        differences = _Differing(solved, SHARED_M**2 + (SHARED_SHARE * middle) ** 2, np.log(self._density * like))
+        like = np.array([alike(each, of).mean() for each in of])
+        differences = _Differing(solved, SHARED_M**2 + (SHARED_SHARE * middle) ** 2, np.log(self._density * like), of)
         return Solution(
             solved.estimate.place[:, :3], own, differences, sightings, last_s,
-            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), may_be, at_once=True,
+            *seen_together(self._view[used], row, int(self._view.max()) + 1, count), of, at_once=True,
         )  # fmt: skip
-
-    def _properties(self, row: IntArray) -> IntArray:
-        """(L, 2) class and name of each landmark."""
-        used = np.flatnonzero(row >= 0)
-        found = np.full((int(row.max(initial=-1)) + 1, 2), UNKNOWN)
-        np.maximum.at(found[:, 0], row[used], self._kind[used])
-        np.maximum.at(found[:, 1], row[used], self._name[used])
-        return found
 
     def _wide_m(self) -> FloatArray:
         """(M,) standard deviation of a position, along its widest axis."""
@@ -440,8 +437,7 @@ class SpatialAssociator:
         at, gate = se3.transform(pose, self._at), gates(1, CONFIDENCE, 3)[1]
         reach = TAIL * math.sqrt(LEFT * gate) * float(np.quantile(self._wide_m(), 0.99))
         seen, row = in_reach(place[:, :3], at, reach)
-        of = self._properties(solved.row)
-        kept = alike(self._kind[seen], of[row, 0]) & alike(self._name[seen], of[row, 1])
+        kept = may_be_of(self._kind[seen], labels_of(self._kind, solved.row, len(place))[row])
         seen, row = seen[kept], row[kept]
         turned = se3.compose(se3.inverse(pose[seen]), place[row])
         oriented = solved.smoother.problem.oriented[row]
@@ -475,10 +471,11 @@ class _Differing:
         solved: the landmarks.
         shared: (L,) variance [m^2] of what sightings from one place have in common.
         log_density: (L,) of landmarks like each, a cubic metre.
+        kind: (L, 2) class and name of each.
     """
 
-    def __init__(self, solved: _Solved, shared: FloatArray, log_density: FloatArray) -> None:
-        problem = solved.smoother.problem
+    def __init__(self, solved: _Solved, shared: FloatArray, log_density: FloatArray, kind: IntArray) -> None:
+        problem, self._kind = solved.smoother.problem, kind
         self._place, self._turned = solved.estimate.place, problem.oriented
         self._symmetries, self._first = problem.symmetries, len(problem.stamp_s)
         self._shared, self._log_density = shared, log_density
@@ -504,7 +501,8 @@ class _Differing:
         # a pair without orientations has none to differ by: three numbers that are 0 in any case
         idle = np.where(both[:, None], 0.0, np.arange(6) >= 3)
         own += idle[:, :, None] * np.eye(6)
-        new = self._log_density[younger] + np.where(both, self._turns(younger, older), -1.5 * math.log(2.0 * math.pi))
+        new = self._log_density[younger] - NAMED_NATS * same_name(self._kind[younger], self._kind[older])
+        new += np.where(both, self._turns(younger, older), -1.5 * math.log(2.0 * math.pi))
 
         def together(some: IntArray) -> FloatArray:
             onto = np.zeros((len(some), 6, len(joint)))

@@ -16,9 +16,10 @@ import numpy as np
 from scipy import sparse
 from scipy.spatial import KDTree
 
+from evermap.slam.association.assignment import alike, same_name
 from evermap.slam.association.consensus import FREE, Candidates, Consensus, consensus
 from evermap.slam.association.jcbb import gates
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 CONFIDENCE = 0.999
 """Of the gate of a pair, given others that are one: a pair that fails is none."""
@@ -71,7 +72,7 @@ class Solution:
         differences: of pairs, rows (K,) of the younger ones and (K,) of the older ones.
         sightings, last_seen_s: (L,) detections of each, stamp of the last.
         together, in_turn: (L, L) frames, see `seen_together`.
-        alike: which of two rows (K,) of landmarks may be one, whatever their places.
+        kind: (L, P) class and name of each, `UNKNOWN` for none: different ones are never one.
         at_once: True where nothing was merged on the way, so that many landmarks may be one: pairs that follow from
             others are no evidence then, and no rivals.
     """
@@ -83,12 +84,18 @@ class Solution:
     last_seen_s: FloatArray
     together: sparse.csr_array
     in_turn: sparse.csr_array
-    alike: Callable[[IntArray, IntArray], BoolArray]
+    kind: IntArray
     at_once: bool = False
 
 
 def propose_merges(
-    solution: Solution, *, probability: float, among: BoolArray, last: bool, refused: set[tuple[int, int]]
+    solution: Solution,
+    *,
+    probability: float,
+    among: BoolArray,
+    last: bool,
+    refused: set[tuple[int, int]],
+    known: BoolArray | None = None,
 ) -> list[tuple[int, int]]:
     """Return pairs (younger, older) of landmarks that are one with at least `probability`, given all other such pairs.
 
@@ -98,14 +105,18 @@ def propose_merges(
         among: (L,) landmarks that are looked up among all.
         last: True where no later frames will tell more.
         refused: pairs that are not looked at.
+        known: (L,) landmarks that they may be; None for all.
     """
-    seen = solution.sightings >= MIN_SIGHTINGS
-    sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen)
+    seen = (solution.sightings >= MIN_SIGHTINGS) | (solution.kind[:, -1] != UNKNOWN)
+    sources, targets = np.flatnonzero(seen & among), np.flatnonzero(seen if known is None else seen & known)
     if len(sources) < 1 or len(targets) < 2:
         return []
-    younger, older = _near(solution.place, solution.covariance, sources, targets)
+    pairs = np.vstack(
+        [_near(solution.place, solution.covariance, sources, targets), _named(solution.kind, sources, targets)]
+    )
+    younger, older = np.unique(pairs, axis=0).T
     kept = np.array([(int(u), int(o)) not in refused for u, o in zip(younger, older, strict=True)], dtype=bool)
-    kept &= solution.alike(younger, older)
+    kept &= alike(solution.kind[younger], solution.kind[older])
     younger, older = younger[kept], older[kept]
     merges: list[tuple[int, int]] = []
     order = sources[np.argsort(solution.last_seen_s[sources], kind="stable")[::-1]]
@@ -116,10 +127,29 @@ def propose_merges(
         mine |= np.isin(older, order[begin : begin + GROUP]) & np.isin(older, sources) & ~np.isin(younger, later)
         if mine.any():
             merges += _agreed(solution, younger[mine], older[mine], probability, last=last)
-    return sorted(set(merges))
+    return _without_contradictions(sorted(set(merges)), solution.kind)
 
 
-def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets: IntArray) -> tuple[IntArray, IntArray]:
+def _without_contradictions(merges: list[tuple[int, int]], kind: IntArray) -> list[tuple[int, int]]:
+    """Pairs without those that make two names, or classes, one by way of a third landmark that has none."""
+    part, label, kept = np.arange(len(kind)), kind.copy(), list[tuple[int, int]]()
+    for one, other in merges:
+        a, b = part[one], part[other]
+        if alike(label[a], label[b]):
+            label[b] = np.maximum(label[a], label[b])
+            part[part == a] = b
+            kept.append((one, other))
+    return kept
+
+
+def _named(kind: IntArray, sources: IntArray, targets: IntArray) -> IntArray:
+    """Different pairs (younger, older) of a source and a target with the same name, wherever they are."""
+    row, column = np.nonzero(same_name(kind[sources][:, None], kind[targets][None]) & (sources[:, None] != targets))
+    pairs = np.column_stack([sources[row], targets[column]])
+    return np.column_stack([pairs.max(axis=1, initial=-1), pairs.min(axis=1, initial=len(kind))])
+
+
+def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets: IntArray) -> IntArray:
     """Different pairs (younger, older) of a source and a target that may be one for all that their own spreads say."""
     spread = np.sqrt(2.0 * np.linalg.eigvalsh(covariance)[:, -1])
     gate = math.sqrt(LOOSE_GATE)
@@ -130,8 +160,7 @@ def _near(place: FloatArray, covariance: FloatArray, sources: IntArray, targets:
     reach = gate * np.hypot(spread[sources][:, None], spread[other]) + 0.1
     row, at = np.nonzero((away < reach) & (other != sources[:, None]))
     one, two = sources[row], other[row, at]
-    pairs = np.unique(np.column_stack([np.maximum(one, two), np.minimum(one, two)]), axis=0)
-    return pairs[:, 0], pairs[:, 1]
+    return np.column_stack([np.maximum(one, two), np.minimum(one, two)])
 
 
 def _agreed(
@@ -149,7 +178,7 @@ def _agreed(
     if not len(inside):
         return []
     younger, older = younger[inside], older[inside]
-    conflict = _conflicts(younger, older, solution.together)
+    conflict = _conflicts(younger, older, solution.together, solution.kind)
     ends = np.unique(np.column_stack([younger, older]), return_inverse=True)[1].reshape(-1, 2)
     candidates = Candidates(
         gap[inside], found.joint(inside), against[inside], conflict, ends if solution.at_once else None
@@ -160,8 +189,8 @@ def _agreed(
     return [(int(younger[k]), int(older[k])) for k in sure]
 
 
-def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array) -> BoolArray:
-    """(P, P) pairs that cannot both be one: a landmark would be two others that were seen together."""
+def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array, kind: IntArray) -> BoolArray:
+    """(P, P) pairs that cannot both be one: a landmark would be two others that were seen together, or named apart."""
     conflict = np.zeros((len(younger), len(younger)), dtype=bool)
     np.fill_diagonal(conflict, True)
     for mine, other in ((younger, older), (older, younger)):
@@ -169,6 +198,7 @@ def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array) -
             shared = mine[:, None] == theirs[None]
             one, two = np.nonzero(shared)
             apart = _entries(together, other[one], another[two]) > 0.0
+            apart |= ~alike(kind[other[one]], kind[another[two]])
             conflict[one[apart], two[apart]] = True
     return conflict
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -74,15 +75,22 @@ class PlaceIndex:
         self._corners = np.take_along_axis(self._corners, order, axis=1)
         self._by_sides = KDTree(sides, balanced_tree=False)
 
-    def pairs(self, source: LocalMap, *, density: float, probability: float) -> list[tuple[int, int]]:
+    def pairs(
+        self, source: LocalMap, *, density: float, probability: float, given: Sequence[tuple[int, int]] = ()
+    ) -> list[tuple[int, int]]:
         """Return landmarks (rows of `source`) that surely stand at places of the map; none where that is not sure.
 
         Args:
             source: the local map, its landmarks in order of trust.
             density: landmarks a square metre that one expects where they are not the same.
             probability: least probability of a pair beside all overlays that differ in it alone.
+            given: pairs that are sure, as by name: where the others are looked for; none to look everywhere.
         """
         done = np.zeros(len(source.place), dtype=bool)
+        if given:
+            mine, theirs = np.array(given).T
+            done[mine] = True
+            return [*given, *self._further(source, mine, theirs, done, density, probability)]
         for _ in range(TRIES):
             if len(source.place) - int(done.sum()) < 3 or not len(self._corners):
                 break

@@ -62,7 +62,7 @@ def displaced_stretches(
     """
     place, first_s, found = assignment.estimate.landmark, assignment.first_seen_s, list[Displaced]()
     order = np.flatnonzero(trusted)[np.argsort(first_s[trusted], kind="stable")]
-    shared, together, kind = assignment.shared_variance, assignment.together, assignment.of_class
+    shared, together, kind = assignment.shared_variance, assignment.together, assignment.of_kind
     indexed = 0
 
     def local(rows: IntArray) -> LocalMap:

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.special import gammainc
 
-from evermap.slam.association.assignment import NOBODY, Assignment, alike
+from evermap.slam.association.assignment import NOBODY, Assignment, alike, same_name
 from evermap.slam.association.jcbb import gates
 from evermap.slam.association.merging import in_reach
 from evermap.slam.kernels import kernel
 from evermap.slam.linearise import detection_residuals
-from evermap.types import BoolArray, FloatArray, IntArray
+from evermap.types import UNKNOWN, BoolArray, FloatArray, IntArray
 
 CONFIDENCE = 0.999
 """Of the gate: a detection outside is not of this landmark."""
@@ -55,7 +55,7 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     wide = np.hypot(sigma[:, 0], problem.reading[:, 0] * sigma[:, 1]) * np.sqrt(1.0 + spread)
     gate = gates(1, CONFIDENCE)[1]
     seen, row = in_reach(estimate.landmark, at, float(np.sqrt(gate) * np.quantile(wide, 0.99)))
-    same = alike(assignment.of_class[row], assignment.kind[seen])
+    same = may_be_of(assignment.kind[seen], assignment.of_kind[row])
     seen, row = seen[same], row[same]
     compared = replace(problem, pose_row=problem.pose_row[seen], landmark_row=row, reading=problem.reading[seen])
     residual = detection_residuals(compared, estimate)
@@ -66,7 +66,16 @@ def reassigned(assignment: Assignment, explained: FloatArray, *, density: float)
     score = -0.5 * (squared + np.log(variance).sum(axis=1)) - np.log(2.0 * np.pi) - new
     inside = (squared < gate) & (score > 0.0)
     seen, row, score = seen[inside], row[inside], score[inside]
-    return replace(assignment, landmark_row=most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks))
+    found = most_probable(seen, row, score, problem.pose_row, assignment.n_landmarks)
+    named = assignment.kind[:, -1] != UNKNOWN  # a name ties the ends of a loop, however far off they are
+    return replace(assignment, landmark_row=np.where((found == NOBODY) & named, assignment.landmark_row, found))
+
+
+def may_be_of(detection: IntArray, landmark: IntArray) -> BoolArray:
+    """Return which detections may be of landmarks by labels (K, P) of both: one with a name of one with that name."""
+    named = detection[:, -1] != UNKNOWN
+    found: BoolArray = alike(detection, landmark) & (~named | same_name(detection, landmark))
+    return found
 
 
 def most_probable(seen: IntArray, row: IntArray, score: FloatArray, frame: IntArray, n_landmarks: int) -> IntArray:
@@ -121,7 +130,7 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
     Args:
         at: (M, D) places in the world.
         wide: (M,) their standard deviations.
-        kind: (M,) classes.
+        kind: (M, P) classes and names.
         frame: (M,) frames.
     """
     free, found = np.ones(len(at), dtype=bool), []
@@ -129,6 +138,7 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
     near = [np.array(tree.query_ball_point(at[k], 3.0 * wide[k]), dtype=np.int64) for k in range(len(at))]
     for k in np.argsort([-len(each) for each in near], kind="stable").tolist():
         mine = near[k][free[near[k]] & alike(kind[near[k]], kind[k])]
+        mine = mine[alike(kind[mine], _most_frequent(kind[mine]))]
         mine = mine[np.unique(frame[mine], return_index=True)[1]]
         if not free[k] or len(mine) < MIN_SIGHTINGS:
             continue
@@ -138,6 +148,16 @@ def lying_together(at: FloatArray, wide: FloatArray, kind: IntArray, frame: IntA
             continue
         free[mine] = False
         found.append(mine)
+    return found
+
+
+def _most_frequent(kind: IntArray) -> IntArray:
+    """(P,) the label that most detections (M, P) have in each column, `UNKNOWN` where none has one."""
+    found = np.full(kind.shape[1], UNKNOWN)
+    for column, values in enumerate(kind.T):
+        known, count = np.unique(values[values != UNKNOWN], return_counts=True)
+        if len(known):
+            found[column] = known[np.argmax(count)]
     return found
 
 
