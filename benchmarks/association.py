@@ -201,7 +201,7 @@ class Lived:
 
 MIXED = (
     ("MRCLAM_Dataset6", 0.5, "detections"), ("MRCLAM_Dataset6", 0.5, "landmarks"), ("dlr", 0.1, "landmarks"),
-    ("park", 0.1, "landmarks"), ("test_11", 0.5, "landmarks"), ("test_11", 0.5, "detections"),
+    ("park", 0.1, "landmarks"), ("TagSLAM", 0.5, "landmarks"), ("TagSLAM", 0.5, "detections"),
 )  # fmt: skip
 """Beginnings of names, shares that keep their identities, and of what."""
 

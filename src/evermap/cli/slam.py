@@ -190,8 +190,7 @@ def slam(
         raise ConfigError("is for a template", field="3d", hint="--init DIR --3d")
     given = {"sensor_model": sensor_model, "method": method, "unknown_ids": _associated(unknown_ids, empty_ids)}
     chosen = configured(config, settings, given, within="slam", show=show_config)
-    paths = input or []
-    if not paths:
+    if not (paths := input or []):
         hint = "a folder, zip or ROS bag; --init DIR shows what to put in"
         raise ConfigError("a recording is needed", field="input", hint=hint)
     if len(paths) > 1 and map_file is None:

@@ -49,7 +49,7 @@ def two_visits(seed: int, off_m: float = 0.0) -> tuple[World, Assignment, np.nda
     row[(row == TWICE) & (problem.pose_row > 24) & (problem.pose_row <= 36)] = NOBODY
     sigma = np.tile(made.noise.detection, (len(row), 1))
     measured = replace(problem, reading=reading, sigma_given=sigma)
-    return made, Assignment(measured, row, made.truth, np.full(len(row), UNKNOWN)), np.flatnonzero(late)
+    return made, Assignment(measured, row, made.truth, np.full((len(row), 2), UNKNOWN)), np.flatnonzero(late)
 
 
 def weighed(made: World, assignment: Assignment) -> Visits:
@@ -111,7 +111,7 @@ def kicked(seed: int) -> tuple[World, Assignment, np.ndarray]:
         replace(problem, sigma_given=sigma),
         row,
         Estimate(pose, np.zeros((len(names), 2)), KNOWN_SENSORS.mean),
-        tree * 0,
+        np.full((len(tree), 2), UNKNOWN),
     )
     points = guess.points()
     place = np.array([np.median(points[row == k], axis=0) for k in range(len(names))])
