@@ -424,9 +424,8 @@ class _Options:
     def _covariance(self, a: IntArray, b: IntArray) -> FloatArray:
         """Between the differences of two sets of places."""
         la, lb = (se2.xy_rows(self.known.landmark[rows], self.dim) for rows in (a, b))
-        pa, pb = se2.xy_rows(a, self.dim), se2.xy_rows(b, self.dim)
-        both: FloatArray = (
-            self._session[np.ix_(la, lb)] + self.known.covariance_m2[np.ix_(pa, pb)] + self._freedom[np.ix_(la, lb)]
-        )
-        both[pa[:, None] == pb[None, :]] += self.drift_m**2
+        pa, pb = se2.xy_rows(a, self.dim)[:, None], se2.xy_rows(b, self.dim)
+        la = la[:, None]
+        both: FloatArray = self._session[la, lb] + self.known.covariance_m2[pa, pb] + self._freedom[la, lb]
+        both[pa == pb] += self.drift_m**2
         return both
