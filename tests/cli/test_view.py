@@ -182,3 +182,21 @@ def test_doubt_is_faint(tmp_path: Path) -> None:
     red, green, blue = rgb(PAPER)
     assert colours["/world/landmarks/2"] == (red << 24) + (green << 16) + (blue << 8) + 255
     assert colours["/world/landmarks/1"] != colours["/world/landmarks/2"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["tcp/localhost:7447", "--save", "drive.mcap"], ".rrd"),
+        (["tcp/localhost", "--save", "drive.rrd"], "--zenoh"),
+    ],
+)
+def test_mistakes_of_a_drive_are_one_line(
+    arguments: list[str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("zenoh", reason="the extra live is not installed")
+    monkeypatch.chdir(tmp_path)
+    result = CliRunner().invoke(app, ["view", *arguments])
+    assert result.exit_code == 2, result.output
+    assert result.stderr.count("\n") == 1
+    assert told in result.stderr

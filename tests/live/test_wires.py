@@ -22,11 +22,12 @@ from evermap.live.feed import run_live
 from evermap.live.now import Now
 from evermap.maps.living import LivingMap
 from evermap.types import Recording, Trajectory, rows_of
+from evermap.viz.rerun_scene import LiveScene
 
 zenoh = pytest.importorskip("zenoh", reason="the extra live is not installed")
 pytest.importorskip("foxglove", reason="the extra live is not installed")
 
-from evermap.live.ros import Listener, Teller, heard, play  # noqa: E402
+from evermap.live.ros import Listener, Teller, heard, look_on, play  # noqa: E402
 from evermap.live.wires import Foxglove, Mailbox, Wire, Zenoh  # noqa: E402
 from evermap.runs.mcap import Ros  # noqa: E402
 
@@ -354,3 +355,38 @@ def test_nobody_who_reads_slowly_holds_the_engine_up(living: LivingMap, endpoint
     assert bridge.mailbox.n_lost == 0
     assert differences(path, replayed(living, ROBOT)).max() < 1e-6
     assert max(bridge.step_s) < 0.5
+
+
+def test_a_drive_is_seen_while_it_happens(living: LivingMap, endpoint: str, tmp_path: Path) -> None:
+    """Robot and landmarks as the engine tells them, and in a file for rerun."""
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    seen: dict[str, list[Any]] = {"robot": [], "landmark": [], "change": [], "erase": []}
+    mailbox, scene = Mailbox(ours=True), LiveScene(tmp_path / "live.rrd")
+    viewer, done = Zenoh(endpoint, mailbox), threading.Event()
+
+    class Both:
+        def __getattr__(self, name: str) -> Any:
+            return lambda *told: (seen[name].append(told), getattr(scene, name)(*told))
+
+    def going_on() -> None:
+        if done.is_set():
+            raise KeyboardInterrupt
+
+    looking = threading.Thread(target=look_on, args=(mailbox, Both(), going_on))
+    looking.start()
+    bridge = Bridge(engine(living, ROBOT, QUICK, mapping=False), lambda box: [Zenoh(endpoint, box)])
+    robot = Zenoh(endpoint, None)
+    drive(ROBOT, robot, bridge)
+    robot.close()
+    wait_until(lambda: len({name for _, name, *_ in seen["landmark"]}) >= len(bridge.engine.landmarks()), 4.0)
+    bridge.close()
+    done.set()
+    looking.join()
+    viewer.close()
+    scene.close()
+    stamps = np.array([told[0] for told in seen["robot"]])
+    assert len(stamps) > 20
+    assert (np.diff(stamps) >= 0.0).all()
+    assert stamps[-1] > ROBOT.frames.stamp_s[-1] - 5.0
+    assert len({name for _, name, *_ in seen["landmark"]}) >= len(bridge.engine.landmarks())
+    assert (tmp_path / "live.rrd").stat().st_size > 10_000

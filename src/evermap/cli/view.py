@@ -1,8 +1,10 @@
-"""`evermap view`: look at a run or a living map in rerun, or write it for rerun or Foxglove."""
+"""`evermap view`: look at a run, a living map or a drive in rerun, or write it for rerun or Foxglove."""
 
 from __future__ import annotations
 
 import os
+import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -14,10 +16,17 @@ import typer
 from evermap.cli.options import AsJson
 from evermap.cli.terminal import print_json, say, warn
 from evermap.errors import ConfigError, InputError
+from evermap.interrupts import watched
 
 
 def view(
-    path: Annotated[Path, typer.Argument(metavar="MAP|RUN", help="A living map, or the folder of a run of slam.")],
+    path: Annotated[
+        str,
+        typer.Argument(
+            metavar="MAP|RUN|LIVE",
+            help="A living map, the folder of a run of slam, or a drive: where `evermap live` meets Zenoh.",
+        ),
+    ],
     save: Annotated[
         Path | None,
         typer.Option(
@@ -28,7 +37,7 @@ def view(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Look at a map or a run in the rerun viewer.
+    """Look at a map, a run, or a drive while it happens, in the rerun viewer.
 
     Landmarks with their beliefs, the path and what changed, on a timeline.
 
@@ -38,7 +47,44 @@ def view(
       evermap view out/monday
       evermap view site.evermap --save site.rrd
       evermap view out/monday --save monday.mcap
+      evermap view tcp/localhost:7447
     """
+    if re.match(r"(tcp|udp|tls|quic|ws)/|listen=", path) and not Path(path).exists():
+        _look_on(path, save)
+    else:
+        _look_at(Path(path), save, as_json=as_json)
+
+
+def _look_on(where: str, save: Path | None) -> None:
+    """Show a drive until it is stopped."""
+    from evermap.live.ros import look_on
+    from evermap.live.wires import Mailbox, Zenoh
+    from evermap.runs.folder import check_output_file
+    from evermap.viz.rerun_scene import LiveScene
+
+    if save is None:
+        _need_screen()
+    else:
+        check_output_file(save, inputs=[], ending=".rrd")
+    mailbox = Mailbox(ours=True)
+    zenoh, scene = Zenoh(where, mailbox), LiveScene(save)
+    say("showing what evermap live tells there; Ctrl-C ends it")
+    with watched(signal.SIGTERM) as watch:
+        look_on(mailbox, scene, watch.stop_if_asked)
+    scene.close()
+    zenoh.close()
+
+
+def _need_screen() -> None:
+    from evermap.viz.rerun_scene import require_rerun
+
+    require_rerun()
+    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
+        raise ConfigError("there is no screen to open a viewer on", field="view", hint="--save scene.rrd")
+
+
+def _look_at(path: Path, save: Path | None, *, as_json: bool) -> None:
+    """Show what was written."""
     from evermap.runs.folder import check_output_file
     from evermap.runs.view import write_view
 
@@ -54,11 +100,7 @@ def view(
             return
         say(f"wrote {save}; open it with: {'rerun' if save.suffix == '.rrd' else 'Foxglove'}")
         return
-    from evermap.viz.rerun_scene import require_rerun
-
-    require_rerun()
-    if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys():
-        raise ConfigError("there is no screen to open a viewer on", field="view", hint="--save scene.rrd")
+    _need_screen()
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / f"{path.resolve().stem}.rrd"
         for remark in write_view(path, scene):

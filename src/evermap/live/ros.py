@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from evermap.io.bag import (
     stated_settings,
 )
 from evermap.io.bag_messages import POSES, BagContent, handler_of
-from evermap.io.rosbag import Topic, ros2_types
+from evermap.io.rosbag import Topic, pose_of, ros2_types, seconds, stamp_of
 from evermap.live.engine import Engine
 from evermap.live.feed import Reading, SensorLook, Velocity, in_time
 from evermap.live.now import Now
@@ -252,7 +252,7 @@ class Listener:
 
 
 def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) -> Iterator[Reading | None]:
-    """Yield readings as they come, for ever, and None where none waits.
+    """Yield readings as they come, for ever, and None after every look and where none waits.
 
     Args:
         mailbox: where messages come in.
@@ -263,8 +263,11 @@ def heard(mailbox: Mailbox, listener: Listener, refused: Callable[[str], None]) 
         if (message := mailbox.take()) is None:
             yield None
             mailbox.wait(WAIT_S)
-        else:
-            yield from _read(listener, message, refused)
+            continue
+        for reading in _read(listener, message, refused):
+            yield reading
+            if isinstance(reading, SensorLook):
+                yield None
 
 
 def spoken(
@@ -315,6 +318,53 @@ def _on_the_floor(pose: FloatArray) -> FloatArray:
     return np.concatenate([pose[..., :2], np.arctan2(turn[..., 1, 0], turn[..., 0, 0])[..., None]], axis=-1)
 
 
+class Scene(Protocol):
+    """What shows a drive; stamps in seconds, places (3,) in the map."""
+
+    def robot(self, stamp_s: float, position_m: FloatArray, quaternion: FloatArray) -> None:
+        """Show where the robot is."""
+
+    def landmark(self, stamp_s: float, name: str, position_m: FloatArray, p_exists: float, text: str) -> None:
+        """Show a landmark, or show it anew."""
+
+    def change(self, stamp_s: float, name: str, line_m: FloatArray, text: str) -> None:
+        """Show a change as an arrow from the first of (2, 3) places to the second."""
+
+    def erase(self, stamp_s: float, name: str) -> None:
+        """Show something no more."""
+
+
+def look_on(mailbox: Mailbox, scene: Scene, going_on: Callable[[], None]) -> None:
+    """Show what an engine tells, until `going_on` raises `KeyboardInterrupt`."""
+    types = ros2_types()
+    try:
+        while True:
+            going_on()
+            if (message := mailbox.take()) is None:
+                mailbox.wait(WAIT_S)
+            elif message.topic in (_POSE, _SCENE) and message.kind == TELLS[message.topic]:
+                _show(types.deserialize_cdr(message.raw, message.kind), scene)
+    except KeyboardInterrupt:
+        return
+
+
+def _show(message: Any, scene: Scene) -> None:
+    if hasattr(message, "pose"):
+        pose = np.array(pose_of(message.pose.pose))
+        scene.robot(stamp_of(message), pose[:3], pose[3:])
+        return
+    for one in message.deletions:
+        scene.erase(seconds(one.timestamp), one.id)
+    for one in message.entities:
+        stamp_s, text = seconds(one.timestamp), one.texts[0].text
+        for body in (*one.spheres, *one.cubes):
+            scene.landmark(stamp_s, one.id, np.array(pose_of(body.pose))[:3], float(body.color.a), text)
+        for arrow in one.arrows:
+            pose = np.array(pose_of(arrow.pose))
+            ends = np.array([[0.0, 0.0, 0.0], [arrow.shaft_length + arrow.head_length, 0.0, 0.0]])
+            scene.change(stamp_s, one.id, se3.transform(pose, ends), text)
+
+
 class Teller:
     """Sends what an engine knows, in a thread of its own: of poses the newest, and all changes.
 
@@ -333,7 +383,7 @@ class Teller:
         self._n_changes, self._at = 0, 0
         self._told: dict[int, FloatArray] = {}
         self._drawn: dict[int, str] = {}
-        self._revision, self._next_s = -1, -math.inf
+        self._revision, self._next_s, self._stamp_s = -1, -math.inf, math.nan
         for wire in wires:
             for topic, kind in TELLS.items():
                 wire.announce(topic, kind)
@@ -375,8 +425,9 @@ class Teller:
 
     def _pose(self, now: Now, child: str, driven: FloatArray | None) -> None:
         """The pose and the frame of the odometry (or the robot's, where that has no frame) in that of the map."""
-        if not np.isfinite(now.pose_world_robot).all():
+        if not np.isfinite(now.pose_world_robot).all() or now.stamp_s == self._stamp_s:
             return
+        self._stamp_s = now.stamp_s
         ros, here = self._ros, now.pose_world_robot
         path = replace(
             now.online,

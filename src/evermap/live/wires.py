@@ -53,9 +53,14 @@ class Message(NamedTuple):
 
 
 class Mailbox:
-    """Messages of all wires, in the order in which they came."""
+    """Messages of all wires, in the order in which they came.
 
-    def __init__(self) -> None:
+    Args:
+        ours: those of an engine, to look on; else those of a robot.
+    """
+
+    def __init__(self, *, ours: bool = False) -> None:
+        self.ours = ours
         self._waiting: deque[Message] = deque(maxlen=MOST_WAITING)
         self._came = threading.Event()
         self.n_lost = 0
@@ -63,7 +68,7 @@ class Mailbox:
 
     def put(self, topic: str, kind: str, raw: bytes, source: object) -> None:
         """Take a message, from any thread."""
-        if topic.startswith(OURS):
+        if topic.startswith(OURS) != self.ours:
             return
         self.n_lost += len(self._waiting) == MOST_WAITING
         self._waiting.append(Message(topic, kind, raw, time.time(), source))
@@ -137,15 +142,16 @@ class Zenoh:
             raise ConfigError(_first_line(error), field="zenoh", hint=hint) from None
         self._id = bytes.fromhex(str(self._session.zid()).rjust(32, "0"))[:16]
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=100)
+        kinds = () if mailbox is None else ("*",) if mailbox.ours else KINDS
         self._subscribers = [
             ext.declare_advanced_subscriber(
                 self._session,
-                f"{self._domain}/**/$*::msg::dds_::{kind}_/*",
+                f"{self._domain}{OURS}**" if kind == "*" else f"{self._domain}/**/$*::msg::dds_::{kind}_/*",
                 zenoh.handlers.Callback(self._receive, indirect=False),  # in the order of arrival, whatever the topic
                 allowed_origin=zenoh.Locality.REMOTE,
                 history=history if kind in FRAMES else None,
             )
-            for kind in (KINDS if mailbox is not None else ())
+            for kind in kinds
         ]
 
     def announce(self, topic: str, kind: str) -> None:

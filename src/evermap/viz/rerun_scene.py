@@ -54,10 +54,14 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 TIMELINE = "stamp_s"
 _MAX_STEPS = 3000
+_STEP_M = 0.1
+"""A path that is shown while it is driven gets a point this often."""
 _MAX_LANDMARK_ENTITIES = 250
 _ELLIPSE_CORNERS = 33
 _ROOM_M = 4.0
 """About a smaller scene, such as a table, robot and landmarks are drawn smaller."""
+_SINCE_1970_S = 1e8
+"""Stamps of messages above this are dates."""
 _PLATE_M = (0.16, 0.16, 0.004)
 """What stands for a tag, whose size a map does not say."""
 
@@ -409,6 +413,70 @@ def _plot(stream: Any, entity: str, times: Any, values: FloatArray, colour: str,
     )
     stream.log(entity, look, static=True)
     stream.send_columns(entity, [times], rr.Scalars.columns(scalars=values))
+
+
+class LiveScene:
+    """A drive that is shown while it happens: in the viewer of rerun, or in a file for it.
+
+    Args:
+        path: of the file (.rrd); None opens the viewer.
+
+    Raises:
+        MissingExtraError: rerun-sdk is not installed.
+    """
+
+    def __init__(self, path: str | Path | None = None) -> None:
+        require_rerun()
+        import rerun as rr
+
+        self._rr, self._before = rr, np.zeros((0, 3))
+        self._stream = rr.RecordingStream("evermap", recording_id="live", send_properties=False)
+        if path is None:
+            self._stream.spawn()
+        else:
+            self._stream.save(path)
+        self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        arrow = rr.Arrows3D(vectors=[[0.4, 0.0, 0.0]], origins=[[0.0, 0.0, 0.1]], colors=rgb(ESTIMATE), radii=0.05)
+        self._stream.log("world/robot/heading", arrow, static=True)
+
+    def robot(self, stamp_s: float, position_m: FloatArray, quaternion: FloatArray) -> None:
+        """Show where the robot is, and where it came from."""
+        self._at(stamp_s)
+        self._stream.log(
+            "world/robot", self._rr.Transform3D(translation=position_m, quaternion=self._rr.Quaternion(xyzw=quaternion))
+        )
+        if not len(self._before) or np.linalg.norm(position_m - self._before[-1]) > _STEP_M:
+            self._before = np.vstack([self._before, position_m])[-_MAX_STEPS:]
+            self._stream.log("world/path", self._rr.LineStrips3D([self._before], colors=rgb(ESTIMATE), radii=0.012))
+
+    def landmark(self, stamp_s: float, name: str, position_m: FloatArray, p_exists: float, text: str) -> None:
+        """Show a landmark, as faint as it is doubtful."""
+        self._at(stamp_s)
+        colour = (p_exists * np.array(rgb(LANDMARK)) + (1.0 - p_exists) * np.array(rgb(PAPER))).astype(np.uint8)
+        mark = self._rr.Points3D([position_m], colors=colour, radii=0.05, labels=[text], show_labels=False)
+        self._stream.log(["world", "landmarks", name], mark)
+
+    def change(self, stamp_s: float, name: str, line_m: FloatArray, text: str) -> None:
+        """Show a change as an arrow between two places, and as a line of the log."""
+        self._at(stamp_s)
+        vector = line_m[1] - line_m[0]
+        arrow = self._rr.Arrows3D(origins=[line_m[0]], vectors=[vector], colors=rgb(ALERT), radii=0.02, labels=[text])
+        self._stream.log(["world", "landmarks", name], arrow)
+        self._stream.log("changes", self._rr.TextLog(text))
+
+    def erase(self, stamp_s: float, name: str) -> None:
+        """Show a landmark no more."""
+        self._at(stamp_s)
+        self._stream.log(["world", "landmarks", name], self._rr.Clear(recursive=True))
+
+    def close(self) -> None:
+        """End the file; a viewer stays open."""
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _at(self, stamp_s: float) -> None:
+        clock = Clock.UNIX if stamp_s > _SINCE_1970_S else Clock.RECORDING
+        self._stream.set_time(TIMELINE, **{_kind(clock): stamp_s})
 
 
 TRACKS_TIMELINE = "time"
