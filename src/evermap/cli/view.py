@@ -64,8 +64,10 @@ def _look_on(where: str, save: Path | None) -> None:
 
     if save is None:
         _need_screen()
+    elif save.suffix != ".rrd":
+        raise ConfigError(f"cannot write a '{save.suffix}' file", path=save, field="save", hint="drive.rrd")
     else:
-        check_output_file(save, inputs=[], ending=".rrd")
+        check_output_file(save, ending=".rrd")
     mailbox = Mailbox(ours=True)
     zenoh, scene = Zenoh(where, mailbox), LiveScene(save)
     say("showing what evermap live tells there; Ctrl-C ends it")
