@@ -9,7 +9,11 @@ does the same in space,
 
     python -m benchmarks.association mixed
 
-where some have identities: a share of the landmarks, or of the detections of each, and
+where some have identities: a share of the landmarks, or of the detections of each,
+
+    python -m benchmarks.association wrong
+
+where some identities are wrong, and
 
     python -m benchmarks.association sessions
 
@@ -206,6 +210,9 @@ MIXED = (
 """Beginnings of names, shares that keep their identities, and of what."""
 
 
+WRONG_RATES = (0.0, 0.05, 0.1, 0.2)
+
+
 def partly_named(recording: AnyRecordingT, share: float, of: str, seed: int = 0) -> AnyRecordingT:
     """Return a recording with the identities of some of its landmarks, or of some detections of each."""
     true, random = recording.detections.landmark_id, np.random.default_rng(seed)
@@ -232,6 +239,32 @@ def mixed_line(recording: Recording | SpatialRecording, share: float, of: str) -
     precision, recall = pairwise(given, true)
     name = f"{recording.name}, {share:.0%} of the {of}"
     return f"| {name} | {precision:.3f} | {recall:.3f} | {counts[0]} ({counts[1]}) | {' / '.join(off)} |"
+
+
+def with_wrong_ids(recording: AnyRecordingT, rate: float, *, twins: bool = False, seed: int = 0) -> AnyRecordingT:
+    """Return a recording with a share of the identities those of any landmark; `twins`: the two seen most have one."""
+    true, random = recording.detections.landmark_id, np.random.default_rng(seed)
+    ids, count = np.unique(true[true != UNKNOWN], return_counts=True)
+    wrong = (random.random(len(true)) < rate) & (true != UNKNOWN)
+    given = np.where(wrong, ids[random.integers(0, len(ids), len(true))], true)
+    if twins:
+        one, other = ids[np.argsort(count, kind="stable")[-2:]]
+        given = np.where(true == other, one, given)
+    return replace(recording, detections=replace(recording.detections, landmark_id=given))
+
+
+def wrong_line(recording: Recording | SpatialRecording) -> str:
+    """Return position errors [m] at each rate of wrong identities, and with one on two landmarks; in the plane also
+    those with `slam.vote_ids`.
+    """
+    truth, off = _truth(recording, em.run_slam(recording)), list[str]()
+    for rate, twins in (*((rate, False) for rate in WRONG_RATES), (0.0, True)):
+        wrong, each = with_wrong_ids(recording, rate, twins=twins), list[str]()
+        for vote in (False,) if isinstance(recording, SpatialRecording) else (False, True):
+            estimated = em.run_slam(wrong, Config(slam={"vote_ids": vote})).trajectory
+            each.append(f"{evaluate_trajectory(estimated, truth, rate_hz=RATE_HZ).rmse_m:.3f}")
+        off.append(" / ".join(each))
+    return f"| {recording.name} | {' | '.join(off)} |"
 
 
 def worlds(folder: Path = FOLDER) -> Iterator[Lived]:
@@ -366,6 +399,11 @@ def main(names: Sequence[str] = ()) -> None:
             for name, share, of in MIXED if not names[1:] or recording.name.startswith(tuple(names[1:])) else ():
                 if recording.name.startswith(name):
                     print(mixed_line(recording, share, of), flush=True)
+        return
+    if names and names[0] == "wrong":
+        for recording in itertools.chain(recordings(parks=1), recordings_in_space()):
+            if not names[1:] or recording.name.startswith(tuple(names[1:])):
+                print(wrong_line(recording), flush=True)
         return
     in_space = bool(names) and names[0] == "space"
     if in_space:

@@ -47,7 +47,7 @@ def run_slam(
     from evermap.maps.sessions.session import existing
     from evermap.slam.check import odd, valid
     from evermap.slam.estimate import solve
-    from evermap.slam.intake import beliefs, prepare
+    from evermap.slam.intake import beliefs, prepare, without_contradicted_ids
     from evermap.slam.result import concluded
 
     config = config or Config()
@@ -56,6 +56,8 @@ def run_slam(
     recording = valid(recording, config.sensor, prior_map)
     remarks = odd(recording, identities=config.slam.unknown_ids is not True, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
+    if config.slam.vote_ids and config.slam.unknown_ids is not True:
+        recording = without_contradicted_ids(recording)
     if config.slam.unknown_ids:
         from evermap.slam.association.identify import identified
 
@@ -202,11 +204,13 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.maps.sessions.session import admitted
     from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
-    from evermap.slam.intake import beliefs
+    from evermap.slam.intake import beliefs, without_contradicted_ids
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     anonymous = config.slam.unknown_ids
     recording = clean(without_ids(recording) if anonymous is True else recording, config.slam.cleaning)
+    if config.slam.vote_ids and anonymous is not True:
+        recording = without_contradicted_ids(recording)
     remarks = odd(recording, identities=anonymous is not True, settings=config.slam.check)
     recording, _ = admitted(recording, living)
     if anonymous:

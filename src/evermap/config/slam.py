@@ -167,6 +167,11 @@ class SlamConfig(Section):
         description="associate by geometry: true ignores the identities that detections carry, 'empty' is for those "
         "without one only",
     )
+    vote_ids: bool = Field(
+        default=False,
+        description="leave out identities that other detections at the same place within seconds contradict, in the "
+        "plane: for detectors that read more than one in twenty wrongly",
+    )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
     outlier_log_odds: float = Field(
         default=7.0,
