@@ -7,6 +7,10 @@ Truth of association is the recording's own identities.
 
 does the same in space,
 
+    python -m benchmarks.association harsh
+
+in worlds that are harsher than those that constants were set on (`benchmarks/harsh.py`),
+
     python -m benchmarks.association mixed
 
 where some have identities: a share of the landmarks, or of the detections of each,
@@ -36,6 +40,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 import evermap as em
+from benchmarks.harsh import harsh_worlds
 from benchmarks.scale_maps import MAP_POSE, SESSION, living_map
 from evermap.config import Config, load_config
 from evermap.errors import EvermapError
@@ -386,7 +391,7 @@ def _truth(recording: Recording | SpatialRecording, named: SlamResult) -> Trajec
 
 
 def main(names: Sequence[str] = ()) -> None:
-    """Print one line as soon as it is known; names are beginnings of those wanted, after 'space' or 'sessions'."""
+    """Print one line as soon as it is known; names are beginnings of those wanted, after one of the words above."""
     if names and names[0] == "sessions":
         for world in worlds():
             for unknown_ids in (False, True) if not names[1:] or world.name.startswith(tuple(names[1:])) else ():
@@ -405,10 +410,10 @@ def main(names: Sequence[str] = ()) -> None:
             if not names[1:] or recording.name.startswith(tuple(names[1:])):
                 print(wrong_line(recording), flush=True)
         return
-    in_space = bool(names) and names[0] == "space"
-    if in_space:
-        names = names[1:]
-    for recording in recordings_in_space() if in_space else recordings():
+    every: Iterator[Recording | SpatialRecording] = recordings()
+    if names and names[0] in ("space", "harsh"):
+        every, names = recordings_in_space() if names[0] == "space" else harsh_worlds(), names[1:]
+    for recording in every:
         if not names or recording.name.startswith(tuple(names)):
             print(_line(score(recording)), flush=True)
 

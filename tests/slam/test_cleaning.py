@@ -17,7 +17,7 @@ from evermap.errors import DataError
 from evermap.io import read_recording, write_template
 from evermap.pipeline import run_slam
 from evermap.slam.cleaning import clean
-from evermap.types import Recording
+from evermap.types import Recording, rows_of
 from evermap_studies.sim import BuildingConfig, SimulatedSensor, simulate_building
 from evermap_studies.worlds.faults import FAULTLESS, NOTHING, FaultConfig, StreamFaults, with_faults
 from evermap_studies.worlds.robots import draw_robot, simulate_robot
@@ -128,6 +128,17 @@ def test_whatever_goes_wrong_a_valid_recording_comes_back(faults: FaultConfig, s
     assert all("\n" not in warning for warning in cleaned.warnings)
     again = clean(cleaned)
     check_valid(again)
+
+
+def test_half_of_a_handful_of_ranges_beyond_reach_is_no_mistake_in_the_unit() -> None:
+    few = patrol(20.0)
+    few = replace(few, detections=rows_of(few.detections, np.arange(9)))
+    ranges = few.detections.range_m.copy()
+    ranges[:5] = 1e5
+    cleaned = clean(replace(few, detections=replace(few.detections, range_m=ranges)))
+    assert len(cleaned.detections.range_m) == 4
+    with pytest.raises(DataError, match="beyond"):
+        clean(replace(few, detections=replace(few.detections, range_m=1e5 * np.ones(9))))
 
 
 @pytest.mark.parametrize("part", ["odometry", "frames"])

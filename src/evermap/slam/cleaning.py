@@ -100,9 +100,10 @@ def _readings(recording: Recording, settings: CleaningConfig, remarks: list[str]
     if not np.isfinite(reach_m):
         reach_m = settings.far_from_median * float(np.median(ranges[real])) if real.any() else 0.0
     far = real & (ranges > reach_m)
-    if np.sum(far) > 0.5 * np.sum(real):  # a mistake in the unit, not outliers
+    count, n_far = int(real.sum()), int(far.sum())
+    if n_far and n_far >= min(count, 0.5 * count + 1.5 * count**0.5):  # a mistake in the unit: 3 sigma above half
         limit = f"{settings.too_far:g} times range_max_m = {sensor.range_max_m:g}"
-        problem = f"{int(far.sum())} of {len(far)} ranges lie beyond {limit}"
+        problem = f"{n_far} of {len(far)} ranges lie beyond {limit}"
         raise DataError(problem, field="range_m", hint="ranges and range_max_m in metres")
     real &= ~far & (np.abs(detections.bearing_rad) <= 2.0 * np.pi)
     real &= (detections.frame >= 0) & (detections.frame < len(recording.frames))
