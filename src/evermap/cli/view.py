@@ -37,7 +37,7 @@ def view(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Look at a map, a run, or a drive while it happens, in the rerun viewer.
+    """Look at a map, a run or a live drive in the rerun viewer.
 
     Landmarks with their beliefs, the path and what changed, on a timeline.
 
