@@ -136,7 +136,7 @@ def _be_the_robot(recording: AnyRecording, wires: Sequence[Wire]) -> None:
 
 
 class _Drive:
-    """A drive: an engine, what feeds it, and who is told."""
+    """A drive: an engine, its readings, and the connections and terminal that show what it knows."""
 
     def __init__(
         self,

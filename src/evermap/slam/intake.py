@@ -10,10 +10,10 @@ from scipy import sparse
 
 from evermap.config import SlamConfig
 from evermap.errors import DataError
-from evermap.geometry import se2
+from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.noise import start_noise
+from evermap.slam.noise import START, start_noise
 from evermap.slam.problem import Drive, Noise, Problem
 from evermap.slam.streaming import PriorMap, sighted_at
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
@@ -122,9 +122,7 @@ def without_contradicted_ids(recording: Recording) -> Recording:
     """
     prepared = prepare(recording)
     problem, given = prepared.problem, recording.detections
-    pose = np.zeros((len(problem.stamp_s), 3))
-    for row, step in enumerate(problem.drive.between(problem.stamp_s, problem.prior.mean).increment):
-        pose[row + 1] = se2.compose(pose[row], step)
+    pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
     at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
     variance = (SEEN_M + SEEN_SHARE * problem.reading[:, 0]) ** 2
     stamp_s, name = problem.stamp_s[problem.pose_row], problem.landmark_row

@@ -77,6 +77,17 @@ def test_a_visit_is_weighed_as_if_its_landmark_had_been_cut_and_solved_again(see
     assert visits.evidence[k] == pytest.approx(evidence, abs=0.1)
 
 
+def test_where_nothing_is_a_landmark_there_are_no_visits() -> None:
+    made, assignment, _ = two_visits(0)
+    nothing = assignment.without(np.ones(8, dtype=bool))
+    _, marginals, smoother = solved(made, assignment)
+    visits = weighed_visits(
+        nothing, marginals, smoother.detections(assignment.estimate),
+        among=np.ones(0, dtype=bool), density=0.1, pause_s=PAUSE_S,
+    )  # fmt: skip
+    assert len(visits.rows) == len(visits.evidence) == 0
+
+
 def test_a_visit_to_another_landmark_contradicts_the_rest() -> None:
     for off_m in (0.0, 0.8):
         made, assignment, _ = two_visits(2, off_m)

@@ -73,22 +73,21 @@ def seen_together(
         n_frames: how many there are.
         n_landmarks: how many there are.
     """
-
-    def seen(before: int) -> sparse.csr_array:
-        """Return (N, L) which landmarks were seen so many frames before each."""
-        at, inside = frame + before, landmark_row >= 0
-        inside &= (at >= 0) & (at < n_frames)
-        ones = np.ones(int(inside.sum()))
-        found = sparse.csr_array((ones, (at[inside], landmark_row[inside])), shape=(n_frames, n_landmarks))
-        found.data[:] = 1.0
-        return found
-
-    each, about = seen(0), seen(-ABOUT)
+    shape = n_frames, n_landmarks
+    each, about = _seen_in(frame, landmark_row, shape), _seen_in(frame - ABOUT, landmark_row, shape)
     for before in range(1 - ABOUT, ABOUT + 1):
-        about = about + seen(before)
+        about = about + _seen_in(frame + before, landmark_row, shape)
     about.data[:] = 1.0
     together, once = sparse.csr_array(each.T @ each), sparse.csr_array(each.T @ about)
     return together, sparse.csr_array(once + once.T - 2.0 * together)
+
+
+def _seen_in(frame: IntArray, landmark_row: IntArray, shape: tuple[int, int]) -> sparse.csr_array:
+    """(N, L) which landmarks were seen in each frame, from frames (M,) and landmarks (M,) of detections."""
+    inside = (landmark_row >= 0) & (frame >= 0) & (frame < shape[0])
+    found = sparse.csr_array((np.ones(int(inside.sum())), (frame[inside], landmark_row[inside])), shape=shape)
+    found.data[:] = 1.0
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +141,9 @@ class Assignment:
     @property
     def together(self) -> sparse.csr_array:
         """(L, L) frames in which two landmarks were both seen."""
-        return self.seen_together()[0]
+        shape = len(self.measured.stamp_s), self.n_landmarks
+        each = _seen_in(self.measured.pose_row, self.landmark_row, shape)
+        return sparse.csr_array(each.T @ each)
 
     @property
     def told(self) -> IntArray:
@@ -223,8 +224,8 @@ class Assignment:
         rank = np.cumsum(kept) - 1
         return self._renumbered(rank[becomes], kept)
 
-    def in_visits(self, pause_s: float) -> IntArray:
-        """Return (M,) landmarks as if each were another one whenever it is met again, but for those with a name.
+    def visits(self, pause_s: float) -> IntArray:
+        """Return (M,) the visit of each detection, numbered by landmark and then by time, `NOBODY` for none.
 
         Args:
             pause_s: time without a detection that ends a visit.
@@ -234,6 +235,11 @@ class Assignment:
         order = order[self.landmark_row[order] >= 0]
         again = (np.diff(self.landmark_row[order]) == 0) & (np.diff(stamp_s[order]) <= pause_s)
         found[order] = np.cumsum(np.append(0, ~again)[: len(order)])
+        return found
+
+    def in_visits(self, pause_s: float) -> IntArray:
+        """Return (M,) landmarks as if each were another one in every visit, but for those with a name; see `visits`."""
+        found = self.visits(pause_s)
         name = labels_of(self.kind, found, int(found.max(initial=NOBODY)) + 1)[:, -1]
         named = name != UNKNOWN
         one = np.arange(len(name))

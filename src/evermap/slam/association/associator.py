@@ -98,12 +98,12 @@ SAME_SHARE = 0.002
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    """An assignment at its optimum: with covariances, its cost, outliers decided, and its detections linearised."""
+    """An assignment at its optimum: with covariances, its cost, outliers decided, and what solved it."""
 
     assignment: Assignment
     marginals: Marginals
     cost: float
-    linear: FloatArray
+    smoother: Smoother
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,8 +368,9 @@ class Associator:
         """
         for _ in range(SPLIT_ROUNDS):
             now = solved.assignment
+            linear = solved.smoother.detections(now.estimate)
             visits = weighed_visits(
-                now, solved.marginals, solved.linear, density=self._density_m2, pause_s=FORGET_S,
+                now, solved.marginals, linear, density=self._density_m2, pause_s=FORGET_S,
                 among=_latest(now, recent),
             )  # fmt: skip
             doubtful = (visits.evidence < math.log(P_MERGE / (1.0 - P_MERGE))) & (visits.squared > CONTRADICTS)
@@ -435,7 +436,7 @@ class Associator:
         left = 1.0 - np.diagonal(marginals.explained_detections, axis1=1, axis2=2)
         self._sighting_noise = fit_sighting_noise(unknown, estimate, NOISE_FLOOR * self._start_noise.detection, left)
         cost = smoother.under(self.noise, heavy=False).cost(estimate)
-        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother.detections(estimate))
+        return _Solved(replace(assignment, estimate=estimate), marginals, cost, smoother)
 
 
 def compared(assignment: Assignment, marginals: Marginals, density: float, *, at_once: bool = False) -> Solution:

@@ -170,7 +170,7 @@ def _agreed(
     found = solution.differences(younger, older)
     gap, own = found.gap, found.covariance
     squared = np.einsum("ki,ki->k", gap, np.linalg.solve(own, gap[..., None])[..., 0])
-    together, in_turn = (_entries(each, younger, older) for each in (solution.together, solution.in_turn))
+    together, in_turn = (entries(each, younger, older) for each in (solution.together, solution.in_turn))
     against = found.log_density + DOUBLE_NATS * together - np.minimum(IN_TURN_NATS * in_turn, MOST_IN_TURN_NATS)
     alone = -0.5 * (squared + np.log(np.linalg.det(own))) - against
     inside = np.flatnonzero((squared < LOOSE_GATE) & (together < 3))
@@ -197,14 +197,14 @@ def _conflicts(younger: IntArray, older: IntArray, together: sparse.csr_array, k
         for theirs, another in ((younger, older), (older, younger)):
             shared = mine[:, None] == theirs[None]
             one, two = np.nonzero(shared)
-            apart = _entries(together, other[one], another[two]) > 0.0
+            apart = entries(together, other[one], another[two]) > 0.0
             apart |= ~alike(kind[other[one]], kind[another[two]])
             conflict[one[apart], two[apart]] = True
     return conflict
 
 
-def _entries(matrix: sparse.csr_array, row: IntArray, column: IntArray) -> FloatArray:
-    """(K,) entries of a sparse matrix."""
+def entries(matrix: sparse.csr_array, row: IntArray, column: IntArray) -> FloatArray:
+    """Return (K,) entries of a sparse matrix."""
     matrix.sum_duplicates()
     key = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr)) * matrix.shape[1] + matrix.indices
     wanted = row * matrix.shape[1] + column

@@ -18,6 +18,7 @@ from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
 from evermap.slam.association.assignment import Assignment, alike
 from evermap.slam.association.constellation import LocalMap
+from evermap.slam.association.merging import entries
 from evermap.slam.association.place_index import PATCH, PlaceIndex
 from evermap.slam.problem import Marginals
 from evermap.types import BoolArray, FloatArray, IntArray
@@ -78,8 +79,7 @@ def displaced_stretches(
         pairs = index.pairs(local(some), density=density, probability=probability)
         mine, theirs = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
         younger, older = some[mine], order[theirs]
-        apart = np.array([together[u, o] == 0 for u, o in zip(younger, older, strict=True)], dtype=bool)
-        apart &= alike(kind[younger], kind[older])
+        apart = (entries(together, younger, older) == 0) & alike(kind[younger], kind[older])
         younger, older = younger[apart], older[apart]
         if len(younger) >= FEWEST:
             motion = rigid(place[younger], place[older])

@@ -58,12 +58,11 @@ def weighed_visits(
     """
     used = np.flatnonzero(assignment.landmark_row >= 0)
     row, pose = assignment.landmark_row[used], assignment.measured.pose_row[used]
-    stamp = assignment.measured.stamp_s[pose]
-    order = np.lexsort((stamp, row))
-    again = (np.diff(row[order]) == 0) & (np.diff(stamp[order]) <= pause_s)
-    every = np.split(order, np.flatnonzero(~again) + 1)
-    several = np.bincount(row[[visit[0] for visit in every]], minlength=assignment.n_landmarks) > 1
-    every = [visit for visit in every if several[row[visit[0]]] and among[row[visit[0]]]]
+    number = assignment.visits(pause_s)[used]
+    of = row[np.unique(number, return_index=True)[1]]
+    wanted = (np.bincount(of, minlength=assignment.n_landmarks) > 1) & among
+    every = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    every = [every[k] for k in np.flatnonzero(wanted[of])]
     landmark = np.array([row[visit[0]] for visit in every], dtype=np.int64)
     squared, evidence = np.empty(len(every)), np.empty(len(every))
     shared = 2.0 * assignment.shared_variance
