@@ -74,15 +74,21 @@ def names(one: BuildingSimulation, sessions: list[Session], k: int) -> dict[int,
     }
 
 
-def test_landmarks_keep_their_names_over_sessions(lived: tuple[BuildingSimulation, list[Session]]) -> None:
-    one, sessions = lived
-    assert all(session.found for session in sessions)
+def met_again(one: BuildingSimulation, sessions: list[Session]) -> tuple[int, int]:
+    """How many landmarks were met in two sessions one after the other, and how many of them under two names."""
     again = wrong = 0
     for k in range(1, len(sessions)):
         before, now = names(one, sessions, k - 1), names(one, sessions, k)
         both = before.keys() & now.keys()
         again += len(both)
         wrong += sum(before[name] != now[name] for name in both)
+    return again, wrong
+
+
+def test_landmarks_keep_their_names_over_sessions(lived: tuple[BuildingSimulation, list[Session]]) -> None:
+    one, sessions = lived
+    assert all(session.found for session in sessions)
+    again, wrong = met_again(one, sessions)
     assert again > 40
     assert wrong <= 0.05 * again
 
@@ -131,14 +137,10 @@ def test_landmarks_without_a_name_keep_company_with_those_that_have_one() -> Non
     ]
     sessions = lived_through(some, mixed)
     assert all(session.found for session in sessions)
-    again = wrong = 0
-    for k in range(1, len(sessions)):
-        given, own = sessions[k].recording.detections.landmark_id, some[k].detections.landmark_id
+    for session, recording in zip(sessions[1:], some[1:], strict=True):
+        given, own = session.recording.detections.landmark_id, recording.detections.landmark_id
         np.testing.assert_array_equal(given[own != UNKNOWN], own[own != UNKNOWN])
-        before, now = names(one, sessions, k - 1), names(one, sessions, k)
-        both = before.keys() & now.keys()
-        again += len(both)
-        wrong += sum(before[name] != now[name] for name in both)
+    again, wrong = met_again(one, sessions)
     assert again > 40
     assert wrong <= 0.03 * again
 
