@@ -29,9 +29,10 @@ def hat(twist: np.ndarray) -> np.ndarray:
 
 
 def true_velocity(reported: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """What the calibration states make of a reported (forward, lateral, turn), as the docstrings say it."""
-    forward, lateral, turn = reported
-    return np.array([states[6] * forward - states[8] * abs(turn), states[6] * lateral, states[7] * turn])
+    """What the calibration states make of a reported (forward, lateral, turn, turn beyond jitter), as the docs say."""
+    forward, lateral, turn, scaled = reported
+    jitter = turn - scaled
+    return np.array([states[6] * forward - states[8] * abs(turn), states[6] * lateral, states[7] * scaled + jitter])
 
 
 def stretches(drive: Drive, start: float, stop: float, delay: float) -> list[tuple[int, float]]:

@@ -13,9 +13,10 @@ from scipy.stats import multivariate_normal
 from evermap.config import Config
 from evermap.errors import ConfigError
 from evermap.geometry import se2
+from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.pipeline import run_slam
 from evermap.slam.calibration import BEARING, FORWARD, KINDS, NAMES, SLOPE, SPECS, CalibrationPrior, needed
-from evermap.slam.problem import Drive
+from evermap.slam.problem import HISTORY_S, Drive, beyond_jitter
 from evermap.slam.smoother import Smoother
 from evermap.types import ParameterEstimate, Recording, Sensor, SensorKind
 from evermap_studies.worlds.robots import draw_robot, simulate_robot
@@ -327,3 +328,39 @@ def test_jitter_of_reported_velocities_is_told_from_their_changes():
     assert np.sqrt(Drive.from_rows(stamp, velocity + noise).jitter) == pytest.approx(
         [0.05, 0.0, 0.1], rel=0.05, abs=1e-9
     )
+
+
+def test_a_turn_counts_and_the_jitter_of_its_report_does_not():
+    rng = np.random.default_rng(6)
+    for rate_hz, sigma in ((5.0, 0.02), (100.0, 0.05)):
+        stamp = np.arange(0.0, 200.0, 1.0 / rate_hz)
+        turning = np.where(stamp % 50.0 < 10.0, 0.5, 0.0)
+        reported = turning + sigma * rng.normal(size=len(stamp))
+        beyond = beyond_jitter(stamp, reported)
+        long_straight = stamp % 50.0 > 15.0
+        assert (beyond[long_straight] ** 2).sum() < 0.03 * (reported[long_straight] ** 2).sum()
+        assert beyond[turning > 0.0].sum() == pytest.approx(turning.sum(), rel=0.02)
+        assert beyond_jitter(stamp, turning) == pytest.approx(turning, rel=0.02)
+        # by what was reported until then, and not long before
+        later = stamp > 60.0 - HISTORY_S
+        assert beyond_jitter(stamp[later], reported[later])[stamp[later] > 60.0] == pytest.approx(beyond[stamp > 60.0])
+    few = np.array([0.1, -0.2, 0.3])
+    for count in range(4):
+        assert beyond_jitter(np.arange(count) * 0.1, few[:count]).tolist() == few[:count].tolist()
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_gyroscope_that_jitters_on_the_straight_says_nothing_of_its_scale(seed):
+    """Down an aisle, round where nothing is seen, and back through another: the turn is as the odometry has it."""
+    from benchmarks.harsh import simulate_copied_aisles
+
+    recording = simulate_copied_aisles(seed)
+    result = run_slam(recording)
+    assert evaluate_trajectory(result.trajectory, recording.truth).rmse_m < 3.0  # the odometry alone: 1 to 2 m
+    scale = next(p for p in result.parameters if p.name == "odometry_turn_scale")
+    assert abs(scale.value - 1.0) < 3.0 * np.hypot(scale.sigma, 0.01)
+    # and the covariance is honest
+    at = np.searchsorted(recording.truth.stamp_s, result.trajectory.stamp_s - 1e-6)
+    true = recording.truth.pose_world_robot[at]
+    off = se2.between(se2.compose(se2.inverse(true[0]), true), result.trajectory.pose_world_robot)[:, 2]
+    assert np.sqrt(np.mean(off**2)) < 2.0 * np.sqrt(result.trajectory.covariance[:, 2, 2].mean())

@@ -66,7 +66,8 @@ def drives(draw):
     gaps = draw(st.lists(st.floats(0.02, 0.45), min_size=3, max_size=8))
     stamps = np.concatenate([[0.0], np.cumsum(gaps)])
     velocity = np.array([draw(rows) for _ in stamps])
-    return Drive(stamps, velocity, np.zeros(len(stamps)))
+    turning = draw(st.floats(0.0, 1.0)) * velocity[:, 2]
+    return Drive(stamps, np.column_stack([velocity, turning]), np.zeros(len(stamps)))
 
 
 def central(function, at, step=1e-6):
@@ -225,7 +226,7 @@ def sampled_drives(drive, start, stop, states, sigma, rng, count, pieces=4):
     pose = np.zeros((count, 3))
     for low, high in pairwise(at):
         row = np.searchsorted(drive.stamp_s, 0.5 * (low + high), side="right") - 1
-        forward, lateral, turn = drive.velocity[row]
+        forward, lateral, turn, _ = drive.velocity[row]
         speed = np.hypot(forward, lateral)
         per_second = np.array(
             [
@@ -276,7 +277,7 @@ def test_covariance_is_that_of_thousands_of_sampled_drives(name):
 def test_noise_counts_reported_distance_angle_and_time():
     """Straight and in place, where the sums are known in closed form."""
     stamps = np.arange(0.0, 3.0, 0.1)
-    straight = Drive(stamps, np.tile([2.0, 0.0, 0.0], (len(stamps), 1)), np.zeros(len(stamps)))
+    straight = Drive(stamps, np.tile([2.0, 0.0, 0.0, 0.0], (len(stamps), 1)), np.zeros(len(stamps)))
     out = integrated(straight, 0.5, 2.5, default_prior().mean)
     assert out.noise[0] == pytest.approx(np.diag([4.0, 0.0, 0.0]))
     assert out.noise[1] == pytest.approx(0.0)
@@ -284,7 +285,7 @@ def test_noise_counts_reported_distance_angle_and_time():
     # int (v (T - t))^2 dt = v^2 T^3 / 3, and its covariance with the angle v T^2 / 2
     assert out.noise[3][1:, 1:] == pytest.approx(np.array([[4 * 8 / 3, 4.0], [4.0, 2.0]]), rel=1e-3)
     assert out.noise[4] == pytest.approx(0.0)
-    turning = Drive(stamps, np.tile([0.0, 0.0, -1.5], (len(stamps), 1)), np.zeros(len(stamps)))
+    turning = Drive(stamps, np.tile([0.0, 0.0, -1.5, -1.5], (len(stamps), 1)), np.zeros(len(stamps)))
     out = integrated(turning, 0.5, 2.5, default_prior().mean)
     assert np.trace(out.noise[1]) == pytest.approx(3.0, rel=1e-2)
     assert out.noise[4] == pytest.approx(np.diag([0.0, 0.0, 3.0]), abs=1e-12)
@@ -327,7 +328,7 @@ def test_silences_become_standing_still_without_knowing():
         np.searchsorted(drive.stamp_s, [0.15, 0.2 + 0.45 * SILENCE_S, 3.0, 5.25, 5.9, 5.9 + SILENCE_S], "right") - 1
     )
     expected = [velocity[1], velocity[2], np.zeros(3), velocity[3], velocity[4], np.zeros(3)]
-    assert np.array_equal(drive.velocity[inside], expected)
+    assert np.array_equal(drive.velocity[inside, :3], expected)
     onwards = (velocity[2] ** 2).sum() * 5.0  # after 5 s: as far as the last speed would have led
     assert drive.unknown[inside] == pytest.approx([0.0, 0.0, SILENT_VARIANCE + onwards, 0.0, 0.0, SILENT_VARIANCE])
 
@@ -364,7 +365,7 @@ def test_inverse_of_three_by_three_is_numpys(below, log_scale):
 
 @pytest.mark.parametrize("turn", [-2.0, -0.05, 0.0499, 1e-3, 1e-7, 0.0, 0.0501, 3.0])
 def test_increment_of_a_turn_by_series_and_by_sines_is_the_exponential(turn):
-    drive = Drive(np.array([0.0, 1.0]), np.tile([0.7, -0.2, turn / 0.1], (2, 1)), np.zeros(2))
+    drive = Drive(np.array([0.0, 1.0]), np.tile([0.7, -0.2, turn / 0.1, turn / 0.1], (2, 1)), np.zeros(2))
     out = integrated(drive, 0.2, 0.3, default_prior().mean)
     assert out.increment == pytest.approx(se2.exp(np.array([0.07, -0.02, turn])), abs=1e-14)
 

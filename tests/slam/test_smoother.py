@@ -103,7 +103,8 @@ def tied(world: World) -> World:
 
 CASES = {
     "free": lambda: make_world(1),
-    "outliers": lambda: make_world(2, p_outlier=0.1),
+    # nothing straight behind the robot, where the range law jumps
+    "outliers": lambda: make_world(12, p_outlier=0.1),
     "map": lambda: elsewhere(make_world(3, n_mapped=3)),
     "fixed states": lambda: make_world(
         4, prior=default_prior(odometry_delay_s=0.1, range_bias_m=0.02, range_slope=0.0)

@@ -2,7 +2,8 @@
 
 The range law is `z_r = a0 + r (1 + a1 + a2 b + a3 b^2)` with true range `r` and bearing `b`; `a3 = -1/2` is a camera
 that reports depth. A bearing reads `z_b = b + b0`. Between two instants the robot moves by the odometry between the two
-instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`.
+instants shifted by `tau`, with velocities `k_v v - k_s |w|` and `k_w w`; of the turn rate `w` the scale acts on what is
+no jitter of its report (`problem.beyond_jitter`).
 
 All nine states form one vector, in the order of `SPECS`. Priors say what a decent camera, laser or wheel encoder does
 out of the box; a kind of sensor (`KINDS`) or its data sheet (`Sensor`) makes those of the sensor narrower. None was

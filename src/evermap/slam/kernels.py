@@ -115,7 +115,7 @@ def integrate_odometry(
 
     Args:
         stamp: (N,) odometry stamps; row i of `velocity` holds from stamp i to stamp i + 1.
-        velocity: (N, 3) reported forward, lateral, turn.
+        velocity: (N, 4) reported forward, lateral, turn, and how much of the latter is no jitter.
         unknown: (N,) extra noise variance per second where the odometry is silent.
         start: first instant, on the detections' clock.
         stop: second instant.
@@ -133,7 +133,7 @@ def integrate_odometry(
     turn_abs = abs(velocity[row, 2])
     first_v = scale_v * velocity[row, 0] - slip * turn_abs
     first_l = scale_v * velocity[row, 1]
-    first_w = scale_w * velocity[row, 2]
+    first_w = velocity[row, 2] + (scale_w - 1.0) * velocity[row, 3]
     v, left, w = first_v, first_l, first_w
     x = y = theta = 0.0
     ct, st = 1.0, 0.0
@@ -152,10 +152,11 @@ def integrate_odometry(
         until = end if row + 1 >= count else min(end, stamp[row + 1])
         if until > now:
             reported_v, reported_l, reported_w = velocity[row, 0], velocity[row, 1], velocity[row, 2]
+            scaled_w = velocity[row, 3]
             turn_abs = abs(reported_w)
             v = scale_v * reported_v - slip * turn_abs
             left = scale_v * reported_l
-            w = scale_w * reported_w
+            w = reported_w + (scale_w - 1.0) * scaled_w
             extra = unknown[row]
             pieces, h = 1, until - now
             if h > MAX_STEP_S and (reported_v != 0.0 or reported_l != 0.0 or reported_w != 0.0):  # else it is exact
@@ -178,9 +179,9 @@ def integrate_odometry(
                 tx, ty = ct * by_turn_x - st * by_turn_y + y, st * by_turn_x + ct * by_turn_y - x
                 scale_x += (fx * reported_v - fy * reported_l) * h
                 scale_y += (fy * reported_v + fx * reported_l) * h
-                turn_x += tx * reported_w * h
-                turn_y += ty * reported_w * h
-                angle += reported_w * h
+                turn_x += tx * scaled_w * h
+                turn_y += ty * scaled_w * h
+                angle += scaled_w * h
                 slip_x -= fx * by_angle
                 slip_y -= fy * by_angle
                 xx, xy, yy = fx * fx, fx * fy, fy * fy

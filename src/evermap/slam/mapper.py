@@ -16,7 +16,7 @@ from evermap.config import SlamConfig
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.intake import FIRST_POSE_INFORMATION
 from evermap.slam.localize import FrameSightings, Located
-from evermap.slam.problem import Drive, Noise, Problem, padded
+from evermap.slam.problem import HISTORY_S, Drive, Noise, Problem, beyond_jitter, padded
 from evermap.slam.streaming import StreamingSlam
 from evermap.types import UNKNOWN, FloatArray, IntArray, Landmarks, Sensor
 
@@ -61,7 +61,7 @@ class Mapper:
     """
 
     def __init__(self, sensor: Sensor, prior: CalibrationPrior, noise: Noise, settings: SlamConfig) -> None:
-        self._stamps, self._odometry = Growing(), Growing(4)
+        self._stamps, self._odometry = Growing(), Growing(5)
         self._pose_row, self._landmark_row = Growing(kind=np.int64), Growing(kind=np.int64)
         self._reading, self._sigma = Growing(2), Growing(2)
         self._row: dict[int, int] = {}
@@ -90,7 +90,11 @@ class Mapper:
     def drive(self, odometry: FloatArray) -> int:
         """Take odometry as in `step`, of a frame that is left out; returns the row of its first."""
         at = int(np.searchsorted(self._odometry.rows[:, 0], odometry[0, 0]))
-        self._odometry.add(odometry, at)
+        rows = self._odometry.rows[:at]
+        before = rows[np.searchsorted(rows[:, 0], odometry[0, 0] - HISTORY_S) :, [0, 3]]
+        stamp_s, turn_radps = np.concatenate([before, odometry[:, [0, 3]]]).T
+        beyond = beyond_jitter(stamp_s, turn_radps)[len(before) :]
+        self._odometry.add(np.column_stack([odometry, beyond]), at)
         return at
 
     def step(self, stamp_s: float, odometry: FloatArray, seen: FrameSightings) -> Located:

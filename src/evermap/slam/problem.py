@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
@@ -25,6 +26,14 @@ LONGEST_SILENCE_S = 60.0
 
 FEWEST_ROWS = 20
 """Rows of odometry from which its jitter is estimated."""
+TURN_S, TURN_ROWS = 2.0, 5
+"""Span in which a turn has to stand out of its jitter, and rows in it from which the jitter is told."""
+SPANS = 2
+"""Such spans until a row, of which the calmest tells the jitter: a turn that begins or ends is none."""
+HISTORY_S = SPANS * TURN_S + 1.0
+"""What was before that says nothing about a row, not even of one in the second that is integrated before a frame."""
+STANDS_OUT = 3.0
+"""Standard deviations by which it does."""
 TRIMMED = 0.6234
 """Mean of a squared standard normal below its 90 % quantile."""
 
@@ -35,7 +44,8 @@ class Drive:
 
     Attributes:
         stamp_s: (n,) strictly increasing.
-        velocity: (n, 3) forward, lateral, turn; row i holds until stamp i + 1.
+        velocity: (n, 4) forward, lateral, turn; row i holds until stamp i + 1. The fourth is as much of the turn rate
+            as is no jitter (`beyond_jitter`): what its scale acts on.
         unknown: (n,) extra variance per second, where the odometry was silent.
     """
 
@@ -52,7 +62,7 @@ class Drive:
         """
         if len(self.velocity) < FEWEST_ROWS:
             return np.zeros(3)
-        square = np.sort(np.diff(self.velocity, n=2, axis=0) ** 2, axis=0)[: int(0.9 * (len(self.velocity) - 2))]
+        square = np.sort(np.diff(self.velocity[:, :3], n=2, axis=0) ** 2, axis=0)[: int(0.9 * (len(self.velocity) - 2))]
         return np.asarray(square.mean(axis=0) / (6.0 * TRIMMED))
 
     def between(self, stamp_s: FloatArray, states: FloatArray) -> Intervals:
@@ -69,18 +79,51 @@ class Drive:
 
         What is not known grows over a silence of length T to the way that the last speed would have led, `(v T)^2`, up
         to that of `LONGEST_SILENCE_S`.
+
+        Args:
+            stamp_s: (n,) strictly increasing.
+            velocity: (n, 3) forward, lateral, turn; (n, 4) with what is known of the turn's jitter.
         """
+        if velocity.shape[1] == 3:
+            velocity = np.column_stack([velocity, beyond_jitter(stamp_s, velocity[:, 2])])
         silence = np.diff(stamp_s)
         silent = np.flatnonzero(silence > SILENCE_S)
         at = silent + 1
         stamps = np.insert(stamp_s, at, stamp_s[silent] + 0.5 * SILENCE_S)
         counted = np.minimum(silence[silent], LONGEST_SILENCE_S)
-        rate = (SILENT_VARIANCE + (velocity[silent] ** 2).sum(axis=1) * counted) * counted / silence[silent]
+        rate = (SILENT_VARIANCE + (velocity[silent, :3] ** 2).sum(axis=1) * counted) * counted / silence[silent]
         unknown = np.insert(np.zeros(len(stamp_s)), at, rate)
         velocities = np.insert(velocity, at, 0.0, axis=0)
         # after the last row nothing is known either
         stamps = np.append(stamps, stamps[-1] + 0.5 * SILENCE_S)
-        return cls(stamps, np.vstack([velocities, np.zeros(3)]), np.append(unknown, SILENT_VARIANCE))
+        return cls(stamps, np.vstack([velocities, np.zeros(4)]), np.append(unknown, SILENT_VARIANCE))
+
+
+def beyond_jitter(stamp_s: FloatArray, turn_radps: FloatArray) -> FloatArray:
+    """Return (n,) turn rates without what may be jitter of their report, each by rows until itself.
+
+    A scale that acts on jitter explains it by a scale of zero: where a robot drives straight on, poses do not jitter as
+    its gyroscope does, and every row says so (attenuation by errors in variables: Fuller 1987, section 1.1). So a turn
+    counts by the share of its square, on average over `TURN_S`, that stands out of the jitter.
+
+    Args:
+        stamp_s: (n,) strictly increasing.
+        turn_radps: (n,) as reported [rad/s].
+    """
+    end = np.arange(1, len(stamp_s) + 1)
+    spans = [end, *(np.searchsorted(stamp_s, stamp_s - k * TURN_S, side="right") for k in range(1, SPANS + 1))]
+    turned = np.append(0.0, np.cumsum(turn_radps))
+    changed = np.append(np.zeros(min(len(stamp_s), 2) + 1), np.cumsum(np.diff(turn_radps, n=2) ** 2))
+    jitter = np.full(len(stamp_s), np.inf)
+    for last, first in pairwise(spans):
+        rows = last - np.maximum(first, 2)
+        variance = (changed[last] - changed[first]) / (6.0 * np.maximum(rows, 1))
+        jitter = np.where(rows >= TURN_ROWS, np.minimum(jitter, variance), jitter)
+    rows = end - spans[1]
+    mean = (turned[end] - turned[spans[1]]) / rows
+    doubt = STANDS_OUT**2 * np.where(np.isfinite(jitter), jitter, 0.0) / rows
+    beyond: FloatArray = turn_radps * np.maximum(1.0 - doubt / np.maximum(mean**2, np.finfo(float).tiny), 0.0)
+    return beyond
 
 
 @dataclass(frozen=True, slots=True)
