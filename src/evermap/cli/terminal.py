@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shlex
 import sys
 import threading
@@ -145,8 +146,8 @@ def progress_bar(label: str, *, speed: bool = True) -> Iterator[Progress | None]
 
 
 def command_line() -> str:
-    """Return what was typed, for the summary."""
-    return shlex.join(["evermap", *sys.argv[1:]])
+    """Return what was typed, for the summary, without passwords in addresses."""
+    return re.sub(r"(://[^/\s:@]*):[^/\s@]*@", r"\1:***@", shlex.join(["evermap", *sys.argv[1:]]))
 
 
 def _console(*, stderr: bool = False) -> Console:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from sqlalchemy import Connection, Engine, bindparam, delete, func, insert, inspect, select, update
 from sqlalchemy.exc import DBAPIError, IntegrityError
+from sqlalchemy.schema import CreateSchema
 
 from evermap import __version__
 from evermap.errors import ConfigError, InputError, NumericalError
@@ -90,6 +91,8 @@ class SqlStore(Shown):
             with store._writing() as connection:
                 version = store._schema_version(connection)  # somebody may have been faster
                 if version == 0:
+                    if own := engine.get_execution_options().get("schema"):
+                        connection.execute(CreateSchema(own, if_not_exists=True))
                     schema.metadata.create_all(connection)
                     values = (schema.SCHEMA_VERSION, now_utc(), __version__, 0, None)
                     row = dict(zip(_STORE_COLUMNS, values, strict=True)) | {"checksum": schema.checksum(*values)}
@@ -357,6 +360,11 @@ class SqlStore(Shown):
         with self._reading() as connection:
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
+
+    def rows(self) -> list[list[Any]]:
+        """Return all rows of all tables, as they are stored."""
+        with self._reading() as connection:
+            return [list(row) for table in schema.metadata.sorted_tables for row in connection.execute(select(table))]
 
     def fill(
         self, chunks: Mapping[bytes, bytes], records: Mapping[int, bytes], head: int, pruned: Mapping[int, str]
@@ -634,6 +642,9 @@ class SqlStore(Shown):
             for part, problem, hint in _FAILURES:
                 if part in message:
                     raise InputError(problem, path=self._where, hint=hint) from error
+            if self._engine.dialect.name == "postgresql":  # that checks its own pages
+                hint = "check the address, the rights of the user, and that the server runs"
+                raise InputError(f"PostgreSQL: {message}", path=self._where, hint=hint) from error
             raise self._damaged(message) from error
 
     def _damaged(self, problem: str) -> InputError:

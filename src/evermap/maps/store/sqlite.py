@@ -120,7 +120,7 @@ class Verification:
         """Whether nothing is damaged."""
         return not self.damaged and not self.problems
 
-    def error(self, path: Path, problem: str = "") -> DamagedMapError:
+    def error(self, path: Path | str, problem: str = "") -> DamagedMapError:
         """Return one line that says what is damaged, which revisions are whole, and how to go back to them."""
         told = [problem] if problem else list(self.problems[:1])
         if self.damaged and not problem:
@@ -145,10 +145,14 @@ def verify(path: Path) -> Verification:
     Raises:
         InputError: the file cannot be read.
     """
-    found = _Found.of_file(path)
-    intact, pruned, damaged = found.verdicts(deep=True)
-    lost, problems = tuple(sorted(found.lost)), tuple(_problems(path))
-    return Verification(found.head, intact, damaged, lost, problems, len(found.chunks), path.stat().st_size, pruned)
+    return _Found.of_file(path).verified(_problems(path), path.stat().st_size)
+
+
+def verify_rows(store: SqlStore) -> Verification:
+    """Check every byte of a map in a database that keeps no file."""
+    rows = store.rows()
+    n_bytes = sum(len(value) for row in rows for value in row if isinstance(value, bytes))
+    return _Found._of_rows(rows).verified(_unread(store), n_bytes)
 
 
 def survey(path: Path) -> Verification | None:
@@ -225,6 +229,12 @@ class _Found:
     names: Mapping[int, bytes]
     lost: Mapping[int, bytes | None]
     pruned: Mapping[int, str]
+
+    def verified(self, problems: Iterable[str], n_bytes: int) -> Verification:
+        """Return what is whole, of the maps themselves too."""
+        intact, pruned, damaged = self.verdicts(deep=True)
+        lost = tuple(sorted(self.lost))
+        return Verification(self.head, intact, damaged, lost, tuple(problems), len(self.chunks), n_bytes, pruned)
 
     @property
     def head(self) -> int:
@@ -352,10 +362,11 @@ def _problems(path: Path) -> Iterator[str]:
     """What the database itself finds, and what ordinary reading finds in its lists."""
     try:
         with open_sqlite(path, create=False) as store:
-            store.log()
-            store.head()
+            unread = list(_unread(store))
     except DamagedMapError as error:
-        yield error.problem.removeprefix("damaged: ").partition("; ")[0]
+        unread = [_plain(error)]
+    if unread:
+        yield from unread
         return
     try:
         with closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)) as database:
@@ -364,6 +375,19 @@ def _problems(path: Path) -> Iterator[str]:
         found = [str(error)]
     if found != ["ok"]:
         yield "SQLite: " + "; ".join(" ".join(line.replace("*** in database main ***", "").split()) for line in found)
+
+
+def _unread(store: SqlStore) -> Iterator[str]:
+    """What ordinary reading finds in the lists of a map."""
+    try:
+        store.log()
+        store.head()
+    except DamagedMapError as error:
+        yield _plain(error)
+
+
+def _plain(error: DamagedMapError) -> str:
+    return error.problem.removeprefix("damaged: ").partition("; ")[0]
 
 
 def _finish_transactions(path: Path) -> None:

@@ -1,0 +1,108 @@
+"""Map stores in a PostgreSQL database: one database schema per site, with the tables of any other store.
+
+An address names the database and the site, `postgresql://user@host:5432/fleet/ward-3`; all else, passwords and TLS
+too, is as libpq reads it (`PGPASSWORD`, `~/.pgpass`, `?sslmode=verify-full`). Readers see one snapshot of the database;
+writers of one site wait for one another. Tables are brought up to date by `schema.migrate`, as those of a file: the
+version and its checksum are in each site's own row, which alembic's one table for a whole database is not made for.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+
+from sqlalchemy import Connection, Engine, create_engine, event, inspect
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+
+from evermap.errors import ConfigError, InputError, MissingExtraError
+from evermap.maps.store.protocol import DamagedMapError
+from evermap.maps.store.sql import SqlStore
+
+SITE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,47}")
+"""Names of sites, which are parts of the names of database schemas (63 bytes) and files."""
+PREFIX = "map_"
+"""Of the schemas of sites."""
+
+
+def open_postgres(address: str, *, create: bool) -> SqlStore:
+    """Return the store of a site, see `open_store`.
+
+    Raises:
+        ConfigError: the address names no site.
+        InputError: there is no such map, or the database cannot be used.
+        MissingExtraError: the driver is not installed.
+    """
+    url, site = split_address(address)
+    where = url.set(database=f"{url.database}/{site}").render_as_string(hide_password=True)
+    engine = engine_of(url.render_as_string(hide_password=False), PREFIX + site)
+
+    def explain(problem: str) -> InputError:
+        return DamagedMapError(f"damaged: {problem}", path=where, hint="a backup of the database")
+
+    return SqlStore.opened(engine, where, create=create, explain=explain)
+
+
+def split_address(address: str) -> tuple[URL, str]:
+    """Return the address of the database, and the name of the site.
+
+    Raises:
+        ConfigError: either is missing or not valid.
+    """
+    try:
+        url = make_url(address)
+    except ArgumentError:
+        raise ConfigError("is no address of a database", field="map", hint=_FORM) from None
+    database, _, site = (url.database or "").rpartition("/")
+    if not database or "/" in database or not SITE.fullmatch(site):
+        problem = f"'{url.render_as_string(hide_password=True)}' names no site"
+        raise ConfigError(problem, field="map", hint=f"{_FORM}; a site has letters, digits, - and _, at most 48")
+    return url.set(database=database), site
+
+
+def address_of(database: str, site: str) -> str:
+    """Return the address of a site from that of its database."""
+    url = make_url(database)
+    return url.set(database=f"{url.database}/{site}").render_as_string(hide_password=False)
+
+
+def sites_in(database: str) -> list[str]:
+    """Return the names of all sites in a database."""
+    with engine_of(database, "public").connect() as connection:
+        schemas = inspect(connection).get_schema_names()
+    return sorted(name.removeprefix(PREFIX) for name in schemas if name.startswith(PREFIX))
+
+
+def engine_of(database: str, schema: str) -> Engine:
+    """Return an engine whose transactions see one schema of a database; all share the connections of this process.
+
+    Transactions of `execution_options(writes=True)` exclude one another within the schema; others only read, and see
+    one snapshot, unless they have `shared=True`.
+    """
+    return _engine(database).execution_options(schema=schema)
+
+
+@functools.lru_cache(maxsize=8)
+def _engine(database: str) -> Engine:
+    url = make_url(database)
+    try:
+        engine = create_engine(url.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
+    except (ImportError, NoSuchModuleError):
+        problem = "PostgreSQL needs the package psycopg, which is not installed"
+        raise MissingExtraError(problem, hint="pip install 'evermap[server]'") from None
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        options = connection.get_execution_options()
+        name, writes, shared = options["schema"], options.get("writes", False), options.get("shared", False)
+        if not (writes or shared):
+            connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY")
+        # for this transaction only, so that a pool of connections in front of the database may share them
+        connection.exec_driver_sql("SELECT set_config('search_path', %s, true)", (f'"{name}"',))
+        if writes:
+            connection.exec_driver_sql("SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))", (name,))
+
+    return engine
+
+
+_FORM = "postgresql://user@host:5432/database/SITE"
