@@ -71,7 +71,7 @@ def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
     return built(tmp_path_factory.mktemp("order") / "site.evermap", range(4))
 
 
-@pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2)])
+@pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2), (1, 3, 0, 2)])
 def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
     assert_same(built(tmp_path / "site.evermap", order), in_order)
 

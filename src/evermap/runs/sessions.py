@@ -7,9 +7,9 @@ kept with their revisions. So the map is the one that the right order would have
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
 
 class TwiceError(InputError):
-    """A session that is in the map already."""
+    """A session that is in the map already.
+
+    Attributes:
+        revision: that it is.
+    """
+
+    revision: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,6 +186,51 @@ def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, so
     return store.commit(living, said, parent=store.head())
 
 
+WORDS: Mapping[str, Mapping[str, bool]] = {
+    "pinned": {"pinned": True}, "unpinned": {"pinned": False},
+    "deleted": {"deleted": True}, "undeleted": {"deleted": False},
+}  # fmt: skip
+"""What operators say of landmarks."""
+
+
+def edit_landmarks(
+    store: MapStore, landmarks: Sequence[str], word: str, *, note: str = "", command: str = ""
+) -> tuple[int, tuple[int, ...], str]:
+    """Commit an operator's word on landmarks; nothing where nothing would change.
+
+    Args:
+        store: the map.
+        landmarks: ids or names.
+        word: one of `WORDS`.
+        note: added to what the log says.
+        command: what was typed.
+
+    Returns:
+        The newest revision, the landmarks that changed, and what the log says.
+
+    Raises:
+        InputError: a landmark is not in the map.
+        StaleRevisionError: another commit came in between.
+    """
+    from evermap.maps.diff import edits
+
+    parent = store.head()
+    before = after = store.load(parent)
+    for name in landmarks:
+        try:
+            after = after.edited(after.landmark_called(name), **WORDS[word])
+        except KeyError:
+            problem = f"no landmark {name} in revision {parent}"
+            raise InputError(problem, path=store.where, hint=f"evermap map show {store.where} --all") from None
+    changed = tuple(name for name, _ in edits(before.members, after.members))
+    if not changed:
+        return parent, (), f"already {word}"
+    listed = ", ".join(map(after.label, changed))
+    said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
+    origin = Provenance(kind=RevisionKind.EDIT, command=command, note=said)
+    return store.commit(after, origin, parent=parent), changed, said
+
+
 def _enter_late(
     store: MapStore,
     recording: AnyRecording,
@@ -196,7 +247,7 @@ def _enter_late(
     from evermap.pipeline import run_session
 
     head, start_s = store.head(), float(recording.frames.stamp_s[0])
-    first = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > start_s)
+    first = _first_again(steps, start_s)
     parent = steps[first].revision.parent
     try:
         base = store.load(parent)
@@ -232,6 +283,17 @@ def _enter_late(
     return Entered(session, newest, living, found, names, head, {RECORDING: data})
 
 
+def _first_again(steps: Sequence[_Step], start_s: float) -> int:
+    """The first step that is taken back: before it the map has no session that begins after one that is entered."""
+    first = len(steps)
+    while True:
+        earliest = min([start_s, *(step.start_s for step in steps[first:] if step.recording is not None)])
+        later = next(k for k, step in enumerate(steps) if step.recording is not None and step.start_s > earliest)
+        if later == first:
+            return first
+        first = later
+
+
 def at_time(store: MapStore, stamp_s: float) -> LivingMap:
     """Return the map of a store as it was at a time: of the last revision whose sessions had all begun; the first for
     earlier.
@@ -255,11 +317,13 @@ def at_time(store: MapStore, stamp_s: float) -> LivingMap:
 def _refuse_twice(store: MapStore, kept: dict[int, Attachment], data: bytes, recording: AnyRecording) -> None:
     for number, item in kept.items():
         if item.n_bytes == len(data) and store.attached(item) == data:
-            raise TwiceError(
+            twice = TwiceError(
                 f"{recording.name}: is in the map already, as revision {number}",
                 path=store.where,
                 hint="a session is evidence once; the map stays as it was",
             )
+            twice.revision = number
+            raise twice
 
 
 def _history(store: MapStore, kept: dict[int, Attachment]) -> list[_Step]:
@@ -290,13 +354,9 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
 
     if step.recording is None:
         number = step.revision.number
-        words: dict[str, dict[str, Any]] = {
-            "pinned": {"pinned": True}, "unpinned": {"pinned": False},
-            "deleted": {"deleted": True}, "undeleted": {"deleted": False},
-        }  # fmt: skip
         for landmark, word in edits(store.members(step.revision.parent), store.members(number)):
             if landmark in living.members.landmark_id:
-                living = living.edited(landmark, **words[word])
+                living = living.edited(landmark, **WORDS[word])
         return living, ()
     from evermap.config import parse_config
     from evermap.maps.store.measured import unpack_recording
