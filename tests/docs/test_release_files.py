@@ -66,3 +66,21 @@ def test_the_service_and_the_container_start_what_exists() -> None:
         named = re.findall(r"(?:evermap|/src)\[(\w+)\]", text)
         assert named
         assert set(named) <= extras["optional-dependencies"].keys()
+
+
+def test_the_examples_of_a_server_start_what_exists() -> None:
+    yaml = pytest.importorskip("yaml", reason="PyYAML is not installed")
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment,method-assign]
+    unit.read(REPOSITORY / "examples" / "evermap-serve.service", encoding="utf-8")
+    services = yaml.safe_load((REPOSITORY / "examples" / "compose.yaml").read_text(encoding="utf-8"))["services"]
+    started = [
+        shlex.split(unit["Service"]["ExecStart"]),
+        *(services[name]["entrypoint"] for name in ("server", "worker")),
+    ]
+    for binary, verb, *arguments in started:
+        assert Path(binary).name == "evermap"
+        shown = CliRunner().invoke(app, [verb, "--help"], terminal_width=200).stdout
+        assert all(re.search(rf"{one}\b", shown) for one in arguments if one.startswith("--"))
+    assert services["server"]["environment"]["EVERMAP_STORE"].startswith("postgresql://")
+    assert "EVERMAP_STORE" in shown

@@ -39,8 +39,9 @@ def log(file: MapFile, as_json: AsJson = False) -> None:
     Example:
       evermap map log site.evermap
     """
-    from evermap.cli.map_content import revision_dict, revision_row
+    from evermap.cli.map_content import revision_row
     from evermap.maps.store import open_store
+    from evermap.runs.map_dicts import revision_dict
 
     with open_store(file) as store:
         revisions = store.log()
@@ -76,8 +77,9 @@ def show(
     Example:
       evermap map show site.evermap --ahead 3d --figure map.png
     """
-    from evermap.cli.map_content import landmark_dicts, landmark_row, life_dicts, prior_dicts
+    from evermap.cli.map_content import landmark_row
     from evermap.maps.store import open_store
+    from evermap.runs.map_dicts import landmark_dicts, life_dicts, prior_dicts
     from evermap.stamps import stamp_text
     from evermap.survival.durations import parse_duration_s
     from evermap.types import json_number
@@ -128,16 +130,14 @@ def diff(
     from evermap.cli.map_content import change_line
     from evermap.maps.diff import diff as between
     from evermap.maps.store import open_store
-    from evermap.runs.summary import change_dict
+    from evermap.runs.map_dicts import diff_dict
     from evermap.viz.change_words import grew
 
     with open_store(file) as store:
         found = between(store, a, b)
         new = store.load(found.b)
     if as_json:
-        told = {"changes": [*map(change_dict, found.changes)], "grown": found.grown.tolist()}
-        edited = [{"landmark": name, "what": word} for name, word in found.edits]
-        print_json({"map": file, "a": found.a, "b": found.b, **told, "edits": edited})
+        print_json({"map": file, **diff_dict(found)})
         return
     lines = [change_line(change, new.clock) for change in found.changes]
     lines += grew(len(found.grown), [*map(new.label, found.grown.tolist())])
@@ -267,9 +267,10 @@ def why(
     Example:
       evermap map why site.evermap 17 --figure why.png
     """
-    from evermap.cli.map_content import answer_dict, draw_why, print_why
+    from evermap.cli.map_content import draw_why, print_why
     from evermap.maps.store import open_store
     from evermap.maps.why import why as of_landmark
+    from evermap.runs.map_dicts import answer_dict
 
     if figure is not None:
         check_picture(figure, "--figure", inputs=[file])

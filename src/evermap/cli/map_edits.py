@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from evermap.cli.terminal import command_line, print_json, say
-from evermap.errors import InputError
 
 MapFile = Annotated[str, typer.Argument(metavar="FILE", help="The map, as `evermap slam --map FILE` writes it.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print as JSON.")]
@@ -124,7 +123,7 @@ def pin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = Fals
     Example:
       evermap map pin site.evermap 3 4
     """
-    _edit(file, landmarks, "pinned", note, as_json, pinned=True)
+    _edit(file, landmarks, "pinned", note, as_json)
 
 
 def unpin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
@@ -134,7 +133,7 @@ def unpin(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = Fa
     Example:
       evermap map unpin site.evermap 3
     """
-    _edit(file, landmarks, "unpinned", note, as_json, pinned=False)
+    _edit(file, landmarks, "unpinned", note, as_json)
 
 
 def delete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
@@ -146,7 +145,7 @@ def delete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = F
     Example:
       evermap map delete site.evermap 17 --note "a reflection"
     """
-    _edit(file, landmarks, "deleted", note, as_json, deleted=True)
+    _edit(file, landmarks, "deleted", note, as_json)
 
 
 def undelete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson = False) -> None:
@@ -156,43 +155,20 @@ def undelete(file: MapFile, landmarks: _Ids, note: _Note = "", as_json: AsJson =
     Example:
       evermap map undelete site.evermap 17
     """
-    _edit(file, landmarks, "undeleted", note, as_json, deleted=False)
+    _edit(file, landmarks, "undeleted", note, as_json)
 
 
-def _edit(
-    file: str,
-    landmarks: list[str],
-    word: str,
-    note: str,
-    as_json: bool,
-    *,
-    pinned: bool | None = None,
-    deleted: bool | None = None,
-) -> None:
+def _edit(file: str, landmarks: list[str], word: str, note: str, as_json: bool) -> None:
     """An operator's word as a revision; none where nothing would change."""
-    from evermap.maps.diff import edits
-    from evermap.maps.store import Provenance, RevisionKind, open_store
+    from evermap.maps.store import open_store
+    from evermap.runs.sessions import edit_landmarks
 
     with open_store(file) as store:
         parent = store.head()
-        before = after = store.load(parent)
-        for name in landmarks:
-            try:
-                after = after.edited(after.landmark_called(name), pinned=pinned, deleted=deleted)
-            except KeyError:
-                problem = f"no landmark {name} in revision {parent}"
-                raise InputError(problem, path=file, hint=f"evermap map show {file} --all") from None
-        changed = [name for name, _ in edits(before.members, after.members)]
-        number = parent
-        if changed:
-            listed = ", ".join(map(after.label, changed))
-            said = f"{word} landmark{'s' if len(changed) > 1 else ''} {listed}" + (f": {note}" if note else "")
-            number = store.commit(
-                after, Provenance(kind=RevisionKind.EDIT, command=command_line(), note=said), parent=parent
-            )
+        number, changed, said = edit_landmarks(store, landmarks, word, note=note, command=command_line())
     if as_json:
         print_json({"map": file, "revision": number, "parent": parent, word: changed})
     elif changed:
         say(f"revision {number}: {said}; back with: evermap map revert {file} {parent}")
     else:
-        say(f"nothing to do: already {word}")
+        say(f"nothing to do: {said}")

@@ -22,6 +22,7 @@ from evermap.maps.store.protocol import (
     Revision,
     RevisionKind,
     StaleRevisionError,
+    StoreUnavailableError,
 )
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "Revision",
     "RevisionKind",
     "StaleRevisionError",
+    "StoreUnavailableError",
     "is_address",
     "open_store",
     "revert_store",

@@ -29,6 +29,10 @@ class StaleRevisionError(InputError):
     """Somebody else committed since the map was read; nothing was written."""
 
 
+class StoreUnavailableError(InputError):
+    """The database of a map does not answer, or refuses; nothing is wrong with the map, or with what was asked."""
+
+
 class DamagedMapError(InputError):
     """A map file whose bytes are not those that were written.
 

@@ -31,6 +31,7 @@ from evermap.maps.store.protocol import (
     Revision,
     RevisionKind,
     StaleRevisionError,
+    StoreUnavailableError,
 )
 from evermap.maps.store.schema import migrate
 from evermap.show import Shown, data_frame
@@ -361,13 +362,25 @@ class SqlStore(Shown):
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
 
+    def name_of(self, revision: int) -> str:
+        """Return the name of a revision's record, a checksum over it and all revisions before it."""
+        with self._reading() as connection:
+            table, number = schema.revision.c, self._known(connection, revision)
+            name = connection.execute(select(table.record).where(table.number == number)).scalar()
+            return name.hex() if isinstance(name, bytes) else ""
+
     def rows(self) -> list[list[Any]]:
         """Return all rows of all tables, as they are stored."""
         with self._reading() as connection:
             return [list(row) for table in schema.metadata.sorted_tables for row in connection.execute(select(table))]
 
     def fill(
-        self, chunks: Mapping[bytes, bytes], records: Mapping[int, bytes], head: int, pruned: Mapping[int, str]
+        self,
+        chunks: Mapping[bytes, bytes],
+        records: Mapping[int, bytes],
+        head: int,
+        pruned: Mapping[int, str],
+        made: tuple[str, str] | None = None,
     ) -> None:
         """Put revisions from elsewhere into an empty store.
 
@@ -376,8 +389,12 @@ class SqlStore(Shown):
             records: names of the records by number; what is missing up to `head` is lost.
             head: number of the newest.
             pruned: revisions without content, and since when.
+            made: when and by which evermap the store was made; None for now and by this one.
         """
         with self._writing() as connection:
+            if made is not None:
+                values = {"created_at": made[0], "evermap_version": made[1]}
+                connection.execute(update(schema.store).values(values))
             rows = [{"name": name, "data": data} for name, data in chunks.items()]
             if rows:
                 connection.execute(insert(schema.chunk), rows)
@@ -644,7 +661,7 @@ class SqlStore(Shown):
                     raise InputError(problem, path=self._where, hint=hint) from error
             if self._engine.dialect.name == "postgresql":  # that checks its own pages
                 hint = "check the address, the rights of the user, and that the server runs"
-                raise InputError(f"PostgreSQL: {message}", path=self._where, hint=hint) from error
+                raise StoreUnavailableError(f"PostgreSQL: {message}", path=self._where, hint=hint) from error
             raise self._damaged(message) from error
 
     def _damaged(self, problem: str) -> InputError:

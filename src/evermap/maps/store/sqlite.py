@@ -10,7 +10,7 @@ import os
 import shutil
 import sqlite3
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ def open_sqlite(path: Path, *, create: bool) -> SqlStore:
         raise InputError("no such map", path=path, hint=f"evermap slam INPUT --map {path} starts one")
     if not path.parent.is_dir():
         raise InputError(f"the folder {path.parent} does not exist", path=path, hint=f"mkdir -p {path.parent}")
-    engine = _engine(path, writable=os.access(path if path.exists() else path.parent, os.W_OK))
+    engine = engine_of(path, writable=os.access(path if path.exists() else path.parent, os.W_OK))
 
     def explain(problem: str) -> InputError | None:
         found = survey(path)
@@ -57,7 +57,8 @@ def _compact(engine: Engine) -> None:
     connection.close()
 
 
-def _engine(path: Path, *, writable: bool) -> Engine:
+def engine_of(path: Path, *, writable: bool) -> Engine:
+    """Return an engine whose transactions lock the file at once where they have `execution_options(writes=True)`."""
     mode = "rwc" if writable else "ro"
     address = f"file:{quote(str(path.absolute()))}?mode={mode}"
 
@@ -167,6 +168,31 @@ def survey(path: Path) -> Verification | None:
     return Verification(found.head, intact, damaged, tuple(sorted(found.lost)), (), len(found.chunks), 0, pruned)
 
 
+def snapshot(store: SqlStore, path: Path, revision: int) -> None:
+    """Write a map of any store, up to a revision, as a file; of equal maps the files are equal.
+
+    Args:
+        store: the map.
+        path: a file that does not exist.
+        revision: the newest that the file is to have.
+
+    Raises:
+        DamagedMapError: the store is damaged.
+        InputError: it has no such revision.
+    """
+    rows = store.rows()
+    found = _Found._of_rows(rows)
+    numbers = [number for number in sorted(found.records) if number <= revision]
+    if revision not in numbers or revision in found.pruned:
+        raise InputError(f"no revision {revision} with its content", path=store.where, hint="a newer one")
+    made = next((row[1], row[2]) for row in rows if len(row) > 2)
+    with open_sqlite(path, create=True) as fresh:
+        try:
+            found.copy_to(fresh, numbers, revision, made)
+        except DamagedError as error:
+            raise DamagedMapError(f"damaged: {error}", path=store.where, hint="evermap map verify") from None
+
+
 def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> tuple[int, Path]:
     """Go back to an intact revision of a damaged file: every intact one is kept, the damaged file is set aside.
 
@@ -189,9 +215,6 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
         checked = Verification(found.head, intact, damaged, (), (), 0, 0)
         raise checked.error(path, f"revision {revision}: {why}")
     records = {number: found.records[number] for number in (*intact, *pruned)}
-    kept: set[bytes] = set()
-    for number, record in records.items():
-        kept |= {found.names[number], *found.closure(record)}
     next_ids = [max((record.next_ids[k] for record in found.records.values()), default=0) for k in (0, 1)]
     before = {number: found.names.get(number - 1) if number - 1 in records else None for number in damaged}
     lost = {**{number: name if number - 1 in records else None for number, name in found.lost.items()}, **before}
@@ -199,9 +222,7 @@ def rescue(path: Path, revision: int, provenance: Provenance | None = None) -> t
     fresh.unlink(missing_ok=True)
     try:
         with open_sqlite(fresh, create=True) as store:
-            names = {number: found.names[number] for number in records}
-            since = {number: found.pruned[number] for number in pruned}
-            store.fill({name: found.chunks[name] for name in kept}, names, found.head, since)
+            found.copy_to(store, records, found.head)
             old = content.unpack(records[revision].content, found.fetch) if revision else LivingMap()
             number = store.restore(old, revision, found.head, (next_ids[0], next_ids[1]), provenance, lost)
         aside = _set_aside(path)
@@ -229,6 +250,17 @@ class _Found:
     names: Mapping[int, bytes]
     lost: Mapping[int, bytes | None]
     pruned: Mapping[int, str]
+
+    def copy_to(
+        self, store: SqlStore, numbers: Collection[int], head: int, made: tuple[str, str] | None = None
+    ) -> None:
+        """Put revisions into an empty store, up to the newest, `head`; `made` as `SqlStore.fill`."""
+        kept: set[bytes] = set()
+        for number in numbers:
+            kept |= {self.names[number], *self.closure(self.records[number])}
+        names = {number: self.names[number] for number in numbers}
+        since = {number: self.pruned[number] for number in numbers if number in self.pruned}
+        store.fill({name: self.chunks[name] for name in sorted(kept)}, names, head, since, made)
 
     def verified(self, problems: Iterable[str], n_bytes: int) -> Verification:
         """Return what is whole, of the maps themselves too."""

@@ -1,0 +1,215 @@
+"""`evermap serve` and `evermap work`: the maps of a fleet behind HTTP, and those who enter its sessions."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from evermap.cli.options import AsJson, ConfigFile, Settings, configured
+from evermap.cli.terminal import print_json, print_table, say, warm_up
+from evermap.errors import ConfigError, MissingExtraError
+
+if TYPE_CHECKING:
+    from evermap.server.database import Database, Job
+    from evermap.server.worker import JobOutcome
+
+app = typer.Typer(
+    name="serve",
+    help="Serve the maps of a fleet.",
+    rich_markup_mode=None,
+    invoke_without_command=True,
+)
+
+Store = Annotated[
+    str,
+    typer.Option(
+        "--store",
+        metavar="WHERE",
+        help="Folder of the maps, or postgresql://user@host/database.",
+        envvar="EVERMAP_STORE",
+    ),
+]
+_DEFAULT = "evermap-maps"
+
+
+@app.callback()
+def serve(
+    ctx: typer.Context,
+    store: Store = _DEFAULT,
+    host: Annotated[str, typer.Option(help="Address to listen at; 0.0.0.0 for all.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at.")] = 8080,
+    workers: Annotated[
+        int, typer.Option(min=0, max=64, help="Processes beside it that enter sessions, see evermap work.")
+    ] = 1,
+    certificate: Annotated[
+        Path | None, typer.Option("--tls-cert", metavar="FILE", help="TLS certificate chain.", show_default="no TLS")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option("--tls-key", metavar="FILE", help="Key of the certificate.", show_default=False)
+    ] = None,
+) -> None:
+    """Serve the maps of a fleet: sessions are uploaded, queued, and entered by workers.
+
+    The first token, of an administrator, is printed where there is none yet.
+
+    \b
+    Examples:
+      evermap serve --store maps
+      evermap serve --store postgresql://evermap@db/fleet --host 0.0.0.0 --workers 2
+      evermap serve token robot-7 --role upload --store maps
+    """
+    if ctx.invoked_subcommand is not None:
+        return
+    if (certificate is None) != (key is None):
+        raise ConfigError("TLS needs both", field="tls-cert", hint="--tls-cert FILE --tls-key FILE")
+    for path in (certificate, key):
+        if path is not None and not path.is_file():
+            raise ConfigError("no such file", path=path, field="tls-cert", hint="files in PEM format")
+    database = _database(store)
+    uvicorn = _uvicorn()
+    from evermap.server.app import Server, create_app
+    from evermap.server.database import Role
+    from evermap.server.sites import SiteStores
+
+    if not database.tokens():
+        typer.echo(database.add_token("admin", Role.ADMIN))
+        say("this token of an administrator is shown once; more of them: evermap serve token NAME --role ROLE")
+    application = create_app(Server(database, SiteStores(store)))
+    scheme = "http" if certificate is None else "https"
+    say(f"serving {scheme}://{host}:{port}; Ctrl-C ends it")
+    tls = {} if certificate is None else {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
+    with _working(store, workers):
+        uvicorn.run(
+            application,
+            host=host,
+            port=port,
+            log_level="warning",
+            server_header=False,
+            timeout_graceful_shutdown=5,
+            **tls,
+        )
+
+
+@app.command("token")
+def token(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Of the robot or person.", show_default=False)
+    ] = None,
+    role: Annotated[str, typer.Option(metavar="read|upload|approve|admin", help="What it may do.")] = "upload",
+    revoke: Annotated[bool, typer.Option("--revoke", help="Take the token of this name back.")] = False,
+    store: Store = _DEFAULT,
+    as_json: AsJson = False,
+) -> None:
+    """Make a token and print it, once; without a name, list them.
+
+    \b
+    Examples:
+      evermap serve token robot-7 --role upload --store maps
+      evermap serve token robot-7 --revoke --store maps
+    """
+    from evermap.errors import suggestion
+
+    database = _database(store)
+    from evermap.server.database import Role
+
+    if name is None:
+        rows = database.tokens()
+        if as_json:
+            print_json({"tokens": rows})
+        else:
+            print_table("tokens", [[*row.values()] for row in rows], ("name", "role", "made (UTC)"))
+        return
+    if not name.strip() or len(name) > 100:
+        raise ConfigError("a token needs a name of up to 100 characters", field="name", hint="robot-7")
+    if revoke:
+        if not database.revoke_token(name):
+            known = [row["name"] for row in database.tokens()]
+            raise ConfigError(f"no token '{name}'", field="name", hint=suggestion(name, known))
+        say(f"the token of {name} is no longer valid")
+        return
+    roles = {item.name.lower(): item for item in Role}
+    if role not in roles:
+        raise ConfigError(f"no role '{role}'", field="role", hint=suggestion(role, roles))
+    text = database.add_token(name, roles[role])
+    if as_json:
+        print_json({"name": name, "role": role, "token": text})
+        return
+    typer.echo(text)
+    say(f"the token of {name}, role {role}; it is shown once")
+
+
+def work(
+    store: Store = _DEFAULT,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    drain: Annotated[bool, typer.Option("--drain", help="End as soon as no session waits.")] = False,
+    lease_s: Annotated[
+        float, typer.Option(min=1.0, max=3600.0, help="Time after which another worker takes a session over [s].")
+    ] = 60.0,
+) -> None:
+    """Enter the sessions that were uploaded to a server.
+
+    By the code of `evermap slam --map`; as many workers as you like, on any machine that reaches the database.
+
+    \b
+    Examples:
+      evermap work --store maps --drain
+      evermap work --store postgresql://evermap@db/fleet --set living.search=gate
+    """
+    chosen = configured(config, settings)
+    database = _database(store)
+    from evermap.server.sites import SiteStores
+    from evermap.server.worker import Worker
+
+    def told(job: Job, outcome: JobOutcome) -> None:
+        became = outcome.state.value if outcome.revision is None else f"revision {outcome.revision}"
+        say(
+            f"session {job.id} of {job.robot} for {job.site}: {became}"
+            + (f" ({outcome.reason})" if outcome.reason else "")
+        )
+
+    warm_up()
+    Worker(database, SiteStores(store), chosen, lease_s).run(told, drain=drain)
+
+
+def _database(store: str) -> Database:
+    from sqlalchemy.exc import DBAPIError
+
+    from evermap.server.database import Database
+
+    try:
+        return Database(store)
+    except DBAPIError as error:
+        hint = "check the address, the rights of the user, and that the server runs"
+        raise ConfigError(f"the database cannot be used: {error.orig}", field="store", hint=hint) from None
+
+
+def _uvicorn() -> Any:
+    try:
+        import fastapi  # noqa: F401
+        import uvicorn
+    except ImportError as error:
+        problem = f"a server needs the package {error.name}, which is not installed"
+        raise MissingExtraError(problem, hint="pip install 'evermap[server]'") from None
+    return uvicorn
+
+
+@contextmanager
+def _working(store: str, count: int) -> Iterator[None]:
+    """Run workers beside this process, and end them with it; what they were at goes back to the queue."""
+    command = [sys.executable, "-m", "evermap", "work", "--store", store]
+    processes = [subprocess.Popen(command, stdin=subprocess.DEVNULL) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGTERM)
+        for process in processes:
+            process.wait()

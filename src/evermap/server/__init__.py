@@ -1,0 +1,1 @@
+"""A server for the maps of a fleet (`docs/server.md`): sessions are uploaded, queued, and entered by workers."""

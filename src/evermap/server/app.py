@@ -1,0 +1,425 @@
+"""The HTTP interface of a server: JSON, the map as a file, and events; every answer needs a token.
+
+A path names a site; what comes from outside reaches SQL as bound values only, the disk by `SiteStores.address` only,
+and is answered as JSON.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from typing import Annotated, Any
+
+import numpy as np
+from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
+from pydantic import BaseModel, Field
+from sqlalchemy.exc import OperationalError
+
+from evermap import __version__
+from evermap.errors import EvermapError, InputError, printable
+from evermap.maps.store import DamagedMapError, Provenance, StaleRevisionError, StoreUnavailableError
+from evermap.maps.store.sql import SqlStore
+from evermap.runs import map_dicts
+from evermap.runs.sessions import WORDS, edit_landmarks
+from evermap.runs.summary import change_dict
+from evermap.server.database import Database, Job, JobState, Role
+from evermap.server.sites import NoSuchSiteError, SiteStores
+from evermap.server.uploads import UploadLimits, checked_digest
+from evermap.types import json_number
+
+_EVERY_S = 1.0
+"""Between two looks for new revisions."""
+_ALIVE_S = 15.0
+"""Between two lines that keep a connection open."""
+_RATE_HZ, _BURST = 50.0, 200.0
+"""Requests of one token, over time and at once."""
+_POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'"
+_PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
+
+
+@dataclass(slots=True)
+class Server:
+    """What requests are answered from.
+
+    Attributes:
+        database: tokens and the queue.
+        sites: the maps.
+        limits: of uploads.
+        rate_hz: requests of one token over time.
+    """
+
+    database: Database
+    sites: SiteStores
+    limits: UploadLimits = field(default_factory=UploadLimits)
+    rate_hz: float = _RATE_HZ
+    _budget: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+    def admits(self, who: str) -> bool:
+        """Count a request; returns whether it is within the rate (a token bucket)."""
+        now = time.monotonic()
+        left, since = self._budget.get(who, (_BURST, now))
+        left = min(_BURST, left + (now - since) * self.rate_hz)
+        self._budget[who] = (max(left - 1.0, 0.0), now)
+        return left >= 1.0
+
+
+def create_app(server: Server) -> FastAPI:
+    """Return the application."""
+    app = FastAPI(title="evermap", version=__version__, docs_url=None, redoc_url=None)
+    app.state.server = server
+    app.include_router(router)
+    app.middleware("http")(_guard)
+    app.exception_handler(EvermapError)(_mistake)
+    app.exception_handler(OperationalError)(_outage)
+    return app
+
+
+async def _guard(request: Request, answer: Callable[[Request], Awaitable[Response]]) -> Response:
+    """Note who changed what, and tell browsers what a page may do."""
+    response = await answer(request)
+    response.headers["Content-Security-Policy"] = _POLICY
+    response.headers["X-Content-Type-Options"] = "nosniff"
+    response.headers["Cache-Control"] = "no-cache"
+    if request.method != "GET":
+        who = getattr(request.state, "who", "-")
+        what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
+        await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
+    return response
+
+
+async def _mistake(request: Request, error: Exception) -> Response:
+    """One line, without the places of files on this machine."""
+    assert isinstance(error, EvermapError)
+    status = 404 if isinstance(error, NoSuchSiteError) or request.method == "GET" else 422
+    if isinstance(error, StaleRevisionError):
+        status = 409
+    if isinstance(error, DamagedMapError):
+        status = 500
+    if isinstance(error, StoreUnavailableError):
+        return await _outage(request, error)
+    what = f"{error.field}: {error.problem}" if error.field else error.problem
+    return JSONResponse({"detail": printable(what, 400)}, status)
+
+
+async def _outage(_: Request, __: Exception) -> Response:
+    return JSONResponse({"detail": "the database does not answer"}, 503, {"Retry-After": "5"})
+
+
+def _server(request: Request) -> Server:
+    server = request.app.state.server
+    assert isinstance(server, Server)
+    return server
+
+
+def _may(role: Role) -> Any:
+    """A dependency: the token's name, if it has this role."""
+
+    def check(request: Request, authorization: Annotated[str, Header()] = "") -> str:
+        server = _server(request)
+        scheme, _, text = authorization.partition(" ")
+        known = server.database.who(text.strip()) if scheme.lower() == "bearer" else None
+        if known is None:
+            raise HTTPException(401, "a token is needed", {"WWW-Authenticate": "Bearer"})
+        name, has = known
+        request.state.who = name
+        if not server.admits(name):
+            raise HTTPException(429, "too many requests", {"Retry-After": "1"})
+        if has < role:
+            raise HTTPException(403, f"this needs the role {role.name.lower()}, the token has {has.name.lower()}")
+        return name
+
+    return Depends(check)
+
+
+Answering = Annotated[Server, Depends(_server)]
+Reader = Annotated[str, _may(Role.READ)]
+Uploader = Annotated[str, _may(Role.UPLOAD)]
+Approver = Annotated[str, _may(Role.APPROVE)]
+Administrator = Annotated[str, _may(Role.ADMIN)]
+AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
+Number = Annotated[float | None, Query(allow_inf_nan=False)]
+router = APIRouter()
+
+
+class Said(BaseModel):
+    """An operator's word on landmarks, ids or names."""
+
+    landmarks: list[Annotated[str, Field(min_length=1, max_length=200)]] = Field(min_length=1, max_length=1000)
+    note: str = Field("", max_length=500)
+
+
+class Chosen(BaseModel):
+    """A revision that an operator chose."""
+
+    revision: int = Field(ge=0, le=2**31 - 1)
+    note: str = Field("", max_length=500)
+
+
+@router.get("/healthz")
+def health(server: Answering) -> dict[str, Any]:
+    """Tell that the server and its database answer; needs no token."""
+    return {"evermap": __version__, "waiting": server.database.depth()}
+
+
+@router.get("/", include_in_schema=False)
+@router.get("/page.js", include_in_schema=False)
+@router.get("/page.css", include_in_schema=False)
+def page(request: Request) -> Response:
+    """Serve the page, which asks for a token and shows the maps."""
+    name = request.url.path.strip("/")
+    text = resources.files("evermap.server").joinpath(name or "page.html").read_text(encoding="utf-8")
+    return HTMLResponse(text, media_type=_PAGE[name])
+
+
+@router.get("/maps")
+def list_maps(server: Answering, _: Reader) -> list[dict[str, Any]]:
+    """List the sites, with the newest revision and the approved one."""
+    told = []
+    for site in server.sites.names():
+        with server.sites.store(site) as store:
+            told.append({"site": site, "head": store.head(), "approved": server.database.approved(site)})
+    return told
+
+
+@router.post("/maps/{site}/sessions", status_code=202)
+async def upload(request: Request, response: Response, site: str, server: Answering, who: Uploader) -> dict[str, Any]:
+    """Queue a session: the body is a zip of a native folder. Sent twice, it is entered once."""
+    server.sites.address(site)
+    most, body = server.limits.n_bytes, bytearray()
+    async for part in request.stream():
+        body += part
+        if len(body) > most:
+            raise HTTPException(413, f"more than {most} bytes")
+    data = bytes(body)
+    digest = await run_in_threadpool(checked_digest, data, server.limits)
+    job, fresh = await run_in_threadpool(server.database.enqueue, site, digest, data, who)
+    response.status_code = 202 if fresh else 200
+    return asdict(job)
+
+
+@router.get("/jobs")
+def list_jobs(
+    server: Answering, _: Reader, site: str | None = None, state: JobState | None = None,
+    most: Annotated[int, Query(ge=1, le=1000)] = 100,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """List uploaded sessions, the newest first."""
+    return [asdict(job) for job in server.database.jobs(site, state, most)]
+
+
+@router.get("/jobs/{number}")
+def show_job(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Reader) -> dict[str, Any]:
+    """Tell what became of an uploaded session."""
+    return asdict(_job(server, number))
+
+
+@router.get("/jobs/{number}/payload")
+def show_payload(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> Response:
+    """Return the zip of a session that waits or was refused."""
+    data = server.database.payload(_job(server, number).id)
+    if data is None:
+        raise HTTPException(404, "its recording is in the map")
+    return Response(data, media_type="application/zip")
+
+
+@router.post("/jobs/{number}/retry")
+def retry(number: Annotated[int, Field(ge=0, le=2**31 - 1)], server: Answering, _: Approver) -> dict[str, Any]:
+    """Queue a refused session once more."""
+    if not server.database.retry(_job(server, number).id):
+        raise HTTPException(409, "only a refused session can be queued again")
+    return asdict(_job(server, number))
+
+
+def _job(server: Server, number: int) -> Job:
+    job = server.database.job(number)
+    if job is None:
+        raise HTTPException(404, "there is no such session")
+    return job
+
+
+@router.get("/maps/{site}/revisions")
+def list_revisions(site: str, server: Answering, _: Reader) -> list[dict[str, Any]]:
+    """List the revisions, the oldest first."""
+    with server.sites.store(site) as store:
+        return [map_dicts.revision_dict(item) for item in store.log()]
+
+
+@router.get("/maps/{site}/diff")
+def diff(site: str, server: Answering, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> dict[str, Any]:
+    """Tell what changed between two revisions."""
+    from evermap.maps.diff import diff as between
+
+    with server.sites.store(site) as store:
+        return map_dicts.diff_dict(between(store, a or 0, b))
+
+
+@router.get("/maps/{site}/changes")
+def changes(site: str, server: Answering, _: Reader, since: AtRevision = 0) -> list[dict[str, Any]]:
+    """List the changes that revisions after `since` told, one by one."""
+    with server.sites.store(site) as store:
+        numbers = [number for number in store.lineage() if number > (since or 0)]
+        return [{"revision": number, **change_dict(change)} for number in numbers for change in store.changes(number)]
+
+
+class LandmarkQuery(BaseModel):
+    """Which landmarks: of a revision, within a region, at least as probable; and when one wants to know of them."""
+
+    revision: int | None = Field(None, ge=0, le=2**31 - 1)
+    at_s: float | None = Field(None, allow_inf_nan=False)
+    p_least: float = Field(0.0, ge=0.0, le=1.0)
+    x_min: float = Field(-np.inf)
+    x_max: float = Field(np.inf)
+    y_min: float = Field(-np.inf)
+    y_max: float = Field(np.inf)
+
+    def holds(self, item: dict[str, Any]) -> bool:
+        """Return whether a landmark is among them; one without a place is in the whole plane only."""
+        x, y = (-np.inf if item[axis] is None else item[axis] for axis in ("x_m", "y_m"))
+        inside = self.x_min <= x <= self.x_max and self.y_min <= y <= self.y_max
+        return bool(inside and item["p_exists"] >= self.p_least)
+
+
+@router.get("/maps/{site}/landmarks")
+def landmarks(site: str, server: Answering, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> dict[str, Any]:
+    """List landmarks within a region; `p_ahead` is the probability that each is there at `at_s`."""
+    with server.sites.store(site) as store:
+        number = store.head() if asked.revision is None else asked.revision
+        living = store.load(number)
+    found = map_dicts.landmark_dicts(living, living.p_exists(living.stamp_s if asked.at_s is None else asked.at_s))
+    return {
+        "site": site,
+        "revision": number,
+        "stamp_s": json_number(living.stamp_s),
+        "clock": living.clock.value,
+        "landmarks": [item for item in found if asked.holds(item)],
+    }
+
+
+@router.get("/maps/{site}/landmarks/{landmark}/why")
+def why(site: str, landmark: str, server: Answering, _: Reader, revision: AtRevision = None) -> dict[str, Any]:
+    """Tell why a landmark is believed to be there, or gone."""
+    from evermap.maps.why import why as of_landmark
+
+    with server.sites.store(site) as store:
+        return map_dicts.answer_dict(of_landmark(store, landmark, revision))
+
+
+@router.get("/maps/{site}/lifetimes")
+def lifetimes(site: str, server: Answering, _: Reader, revision: AtRevision = None) -> dict[str, Any]:
+    """Tell how long things stay, by class and place."""
+    with server.sites.store(site) as store:
+        living = store.load(revision)
+    return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
+
+
+@router.get("/maps/{site}/file")
+def map_file(
+    site: str, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
+    if_none_match: Annotated[str, Header()] = "",
+) -> Response:  # fmt: skip
+    """Return the map as one file, of a revision, of the approved one, or of the newest."""
+    if approved:
+        chosen = server.database.approved(site)
+        if chosen is None:
+            raise HTTPException(404, "no revision of it is approved")
+        revision = chosen["revision"]
+    found = server.sites.file(site, revision)
+    told = {"ETag": f'"{found.tag}"', "X-Checksum-Sha256": found.sha256}
+    if f'"{found.tag}"' in if_none_match:
+        return Response(status_code=304, headers=told)
+    told["Content-Disposition"] = f'attachment; filename="{site}.evermap"'
+    return Response(found.data, media_type="application/vnd.sqlite3", headers=told)
+
+
+@router.post("/maps/{site}/approve")
+def approve(request: Request, site: str, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
+    """Approve a revision for the robots of this site."""
+    with server.sites.store(site) as store:
+        if not 1 <= chosen.revision <= store.head():
+            raise HTTPException(422, "there is no such revision")
+    request.state.said = f"revision {chosen.revision}: {chosen.note}"
+    server.database.approve(site, chosen.revision, who)
+    return {"site": site, "approved": server.database.approved(site)}
+
+
+@router.post("/maps/{site}/revert")
+def revert(request: Request, site: str, chosen: Chosen, server: Answering, who: Approver) -> dict[str, Any]:
+    """Go back to an older revision, by a new one."""
+    request.state.said = f"to revision {chosen.revision}"
+    with server.sites.store(site) as store:
+        number = store.revert(chosen.revision, Provenance(command=f"evermap serve ({who})", note=chosen.note))
+    return {"site": site, "revision": number, "restores": chosen.revision}
+
+
+def _word(action: str, word: str) -> None:
+    """The answer to an operator who says this of landmarks."""
+
+    def say(request: Request, site: str, said: Said, server: Answering, who: Approver) -> dict[str, Any]:
+        request.state.said = ", ".join(said.landmarks)
+        with server.sites.store(site) as store:
+            number, changed, told = edit_landmarks(
+                store, said.landmarks, word, note=said.note, command=f"evermap serve ({who})"
+            )
+        return {"site": site, "revision": number, word: changed, "note": told}
+
+    router.add_api_route(f"/maps/{{site}}/{action}", say, methods=["POST"], summary=f"Make landmarks {word}")
+
+
+for _action, _said in zip(("pin", "unpin", "delete", "undelete"), WORDS, strict=True):
+    _word(_action, _said)
+
+
+@router.get("/audit")
+def audit(
+    server: Answering, _: Administrator, most: Annotated[int, Query(ge=1, le=1000)] = 100
+) -> list[dict[str, Any]]:
+    """List who asked for changes, the newest first."""
+    return server.database.audit(most)
+
+
+@router.get("/maps/{site}/events")
+async def events(
+    request: Request, site: str, server: Answering, _: Reader, since: AtRevision = None,
+    last_event_id: Annotated[str, Header()] = "",
+) -> StreamingResponse:  # fmt: skip
+    """Send an event for every new revision (Server-Sent Events); `Last-Event-ID` or `since` says from where."""
+    told = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 10 else since
+    head = await run_in_threadpool(_head, server, site)
+    told = head if told is None else min(told, head)
+    return StreamingResponse(_news(request, server, site, told), media_type="text/event-stream")
+
+
+async def _news(request: Request, server: Server, site: str, told: int) -> AsyncIterator[str]:
+    alive = time.monotonic()
+    yield ": following\n\n"
+    while not await request.is_disconnected():
+        for number, text in await run_in_threadpool(_since, server, site, told):
+            yield f"id: {number}\nevent: revision\ndata: {text}\n\n"
+            told = number
+        if time.monotonic() - alive > _ALIVE_S:
+            alive = time.monotonic()
+            yield ": alive\n\n"
+        await asyncio.sleep(_EVERY_S)
+
+
+def _head(server: Server, site: str) -> int:
+    with server.sites.store(site) as store:
+        return store.head()
+
+
+def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
+    """Revisions after one, as events; none while the database does not answer."""
+    try:
+        with server.sites.store(site) as store:
+            return _lines(store, told) if store.head() > told else []
+    except (InputError, OperationalError):
+        return []
+
+
+def _lines(store: SqlStore, told: int) -> list[tuple[int, str]]:
+    return [(item.number, json.dumps(map_dicts.revision_dict(item))) for item in store.log() if item.number > told]

@@ -1,0 +1,374 @@
+"""What a server keeps beside its maps: tokens, the queue of uploaded sessions, approvals, and who did what.
+
+In SQLite it is one file, `server.db` in the folder of the maps; in PostgreSQL a schema `evermap_server` in their
+database. A job is never lost: a worker leases it for a while and renews the lease as long as it lives; what a killed
+worker had goes back to the queue when its lease ends. A refused session stays, with the reason and its bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import IntEnum, StrEnum
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import (
+    Column,
+    Connection,
+    Float,
+    Integer,
+    LargeBinary,
+    MetaData,
+    Row,
+    Table,
+    Text,
+    UniqueConstraint,
+    and_,
+    delete,
+    exists,
+    func,
+    insert,
+    inspect,
+    not_,
+    or_,
+    select,
+    update,
+)
+from sqlalchemy.exc import IntegrityError
+from sqlalchemy.schema import CreateSchema
+
+from evermap.errors import ConfigError, InputError, printable
+from evermap.maps.store import is_address
+from evermap.maps.store.postgres import engine_of as postgres_engine
+from evermap.maps.store.sql import now_utc
+from evermap.maps.store.sqlite import engine_of as sqlite_engine
+
+VERSION = 1
+"""Of the tables; there is no older one to bring up to date."""
+SCHEMA = "evermap_server"
+MOST_TRIES = 3
+"""Workers that may die of a session before it is refused."""
+
+metadata = MetaData()
+_server = Table("server", metadata, Column("version", Integer, nullable=False))
+_token = Table(
+    "token",
+    metadata,
+    Column("digest", LargeBinary, primary_key=True),
+    Column("name", Text, nullable=False, unique=True),
+    Column("role", Text, nullable=False),
+    Column("created_at", Text, nullable=False),
+)
+_job = Table(
+    "job",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("site", Text, nullable=False),
+    Column("digest", Text, nullable=False),
+    Column("n_bytes", Integer, nullable=False),
+    Column("robot", Text, nullable=False),
+    Column("state", Text, nullable=False, index=True),
+    Column("reason", Text, nullable=False, default=""),
+    Column("revision", Integer),
+    Column("tries", Integer, nullable=False, default=0),
+    Column("worker", Text, nullable=False, default=""),
+    Column("lease_s", Float, nullable=False, default=0.0),
+    Column("created_at", Text, nullable=False),
+    Column("changed_at", Text, nullable=False),
+    UniqueConstraint("site", "digest"),
+)
+_payload = Table(
+    "payload", metadata, Column("job", Integer, primary_key=True), Column("data", LargeBinary, nullable=False)
+)
+_approval = Table(
+    "approval",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("site", Text, nullable=False),
+    Column("revision", Integer, nullable=False),
+    Column("who", Text, nullable=False),
+    Column("at", Text, nullable=False),
+)
+_audit = Table(
+    "audit",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("at", Text, nullable=False),
+    Column("who", Text, nullable=False),
+    Column("what", Text, nullable=False),
+    Column("status", Integer, nullable=False),
+)
+
+
+class Role(IntEnum):
+    """What a token may do; each role may do what those before it may."""
+
+    READ = 1
+    UPLOAD = 2
+    APPROVE = 3
+    ADMIN = 4
+
+
+class JobState(StrEnum):
+    """Where an uploaded session is."""
+
+    QUEUED = "queued"
+    WORKING = "working"
+    ENTERED = "entered"
+    REJECTED = "rejected"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """An uploaded session.
+
+    Attributes:
+        id: its number.
+        site: the map that it is for.
+        digest: SHA-256 of what is in it, by which a second upload is known.
+        n_bytes: of the upload.
+        robot: name of the token that sent it.
+        state: where it is.
+        reason: why it was refused, or a remark.
+        revision: that it became; None before.
+        tries: workers that have begun it.
+        created_at, changed_at: ISO 8601, UTC.
+    """
+
+    id: int
+    site: str
+    digest: str
+    n_bytes: int
+    robot: str
+    state: JobState
+    reason: str
+    revision: int | None
+    tries: int
+    created_at: str
+    changed_at: str
+
+
+_SHOWN = [_job.c[name] for name in Job.__slots__]
+
+
+class Database:
+    """The tables of a server, made where there are none.
+
+    Args:
+        where: folder of the maps, or address of a database without a site, `postgresql://user@host/fleet`.
+
+    Raises:
+        ConfigError: the address is not valid.
+        InputError: the tables are of another evermap.
+    """
+
+    def __init__(self, where: str | Path) -> None:
+        if is_address(where):
+            self._engine = postgres_engine(str(where), SCHEMA)
+        else:
+            folder = Path(where)
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(f"no folder for maps: {error.strerror}", path=folder, field="store") from None
+            self._engine = sqlite_engine(folder / "server.db", writable=True)
+        on_server = self._engine.dialect.name == "postgresql"
+        with self._engine.execution_options(writes=True).begin() as connection:
+            if on_server:
+                connection.execute(CreateSchema(SCHEMA, if_not_exists=True))
+            if "server" not in inspect(connection).get_table_names():
+                metadata.create_all(connection)
+                connection.execute(insert(_server).values(version=VERSION))
+            version = connection.execute(select(_server.c.version)).scalar()
+        if version != VERSION:
+            problem = f"the server's tables are of version {version}, this evermap has {VERSION}"
+            raise InputError(problem, hint="the evermap that wrote them, or an empty store")
+        # SQLite has one writer at a time; PostgreSQL locks the rows that are written
+        self._writer = self._engine.execution_options(writes=not on_server, shared=True)
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        with self._writer.begin() as connection:
+            yield connection
+
+    def add_token(self, name: str, role: Role) -> str:
+        """Return a new token; only its digest is kept.
+
+        Raises:
+            ConfigError: there is one of that name.
+        """
+        text = f"evermap_{secrets.token_urlsafe(32)}"
+        row = {"digest": _digest(text), "name": name, "role": role.name.lower(), "created_at": now_utc()}
+        try:
+            with self._writing() as connection:
+                connection.execute(insert(_token).values(row))
+        except IntegrityError:
+            hint = "another name, or revoke that one first"
+            raise ConfigError(f"there is a token of the name '{name}'", field="name", hint=hint) from None
+        return text
+
+    def revoke_token(self, name: str) -> bool:
+        """Delete a token; returns whether there was one."""
+        with self._writing() as connection:
+            return connection.execute(delete(_token).where(_token.c.name == name)).rowcount > 0
+
+    def tokens(self) -> list[dict[str, Any]]:
+        """Return names and roles of all tokens."""
+        question = select(_token.c.name, _token.c.role, _token.c.created_at).order_by(_token.c.name)
+        with self._reading() as connection:
+            return [dict(row) for row in connection.execute(question).mappings()]
+
+    def who(self, text: str) -> tuple[str, Role] | None:
+        """Return the name and role of a token; None of one that is not known."""
+        with self._reading() as connection:
+            row = connection.execute(
+                select(_token.c.name, _token.c.role).where(_token.c.digest == _digest(text))
+            ).one_or_none()
+        return None if row is None else (row.name, Role[row.role.upper()])
+
+    def enqueue(self, site: str, digest: str, data: bytes, robot: str) -> tuple[Job, bool]:
+        """Queue a session; returns its job, and whether it is a new one."""
+        now = now_utc()
+        told = {"site": site, "digest": digest, "n_bytes": len(data), "robot": robot, "state": JobState.QUEUED.value}
+        try:
+            with self._writing() as connection:
+                known = self._known(connection, site, digest)
+                if known is not None:
+                    return known, False
+                row = insert(_job).values(**told, created_at=now, changed_at=now).returning(*_SHOWN)
+                job = _job_of(connection.execute(row).one())
+                connection.execute(insert(_payload).values(job=job.id, data=data))
+                return job, True
+        except IntegrityError:  # sent twice at the same time
+            with self._reading() as connection:
+                known = self._known(connection, site, digest)
+            assert known is not None
+            return known, False
+
+    def _known(self, connection: Connection, site: str, digest: str) -> Job | None:
+        row = connection.execute(select(*_SHOWN).where(_job.c.site == site, _job.c.digest == digest)).one_or_none()
+        return None if row is None else _job_of(row)
+
+    def claim(self, worker: str, lease_s: float) -> tuple[Job, bytes] | None:
+        """Lease the oldest waiting session of a site on which nobody works; None where there is none."""
+        now, other = time.time(), _job.alias()
+        busy = exists().where(
+            other.c.site == _job.c.site, other.c.state == JobState.WORKING.value, other.c.lease_s >= now
+        )
+        lapsed = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
+        waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed)
+        oldest = select(*_SHOWN).where(waiting, not_(busy)).order_by(_job.c.id).limit(1)
+        with self._writing() as connection:
+            row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
+            if row is None:
+                return None
+            values = {"state": JobState.WORKING.value, "worker": worker, "lease_s": now + lease_s}
+            values |= {"tries": row.tries + 1, "changed_at": now_utc()}
+            connection.execute(update(_job).where(_job.c.id == row.id).values(values))
+            data = connection.execute(select(_payload.c.data).where(_payload.c.job == row.id)).scalar_one()
+        return _job_of(row), data
+
+    def renew(self, job: int, worker: str, lease_s: float) -> None:
+        """Keep a session for another while."""
+        with self._writing() as connection:
+            connection.execute(update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
+
+    def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
+        """Say what became of a session; nothing happens where its lease is somebody else's by now."""
+        values: dict[str, Any] = {
+            "state": state.value,
+            "reason": printable(reason, 2000),
+            "revision": revision,
+            "worker": "",
+        }
+        if state is JobState.QUEUED:  # given back: that was no try
+            values["tries"] = _job.c.tries - 1
+        with self._writing() as connection:
+            mine = update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
+            if connection.execute(mine).rowcount and state is JobState.ENTERED:  # the map keeps the recording
+                connection.execute(delete(_payload).where(_payload.c.job == job))
+
+    def retry(self, job: int) -> bool:
+        """Queue a refused session once more; returns whether it was one."""
+        refused = and_(_job.c.id == job, _job.c.state == JobState.REJECTED.value)
+        values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
+        with self._writing() as connection:
+            return connection.execute(update(_job).where(refused).values(values)).rowcount > 0
+
+    def jobs(self, site: str | None = None, state: JobState | None = None, most: int = 100) -> list[Job]:
+        """Return the newest sessions that were uploaded."""
+        question = select(*_SHOWN).order_by(_job.c.id.desc()).limit(most)
+        question = question if site is None else question.where(_job.c.site == site)
+        question = question if state is None else question.where(_job.c.state == state.value)
+        with self._reading() as connection:
+            return [_job_of(row) for row in connection.execute(question)]
+
+    def job(self, number: int) -> Job | None:
+        """Return one session that was uploaded; None of an unknown number."""
+        with self._reading() as connection:
+            row = connection.execute(select(*_SHOWN).where(_job.c.id == number)).one_or_none()
+        return None if row is None else _job_of(row)
+
+    def payload(self, job: int) -> bytes | None:
+        """Return the bytes of a session that is not entered; None where they are not kept."""
+        with self._reading() as connection:
+            return connection.execute(select(_payload.c.data).where(_payload.c.job == job)).scalar()
+
+    def approve(self, site: str, revision: int, who: str) -> None:
+        """Make a revision the one that robots are to use."""
+        with self._writing() as connection:
+            connection.execute(insert(_approval).values(site=site, revision=revision, who=who, at=now_utc()))
+
+    def approved(self, site: str) -> dict[str, Any] | None:
+        """Return the revision that was approved last, by whom and when; None where none was."""
+        question = select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
+        with self._reading() as connection:
+            row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
+        return None if row is None else dict(row)
+
+    def note(self, who: str, what: str, status: int) -> None:
+        """Note who asked for a change, and what came of it."""
+        with self._writing() as connection:
+            row = {"at": now_utc(), "who": who, "what": printable(what, 500), "status": status}
+            connection.execute(insert(_audit).values(row))
+
+    def audit(self, most: int = 100) -> list[dict[str, Any]]:
+        """Return the newest notes."""
+        question = select(_audit.c.at, _audit.c.who, _audit.c.what, _audit.c.status)
+        with self._reading() as connection:
+            rows = connection.execute(question.order_by(_audit.c.id.desc()).limit(most)).mappings()
+            return [dict(row) for row in rows]
+
+    def depth(self) -> int:
+        """Return how many sessions wait or are worked on; proves that the database answers."""
+        waiting = _job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value])
+        with self._reading() as connection:
+            return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
+
+    def close(self) -> None:
+        """Let go of all connections."""
+        self._engine.dispose()
+
+
+def _mine(job: int, worker: str) -> Any:
+    return and_(_job.c.id == job, _job.c.worker == worker, _job.c.state == JobState.WORKING.value)
+
+
+def _job_of(row: Row[Any]) -> Job:
+    values = dict(row._mapping)
+    return Job(**{**values, "state": JobState(values["state"])})
+
+
+def _digest(token: str) -> bytes:
+    """A token is 256 random bits: no salt and no slow hash makes it harder to guess."""
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).digest()

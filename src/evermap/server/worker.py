@@ -1,0 +1,138 @@
+"""Workers, who enter the sessions that wait by the same code as `evermap slam --map`."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from sqlalchemy.exc import OperationalError
+
+from evermap.config import Config
+from evermap.errors import EvermapError
+from evermap.maps.store import StaleRevisionError, StoreUnavailableError
+from evermap.runs.sessions import TwiceError, enter_session
+from evermap.server.database import MOST_TRIES, Database, Job, JobState
+from evermap.server.sites import SiteStores
+from evermap.server.uploads import recording_of
+
+LEASE_S = 60.0
+_PAUSE_S = 0.5
+_OUTAGE_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class JobOutcome:
+    """What became of a session.
+
+    Attributes:
+        state: entered, rejected, or queued where the store did not answer.
+        reason: why, or a remark.
+        revision: that it is.
+    """
+
+    state: JobState
+    reason: str = ""
+    revision: int | None = None
+
+
+class Worker:
+    """Takes sessions from the queue, one after the other.
+
+    Args:
+        database: with the queue.
+        sites: the maps.
+        config: settings of the sessions.
+        lease_s: time after which a session of a worker that was killed is taken by another.
+    """
+
+    def __init__(self, database: Database, sites: SiteStores, config: Config, lease_s: float = LEASE_S) -> None:
+        self._database, self._sites, self._config, self._lease_s = database, sites, config, lease_s
+        self.name = f"{socket.gethostname()}-{os.getpid()}-{secrets.token_hex(3)}"
+
+    def run(self, told: Callable[[Job, JobOutcome], None], *, drain: bool = False) -> None:
+        """Work until the process ends.
+
+        Args:
+            told: called after every session.
+            drain: end as soon as nothing waits.
+        """
+        while True:
+            try:
+                job = self.step(told)
+                if job is None and drain and not self._database.depth():
+                    return
+            except (OperationalError, StoreUnavailableError):  # a database that restarts
+                time.sleep(_OUTAGE_S)
+                continue
+            if job is None:
+                time.sleep(_PAUSE_S)
+
+    def step(self, told: Callable[[Job, JobOutcome], None] = lambda *_: None) -> Job | None:
+        """Work on one session; returns None where none waits."""
+        claimed = self._database.claim(self.name, self._lease_s)
+        if claimed is None:
+            return None
+        job, data = claimed
+        with self._leased(job):
+            if job.tries >= MOST_TRIES:
+                outcome = JobOutcome(JobState.REJECTED, f"{job.tries} workers died of it")
+            else:
+                outcome = self._enter(job, data)
+        self._database.finish(job.id, self.name, outcome.state, outcome.reason, outcome.revision)
+        told(job, outcome)
+        if outcome.state is JobState.QUEUED:
+            time.sleep(_OUTAGE_S)
+        return job
+
+    def _enter(self, job: Job, data: bytes) -> JobOutcome:
+        try:
+            recording = recording_of(data, job.digest)
+            while True:
+                start = time.perf_counter()
+                try:
+                    with self._sites.store(job.site, create=True) as store:
+                        entered = enter_session(store, recording, self._config)
+                        if not entered.session.found:
+                            return JobOutcome(
+                                JobState.REJECTED, f"not found in this map: {entered.session.set_aside[0]}"
+                            )
+                        command = f"evermap work ({job.robot})"
+                        took_s = time.perf_counter() - start
+                        number = entered.commit(store, self._config, command=command, wall_s=took_s)
+                        return JobOutcome(JobState.ENTERED, ", ".join(entered.session.slam.warnings[:3]), number)
+                except StaleRevisionError:  # somebody committed meanwhile: again, from the newest
+                    continue
+        except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
+            return JobOutcome(JobState.ENTERED, error.problem, error.revision)
+        except StoreUnavailableError as error:
+            return JobOutcome(JobState.QUEUED, error.problem)
+        except EvermapError as error:
+            return JobOutcome(JobState.REJECTED, error.one_line())
+        except Exception as error:  # a defect of ours must not stop those who wait behind it
+            return JobOutcome(JobState.REJECTED, f"a defect of evermap: {type(error).__name__}: {error}")
+
+    @contextmanager
+    def _leased(self, job: Job) -> Iterator[None]:
+        """Renew the lease as long as the block runs."""
+        done = threading.Event()
+
+        def renew() -> None:
+            while not done.wait(self._lease_s / 3.0):
+                try:
+                    self._database.renew(job.id, self.name, self._lease_s)
+                except OperationalError:  # it may be back the next time
+                    continue
+
+        thread = threading.Thread(target=renew, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

@@ -1,0 +1,477 @@
+"""Sessions by HTTP: who may, what is refused, and that nothing is lost or entered twice."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+import re
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("fastapi", reason="a server needs evermap[server]")
+pytest.importorskip("httpx", reason="needs httpx: pip install 'evermap[dev]'")
+
+import httpx
+import uvicorn
+from fastapi.testclient import TestClient
+
+from evermap.config import Config
+from evermap.errors import ConfigError, InputError
+from evermap.io import write_native
+from evermap.maps.living import LivingMap
+from evermap.maps.store import open_store, verify_store
+from evermap.runs.sessions import enter_session
+from evermap.server.app import Server, create_app
+from evermap.server.database import MOST_TRIES, Database, JobState, Role
+from evermap.server.sites import SiteStores
+from evermap.server.uploads import UploadLimits, checked_digest, recording_of
+from evermap.server.worker import Worker
+from evermap_studies.sim import BuildingConfig, simulate_building
+
+COUNT = 6
+
+
+def zipped(files: Mapping[str, bytes], **how: Any) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", **{"compression": zipfile.ZIP_DEFLATED, **how}) as archive:
+        for name, data in files.items():
+            archive.writestr(name, data)
+    return buffer.getvalue()
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Sessions of one building, in order of time."""
+    folder = tmp_path_factory.mktemp("sessions")
+    sessions = simulate_building(BuildingConfig(days=COUNT, patrol_s=35.0), 3).sessions
+    for number, recording in enumerate(sessions):
+        write_native(recording, folder / f"day{number}")
+    return [folder / f"day{number}" for number in range(COUNT)]
+
+
+@pytest.fixture(scope="module")
+def zips(folders: list[Path]) -> list[bytes]:
+    return [
+        zipped({f"{folder.name}/{path.name}": path.read_bytes() for path in sorted(folder.iterdir())})
+        for folder in folders
+    ]
+
+
+@dataclass
+class Fleet:
+    """A server with a token for every role."""
+
+    where: str
+    server: Server
+    client: TestClient
+    tokens: dict[str, str]
+
+    def __call__(self, method: str, path: str, role: str = "admin", **what: Any) -> httpx.Response:
+        return self.client.request(method, path, headers={"Authorization": f"Bearer {self.tokens[role]}"}, **what)
+
+    def upload(self, data: bytes, site: str = "ward", role: str = "upload") -> httpx.Response:
+        return self("POST", f"/maps/{site}/sessions", role, content=data)
+
+    def worker(self, lease_s: float = 60.0) -> Worker:
+        return Worker(self.server.database, self.server.sites, Config(), lease_s)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def where(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    if request.param == "sqlite":
+        return str(tmp_path / "maps")
+    address: str = request.getfixturevalue("postgres")
+    import psycopg
+
+    name = f"fleet_{secrets.token_hex(4)}"
+    with psycopg.connect(address, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}".encode())
+    return address.replace("/postgres?", f"/{name}?")
+
+
+@pytest.fixture
+def fleet(where: str) -> Iterator[Fleet]:
+    database = Database(where)
+    server = Server(database, SiteStores(where))
+    tokens = {role.name.lower(): database.add_token(role.name.lower(), role) for role in Role}
+    with TestClient(create_app(server)) as client:
+        yield Fleet(where, server, client, tokens)
+    database.close()
+
+
+def assert_same(a: LivingMap, b: LivingMap) -> None:
+    one, other = a.landmarks(), b.landmarks()
+    np.testing.assert_array_equal(one.landmark_id, other.landmark_id)
+    for name in ("position_m", "covariance_m2", "p_exists", "n_hits", "n_misses", "last_seen_s"):
+        np.testing.assert_allclose(getattr(one, name), getattr(other, name), rtol=0.0, atol=1e-12, err_msg=name)
+
+
+def test_nobody_is_answered_without_a_token(fleet: Fleet) -> None:
+    assert fleet.client.get("/healthz").json()["waiting"] == 0
+    assert "Content-Security-Policy" in fleet.client.get("/healthz").headers
+    asked = 0
+    for path, methods in fleet.client.get("/openapi.json").json()["paths"].items():
+        for method in methods:
+            if path != "/healthz":
+                filled = path.replace("{site}", "ward").replace("{number}", "1").replace("{landmark}", "1")
+                for headers in (
+                    {},
+                    {"Authorization": "Bearer nobody"},
+                    {"Authorization": f"Basic {fleet.tokens['admin']}"},
+                ):
+                    assert fleet.client.request(method.upper(), filled, headers=headers).status_code == 401, path
+                    asked += 1
+    assert asked > 50
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "least"),
+    [
+        ("GET", "/maps", Role.READ),
+        ("GET", "/jobs", Role.READ),
+        ("POST", "/maps/ward/sessions", Role.UPLOAD),
+        ("POST", "/maps/ward/approve", Role.APPROVE),
+        ("POST", "/maps/ward/delete", Role.APPROVE),
+        ("POST", "/jobs/1/retry", Role.APPROVE),
+        ("GET", "/jobs/1/payload", Role.APPROVE),
+        ("GET", "/audit", Role.ADMIN),
+    ],
+)
+def test_a_role_may_what_those_below_it_may(fleet: Fleet, method: str, path: str, least: Role) -> None:
+    for role in Role:
+        assert (fleet(method, path, role.name.lower()).status_code == 403) == (role < least), role
+
+
+def test_tokens_are_kept_as_digests_and_can_be_revoked(fleet: Fleet) -> None:
+    database = fleet.server.database
+    with pytest.raises(ConfigError, match="there is a token"):
+        database.add_token("read", Role.ADMIN)
+    assert database.revoke_token("read")
+    assert not database.revoke_token("read")
+    assert fleet("GET", "/maps", "read").status_code == 401
+    if not fleet.where.startswith("postgresql"):
+        kept = (Path(fleet.where) / "server.db").read_bytes()
+        assert not any(token.encode() in kept for token in fleet.tokens.values())
+
+
+def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[bytes], tmp_path: Path) -> None:
+    answer = fleet.upload(zips[0])
+    assert answer.status_code == 202
+    job = answer.json()
+    assert (job["state"], job["robot"], job["site"]) == ("queued", "upload", "ward")
+    again = fleet.upload(zips[0])
+    assert (again.status_code, again.json()["id"]) == (200, job["id"])
+    fleet.upload(zips[2])
+    worker = fleet.worker()
+    while worker.step():
+        pass
+    assert fleet("GET", f"/jobs/{job['id']}").json()["state"] == "entered"
+    assert fleet("GET", f"/jobs/{job['id']}").json()["revision"] == 1
+    assert fleet("GET", f"/jobs/{job['id']}/payload").status_code == 404
+    assert fleet.upload(zips[0]).json()["state"] == "entered"
+    assert fleet("GET", "/maps").json() == [{"site": "ward", "head": 2, "approved": None}]
+    revisions = fleet("GET", "/maps/ward/revisions", "read").json()
+    assert [item["kind"] for item in revisions] == ["session", "session"]
+    assert revisions[0]["command"] == "evermap work (upload)"
+    told = fleet("GET", "/maps/ward/changes?since=1").json()
+    assert sum(revisions[1]["changes"].values()) == len(told)
+    assert fleet("GET", "/maps/ward/diff?a=1&b=2").json()["b"] == 2
+    everything = fleet("GET", "/maps/ward/landmarks").json()["landmarks"]
+    some = fleet("GET", "/maps/ward/landmarks?x_max=5&p_least=0.5&at_s=1e12").json()["landmarks"]
+    assert 0 < len(some) < len(everything)
+    assert all(item["x_m"] <= 5.0 for item in some)
+    assert fleet("GET", f"/maps/ward/landmarks/{some[0]['label']}/why").json()["landmark"] == some[0]["landmark"]
+    assert fleet("GET", "/maps/ward/lifetimes").json()["lifetimes"]
+    for path in ("/maps/other/revisions", "/maps/ward/landmarks?revision=9", "/maps/ward/landmarks/nothing/why"):
+        assert fleet("GET", path).status_code == 404, path
+    file = fleet("GET", "/maps/ward/file?revision=1")
+    (tmp_path / "first.evermap").write_bytes(file.content)
+    assert verify_store(tmp_path / "first.evermap").sound
+    with open_store(tmp_path / "first.evermap") as store, fleet.server.sites.store("ward") as served:
+        assert (store.head(), store.log()[0]) == (1, served.log()[0])
+        assert_same(store.load(), served.load(1))
+    unchanged = {"Authorization": f"Bearer {fleet.tokens['read']}", "If-None-Match": file.headers["ETag"]}
+    assert fleet.client.get("/maps/ward/file?revision=1", headers=unchanged).status_code == 304
+    assert fleet.client.get("/maps/ward/file", headers=unchanged).status_code == 200
+    fresh = SiteStores(fleet.where).file("ward", 1)  # another process makes the same file
+    assert (fresh.sha256, f'"{fresh.tag}"') == (file.headers["X-Checksum-Sha256"], file.headers["ETag"])
+
+
+def test_an_operator_edits_reverts_and_approves(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    name = fleet("GET", "/maps/ward/landmarks").json()["landmarks"][0]["label"]
+    said = {"landmarks": [name], "note": "<script>alert(1)</script>'; DROP TABLE job; --"}
+    deleted = fleet("POST", "/maps/ward/delete", "approve", json=said)
+    assert (deleted.status_code, deleted.json()["revision"]) == (200, 2)
+    assert said["note"] in fleet("GET", "/maps/ward/revisions").json()[1]["note"]
+    assert fleet("POST", "/maps/ward/delete", json={**said, "landmarks": ["nothing"]}).status_code == 422
+    assert fleet("POST", "/maps/ward/revert", json={"revision": 1}).json()["revision"] == 3
+    assert fleet("GET", "/maps/ward/file?approved=true").status_code == 404
+    assert fleet("POST", "/maps/ward/approve", json={"revision": 4}).status_code == 422
+    assert fleet("POST", "/maps/ward/approve", "approve", json={"revision": 2}).status_code == 200
+    assert fleet("GET", "/maps").json()[0]["approved"]["who"] == "approve"
+    assert (
+        fleet("GET", "/maps/ward/file?approved=true").headers["ETag"]
+        == fleet("GET", "/maps/ward/file?revision=2").headers["ETag"]
+    )
+    notes = fleet("GET", "/audit").json()
+    assert [(note["who"], note["status"]) for note in notes[:2]] == [("approve", 200), ("admin", 422)]
+    assert any("/maps/ward/delete" in note["what"] for note in notes)
+
+
+def renamed(data: bytes, change: Callable[[dict[str, bytes]], Mapping[str, bytes]], **how: Any) -> bytes:
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    return zipped(change(files), **how)
+
+
+def bomb(data: bytes) -> bytes:
+    return renamed(data, lambda files: {**files, "day0/more.csv": bytes(3_000_000)})
+
+
+def link(data: bytes) -> bytes:
+    buffer = io.BytesIO(data)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        info = zipfile.ZipInfo("day0/frames.toml")
+        info.external_attr = 0o120777 << 16
+        archive.writestr(info, "/etc/passwd")
+    return buffer.getvalue()
+
+
+HOSTILE: dict[str, Callable[[bytes], bytes]] = {
+    "nothing": lambda _: b"",
+    "no zip": lambda _: b"PK\x03\x04 not really",
+    "cut off": lambda data: data[: len(data) // 2],
+    "parent": lambda data: renamed(data, lambda files: {**files, "../up.csv": b"x"}),
+    "absolute": lambda data: renamed(data, lambda files: {**files, "/etc/cron.csv": b"x"}),
+    "backslash": lambda data: renamed(data, lambda files: {**files, "..\\up.csv": b"x"}),
+    "deep": lambda data: renamed(data, lambda files: {**files, "a/b/c.csv": b"x"}),
+    "hidden": lambda data: renamed(data, lambda files: {**files, "day0/.csv": b"x"}),
+    "control": lambda data: renamed(data, lambda files: {**files, "day0/a\x1b[1m.csv": b"x"}),
+    "twice": lambda data: renamed(data, lambda files: {**files, "day1/detections.csv": b"x"}),
+    "bomb": bomb,
+    "many": lambda data: renamed(data, lambda files: {**files, **{f"day0/{k}.csv": b"" for k in range(200)}}),
+    "thousands": lambda data: zipped({f"{k}": b"" for k in range(5000)}),
+    "link": link,
+    "gzip": lambda data: renamed(data, lambda files: {**files, "day0/frames.csv": b"\x1f\x8b" + bytes(9)}),
+    "parquet": lambda data: renamed(data, lambda files: {**files, "day0/frames.parquet": b"PAR1"}),
+    "rows": lambda data: renamed(data, lambda files: {**files, "day0/objects.parquet": many_rows()}),
+    "empty": lambda _: zipped({"a/readme.csv": b""}),
+}
+
+
+def many_rows() -> bytes:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    buffer = io.BytesIO()
+    parquet.write_table(pa.table({"x": pa.array(np.zeros(400_000))}), buffer)
+    assert len(buffer.getvalue()) < 20_000
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+@pytest.mark.parametrize("kind", HOSTILE)
+def test_hostile_zips_are_refused(fleet: Fleet, zips: list[bytes], kind: str) -> None:
+    fleet.server.limits = UploadLimits(n_bytes=2_000_000, unpacked_bytes=2_500_000)
+    assert fleet.upload(zips[0]).status_code == 202
+    answer = fleet.upload(HOSTILE[kind](zips[0]))
+    assert answer.status_code == 422, answer.text
+    assert "\x1b" not in answer.json()["detail"]
+    assert len(fleet("GET", "/jobs").json()) == 1
+    assert not list(Path(fleet.where).parent.rglob("up.csv"))
+
+
+@pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+def test_what_is_too_large_or_has_no_site_is_refused(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.server.limits = UploadLimits(n_bytes=1000)
+    assert fleet.upload(zips[0]).status_code == 413
+    for site in ("..", "%2e%2e%2fx", "a b", "x" * 49, "a;b", "%00", "server.db", 'a"b'):
+        assert fleet.upload(zips[0], site=site).status_code in (404, 405, 422), site
+        assert fleet("GET", f"/maps/{site}/revisions").status_code in (404, 405), site
+    assert {path.name for path in Path(fleet.where).iterdir()} == {"server.db"}
+
+
+@pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+def test_too_many_requests_are_told_to_wait(fleet: Fleet) -> None:
+    fleet.server.rate_hz = 0.0
+    answers = [fleet("GET", "/jobs", "read").status_code for _ in range(210)]
+    assert (answers.count(200), answers.count(429)) == (200, 10)
+    assert fleet("GET", "/jobs", "upload").status_code == 200
+
+
+def test_the_digest_is_of_the_session_and_not_of_the_zip(zips: list[bytes]) -> None:
+    def moved(files: dict[str, bytes]) -> dict[str, bytes]:
+        return {f"elsewhere/{name.rpartition('/')[2]}": files[name] for name in sorted(files, reverse=True)}
+
+    other = renamed(zips[0], moved, compression=zipfile.ZIP_STORED)
+    assert other != zips[0]
+    assert (
+        checked_digest(other, UploadLimits())
+        == checked_digest(zips[0], UploadLimits())
+        != checked_digest(zips[1], UploadLimits())
+    )
+
+
+def test_a_refused_session_is_kept_with_its_reason(fleet: Fleet, zips: list[bytes]) -> None:
+    broken = renamed(zips[0], lambda files: {**files, "day0/detections.csv": b"stamp_s,range_m\n1,x\n"})
+    job = fleet.upload(broken).json()["id"]
+    fleet.worker().step()
+    told = fleet("GET", f"/jobs/{job}").json()
+    assert told["state"] == "rejected"
+    assert "detections.csv" in told["reason"]
+    assert "/tmp" not in told["reason"]
+    assert fleet("GET", f"/jobs/{job}/payload").content == broken
+    assert fleet.upload(broken).json()["state"] == "rejected"
+    assert fleet("POST", f"/jobs/{job}/retry").json()["state"] == "queued"
+    assert fleet("POST", f"/jobs/{job}/retry").status_code == 409
+    fleet.worker().step()
+    assert fleet("GET", "/jobs?state=rejected").json()[0]["id"] == job
+
+
+def work(where: str, *more: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "evermap", "work", "--store", where, "--drain", *more]
+    return subprocess.Popen(command, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+
+
+@pytest.fixture(scope="module")
+def in_order(zips: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
+    with open_store(tmp_path_factory.mktemp("order") / "m.evermap", create=True) as store:
+        for data in zips:
+            entered = enter_session(store, recording_of(data, checked_digest(data, UploadLimits())))
+            entered.commit(store)
+        return store.load()
+
+
+def test_two_workers_lose_nothing_in_any_order(fleet: Fleet, zips: list[bytes], in_order: LivingMap) -> None:
+    for number in (3, 0, 5, 1, 4, 2, 3, 0):
+        assert fleet.upload(zips[number]).status_code in (200, 202)
+    workers = [work(fleet.where) for _ in range(2)]
+    assert [worker.wait(timeout=300) for worker in workers] == [0, 0]
+    jobs = fleet("GET", "/jobs").json()
+    assert [job["state"] for job in jobs] == [JobState.ENTERED] * COUNT
+    assert sorted(job["revision"] for job in jobs) == list(range(1, COUNT + 1))
+    with fleet.server.sites.store("ward") as store:
+        assert_same(store.load(), in_order)
+
+
+def test_a_session_of_a_worker_that_is_killed_goes_back(fleet: Fleet, zips: list[bytes]) -> None:
+    job = fleet.upload(zips[0]).json()["id"]
+    worker = work(fleet.where, "--lease-s", "1")
+    while fleet("GET", f"/jobs/{job}").json()["state"] == "queued":
+        time.sleep(0.01)
+    worker.send_signal(signal.SIGKILL)
+    worker.wait()
+    told = fleet("GET", f"/jobs/{job}").json()
+    assert (told["state"], told["tries"]) == ("working", 1)
+    other = fleet.worker(lease_s=1.0)
+    end = time.monotonic() + 30.0
+    while other.step() is None:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    assert fleet("GET", f"/jobs/{job}").json()["state"] == "entered"
+    assert fleet("GET", "/maps").json()[0]["head"] == 1
+
+
+def test_a_worker_killed_after_the_commit_enters_nothing_twice(fleet: Fleet, zips: list[bytes]) -> None:
+    number = fleet.upload(zips[0]).json()["id"]
+    claimed = fleet.server.database.claim("killed", 0.0)
+    assert claimed is not None
+    fleet.worker()._enter(*claimed)
+    fleet.worker().step()
+    told = fleet("GET", f"/jobs/{number}").json()
+    assert (told["state"], told["revision"], told["tries"]) == ("entered", 1, 2)
+    assert "is in the map already" in told["reason"]
+    assert fleet("GET", "/maps").json()[0]["head"] == 1
+    fleet.server.database.finish(number, "killed", JobState.REJECTED, "too late")
+    assert fleet("GET", f"/jobs/{number}").json()["state"] == "entered"
+
+
+def test_a_session_that_kills_its_workers_is_refused_in_the_end(fleet: Fleet, zips: list[bytes]) -> None:
+    number = fleet.upload(zips[0]).json()["id"]
+    for _ in range(MOST_TRIES):
+        assert fleet.server.database.claim("killed", 0.0) is not None
+    fleet.worker().step()
+    told = fleet("GET", f"/jobs/{number}").json()
+    assert (told["state"], told["reason"]) == ("rejected", f"{MOST_TRIES} workers died of it")
+
+
+def test_many_who_claim_at_once_get_different_sessions(fleet: Fleet, zips: list[bytes]) -> None:
+    for site, data in itertools.product(("a", "b", "c", "d"), zips[:1]):
+        fleet.upload(data, site=site)
+    fleet.upload(zips[1], site="a")  # waits for the other one of its site
+    got: list[int] = []
+
+    def claim() -> None:
+        database = Database(fleet.where)
+        while claimed := database.claim(threading.current_thread().name, 60.0):
+            got.append(claimed[0].id)
+
+    threads = [threading.Thread(target=claim) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(got) == len(set(got))
+    for _ in range(5):  # what was skipped while another looked at it
+        claim()
+    assert sorted(got)[:4] == sorted(job["id"] for job in fleet("GET", "/jobs").json())[:4]
+
+
+def test_new_revisions_are_events(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    served = uvicorn.Server(uvicorn.Config(create_app(fleet.server), port=0, log_level="warning"))
+    thread = threading.Thread(target=served.run)
+    thread.start()
+    while not served.started:
+        time.sleep(0.01)
+    port = served.servers[0].sockets[0].getsockname()[1]
+    headers = {"Authorization": f"Bearer {fleet.tokens['read']}"}
+    address = f"http://127.0.0.1:{port}/maps/ward/events?since=0"
+    with httpx.stream("GET", address, headers=headers, timeout=30.0) as answer:
+        assert answer.headers["Content-Type"].startswith("text/event-stream")
+        lines = answer.iter_lines()
+        assert next(line for line in lines if line.startswith("id:")) == "id: 1"
+        fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
+        assert next(line for line in lines if line.startswith("id:")) == "id: 2"
+    served.should_exit = True
+    thread.join()
+
+
+@pytest.mark.parametrize("where", ["sqlite"], indirect=True)
+def test_the_page_is_served_without_text_that_becomes_html(fleet: Fleet) -> None:
+    served = {name: fleet.client.get(f"/{name}") for name in ("", "page.js", "page.css")}
+    assert {answer.status_code for answer in served.values()} == {200}
+    assert "script-src 'self'" in served[""].headers["Content-Security-Policy"]
+    assert not any(
+        word in served["page.js"].text for word in ("innerHTML", "insertAdjacentHTML", "eval(", "document.write")
+    )
+    for asked in set(re.findall(r'\$\("([a-z]+)"\)', served["page.js"].text)):
+        assert f'id="{asked}"' in served[""].text
+    assert "<script>" not in served[""].text
+    assert fleet.client.get("/app.py").status_code == 404
+
+
+def test_tables_of_another_version_are_one_line(tmp_path: Path) -> None:
+    import sqlite3
+
+    Database(tmp_path).close()
+    with sqlite3.connect(tmp_path / "server.db") as connection:
+        connection.execute("UPDATE server SET version = 9")
+    with pytest.raises(InputError, match="of version 9, this evermap has 1"):
+        Database(tmp_path)
