@@ -25,7 +25,7 @@ from evermap.sensing.visibility import NominalField
 from evermap.slam import localize
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.known_places import KnownPlaces, Neighbourhood
-from evermap.slam.localize import Localizer
+from evermap.slam.localize import FrameSightings, Localizer
 from evermap.slam.motion import Motion
 from evermap.slam.problem import Drive
 
@@ -70,6 +70,23 @@ def test_a_long_stay_among_the_same_landmarks_makes_nobody_too_sure():
         assert not any(one.lost for one in located[5:])
     assert within_chance(of_pose, 3 * runs)
     assert within_chance(of_states, 9 * runs)
+
+
+def test_landmarks_that_the_map_lacks_tell_nothing_of_where_in_it_the_robot_is():
+    """Behind six seconds in which it saw nothing all it sees is new, and its heading stays as unknown as it was."""
+    of_pose, of_heading, runs = 0.0, 0.0, 40
+    for seed in range(runs):
+        rng, true = world(seed, n_frames=300)
+        places = surveyed(rng, true.landmark, 0.05)
+        for k, seen in enumerate(true.sightings[50:], start=50):
+            kept = slice(None if k >= 80 else 0)
+            true.sightings[k] = FrameSightings(seen.landmark_id[kept] + COUNT, *(part[kept] for part in seen[1:]))
+        _, located = run(true, places, learn=True)
+        error, covariance = errors(true, located)[-1], located[-1].covariance
+        of_pose += nees(error[None], covariance[None])[0]
+        of_heading += error[2] ** 2 / covariance[2, 2]
+    assert within_chance(of_pose, 3 * runs)
+    assert within_chance(of_heading, runs)
 
 
 def test_a_map_that_is_turned_as_a_whole_is_as_good_as_its_parts_fit_together():

@@ -30,6 +30,8 @@ SMALL_STEP = 1e-4
 """Iterations of an update at most, and the step (m, rad or 1) that ends them."""
 CONSIDERED_STEP = 1e-2
 """The same where places are only considered, and none can be led astray: less bends no measurement equation."""
+SMALL_TURN = 1e-6
+"""Angle (rad) below which an arc is its second-order series."""
 SETTLED_WEIGHT = 0.02
 """Change of a weight below which the iterations end."""
 UNSURE = 4.0
@@ -46,23 +48,25 @@ that they passed: iterated, a wrong pairing leads farther astray (MRCLAM 6, robo
 
 @kernel
 def linearise_frame(
-    pose: FloatArray, states: FloatArray, place: FloatArray, slot: IntArray, reading: FloatArray, mount: FloatArray,
-    free: Any, turned: float, residual: FloatArray, jacobian: FloatArray, column: IntArray,
+    pose: FloatArray, states: FloatArray, place: FloatArray, start: FloatArray, start_place: FloatArray, slot: IntArray,
+    reading: FloatArray, mount: FloatArray, free: Any, residual: FloatArray, jacobian: FloatArray, column: IntArray,
 ) -> None:  # fmt: skip
     """Compute residuals (2 M,), derivatives (2 M, 10) and which numbers of the state (M, 10) these are by.
 
-    The step of the pose is told in the frame of where it started, from which it has `turned` by now.
+    Derivatives are by the errors at the start of the update, which `_turn_on` carries to where pose and places are now.
     """
     e, jx, jl, jc = np.zeros(2), np.zeros((2, 3)), np.zeros((2, 2)), np.zeros((2, 5))
-    c, s = math.cos(turned), math.sin(turned)
+    c, s = math.cos(start[2] - pose[2]), math.sin(start[2] - pose[2])
     for m in range(len(reading)):
+        x = place[slot[m], 0] - start_place[slot[m], 0] - pose[0] + start[0]
+        y = place[slot[m], 1] - start_place[slot[m], 1] - pose[1] + start[1]
         detection_residual(pose, place[slot[m]], states, mount, reading[m, 0], reading[m, 1], e, jx, jl, jc)
         for k in range(2):
             row = 2 * m + k
             residual[row] = e[k]
-            jacobian[row, 0] = c * jx[k, 0] - s * jx[k, 1]
-            jacobian[row, 1] = s * jx[k, 0] + c * jx[k, 1]
-            jacobian[row, 2] = jx[k, 2]
+            jacobian[row, 0] = c * jx[k, 0] + s * jx[k, 1]
+            jacobian[row, 1] = -s * jx[k, 0] + c * jx[k, 1]
+            jacobian[row, 2] = jx[k, 2] + x * jl[k, 1] - y * jl[k, 0]
             for a in range(5):
                 jacobian[row, 3 + a] = jc[k, a] if free[a] else 0.0
             jacobian[row, 8], jacobian[row, 9] = jl[k, 0], jl[k, 1]
@@ -92,15 +96,15 @@ def spread_of_frame(
 
 
 @kernel
-def turn_pose(covariance: FloatArray, turned: float) -> None:
-    """Rotate the covariance of the pose into its own frame, which has turned."""
-    c, s = math.cos(turned), math.sin(turned)
-    for k in range(len(covariance)):
-        x, y = covariance[0, k], covariance[1, k]
-        covariance[0, k], covariance[1, k] = c * x + s * y, -s * x + c * y
-    for k in range(len(covariance)):
-        x, y = covariance[k, 0], covariance[k, 1]
-        covariance[k, 0], covariance[k, 1] = c * x + s * y, -s * x + c * y
+def along_turn(x: float, y: float, turn: float) -> tuple[float, float]:
+    """Return the chord (2,) of an arc that begins in the direction of, and is as long as, (x, y), and turns by `turn`.
+
+    `V(turn) (x, y)` of the exponential of SE(2).
+    """
+    if abs(turn) < SMALL_TURN:
+        return x - 0.5 * turn * y, y + 0.5 * turn * x
+    s, c = math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn
+    return s * x - c * y, c * x + s * y
 
 
 @kernel
@@ -181,6 +185,10 @@ def update(
 ) -> tuple[FloatArray, FloatArray]:  # fmt: skip
     """Update by all detections of a frame at once, relinearised and re-weighted until nothing moves.
 
+    The step is right-invariant (Barrau and Bonnabel 2015, "An EKF-SLAM algorithm with consistency properties"): it
+    moves whatever stands in the world by `V(phi) dp`. The covariance, of errors in the world, is re-expressed at the
+    new state, `dp + J (p+ - p-) phi`, so that a heading that no detection shows stays as uncertain as it was.
+
     Only pose, calibration and the places that are seen take part in that; the other places follow at last. Places that
     are only considered (Schmidt 1966) stand in the covariance with the correlations that detections make, but stay
     where they are: pose and calibration get the gain that is best for them, the places none.
@@ -224,7 +232,9 @@ def update(
     root, gain, spread = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, size)), np.zeros((0, 0))
     unsure = False
     for iteration in range(1 if weighing == GATED else ITERATIONS):
-        linearise_frame(pose, states, place, own, reading, mount, free, step[2], innovation, jacobian, column)
+        linearise_frame(
+            pose, states, place, start, start_place, own, reading, mount, free, innovation, jacobian, column
+        )
         spread_of_frame(part, jacobian, column, gain, root)
         if weighing == BY_OTHERS and iteration == 0:
             unsure = _surprises(part, jacobian, root, innovation, sigma, nis)
@@ -254,19 +264,22 @@ def update(
                 step[k] -= pull[each] * gain[each, k]
             moved = max(moved, abs(step[k] - before[k]))
         c, s = math.cos(start[2]), math.sin(start[2])
-        pose[0] = start[0] + c * step[0] - s * step[1]
-        pose[1] = start[1] + s * step[0] + c * step[1]
-        pose[2] = wrapped(start[2] + step[2])
-        for k in range(3, size):
-            if k >= AT_PLACES:
-                place[(k - AT_PLACES) // 2, k % 2] = start_place[(k - AT_PLACES) // 2, k % 2] + step[k]
-            else:
-                states[k - 3] = start_states[k - 3] + step[k]
+        x, y = along_turn(c * step[0] - s * step[1], s * step[0] + c * step[1], step[2])
+        pose[0], pose[1], pose[2] = start[0] + x, start[1] + y, wrapped(start[2] + step[2])
+        for k in range(9):
+            states[k] = start_states[k] + step[3 + k]
+        for k in range(0 if considered else count):
+            x, y = along_turn(step[AT_PLACES + 2 * k], step[AT_PLACES + 2 * k + 1], step[2])
+            place[k, 0], place[k, 1] = start_place[k, 0] + x, start_place[k, 1] + y
         changed = 0.0
         if unsure:
             changed = _weigh_by_the_others(spread, pull, sigma, log_odds, iteration == 0, credible, weight)
         if moved < small and changed < SETTLED_WEIGHT:
             break
+    lever = np.zeros(AT_PLACES if considered else len(covariance))
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = pose[0] - start[0], pose[1] - start[1]
+    lever[0], lever[1] = s * x - c * y, c * x + s * y
     white = np.zeros((2 * count, len(covariance) + 1))
     for k in range(2 * count):
         column[k // 2, 8 + k % 2], white[k, -1] = where[AT_PLACES + k], innovation[k]
@@ -276,10 +289,15 @@ def update(
     else:
         _condition(covariance, root, white)
         for k in range(len(row)):
-            for each in range(2 * count if row[k] >= 0 else 0):
-                for a in range(2):
-                    position[row[k], a] -= white[each, AT_PLACES + 2 * k + a] * white[each, -1]
-    turn_pose(covariance, step[2])
+            if row[k] >= 0:
+                x = y = 0.0
+                for each in range(2 * count):
+                    x -= white[each, AT_PLACES + 2 * k] * white[each, -1]
+                    y -= white[each, AT_PLACES + 2 * k + 1] * white[each, -1]
+                x, y = along_turn(x, y, step[2])
+                position[row[k], 0], position[row[k], 1] = position[row[k], 0] + x, position[row[k], 1] + y
+                lever[AT_PLACES + 2 * k], lever[AT_PLACES + 2 * k + 1] = -y, x
+    _turn_on(covariance, step[2], lever)
     return nis, weight
 
 
@@ -420,3 +438,26 @@ def _consider(covariance: FloatArray, root: FloatArray, across: FloatArray) -> N
         for k in range(a, size):
             covariance[a, k] -= less[a, k]
             covariance[k, a] = covariance[a, k]
+
+
+@vectorised
+def _turn_on(covariance: FloatArray, turned: float, lever: FloatArray) -> None:
+    """Re-express a covariance at the corrected state: of the pose in its own frame, which has turned, and of everything
+    that has moved, by `lever` times the error of the heading.
+    """
+    c, s, heading = math.cos(turned), math.sin(turned), covariance[2].copy()
+    for k in range(len(covariance)):
+        x, y = covariance[0, k], covariance[1, k]
+        covariance[0, k], covariance[1, k] = c * x + s * y, c * y - s * x
+    for k in range(len(covariance)):
+        x, y = covariance[k, 0], covariance[k, 1]
+        covariance[k, 0], covariance[k, 1] = c * x + s * y, c * y - s * x
+    x, y = heading[0], heading[1]
+    heading[0], heading[1] = c * x + s * y, c * y - s * x
+    for i in range(len(covariance)):
+        mine = covariance[i]
+        for k in range(len(covariance) if i < len(lever) else 0):
+            mine[k] += lever[i] * heading[k]
+        by = mine[2]
+        for k in range(len(lever)):
+            mine[k] += by * lever[k]

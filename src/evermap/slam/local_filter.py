@@ -160,7 +160,10 @@ class LocalFilter:
         waiting = list(dict.fromkeys(rows[~here].tolist()))
         self._make_room(len(waiting))
         for row in waiting:
-            self._return(row, self._left.pop(row) if row in self._left else self._given(row))
+            ties = self._left.pop(row, None)
+            if ties is None or (self._is_solved(row) and 2 * sum(self._slot[ties.rows] >= 0) < len(ties.rows)):
+                ties = self._given(row)
+            self._return(row, ties)
         return self._slot[rows]
 
     def meet(
@@ -281,6 +284,10 @@ class LocalFilter:
         self._slot[self._row[leaving]], self._row[leaving] = -1, UNKNOWN
         at = columns(leaving)
         self.covariance[at], self.covariance[:, at] = 0.0, 0.0
+
+    def _is_solved(self, row: int) -> bool:
+        """Whether the solution or the map knows a place."""
+        return row < len(self._given_position) and bool(np.isfinite(self._given_position[row, 0]))
 
     def _given(self, row: int) -> Ties:
         """What ties a place to others, as the solution or the map says."""

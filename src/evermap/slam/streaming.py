@@ -428,7 +428,8 @@ class StreamingSlam:
             weights = smoother.inlier_probability(estimate)
             fit = refine_noise(problem, estimate, marginals, weights, self._noise, self._start_noise)
             self._noise = fit.noise
-            marginals = yield from smoother.under(self._noise, heavy=True).marginals_in_slices(estimate)
+            smoother = smoother.under(self._noise, heavy=True)
+        marginals = yield from smoother.marginals_in_slices(estimate)
         if learn:
             self._scale = 1.0 if self._aligned else self._prior.split_scale(estimate.states, np.zeros((9, 9)))[2]
         following = SessionFilter(self._problem, self._noise, robust=self._robust)
