@@ -10,12 +10,14 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from benchmarks import (
     association,
     cliques,
+    fleet,
     kitti,
     localize,
     npmle,
@@ -52,6 +54,7 @@ METRICS: dict[str, tuple[str, float, str]] = {
     **scale.METRICS,
     **space.METRICS,
     **association.METRICS,
+    **fleet.METRICS,
 }
 """Metric: which direction is better, relative tolerance, meaning."""
 
@@ -67,6 +70,7 @@ PARTS = (
     "scale",
     "space",
     "association",
+    "fleet",
 )
 _RENEW = "evermap bench --update-baseline"
 
@@ -144,6 +148,9 @@ def run(
         measured |= ratios
     if only == "association" or (only is None and (association.FOLDER / "mrclam").is_dir()):
         ratios, shown["association"] = association.run()
+        measured |= ratios
+    if only == "fleet" or (only is None and find_spec("fastapi")):
+        ratios, shown["fleet"] = fleet.run()
         measured |= ratios
     if update_baseline:
         kept = {name: row["value"] for name, row in _rows(BASELINE).items()} if only or "kitti" not in shown else {}
@@ -238,6 +245,8 @@ def as_text(measured: Mapping[str, Any]) -> str:
         lines += ["", space.as_markdown(shown["space"])]
     if "association" in shown:
         lines += ["", association.as_markdown(shown["association"])]
+    if "fleet" in shown:
+        lines += ["", fleet.as_markdown(shown["fleet"])]
     verdict = ", ".join(measured["regressions"])
     lines += ["", f"worse than the baseline allows: {verdict}" if verdict else "no regression"]
     return "\n".join(lines)

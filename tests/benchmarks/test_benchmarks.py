@@ -299,6 +299,9 @@ def test_a_small_run_writes_compares_and_reports(
     (tmp_path / "mrclam").mkdir()
     monkeypatch.setattr(run.association, "FOLDER", tmp_path)
     monkeypatch.setattr(run.association, "run", lambda: nameless)
+    soaked = {"sessions": 1, "sites": 1, "uploads": 1, "kills": 0, "store": "sqlite", "took_s": 1.0, "wait_ms": {}}
+    served = dict.fromkeys(run.fleet.METRICS, 1.0), {**soaked, "memory_mb": [1.0, 1.0]}
+    monkeypatch.setattr(run.fleet, "run", lambda: served)
     measured = run.run(
         update_baseline=True,
         n_poses=80,

@@ -13,9 +13,9 @@ import evermap as em
 from evermap.config import Config, parse_config, to_toml
 from evermap.errors import DataError, InputError
 from evermap.maps.living import LivingMap
-from evermap.maps.store import MapStore, Provenance, RevisionKind, open_store
+from evermap.maps.store import MapStore, Provenance, RevisionKind, StaleRevisionError, open_store
 from evermap.maps.store.measured import pack_recording, unpack_recording
-from evermap.runs.sessions import at_time
+from evermap.runs.sessions import UnbridgedError, at_time
 from evermap.types import Recording
 from evermap_studies.sim import BuildingConfig, simulate_building
 
@@ -74,6 +74,41 @@ def in_order(tmp_path_factory: pytest.TempPathFactory) -> LivingMap:
 @pytest.mark.parametrize("order", [(0, 2, 3, 1), (3, 1, 0, 2), (1, 3, 0, 2)])
 def test_the_order_of_arrival_makes_no_difference(tmp_path: Path, in_order: LivingMap, order: Sequence[int]) -> None:
     assert_same(built(tmp_path / "site.evermap", order), in_order)
+
+
+def test_a_late_session_with_which_a_later_one_is_lost_stays_out(tmp_path: Path) -> None:
+    """Neither shows enough of what the other has: the map keeps the one that it has."""
+    days = simulate_building(BuildingConfig(days=8, patrol_s=35.0), 10).sessions
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        fed(store, days[5])
+        with pytest.raises(UnbridgedError, match="revision 1 cannot be brought in again: too few"):
+            em.enter_session(store, days[2])
+        assert store.head() == 1
+
+
+class Overtaken:
+    """A store into which another session comes while one is entered."""
+
+    def __init__(self, store: MapStore, other: Recording) -> None:
+        self._store, self._other = store, other
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._store, name)
+
+    def log(self) -> object:
+        log, other = self._store.log(), self._other
+        if other is not None:
+            self._other = None  # type: ignore[assignment]
+            fed(self._store, other)
+        return log
+
+
+def test_a_late_session_that_was_overtaken_is_entered_again(tmp_path: Path) -> None:
+    with open_store(tmp_path / "site.evermap", create=True) as store:
+        fed(store, SESSIONS[3])
+        entered = em.enter_session(Overtaken(store, SESSIONS[0]), SESSIONS[1])  # type: ignore[arg-type]
+        with pytest.raises(StaleRevisionError):
+            entered.commit(store)
 
 
 def test_nor_in_a_database(site_address: str, in_order: LivingMap) -> None:

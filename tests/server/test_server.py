@@ -410,6 +410,32 @@ def test_a_session_that_kills_its_workers_is_refused_in_the_end(fleet: Fleet, zi
     assert (told["state"], told["reason"]) == ("rejected", f"{MOST_TRIES} workers died of it")
 
 
+def test_what_does_not_fit_is_tried_again_as_the_map_grows(fleet: Fleet, zips: list[bytes]) -> None:
+    database = fleet.server.database
+
+    def settle(job: int, state: JobState, revision: int) -> None:
+        claimed = database.claim("w", 60.0)
+        assert claimed is not None
+        assert claimed[0].id == job
+        database.finish(job, "w", state, "why", revision)
+
+    first, aside, other, third = (fleet.upload(data).json()["id"] for data in zips[:4])
+    settle(first, JobState.ENTERED, 1)
+    settle(aside, JobState.ASIDE, 1)
+    assert fleet("GET", f"/jobs/{aside}/payload").content == zips[1]
+    settle(other, JobState.ENTERED, 4)
+    settle(aside, JobState.ASIDE, 4)
+    settle(third, JobState.ENTERED, 5)  # a quarter more is one that is more than 5
+    assert database.claim("w", 60.0) is None
+    assert database.depth() == 0
+    last = fleet.upload(zips[4]).json()["id"]
+    settle(last, JobState.ENTERED, 6)
+    assert database.depth() == 1
+    settle(aside, JobState.ENTERED, 7)
+    assert fleet.upload(zips[5], site="other").status_code == 202
+    assert fleet("GET", f"/jobs/{aside}").json()["revision"] == 7
+
+
 def test_many_who_claim_at_once_get_different_sessions(fleet: Fleet, zips: list[bytes]) -> None:
     for site, data in itertools.product(("a", "b", "c", "d"), zips[:1]):
         fleet.upload(data, site=site)

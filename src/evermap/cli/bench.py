@@ -24,7 +24,7 @@ def bench(
         str | None,
         typer.Option(
             help="Measure one part: slam, persistence, selectors, cliques, npmle, tracking, kitti, localize, scale, "
-            "space, association."
+            "space, association, fleet."
         ),
     ] = None,
     sizes: Annotated[

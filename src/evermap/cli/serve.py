@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -175,6 +176,8 @@ def work(
             + (f" ({outcome.reason})" if outcome.reason else "")
         )
 
+    with suppress(OSError):
+        os.nice(10)  # who asks the server goes first
     warm_up()
     Worker(database, SiteStores(store), chosen, lease_s).run(told, drain=drain)
 

@@ -36,6 +36,10 @@ class TwiceError(InputError):
     revision: int = 0
 
 
+class UnbridgedError(DataError):
+    """A late session with which a later one of the map cannot be found any more; others may show what lies between."""
+
+
 @dataclass(frozen=True, slots=True)
 class Entered(Shown):
     """What a session made of a stored map; nothing is committed yet.
@@ -135,6 +139,7 @@ def enter_session(
         InputError: it is in the map already, or it is late and a later session kept no recording, or the revision
             before that is pruned.
         ConfigError: a prior of a class that neither the map nor the recording has.
+        UnbridgedError: it is late, and with it a later session of the map is not found any more.
         DataError, NumericalError: as `pipeline.run_session`.
     """
     from evermap.config import Config
@@ -156,7 +161,8 @@ def enter_session(
     if not start_s < newest.session_start_s:
         session = run_session(recording, said, config, progress=progress)
         return Entered(session, newest, session.living, session.changes, (), head, {RECORDING: data})
-    return _enter_late(store, recording, said, config, _history(store, kept), data, progress)
+    late = _enter_late(store, recording, said, config, _history(store, kept), data, progress)
+    return replace(late, parent=head)  # whatever came in since `head` was read makes the commit stale
 
 
 def begin_map(store: MapStore, landmarks: Landmarks, recording: AnyRecording, source: str) -> int:
@@ -366,5 +372,8 @@ def _again(store: MapStore, step: _Step, living: LivingMap) -> tuple[LivingMap, 
     try:
         session = run_session(recording, living, parse_config(step.revision.provenance.config))
     except DataError as error:
-        raise DataError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
+        raise UnbridgedError(f"revision {step.revision.number} cannot be brought in again: {error}") from None
+    if not session.found:  # what is in the map is not dropped
+        problem = f"revision {step.revision.number} cannot be brought in again: {session.set_aside[0]}"
+        raise UnbridgedError(problem, path=store.where, hint="sessions that overlap with both, then this one again")
     return session.living, session.changes

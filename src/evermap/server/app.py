@@ -287,9 +287,7 @@ class LandmarkQuery(BaseModel):
 @router.get("/maps/{site}/landmarks")
 def landmarks(site: str, server: Answering, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> dict[str, Any]:
     """List landmarks within a region; `p_ahead` is the probability that each is there at `at_s`."""
-    with server.sites.store(site) as store:
-        number = store.head() if asked.revision is None else asked.revision
-        living = store.load(number)
+    number, living = server.sites.living(site, asked.revision)
     found = map_dicts.landmark_dicts(living, living.p_exists(living.stamp_s if asked.at_s is None else asked.at_s))
     return {
         "site": site,
@@ -312,8 +310,7 @@ def why(site: str, landmark: str, server: Answering, _: Reader, revision: AtRevi
 @router.get("/maps/{site}/lifetimes")
 def lifetimes(site: str, server: Answering, _: Reader, revision: AtRevision = None) -> dict[str, Any]:
     """Tell how long things stay, by class and place."""
-    with server.sites.store(site) as store:
-        living = store.load(revision)
+    living = server.sites.living(site, revision)[1]
     return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
 
 

@@ -2,7 +2,8 @@
 
 In SQLite it is one file, `server.db` in the folder of the maps; in PostgreSQL a schema `evermap_server` in their
 database. A job is never lost: a worker leases it for a while and renews the lease as long as it lives; what a killed
-worker had goes back to the queue when its lease ends. A refused session stays, with the reason and its bytes.
+worker had goes back to the queue when its lease ends. A session that does not fit its map is set aside, and tried again
+as the map grows, the less often the larger that is; a refused one stays, with the reason and its bytes.
 """
 
 from __future__ import annotations
@@ -51,8 +52,11 @@ from evermap.maps.store.sqlite import engine_of as sqlite_engine
 VERSION = 1
 """Of the tables; there is no older one to bring up to date."""
 SCHEMA = "evermap_server"
-MOST_TRIES = 3
-"""Workers that may die of a session before it is refused."""
+MOST_TRIES = 10
+"""Workers that may die of a session before it is refused: more than chance has at the same one."""
+
+_GROWTH = 4
+"""A session that never fits is tried a number of times that grows as the logarithm of the map's revisions."""
 
 metadata = MetaData()
 _server = Table("server", metadata, Column("version", Integer, nullable=False))
@@ -120,6 +124,7 @@ class JobState(StrEnum):
     QUEUED = "queued"
     WORKING = "working"
     ENTERED = "entered"
+    ASIDE = "aside"
     REJECTED = "rejected"
 
 
@@ -135,8 +140,8 @@ class Job:
         robot: name of the token that sent it.
         state: where it is.
         reason: why it was refused, or a remark.
-        revision: that it became; None before.
-        tries: workers that have begun it.
+        revision: that it became, or of the map that it did not fit; None before.
+        tries: workers that have begun it since it was queued.
         created_at, changed_at: ISO 8601, UTC.
     """
 
@@ -266,7 +271,7 @@ class Database:
             other.c.site == _job.c.site, other.c.state == JobState.WORKING.value, other.c.lease_s >= now
         )
         lapsed = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
-        waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed)
+        waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
         oldest = select(*_SHOWN).where(waiting, not_(busy)).order_by(_job.c.id).limit(1)
         with self._writing() as connection:
             row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
@@ -293,14 +298,16 @@ class Database:
         }
         if state is JobState.QUEUED:  # given back: that was no try
             values["tries"] = _job.c.tries - 1
+        if state is JobState.ASIDE:
+            values["tries"] = 0
         with self._writing() as connection:
             mine = update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
             if connection.execute(mine).rowcount and state is JobState.ENTERED:  # the map keeps the recording
                 connection.execute(delete(_payload).where(_payload.c.job == job))
 
     def retry(self, job: int) -> bool:
-        """Queue a refused session once more; returns whether it was one."""
-        refused = and_(_job.c.id == job, _job.c.state == JobState.REJECTED.value)
+        """Queue a session once more that was refused or set aside; returns whether it was one."""
+        refused = and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
         values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
         with self._writing() as connection:
             return connection.execute(update(_job).where(refused).values(values)).rowcount > 0
@@ -351,7 +358,7 @@ class Database:
 
     def depth(self) -> int:
         """Return how many sessions wait or are worked on; proves that the database answers."""
-        waiting = _job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value])
+        waiting = or_(_job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value]), _grown())
         with self._reading() as connection:
             return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
 
@@ -362,6 +369,16 @@ class Database:
 
 def _mine(job: int, worker: str) -> Any:
     return and_(_job.c.id == job, _job.c.worker == worker, _job.c.state == JobState.WORKING.value)
+
+
+def _grown() -> Any:
+    """Sessions set aside whose map has a quarter more revisions than when they were tried last."""
+    other = _job.alias()
+    newest = select(func.max(other.c.revision)).where(
+        other.c.site == _job.c.site, other.c.state == JobState.ENTERED.value
+    )
+    due = newest.correlate(_job).scalar_subquery() > _job.c.revision + _job.c.revision // _GROWTH
+    return and_(_job.c.state == JobState.ASIDE.value, due)
 
 
 def _job_of(row: Row[Any]) -> Job:

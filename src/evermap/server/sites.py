@@ -9,16 +9,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from evermap.errors import ConfigError, InputError
+from evermap.maps.living import LivingMap
 from evermap.maps.store import is_address, open_store
 from evermap.maps.store.postgres import SITE, address_of, sites_in
 from evermap.maps.store.sql import SqlStore
 from evermap.maps.store.sqlite import snapshot
 
+_Kept = TypeVar("_Kept")
+
 ENDING = ".evermap"
 _MOST_OPEN = 200
-_MOST_FILES = 8
+_MOST_FILES, _MOST_MAPS = 8, 16
 
 
 class NoSuchSiteError(InputError):
@@ -50,7 +54,8 @@ class SiteStores:
     def __init__(self, where: str | Path) -> None:
         self._where = where
         self._open: dict[str, list[SqlStore]] = {}
-        self._files: dict[tuple[str, int, str], MapFile] = {}
+        self._files: dict[tuple[str, str], MapFile] = {}
+        self._maps: dict[tuple[str, str], LivingMap] = {}
         self._lock = threading.Lock()
 
     def address(self, site: str) -> str:
@@ -101,16 +106,34 @@ class SiteStores:
         with self.store(site) as store:
             number = store.head() if revision is None else revision
             tag = store.name_of(number)
-            key = (site, number, tag)
-            found = self._files.get(key)
+            found = self._files.get((site, tag))
             if found is None:
                 with tempfile.TemporaryDirectory(prefix="evermap-file-") as folder:
                     path = Path(folder) / "map.evermap"
                     snapshot(store, path, number)
                     data = path.read_bytes()
                 found = MapFile(data, tag, hashlib.sha256(data).hexdigest())
-                with self._lock:
-                    while len(self._files) >= _MOST_FILES:
-                        self._files.pop(next(iter(self._files)))
-                    self._files[key] = found
+                self._keep(self._files, (site, tag), found, _MOST_FILES)
         return found
+
+    def living(self, site: str, revision: int | None = None) -> tuple[int, LivingMap]:
+        """Return a revision's number and its map; the last few are kept.
+
+        Raises:
+            InputError: there is no such map or revision.
+        """
+        with self.store(site) as store:
+            number = store.head() if revision is None else revision
+            key = (site, store.name_of(number))
+            found = self._maps.get(key)
+            if found is None:
+                found = store.load(number)
+                self._keep(self._maps, key, found, _MOST_MAPS)
+        return number, found
+
+    def _keep(self, kept: dict[tuple[str, str], _Kept], key: tuple[str, str], value: _Kept, most: int) -> None:
+        """Keep a value, and forget the oldest of too many."""
+        with self._lock:
+            while len(kept) >= most:
+                kept.pop(next(iter(kept)))
+            kept[key] = value

@@ -16,7 +16,7 @@ from sqlalchemy.exc import OperationalError
 from evermap.config import Config
 from evermap.errors import EvermapError
 from evermap.maps.store import StaleRevisionError, StoreUnavailableError
-from evermap.runs.sessions import TwiceError, enter_session
+from evermap.runs.sessions import TwiceError, UnbridgedError, enter_session
 from evermap.server.database import MOST_TRIES, Database, Job, JobState
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import recording_of
@@ -31,9 +31,9 @@ class JobOutcome:
     """What became of a session.
 
     Attributes:
-        state: entered, rejected, or queued where the store did not answer.
+        state: entered, rejected, set aside where it does not fit the map, or queued where the store did not answer.
         reason: why, or a remark.
-        revision: that it is.
+        revision: that it is, or that it was tried with.
     """
 
     state: JobState
@@ -97,11 +97,10 @@ class Worker:
                 start = time.perf_counter()
                 try:
                     with self._sites.store(job.site, create=True) as store:
+                        head = store.head()
                         entered = enter_session(store, recording, self._config)
                         if not entered.session.found:
-                            return JobOutcome(
-                                JobState.REJECTED, f"not found in this map: {entered.session.set_aside[0]}"
-                            )
+                            return JobOutcome(JobState.ASIDE, entered.session.set_aside[0], entered.parent)
                         command = f"evermap work ({job.robot})"
                         took_s = time.perf_counter() - start
                         number = entered.commit(store, self._config, command=command, wall_s=took_s)
@@ -110,6 +109,8 @@ class Worker:
                     continue
         except TwiceError as error:  # a worker died between the commit and saying so, or it came another way
             return JobOutcome(JobState.ENTERED, error.problem, error.revision)
+        except UnbridgedError as error:
+            return JobOutcome(JobState.ASIDE, error.problem, head)
         except StoreUnavailableError as error:
             return JobOutcome(JobState.QUEUED, error.problem)
         except EvermapError as error:
