@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
+import json
 import os
 import re
 import secrets
@@ -17,6 +18,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote, urlencode
 
 import numpy as np
 import pytest
@@ -27,6 +29,8 @@ pytest.importorskip("httpx", reason="needs httpx: pip install 'evermap[dev]'")
 import httpx
 import uvicorn
 from fastapi.testclient import TestClient
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from evermap.config import Config
 from evermap.errors import ConfigError, InputError
@@ -80,7 +84,10 @@ class Fleet:
     tokens: dict[str, str]
 
     def __call__(self, method: str, path: str, role: str = "admin", **what: Any) -> httpx.Response:
-        return self.client.request(method, path, headers={"Authorization": f"Bearer {self.tokens[role]}"}, **what)
+        headers = {"Authorization": f"Bearer {self.tokens[role]}"}
+        if "content" in what:
+            headers["Content-Type"] = "application/json"
+        return self.client.request(method, path, headers=headers, **what)
 
     def upload(self, data: bytes, site: str = "ward", role: str = "upload") -> httpx.Response:
         return self("POST", f"/maps/{site}/sessions", role, content=data)
@@ -501,3 +508,57 @@ def test_tables_of_another_version_are_one_line(tmp_path: Path) -> None:
         connection.execute("UPDATE server SET version = 9")
     with pytest.raises(InputError, match="of version 9, this evermap has 1"):
         Database(tmp_path)
+
+
+ODD = st.one_of(
+    st.text(max_size=12),
+    st.integers(-(2**70), 2**70).map(str),
+    st.floats().map(str),
+    st.sampled_from(
+        ["", "ward", "1", "true", "queued", "\0", "%00", "' OR 1=1 --", "<b>", "\ud800", "۱", "٣", "1e999"]
+    ),
+)
+
+
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def fuzzed(fleet: Fleet, asked: list[tuple[str, str, dict[str, Any]]], data: st.DataObject) -> None:
+    method, path, operation = data.draw(st.sampled_from(asked))
+    for name in re.findall(r"\{(\w+)\}", path):
+        value = data.draw(st.one_of(st.just("ward"), ODD) if name == "site" else st.one_of(st.just("1"), ODD))
+        path = path.replace(f"{{{name}}}", quote(value, safe="", errors="surrogatepass"))
+    listed = [item["name"] for item in operation.get("parameters", ()) if item["in"] == "query"]
+    query = {name: data.draw(ODD) for name in listed if data.draw(st.booleans())}
+    text = urlencode(query, errors="surrogatepass")
+    body = st.fixed_dictionaries(
+        {},
+        optional={
+            "landmarks": st.lists(st.one_of(st.just("1"), ODD), max_size=3),
+            "note": ODD,
+            "revision": st.one_of(st.integers(), ODD),
+        },
+    )
+    content = data.draw(st.one_of(st.binary(max_size=40), body.map(json.dumps).map(str.encode)))
+    answer = fleet(method, f"{path}?{text}", content=content if method == "POST" else None)
+    assert answer.status_code < 500, (method, path, text, content, answer.text)
+
+
+def test_no_question_is_a_defect(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.server.rate_hz = 1e6
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    for note, status in (("\ud800", 422), ("\0\x1b\u202e", 200)):
+        said = json.dumps({"landmarks": ["1"], "note": note}).encode()
+        assert fleet("POST", "/maps/ward/pin", content=said).status_code == status
+        fleet("POST", "/maps/ward/unpin", content=said)
+    paths = ("/audit", "/jobs", "/maps", "/maps/ward/revisions", "/maps/ward/landmarks/1/why")
+    assert {fleet("GET", path).status_code for path in paths} == {200}
+    assert fleet("GET", "/jobs?site=%00").status_code == 422
+    assert fleet("GET", "/maps/%00/revisions").status_code == 404
+    asked = [
+        (method.upper(), path, operation)
+        for path, methods in fleet.client.get("/openapi.json").json()["paths"].items()
+        for method, operation in methods.items()
+        if not path.endswith("/events")
+    ]
+    fuzzed(fleet, asked)

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 from fastapi import APIRouter, Depends, FastAPI, Header, HTTPException, Query, Request, Response
 from fastapi.concurrency import run_in_threadpool
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
 from sqlalchemy.exc import OperationalError
@@ -24,6 +25,7 @@ from sqlalchemy.exc import OperationalError
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
 from evermap.maps.store import DamagedMapError, Provenance, StaleRevisionError, StoreUnavailableError
+from evermap.maps.store.postgres import SITE
 from evermap.maps.store.sql import SqlStore
 from evermap.runs import map_dicts
 from evermap.runs.sessions import WORDS, edit_landmarks
@@ -69,13 +71,23 @@ class Server:
         return left >= 1.0
 
 
+class PlainJSON(JSONResponse):
+    """JSON in ASCII: whatever text a map holds, also what no encoding has, can be sent."""
+
+    def render(self, content: Any) -> bytes:
+        """Encode the answer."""
+        return json.dumps(content, allow_nan=False).encode("ascii")
+
+
 def create_app(server: Server) -> FastAPI:
     """Return the application."""
-    app = FastAPI(title="evermap", version=__version__, docs_url=None, redoc_url=None)
+    about: dict[str, Any] = {"title": "evermap", "version": __version__, "docs_url": None, "redoc_url": None}
+    app = FastAPI(**about, default_response_class=PlainJSON)
     app.state.server = server
     app.include_router(router)
     app.middleware("http")(_guard)
     app.exception_handler(EvermapError)(_mistake)
+    app.exception_handler(RequestValidationError)(_unread)
     app.exception_handler(OperationalError)(_outage)
     return app
 
@@ -104,11 +116,18 @@ async def _mistake(request: Request, error: Exception) -> Response:
     if isinstance(error, StoreUnavailableError):
         return await _outage(request, error)
     what = f"{error.field}: {error.problem}" if error.field else error.problem
-    return JSONResponse({"detail": printable(what, 400)}, status)
+    return PlainJSON({"detail": printable(what, 400)}, status)
+
+
+async def _unread(_: Request, error: Exception) -> Response:
+    """What is wrong with a request, without repeating it."""
+    assert isinstance(error, RequestValidationError)
+    told = [f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
+    return PlainJSON({"detail": printable("; ".join(told), 400)}, 422)
 
 
 async def _outage(_: Request, __: Exception) -> Response:
-    return JSONResponse({"detail": "the database does not answer"}, 503, {"Retry-After": "5"})
+    return PlainJSON({"detail": "the database does not answer"}, 503, {"Retry-After": "5"})
 
 
 def _server(request: Request) -> Server:
@@ -142,6 +161,7 @@ Reader = Annotated[str, _may(Role.READ)]
 Uploader = Annotated[str, _may(Role.UPLOAD)]
 Approver = Annotated[str, _may(Role.APPROVE)]
 Administrator = Annotated[str, _may(Role.ADMIN)]
+OfSite = Annotated[str | None, Query(pattern=f"^{SITE.pattern}$")]
 AtRevision = Annotated[int | None, Query(ge=0, le=2**31 - 1)]
 Number = Annotated[float | None, Query(allow_inf_nan=False)]
 router = APIRouter()
@@ -205,7 +225,7 @@ async def upload(request: Request, response: Response, site: str, server: Answer
 
 @router.get("/jobs")
 def list_jobs(
-    server: Answering, _: Reader, site: str | None = None, state: JobState | None = None,
+    server: Answering, _: Reader, site: OfSite = None, state: JobState | None = None,
     most: Annotated[int, Query(ge=1, le=1000)] = 100,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """List uploaded sessions, the newest first."""
