@@ -34,7 +34,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -55,6 +55,7 @@ from evermap.slam.association.in_space import identified_in_space
 from evermap.slam.intake import beliefs
 from evermap.types import (
     UNKNOWN,
+    AnyRecordingT,
     ChangeKind,
     FloatArray,
     IntArray,
@@ -72,7 +73,6 @@ from evermap_studies.partial_views.study import Settings, building_of
 from evermap_studies.sim import simulate_warehouse
 from evermap_studies.sim.park import simulate_park
 
-AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data"
 PARKS = 3
 DATASETS = (3, 6)
@@ -259,13 +259,13 @@ def with_wrong_ids(recording: AnyRecordingT, rate: float, *, twins: bool = False
 
 
 def wrong_line(recording: Recording | SpatialRecording) -> str:
-    """Return position errors [m] at each rate of wrong identities, and with one on two landmarks; in the plane also
-    those with `slam.vote_ids`.
+    """Return position errors [m] at each rate of wrong identities, and with one on two landmarks; as read, and voted on
+    (`slam.vote_ids`).
     """
     truth, off = _truth(recording, em.run_slam(recording)), list[str]()
     for rate, twins in (*((rate, False) for rate in WRONG_RATES), (0.0, True)):
         wrong, each = with_wrong_ids(recording, rate, twins=twins), list[str]()
-        for vote in (False,) if isinstance(recording, SpatialRecording) else (False, True):
+        for vote in (False, True):
             estimated = em.run_slam(wrong, Config(slam={"vote_ids": vote})).trajectory
             each.append(f"{evaluate_trajectory(estimated, truth, rate_hz=RATE_HZ).rmse_m:.3f}")
         off.append(" / ".join(each))

@@ -13,7 +13,7 @@ import numpy as np
 
 from evermap.config import Config
 from evermap.errors import ConfigError, DataError, NumericalError
-from evermap.types import AnyRecording, Landmarks, Progress, Recording, SlamResult, SpatialRecording
+from evermap.types import AnyRecording, AnyRecordingT, Landmarks, Progress, Recording, SlamResult, SpatialRecording
 
 if TYPE_CHECKING:
     from evermap.maps.living import LivingMap
@@ -47,7 +47,7 @@ def run_slam(
     from evermap.maps.sessions.session import existing
     from evermap.slam.check import odd, valid
     from evermap.slam.estimate import solve
-    from evermap.slam.intake import beliefs, prepare, without_contradicted_ids
+    from evermap.slam.intake import beliefs, prepare
     from evermap.slam.result import concluded
 
     config = config or Config()
@@ -56,8 +56,7 @@ def run_slam(
     recording = valid(recording, config.sensor, prior_map)
     remarks = odd(recording, identities=config.slam.unknown_ids is not True, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
-    if config.slam.vote_ids and config.slam.unknown_ids is not True:
-        recording = without_contradicted_ids(recording)
+    recording = _voted(recording, config)
     if config.slam.unknown_ids:
         from evermap.slam.association.identify import identified
 
@@ -67,6 +66,15 @@ def run_slam(
     with _one_thread():
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
         return existing(solved, concluded(solved), config.living)
+
+
+def _voted(recording: AnyRecordingT, config: Config) -> AnyRecordingT:
+    """The recording without ids that are contradicted, where ids are used and that is asked for."""
+    from evermap.slam.votes import without_contradicted_ids
+
+    if config.slam.unknown_ids is True or not config.slam.vote_ids:
+        return recording
+    return without_contradicted_ids(recording, config.slam.space)
 
 
 def _one_thread() -> AbstractContextManager[Any]:
@@ -89,6 +97,8 @@ def _run_in_space(
     from evermap.slam.space.solve import solve_space
 
     with _one_thread():
+        if not has_traffic(recording):
+            recording = _voted(recording, config)
         if config.slam.unknown_ids:
             from evermap.slam.association.in_space import identified_in_space
 
@@ -153,7 +163,7 @@ def _bring_in_space(
 
     if has_traffic(recording):
         return _bring_in_traffic(recording, living, config, progress)
-    recording, living = steps.admitted(recording, living)
+    recording, living = steps.admitted(_voted(recording, config), living)
     intake = prepare_space(recording, config.slam.space)
     with _one_thread():
         whole, vicinity = living, None
@@ -204,13 +214,12 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     from evermap.maps.sessions.session import admitted
     from evermap.slam.check import odd
     from evermap.slam.cleaning import clean
-    from evermap.slam.intake import beliefs, without_contradicted_ids
+    from evermap.slam.intake import beliefs
 
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     anonymous = config.slam.unknown_ids
     recording = clean(without_ids(recording) if anonymous is True else recording, config.slam.cleaning)
-    if config.slam.vote_ids and anonymous is not True:
-        recording = without_contradicted_ids(recording)
+    recording = _voted(recording, config)
     remarks = odd(recording, identities=anonymous is not True, settings=config.slam.check)
     recording, _ = admitted(recording, living)
     if anonymous:

@@ -660,6 +660,7 @@ class SpatialRecording(Shown):
 
 
 AnyRecording = Recording | SpatialRecording
+AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
 """A session in the plane or in space."""
 
 

@@ -168,9 +168,9 @@ class SlamConfig(Section):
         "without one only",
     )
     vote_ids: bool = Field(
-        default=False,
-        description="leave out identities that other detections at the same place within seconds contradict, in the "
-        "plane: for detectors that read more than one in twenty wrongly",
+        default=True,
+        description="leave out identities that other detections at the same place within seconds contradict, and those "
+        "that are on two landmarks",
     )
     robust: bool = Field(default=True, description="down-weight detections of wrong identity; off only for comparison")
     outlier_log_odds: float = Field(

@@ -10,24 +10,15 @@ from scipy import sparse
 
 from evermap.config import SlamConfig
 from evermap.errors import DataError
-from evermap.slam.bridge import dead_reckoned
 from evermap.slam.calibration import CalibrationPrior
 from evermap.slam.changes.explain import GivenMap
-from evermap.slam.noise import START, start_noise
+from evermap.slam.noise import start_noise
 from evermap.slam.problem import Drive, Noise, Problem
-from evermap.slam.streaming import PriorMap, sighted_at
+from evermap.slam.streaming import PriorMap
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording, Sensor
 
 FIRST_POSE_INFORMATION = 1e8
 """The first pose is the origin, to 0.1 mm."""
-VOTE_S = 5.0
-"""Before and after a detection, in which odometry drifts less than detections err."""
-SEEN_M, SEEN_SHARE = 0.05, 0.05
-"""Error of a detection's place at no distance, and as a share of its range: that of a cheap camera."""
-VOTE_GATE = 2.0
-"""Standard deviations within which another detection is of the same place; twice as many for its own id."""
-FEWEST_VOTES, VOTES = 2, 3
-"""Detections with another id that contradict one, at least, and more than so many times those with its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,40 +100,6 @@ def prepare(recording: Recording, prior_map: Landmarks | None = None, remarks: t
     )
     in_map = None if prior_map is None else _in_rows(prior_map, landmark_id)
     return Prepared(problem, start_s, pose_frame, used, landmark_id, in_map, tuple(warnings), recording.landmark_names)
-
-
-def without_contradicted_ids(recording: Recording) -> Recording:
-    """Return the recording without the landmark ids of detections that others contradict, with a remark on how many.
-
-    Carried to one pose by odometry, which is good for some seconds, detections of one landmark lie together. Several
-    with one id, and none or hardly any with its own anywhere near, say that an id was read wrongly.
-
-    Raises:
-        DataError: as of `prepare`.
-    """
-    prepared = prepare(recording)
-    problem, given = prepared.problem, recording.detections
-    pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
-    at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
-    variance = (SEEN_M + SEEN_SHARE * problem.reading[:, 0]) ** 2
-    stamp_s, name = problem.stamp_s[problem.pose_row], problem.landmark_row
-    first, last = (np.searchsorted(stamp_s, stamp_s + sign * VOTE_S) for sign in (-1.0, 1.0))
-    wrong = np.zeros(len(at), dtype=np.bool_)
-    for k in range(len(at)):
-        near = slice(first[k], last[k])
-        squared = ((at[near] - at[k]) ** 2).sum(axis=1) / (variance[near] + variance[k])
-        same = name[near] == name[k]
-        own = np.count_nonzero(same & (squared < (2.0 * VOTE_GATE) ** 2)) - 1
-        others = np.bincount(name[near][~same & (squared < VOTE_GATE**2)]).max(initial=0)
-        wrong[k] = others >= FEWEST_VOTES and others > VOTES * own
-    if not wrong.any():
-        return recording
-    landmark_id = given.landmark_id.copy()
-    landmark_id[prepared.used[wrong]] = UNKNOWN
-    remark = f"{int(wrong.sum())} detections whose landmark_id those of the seconds around contradict"
-    return replace(
-        recording, detections=replace(given, landmark_id=landmark_id), warnings=(*recording.warnings, remark)
-    )
 
 
 def beliefs(sensor: Sensor, settings: SlamConfig) -> tuple[CalibrationPrior, Noise]:

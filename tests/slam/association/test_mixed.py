@@ -10,18 +10,15 @@ from identity_scores import identity_scores
 from problems import make_world
 from recordings import building
 
-from evermap import run_slam
 from evermap.config import Config
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, names_of
 from evermap.slam.association.identify import identified, numbered
 from evermap.slam.association.merging import _without_contradictions
 from evermap.slam.calibration import CalibrationPrior
-from evermap.slam.intake import without_contradicted_ids
 from evermap.slam.noise import START
 from evermap.slam.problem import Estimate
 from evermap.types import UNKNOWN, IntArray, Landmarks, Recording
-from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
 
 PRIOR = CalibrationPrior.from_settings(calibrated=True, fix={})
@@ -141,22 +138,3 @@ def test_names_say_where_in_a_map_it_is() -> None:
     met = np.isin(found, survey.landmark_id)
     assert np.mean(found[met] == true[met]) > 0.98
     assert met.mean() > 0.8
-
-
-def test_ids_that_the_seconds_around_contradict_are_left_out() -> None:
-    recording = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
-    true, rng = recording.detections.landmark_id, np.random.default_rng(0)
-    wrong = rng.random(len(true)) < 0.2
-    given = np.where(wrong, rng.integers(0, 60, len(true)), true)
-    misread = replace(recording, detections=replace(recording.detections, landmark_id=given))
-    left_out = without_contradicted_ids(misread).detections.landmark_id == UNKNOWN
-    assert left_out[given != true].mean() > 0.9
-    assert left_out[given == true].mean() < 0.03
-    assert without_contradicted_ids(recording).detections is recording.detections
-    assert recording.truth is not None
-    off = [
-        evaluate_trajectory(run_slam(one, Config(slam={"vote_ids": vote})).trajectory, recording.truth, rate_hz=2.0)
-        for one, vote in ((recording, False), (misread, False), (misread, True))
-    ]
-    assert off[1].rmse_m > 5.0 * off[0].rmse_m
-    assert off[2].rmse_m < 1.5 * off[0].rmse_m

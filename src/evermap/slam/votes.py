@@ -1,0 +1,153 @@
+"""Identities that were read wrongly, by the vote of the seconds around.
+
+Carried to one pose by odometry, which is good for some seconds, detections of one landmark lie together. Several with
+one id, and none or hardly any with its own anywhere near, say that an id was read wrongly. How far detections of one
+landmark lie apart is told by those with one id, of which most are right. An id that is read at two places in one frame,
+time and again, is on two landmarks, and says nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from evermap.config import SpaceConfig
+from evermap.geometry import se3
+from evermap.slam.bridge import dead_reckoned
+from evermap.slam.intake import prepare
+from evermap.slam.kernels import kernel
+from evermap.slam.noise import START
+from evermap.slam.space.intake import prepare_space, without_range
+from evermap.slam.streaming import sighted_at
+from evermap.types import UNKNOWN, AnyRecordingT, BoolArray, FloatArray, IntArray, SpatialRecording
+
+VOTE_S = 5.0
+"""Before and after a detection, in which odometry drifts less than detections err."""
+SEEN_M, SEEN_SHARE = 0.05, 0.05
+"""Error of a detection's place at no distance, and as a share of its range, beside that of others."""
+FIRST_QUARTILE = {2: 0.575, 3: 1.213}
+"""Of a squared standard normal vector, by its dimension: most ids are right, not all."""
+FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
+"""Detections of one id from which their error is told, and its variance as a share of the above, at least."""
+VOTE_GATE = 2.0
+"""Standard deviations within which another detection is of the same place; twice as many for its own id."""
+FEWEST_VOTES, VOTES = 2, 3
+"""Detections with another id that contradict one, at least, and more than so many times those with its own."""
+FEWEST_DOUBLES = 3
+"""Frames that have an id at two places, each of which others with that id confirm."""
+
+
+def without_contradicted_ids(recording: AnyRecordingT, settings: SpaceConfig) -> AnyRecordingT:
+    """Return the recording without the landmark ids that the seconds around contradict, with a remark on how many.
+
+    In space that takes odometry; boxes, which move, and detections without a range keep their ids.
+
+    Args:
+        recording: as read.
+        settings: of the estimator in space.
+
+    Raises:
+        DataError: as of `prepare` and `prepare_space`.
+    """
+    given = recording.detections
+    if isinstance(recording, SpatialRecording):
+        if recording.odometry is None:
+            return recording
+        intake = prepare_space(recording, settings)
+        usable = ~np.isfinite(given.size_m).all(axis=1) & ~without_range(recording)
+        voting = np.flatnonzero(usable[intake.used])
+        problem, used = intake.problem, intake.used[voting]
+        mount = problem.mount[problem.sensor[voting]]
+        on_robot = se3.transform(mount, problem.measured[voting, :3])
+        at = se3.transform(intake.driven_pose[problem.pose_row[voting]], on_robot)
+        variance = (np.linalg.inv(problem.measured_root[voting]) ** 2).sum(axis=(1, 2)) / 3.0
+        stamp_s, name = problem.stamp_s[problem.pose_row[voting]], problem.place[voting]
+    else:
+        prepared = prepare(recording)
+        plane, used = prepared.problem, prepared.used
+        pose, _ = dead_reckoned(plane.stamp_s, plane.drive, plane.prior.mean, START)
+        at = sighted_at(pose[plane.pose_row], plane.reading, plane.prior.mean, plane.mount)
+        variance = (SEEN_M + SEEN_SHARE * plane.reading[:, 0]) ** 2
+        stamp_s, name = plane.stamp_s[plane.pose_row], plane.landmark_row
+    wrong, doubled = contradicted(at, variance, stamp_s, name)
+    left_out = wrong | doubled[name]
+    if not left_out.any():
+        return recording
+    landmark_id, warnings = given.landmark_id.copy(), list(recording.warnings)
+    landmark_id[used[left_out]] = UNKNOWN
+    if wrong.any():
+        warnings.append(f"{int(wrong.sum())} detections whose landmark_id those of the seconds around contradict")
+    texts = recording.landmark_names
+    twice = [texts.get(one, str(one)) for one in np.unique(given.landmark_id[used[doubled[name]]]).tolist()]
+    if twice:
+        warnings.append(f"landmark_id {', '.join(twice)}: on two landmarks, seen at two places at once; not used")
+    return replace(recording, detections=replace(given, landmark_id=landmark_id), warnings=tuple(warnings))
+
+
+def contradicted(
+    at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray
+) -> tuple[BoolArray, BoolArray]:
+    """Return which of M detections those of the seconds around contradict, and which of N names are at two places.
+
+    Args:
+        at: (M, D) where they are [m], by odometry alone.
+        variance: (M,) of each beside that of others.
+        stamp_s: (M,) in ascending order.
+        name: (M,) from 0.
+    """
+    near = np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * VOTE_S) for sign in (-1.0, 1.0)])
+    apart = _apart(at, variance, name, near)
+    apart = apart[np.isfinite(apart)]
+    if len(apart) >= FEWEST_PAIRS:
+        variance = variance * np.maximum(np.quantile(apart, 0.25) / FIRST_QUARTILE[at.shape[1]], LEAST_SHARE)
+    own, others = _votes(at, variance, name, near)
+    wrong = (others >= FEWEST_VOTES) & (others > VOTES * own)
+    return wrong, _doubles(at, variance, stamp_s, name, ~wrong & (own > 0)) >= FEWEST_DOUBLES
+
+
+@kernel
+def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray) -> FloatArray:
+    """(M,) normalised squared distance of the last detection with the same name in rows `near` (M, 2)."""
+    found = np.full(len(at), np.nan)
+    for k in range(len(at)):
+        for j in range(near[k, 1] - 1, k, -1):
+            if name[j] == name[k]:
+                found[k] = ((at[j] - at[k]) ** 2).sum() / (variance[j] + variance[k])
+                break
+    return found
+
+
+@kernel
+def _votes(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
+    """(M,) detections in rows `near` (M, 2) where each is, with its name, and most with one other name."""
+    own, others = np.zeros(len(at), dtype=np.int64), np.zeros(len(at), dtype=np.int64)
+    count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
+    for k in range(len(at)):
+        for j in range(near[k, 0], near[k, 1]):
+            squared = 0.0
+            for axis in range(at.shape[1]):
+                squared += (at[j, axis] - at[k, axis]) ** 2
+            squared /= variance[j] + variance[k]
+            if name[j] == name[k]:
+                own[k] += j != k and squared < 4.0 * VOTE_GATE * VOTE_GATE
+            elif squared < VOTE_GATE * VOTE_GATE:
+                count[name[j]] += 1
+                others[k] = max(others[k], count[name[j]])
+        for j in range(near[k, 0], near[k, 1]):
+            count[name[j]] = 0
+    return own, others
+
+
+@kernel
+def _doubles(at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray, sure: BoolArray) -> IntArray:
+    """(N,) pairs of detections with each name, both sure (M,), that are at two places at one time."""
+    count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
+    for k in range(len(at)):
+        j = k + 1
+        while j < len(at) and stamp_s[j] == stamp_s[k]:
+            if name[j] == name[k] and sure[j] and sure[k]:
+                squared = ((at[j] - at[k]) ** 2).sum() / (variance[j] + variance[k])
+                count[name[k]] += squared > 4.0 * VOTE_GATE * VOTE_GATE
+            j += 1
+    return count

@@ -1,0 +1,79 @@
+"""Identities that were read wrongly are left out by the vote of the seconds around, in the plane and in space."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from space.halls import hall
+
+from evermap import run_slam
+from evermap.config import Config, SpaceConfig
+from evermap.metrics.trajectory import evaluate_trajectory
+from evermap.slam.votes import without_contradicted_ids
+from evermap.types import UNKNOWN, AnyRecordingT, IntArray
+from evermap_studies.sim import WarehouseConfig, simulate_warehouse
+from evermap_studies.sim.park import ParkConfig, simulate_park
+
+SPACE = SpaceConfig()
+
+
+def with_ids(recording: AnyRecordingT, landmark_id: IntArray) -> AnyRecordingT:
+    return replace(recording, detections=replace(recording.detections, landmark_id=landmark_id))
+
+
+def misread(recording: AnyRecordingT, rate: float) -> AnyRecordingT:
+    """A share of the ids those of any landmark."""
+    true, rng = recording.detections.landmark_id, np.random.default_rng(0)
+    ids = np.unique(true[true != UNKNOWN])
+    wrong = (rng.random(len(true)) < rate) & (true != UNKNOWN)
+    return with_ids(recording, np.where(wrong, ids[rng.integers(0, len(ids), len(true))], true))
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.2])
+@pytest.mark.parametrize(
+    "recording",
+    [
+        pytest.param(simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0)), id="warehouse"),
+        pytest.param(simulate_park(ParkConfig(n_trees=80, drive_m=600.0), seed=3), id="park"),
+        pytest.param(hall(1, n_points=40, n_frames=300), id="space"),
+    ],
+)
+def test_ids_that_the_seconds_around_contradict_are_left_out(recording, rate):
+    true, wrongly = recording.detections.landmark_id, misread(recording, rate)
+    given = wrongly.detections.landmark_id
+    left_out = (without_contradicted_ids(wrongly, SPACE).detections.landmark_id == UNKNOWN) & (given != UNKNOWN)
+    assert left_out[given != true].mean() > 0.75
+    assert left_out[given == true].mean() < 0.01
+    assert (without_contradicted_ids(recording, SPACE).detections.landmark_id != true).mean() < 0.002
+
+
+def test_a_fifth_of_the_ids_wrong_is_nearly_as_good_as_none():
+    recording = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
+    wrongly, as_read = misread(recording, 0.2), Config(slam={"vote_ids": False})
+    assert recording.truth is not None
+    off = [
+        evaluate_trajectory(run_slam(*args).trajectory, recording.truth, rate_hz=2.0).rmse_m
+        for args in ((recording, as_read), (recording,), (wrongly, as_read), (wrongly,))
+    ]
+    assert off[1] == pytest.approx(off[0], rel=0.02)
+    assert off[2] > 5.0 * off[0]
+    assert off[3] < 1.5 * off[0]
+
+
+def test_an_id_on_two_landmarks_is_not_used_and_named():
+    recording = simulate_warehouse(WarehouseConfig(n_landmarks=60, rate_hz=2.0))
+    true = recording.detections.landmark_id
+    together = np.zeros((60, 60))
+    for frame in np.unique(recording.detections.frame):
+        seen = true[recording.detections.frame == frame]
+        together[np.ix_(seen, seen)] += 1
+    one, other = np.unravel_index(np.triu(together, 1).argmax(), together.shape)
+    twins = with_ids(recording, np.where(true == other, one, true))
+    found = without_contradicted_ids(twins, SPACE)
+    assert np.array_equal(found.detections.landmark_id == UNKNOWN, np.isin(true, (one, other)))
+    assert f"landmark_id {one}: on two landmarks" in found.warnings[-1]
+    assert recording.truth is not None
+    off = evaluate_trajectory(run_slam(twins).trajectory, recording.truth, rate_hz=2.0).rmse_m
+    assert off < 1.5 * evaluate_trajectory(run_slam(recording).trajectory, recording.truth, rate_hz=2.0).rmse_m
