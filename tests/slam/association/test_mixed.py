@@ -10,6 +10,7 @@ from identity_scores import identity_scores
 from problems import make_world
 from recordings import building
 
+from evermap import run_slam
 from evermap.config import Config
 from evermap.metrics.trajectory import evaluate_trajectory
 from evermap.slam.association.assignment import NOBODY, Assignment, alike, names_of
