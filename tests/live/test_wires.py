@@ -17,6 +17,7 @@ from feeding import AT_THE_END, SESSIONS, engine, entered, online, stored
 
 import evermap as em
 from evermap.config import Config
+from evermap.errors import ConfigError
 from evermap.io.rosbag import ros2_types
 from evermap.live.feed import run_live
 from evermap.live.now import Now
@@ -390,3 +391,9 @@ def test_a_drive_is_seen_while_it_happens(living: LivingMap, endpoint: str, tmp_
     assert stamps[-1] > ROBOT.frames.stamp_s[-1] - 5.0
     assert len({name for _, name, *_ in seen["landmark"]}) >= len(bridge.engine.landmarks())
     assert (tmp_path / "live.rrd").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("where", ["tcp/localhost", "listen=tcp/[::1]", "udp/127.0.0.1#iface=lo"])
+def test_an_endpoint_without_a_port_is_refused_and_not_waited_for(where):
+    with pytest.raises(ConfigError, match="names no port"):
+        Zenoh(where, None)

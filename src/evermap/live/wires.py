@@ -283,10 +283,13 @@ def _zenoh_config(zenoh: Any, where: str) -> Any:
     if Path(where).is_file():
         config = zenoh.Config.from_file(where)
     else:
-        config, listens = zenoh.Config(), where.startswith("listen=")
+        config, listens, endpoint = zenoh.Config(), where.startswith("listen="), where.removeprefix("listen=")
+        if re.match(r"(tcp|udp|tls|quic|ws)/", endpoint) and not re.search(r":\d+($|[?#])", endpoint):
+            hint = where + ":7447, the port of a router by default"
+            raise ConfigError(f"'{where}' names no port", field="zenoh", hint=hint)
         values |= {
             "mode": "router" if listens else "peer",
-            "listen/endpoints": [where.removeprefix("listen=") if listens else "tcp/localhost:0"],
+            "listen/endpoints": [endpoint if listens else "tcp/localhost:0"],
             "scouting/multicast/enabled": False,
         }
         if not listens:

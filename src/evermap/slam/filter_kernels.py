@@ -402,18 +402,25 @@ def _condition(covariance: FloatArray, root: FloatArray, white: FloatArray) -> N
     `root^-1 (H P, innovations)`.
     """
     for row in range(len(white)):
-        for other in range(row):
-            for k in range(white.shape[1]):
-                white[row, k] -= root[row, other] * white[other, k]
-        for k in range(white.shape[1]):
-            white[row, k] /= root[row, row]
+        mine = white[row]
+        for other in range(row % 2):
+            for k in range(len(mine)):
+                mine[k] -= root[row, other] * white[other, k]
+        for other in range(row % 2, row, 2):
+            a, b, one, two = root[row, other], root[row, other + 1], white[other], white[other + 1]
+            for k in range(len(mine)):
+                mine[k] -= a * one[k] + b * two[k]
+        for k in range(len(mine)):
+            mine[k] /= root[row, row]
     for i in range(len(covariance)):
         mine = covariance[i]
         for row in range(0, len(white), 2):
             one, two = white[row], white[row + 1]
             a, b = one[i], two[i]
-            for k in range(len(covariance)):
+            for k in range(i + 1):
                 mine[k] -= a * one[k] + b * two[k]
+        for k in range(i):
+            covariance[k, i] = mine[k]
 
 
 @vectorised

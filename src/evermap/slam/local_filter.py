@@ -159,10 +159,7 @@ class LocalFilter:
         self._used_at[slots[here]] = self._now
         waiting = list(dict.fromkeys(rows[~here].tolist()))
         self._make_room(len(waiting))
-        for row in waiting:
-            ties = self._left.pop(row, None)
-            if ties is None or (self._is_solved(row) and 2 * sum(self._slot[ties.rows] >= 0) < len(ties.rows)):
-                ties = self._given(row)
+        for row, ties in zip(waiting, self._tied(waiting), strict=True):
             self._return(row, ties)
         return self._slot[rows]
 
@@ -285,19 +282,34 @@ class LocalFilter:
         at = columns(leaving)
         self.covariance[at], self.covariance[:, at] = 0.0, 0.0
 
-    def _is_solved(self, row: int) -> bool:
-        """Whether the solution or the map knows a place."""
-        return row < len(self._given_position) and bool(np.isfinite(self._given_position[row, 0]))
-
-    def _given(self, row: int) -> Ties:
-        """What ties a place to others, as the solution or the map says."""
-        assert self._given_joint is not None
-        of = self.active if self._neighbours else self._row[:0]
-        of = of[of < len(self._given_position)]
-        of = of[np.isfinite(self._given_position[of, 0])]
-        near = of[_nearest(self._given_position[of], self._given_position[row], self._neighbours)]
-        joint = self._given_joint(np.append(row, near))
-        return Ties(near, self._given_position[row], self._given_position[near], joint)
+    def _tied(self, waiting: list[int]) -> list[Ties]:
+        """What ties places to others, each to those before it, too: as it was when they left, or as the solution or the
+        map says where these know them and most of their neighbours have left.
+        """
+        solved, here = np.isfinite(self._given_position[:, 0]), self._slot >= 0
+        of = self.active if self._neighbours else NO_PLACES
+        of = of[of < len(solved)]
+        of = of[solved[of]]
+        ties: dict[int, Ties] = {}
+        near: dict[int, IntArray] = {}
+        for row in waiting:
+            left, is_solved = self._left.pop(row, None), row < len(solved) and bool(solved[row])
+            if left is not None and not (is_solved and 2 * np.count_nonzero(here[left.rows]) < len(left.rows)):
+                ties[row] = left
+            else:
+                near[row] = of[_nearest(self._given_position[of], self._given_position[row], self._neighbours)]
+            here[row] = True
+            if is_solved and self._neighbours:
+                of = np.append(of, row)
+        if near:
+            assert self._given_joint is not None
+            every = np.unique(np.concatenate([[row, *others] for row, others in near.items()]))
+            joint = self._given_joint(every)
+            for row, others in near.items():
+                at = (2 * np.searchsorted(every, np.append(row, others))[:, None] + [0, 1]).ravel()
+                there = self._given_position[row], self._given_position[others]
+                ties[row] = Ties(others, *there, joint[np.ix_(at, at)])
+        return [ties[row] for row in waiting]
 
     def _return(self, row: int, ties: Ties) -> None:
         """Put a known place back where those of its neighbours that are in the covariance take it."""

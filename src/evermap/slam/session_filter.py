@@ -46,7 +46,8 @@ class SessionFilter(LocalFilter):
             marginals: covariances at `estimate`, where they are known already.
         """
         self.problem, self._noise, self._free = problem, noise, problem.prior.free
-        n, room = len(estimate.pose), int(ROOM_SHARE * self._most)
+        n = len(estimate.pose)
+        room = max(int(ROOM_SHARE * self._most), len(np.unique(problem.landmark_row[problem.detections_of(n - 1)])))
         if marginals is None:
             marginals = Smoother(problem.until(n), noise, heavy=True, robust=self._robust).marginals(estimate)
         recent = problem.landmark_row[: np.searchsorted(problem.pose_row, n)][::-1]

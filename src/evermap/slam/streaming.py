@@ -49,8 +49,8 @@ ELSEWHERE = 0.1
 """Motion (m or rad) of a part that the optimum near it does not take back."""
 SLICES_A_FRAME = 3.0
 """Work on a relinearisation in every frame, in milliseconds of a usual core."""
-CAUGHT_UP_MS = 0.15
-"""What a frame takes that is processed again."""
+CAUGHT_UP_MS, OF_PAIR_MS = 0.15, 5e-4
+"""What a frame takes that is processed again, and each pair of its detections, as far as two of them fit in a frame."""
 STEPS_A_ROUND = 4
 """Gauss-Newton steps of a relinearisation, or between two estimates of the noise, at most."""
 NEAR, NEAR_NOISE = 0.02, 1e-4
@@ -446,7 +446,7 @@ class StreamingSlam:
             detections = self._problem.detections_of(row)
             self._meet_new_landmarks(following, landmark, detections)
             following.add(row, landmark)
-            yield CAUGHT_UP_MS
+            yield min(CAUGHT_UP_MS + OF_PAIR_MS * len(detections) ** 2, 0.5 * SLICES_A_FRAME)
         self._filter, self._landmark = following, landmark
 
     def _restart(self, estimate: Estimate) -> None:
