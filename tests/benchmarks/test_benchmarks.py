@@ -299,7 +299,7 @@ def test_a_small_run_writes_compares_and_reports(
     (tmp_path / "mrclam").mkdir()
     monkeypatch.setattr(run.association, "FOLDER", tmp_path)
     monkeypatch.setattr(run.association, "run", lambda: nameless)
-    soaked = {"sessions": 1, "sites": 1, "uploads": 1, "kills": 0, "store": "sqlite", "took_s": 1.0, "wait_ms": {}}
+    soaked = {"sessions": 1, "sites": 1, "uploads": 1, "kills": {}, "store": "sqlite", "took_s": 1.0, "wait_ms": {}}
     served = dict.fromkeys(run.fleet.METRICS, 1.0), {**soaked, "memory_mb": [1.0, 1.0]}
     monkeypatch.setattr(run.fleet, "run", lambda: served)
     measured = run.run(

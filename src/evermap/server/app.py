@@ -10,6 +10,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from typing import Annotated, Any
@@ -20,7 +21,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import InterfaceError, OperationalError
 
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
@@ -35,6 +36,8 @@ from evermap.server.sites import NoSuchSiteError, SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest
 from evermap.types import json_number
 
+_AWAY = (OperationalError, InterfaceError)
+"""What a database that does not answer raises."""
 _EVERY_S = 1.0
 """Between two looks for new revisions."""
 _ALIVE_S = 15.0
@@ -88,7 +91,8 @@ def create_app(server: Server) -> FastAPI:
     app.middleware("http")(_guard)
     app.exception_handler(EvermapError)(_mistake)
     app.exception_handler(RequestValidationError)(_unread)
-    app.exception_handler(OperationalError)(_outage)
+    for away in _AWAY:
+        app.exception_handler(away)(_outage)
     return app
 
 
@@ -101,7 +105,8 @@ async def _guard(request: Request, answer: Callable[[Request], Awaitable[Respons
     if request.method != "GET":
         who = getattr(request.state, "who", "-")
         what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
-        await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
+        with suppress(*_AWAY):  # the answer says so
+            await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
     return response
 
 
@@ -434,7 +439,7 @@ def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
     try:
         with server.sites.store(site) as store:
             return _lines(store, told) if store.head() > told else []
-    except (InputError, OperationalError):
+    except (InputError, *_AWAY):
         return []
 
 

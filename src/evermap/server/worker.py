@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from sqlalchemy.exc import OperationalError
+from sqlalchemy.exc import InterfaceError, OperationalError
 
 from evermap.config import Config
 from evermap.errors import EvermapError
@@ -67,7 +67,7 @@ class Worker:
                 job = self.step(told)
                 if job is None and drain and not self._database.depth():
                     return
-            except (OperationalError, StoreUnavailableError):  # a database that restarts
+            except (OperationalError, InterfaceError, StoreUnavailableError):  # a database that restarts
                 time.sleep(_OUTAGE_S)
                 continue
             if job is None:
@@ -127,7 +127,7 @@ class Worker:
             while not done.wait(self._lease_s / 3.0):
                 try:
                     self._database.renew(job.id, self.name, self._lease_s)
-                except OperationalError:  # it may be back the next time
+                except (OperationalError, InterfaceError):  # it may be back the next time
                     continue
 
         thread = threading.Thread(target=renew, daemon=True)
