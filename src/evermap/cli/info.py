@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
@@ -17,6 +18,8 @@ from evermap.errors import ConfigError, EvermapError, InputError
 if TYPE_CHECKING:
     from evermap.types import Landmarks
 
+MOST_LETTERS = 150
+"""Of a command line that is shown; `--json` has all of it."""
 _TABLES = {
     ("feature_id", "detected"): "looks, as `evermap persist` reads them",
     ("left", "right"): "lifetimes, as `evermap survival fit` reads them",
@@ -109,7 +112,7 @@ def _run(path: Path, summary: dict[str, Any]) -> Described:
     files = {name: _size(folder / name) for name in summary["outputs"] if (folder / name).is_file()}
     missing = [name for name in summary["outputs"] if name not in files and not (folder / name).is_dir()]
     rows = [
-        ("command", summary.get("command") or "-"),
+        ("command", shorten(summary.get("command") or "-", MOST_LETTERS, placeholder=" ...")),
         ("input", summary.get("input") or "-"),
         ("written", f"{timing.get('written_at', '-')} by evermap {summary['evermap']}"),
         *((name.replace("_", " "), f"{value:,.10g}") for name, value in numbers.items()),
