@@ -56,25 +56,26 @@ def run_slam(
     recording = valid(recording, config.sensor, prior_map)
     remarks = odd(recording, identities=config.slam.unknown_ids is not True, settings=config.slam.check)
     prior, noise = beliefs(recording.sensor, config.slam)
-    recording = _voted(recording, config)
+    recording, voted = _voted(recording, config)
     if config.slam.unknown_ids:
         from evermap.slam.association.identify import identified
 
         keep_ids = config.slam.unknown_ids == "empty"
         recording = identified(recording, prior, noise, prior_map=prior_map, keep_ids=keep_ids)
-    prepared = prepare(recording, prior_map, remarks)
+    prepared = prepare(recording, prior_map, (*remarks, *voted))
     with _one_thread():
         solved = solve(recording, prepared, prior, noise, config.slam, realtime=realtime, progress=progress)
         return existing(solved, concluded(solved), config.living)
 
 
-def _voted(recording: AnyRecordingT, config: Config) -> AnyRecordingT:
-    """The recording without ids that are contradicted, where ids are used and that is asked for."""
+def _voted(recording: AnyRecordingT, config: Config) -> tuple[AnyRecordingT, tuple[str, ...]]:
+    """The recording without ids that are contradicted, where ids are used and that is asked for; and remarks on it."""
     from evermap.slam.votes import without_contradicted_ids
 
     if config.slam.unknown_ids is True or not config.slam.vote_ids:
-        return recording
-    return without_contradicted_ids(recording, config.slam.space)
+        return recording, ()
+    voted = without_contradicted_ids(recording, config.slam.space)
+    return voted, voted.warnings[len(recording.warnings) :]
 
 
 def _one_thread() -> AbstractContextManager[Any]:
@@ -97,8 +98,9 @@ def _run_in_space(
     from evermap.slam.space.solve import solve_space
 
     with _one_thread():
+        voted: tuple[str, ...] = ()
         if not has_traffic(recording):
-            recording = _voted(recording, config)
+            recording, voted = _voted(recording, config)
         if config.slam.unknown_ids:
             from evermap.slam.association.in_space import identified_in_space
 
@@ -106,7 +108,7 @@ def _run_in_space(
             recording = identified_in_space(recording, config.slam.space, prior_map, keep_ids=keep_ids)
         if has_traffic(recording):
             return run_in_traffic(recording, config.slam.space, config.track, prior_map, progress)
-        intake = prepare_space(recording, config.slam.space)
+        intake = prepare_space(recording, config.slam.space, voted)
         visit = SpatialVisit(recording, intake, solve_space(intake, prior_map, progress=progress))
         return existing(visit, concluded_in_space(recording, intake, visit.solved), config.living)
 
@@ -163,8 +165,9 @@ def _bring_in_space(
 
     if has_traffic(recording):
         return _bring_in_traffic(recording, living, config, progress)
-    recording, living = steps.admitted(_voted(recording, config), living)
-    intake = prepare_space(recording, config.slam.space)
+    recording, voted = _voted(recording, config)
+    recording, living = steps.admitted(recording, living)
+    intake = prepare_space(recording, config.slam.space, voted)
     with _one_thread():
         whole, vicinity = living, None
         if len(whole.places) > config.living.whole_places:
@@ -219,8 +222,8 @@ def solve_alone(recording: Recording, living: LivingMap, config: Config, *, prog
     recording = replace(recording, sensor=config.sensor.applied_to(recording.sensor))
     anonymous = config.slam.unknown_ids
     recording = clean(without_ids(recording) if anonymous is True else recording, config.slam.cleaning)
-    recording = _voted(recording, config)
-    remarks = odd(recording, identities=anonymous is not True, settings=config.slam.check)
+    recording, voted = _voted(recording, config)
+    remarks = (*odd(recording, identities=anonymous is not True, settings=config.slam.check), *voted)
     recording, _ = admitted(recording, living)
     if anonymous:
         prior, noise = beliefs(recording.sensor, config.slam)

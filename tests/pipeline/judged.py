@@ -83,6 +83,10 @@ class Judged:
         return next(p for p in self.result.parameters if p.name == name)
 
 
+AS_READ = "slam.vote_ids=false"
+"""Wrong identities stay."""
+
+
 def judge(recording: Recording, wrong: np.ndarray, config: Config | None = None, **options: Any) -> Judged:
     return Judged(recording, run_slam(recording, config, **options), wrong)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from judged import SEEDS, consistent, judged, true_pose_at
+from judged import AS_READ, SEEDS, consistent, judged, true_pose_at
 from scipy import stats
 
 from evermap.geometry import se2
@@ -38,7 +38,7 @@ def test_many_runs_are_as_good_as_they_say():
 
 
 def test_wrong_identities_are_found():
-    runs = [judged(seed, faults=0.05) for seed in SEEDS]
+    runs = [judged(seed, AS_READ, faults=0.05) for seed in SEEDS]
     wrong = np.concatenate([run.wrong[run.result.innovations.detection] for run in runs])
     p_inlier = np.concatenate([run.result.innovations.p_inlier for run in runs])
     # a landmark that nobody ever saw rightly cannot be told from one that is there
@@ -49,8 +49,8 @@ def test_wrong_identities_are_found():
 
 def test_wrong_identities_hurt_only_those_who_believe_everything():
     seeds = (0, 2)
-    robust = np.array([judged(seed).landmark_rmse() for seed in seeds])
-    credulous = np.array([judged(seed, "slam.robust=false").landmark_rmse() for seed in seeds])
+    robust = np.array([judged(seed, AS_READ).landmark_rmse() for seed in seeds])
+    credulous = np.array([judged(seed, AS_READ, "slam.robust=false").landmark_rmse() for seed in seeds])
     without = np.array([judged(seed, faults=0.0).landmark_rmse() for seed in seeds])
     assert credulous.sum() > 2 * robust.sum()
     assert robust.sum() < 1.5 * without.sum()
@@ -95,7 +95,7 @@ def test_trajectory_has_every_frame_and_no_long_step():
 
 
 def test_misses_are_expected_and_not_detected():
-    run = judged(0)
+    run = judged(0, AS_READ)
     misses, detections = run.result.misses, run.recording.detections
     hits = set(zip(detections.frame.tolist(), detections.landmark_id.tolist(), strict=True))
     assert len(misses) > 50

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from judged import arrays_of, judge, judged, recording_of, surveyed
+from judged import AS_READ, arrays_of, judge, judged, recording_of, surveyed
 from recordings import building, with_detections, with_ids, without_odometry_between
 
+from evermap.config import load_config
 from evermap.errors import DataError
 from evermap.geometry import se2
 from evermap.geometry.rigid import rigid
@@ -26,7 +27,7 @@ def test_an_interrupt_leaves_the_finished_part():
         if len(seen) == 100:
             raise KeyboardInterrupt
 
-    run = judge(recording, judged(0).wrong, progress=stop_after_100)
+    run = judge(recording, judged(0).wrong, load_config(None, [AS_READ]), progress=stop_after_100)
     result = run.result
     assert result.interrupted
     assert any("interrupted" in warning for warning in result.warnings)

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from judged import assert_same, judge, judged, recording_of, surveyed
+from judged import AS_READ, assert_same, judge, judged, recording_of, surveyed
 from recordings import some_rows
 
+from evermap.config import load_config
 from evermap.geometry import se2
 from evermap.pipeline import run_slam
 from evermap.types import FloatArray, Landmarks
@@ -45,8 +46,9 @@ def test_a_map_may_know_more_and_less_than_the_recording():
     strangers = Landmarks.at(
         np.append(half.landmark_id, [7000, 8000]), np.vstack([half.position_m, [[1e4, 0.0], [0.0, -1e4]]])
     )
-    run = judge(recording, judged(1).wrong, prior_map=half)
-    with_strangers = run_slam(recording, prior_map=strangers)
+    config = load_config(None, [AS_READ])
+    run = judge(recording, judged(1).wrong, config, prior_map=half)
+    with_strangers = run_slam(recording, config, prior_map=strangers)
     assert run.result.trajectory.frame == "prior_map"
     assert np.sqrt((run.pose_error[:, :2] ** 2).sum(axis=1).mean()) < 0.08
     assert np.isin(recording.detections.landmark_id, run.result.landmarks.landmark_id).all()

@@ -11,7 +11,7 @@ from space.halls import hall
 from evermap import run_slam
 from evermap.config import Config, SpaceConfig
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.slam.votes import without_contradicted_ids
+from evermap.slam.votes import contradicted, without_contradicted_ids
 from evermap.types import UNKNOWN, AnyRecordingT, IntArray
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
@@ -75,5 +75,19 @@ def test_an_id_on_two_landmarks_is_not_used_and_named():
     assert np.array_equal(found.detections.landmark_id == UNKNOWN, np.isin(true, (one, other)))
     assert f"landmark_id {one}: on two landmarks" in found.warnings[-1]
     assert recording.truth is not None
-    off = evaluate_trajectory(run_slam(twins).trajectory, recording.truth, rate_hz=2.0).rmse_m
+    result = run_slam(twins)
+    assert found.warnings[-1] in result.warnings
+    off = evaluate_trajectory(result.trajectory, recording.truth, rate_hz=2.0).rmse_m
     assert off < 1.5 * evaluate_trajectory(run_slam(recording).trajectory, recording.truth, rate_hz=2.0).rmse_m
+
+
+def test_what_is_seen_beside_another_in_one_frame_is_no_misreading_of_it():
+    """A landmark 2 cm from another one, and seen an eighth as often: in frames that have both, or in place of it."""
+    stamp_s, name = np.repeat(np.arange(0.0, 20.0, 0.1), 2), np.tile([0, 1], 200)
+    at = 0.05 * np.random.default_rng(0).normal(size=(400, 2)) + np.column_stack([np.zeros(400), 0.02 * name])
+    second = np.arange(400) % 16 == 1
+    for with_both in (True, False):
+        some = second | ((name == 0) & (with_both | ~np.roll(second, -1)))
+        wrong, doubled = contradicted(at[some], np.ones(some.sum()), stamp_s[some], name[some])
+        assert np.array_equal(wrong, (name[some] == 1) & (not with_both))
+        assert not doubled.any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -154,6 +155,7 @@ def work(
     lease_s: Annotated[
         float, typer.Option(min=1.0, max=3600.0, help="Time after which another worker takes a session over [s].")
     ] = 60.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print what became of each, one JSON object a line.")] = False,
 ) -> None:
     """Enter the sessions that were uploaded to a server.
 
@@ -171,6 +173,9 @@ def work(
 
     def told(job: Job, outcome: JobOutcome) -> None:
         became = outcome.state.value if outcome.revision is None else f"revision {outcome.revision}"
+        if as_json:
+            of = {"job": job.id, "site": job.site, "robot": job.robot, "state": outcome.state.value}
+            typer.echo(json.dumps({**of, "revision": outcome.revision, "reason": outcome.reason}))
         say(
             f"session {job.id} of {job.robot} for {job.site}: {became}"
             + (f" ({outcome.reason})" if outcome.reason else "")

@@ -31,7 +31,7 @@ FIRST_QUARTILE = {2: 0.575, 3: 1.213}
 FEWEST_PAIRS, LEAST_SHARE = 20, 1e-4
 """Detections of one id from which their error is told, and its variance as a share of the above, at least."""
 VOTE_GATE = 2.0
-"""Standard deviations within which another detection is of the same place; twice as many for its own id."""
+"""Standard deviations within which another detection is of the same place; twice as many for what speaks for its id."""
 FEWEST_VOTES, VOTES = 2, 3
 """Detections with another id that contradict one, at least, and more than so many times those with its own."""
 FEWEST_DOUBLES = 3
@@ -101,7 +101,7 @@ def contradicted(
     apart = apart[np.isfinite(apart)]
     if len(apart) >= FEWEST_PAIRS:
         variance = variance * np.maximum(np.quantile(apart, 0.25) / FIRST_QUARTILE[at.shape[1]], LEAST_SHARE)
-    own, others = _votes(at, variance, name, near)
+    own, others = _votes(at, variance, stamp_s, name, near)
     wrong = (others >= FEWEST_VOTES) & (others > VOTES * own)
     return wrong, _doubles(at, variance, stamp_s, name, ~wrong & (own > 0)) >= FEWEST_DOUBLES
 
@@ -119,8 +119,13 @@ def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray)
 
 
 @kernel
-def _votes(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray) -> tuple[IntArray, IntArray]:
-    """(M,) detections in rows `near` (M, 2) where each is, with its name, and most with one other name."""
+def _votes(
+    at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray, near: IntArray
+) -> tuple[IntArray, IntArray]:
+    """(M,) detections in rows `near` (M, 2) where each is, with its name, and most with one other name.
+
+    One that is read in the same frame is another landmark, which this one is beside.
+    """
     own, others = np.zeros(len(at), dtype=np.int64), np.zeros(len(at), dtype=np.int64)
     count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
     for k in range(len(at)):
@@ -131,9 +136,12 @@ def _votes(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray)
             squared /= variance[j] + variance[k]
             if name[j] == name[k]:
                 own[k] += j != k and squared < 4.0 * VOTE_GATE * VOTE_GATE
+            elif stamp_s[j] == stamp_s[k]:
+                count[name[j]] -= len(at) if squared < 4.0 * VOTE_GATE * VOTE_GATE else 0
             elif squared < VOTE_GATE * VOTE_GATE:
                 count[name[j]] += 1
-                others[k] = max(others[k], count[name[j]])
+        for j in range(near[k, 0], near[k, 1]):
+            others[k] = max(others[k], count[name[j]])
         for j in range(near[k, 0], near[k, 1]):
             count[name[j]] = 0
     return own, others
