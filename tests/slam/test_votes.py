@@ -11,7 +11,7 @@ from space.halls import hall
 from evermap import run_slam
 from evermap.config import Config, SpaceConfig
 from evermap.metrics.trajectory import evaluate_trajectory
-from evermap.slam.votes import contradicted, without_contradicted_ids
+from evermap.slam.votes import Read, contradicted, without_contradicted_ids
 from evermap.types import UNKNOWN, AnyRecordingT, IntArray
 from evermap_studies.sim import WarehouseConfig, simulate_warehouse
 from evermap_studies.sim.park import ParkConfig, simulate_park
@@ -88,7 +88,16 @@ def test_what_is_seen_beside_another_in_one_frame_is_no_misreading_of_it():
     second = np.arange(400) % 16 == 1
     for with_both in (True, False):
         some = second | ((name == 0) & (with_both | ~np.roll(second, -1)))
-        wrong, doubled = contradicted(at[some], np.ones(some.sum()), stamp_s[some], name[some])
+        view = np.round(10.0 * stamp_s[some]).astype(np.int64)
+        wrong, doubled = contradicted(Read(at[some], np.ones(some.sum()), stamp_s[some], view, name[some]))
         assert not wrong[name[some] == 0].any()
         assert wrong[name[some] == 1].mean() >= 0.9 if not with_both else not wrong.any()
         assert not doubled.any()
+
+
+def test_without_ids_or_odometry_there_is_no_vote():
+    recording = simulate_park(ParkConfig(n_trees=80, drive_m=60.0), seed=3)
+    nameless = with_ids(recording, np.full_like(recording.detections.landmark_id, UNKNOWN))
+    assert without_contradicted_ids(nameless, SPACE) is nameless
+    in_space = replace(hall(1, n_points=40, n_frames=50), odometry=None)
+    assert without_contradicted_ids(in_space, SPACE) is in_space

@@ -9,10 +9,12 @@ time and again, is on two landmarks, and says nothing.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from evermap.config import SpaceConfig
+from evermap.errors import DataError
 from evermap.geometry import se3
 from evermap.slam.bridge import dead_reckoned
 from evermap.slam.intake import prepare
@@ -20,7 +22,16 @@ from evermap.slam.kernels import kernel
 from evermap.slam.noise import START
 from evermap.slam.space.intake import prepare_space, without_range
 from evermap.slam.streaming import sighted_at
-from evermap.types import UNKNOWN, AnyRecordingT, BoolArray, FloatArray, IntArray, SpatialRecording
+from evermap.types import (
+    UNKNOWN,
+    AnyRecording,
+    AnyRecordingT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Recording,
+    SpatialRecording,
+)
 
 VOTE_S = 5.0
 """Before and after a detection, in which odometry drifts less than detections err."""
@@ -46,31 +57,13 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SpaceConfig) ->
     Args:
         recording: as read.
         settings: of the estimator in space.
-
-    Raises:
-        DataError: as of `prepare` and `prepare_space`.
     """
     given = recording.detections
-    if isinstance(recording, SpatialRecording):
-        if recording.odometry is None:
-            return recording
-        intake = prepare_space(recording, settings)
-        usable = ~np.isfinite(given.size_m).all(axis=1) & ~without_range(recording)
-        voting = np.flatnonzero(usable[intake.used])
-        problem, used = intake.problem, intake.used[voting]
-        mount = problem.mount[problem.sensor[voting]]
-        on_robot = se3.transform(mount, problem.measured[voting, :3])
-        at = se3.transform(intake.driven_pose[problem.pose_row[voting]], on_robot)
-        variance = (np.linalg.inv(problem.measured_root[voting]) ** 2).sum(axis=(1, 2)) / 3.0
-        stamp_s, name = problem.stamp_s[problem.pose_row[voting]], problem.place[voting]
-    else:
-        prepared = prepare(recording)
-        plane, used = prepared.problem, prepared.used
-        pose, _ = dead_reckoned(plane.stamp_s, plane.drive, plane.prior.mean, START)
-        at = sighted_at(pose[plane.pose_row], plane.reading, plane.prior.mean, plane.mount)
-        variance = (SEEN_M + SEEN_SHARE * plane.reading[:, 0]) ** 2
-        stamp_s, name = plane.stamp_s[plane.pose_row], plane.landmark_row
-    wrong, doubled = contradicted(at, variance, stamp_s, name)
+    try:
+        used, read = _read(recording, settings)
+    except DataError:  # too few ids: the estimator says so, if it needs any
+        return recording
+    name, (wrong, doubled) = read.name, contradicted(read)
     left_out = wrong | doubled[name]
     if not left_out.any():
         return recording
@@ -85,23 +78,62 @@ def without_contradicted_ids(recording: AnyRecordingT, settings: SpaceConfig) ->
     return replace(recording, detections=replace(given, landmark_id=landmark_id), warnings=tuple(warnings))
 
 
-def contradicted(
-    at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray
-) -> tuple[BoolArray, BoolArray]:
-    """Return which of M detections those of the seconds around contradict, and which of N names are at two places.
+class Read(NamedTuple):
+    """M detections with an id, in the order of time.
 
-    Args:
+    Attributes:
         at: (M, D) where they are [m], by odometry alone.
         variance: (M,) of each beside that of others.
-        stamp_s: (M,) in ascending order.
+        stamp_s: (M,).
+        view: (M,) what one sensor saw at a time has one number.
         name: (M,) from 0.
     """
+
+    at: FloatArray
+    variance: FloatArray
+    stamp_s: FloatArray
+    view: IntArray
+    name: IntArray
+
+
+def _read(recording: AnyRecording, settings: SpaceConfig) -> tuple[IntArray, Read]:
+    return _in_space(recording, settings) if isinstance(recording, SpatialRecording) else _in_plane(recording)
+
+
+def _in_plane(recording: Recording) -> tuple[IntArray, Read]:
+    """Rows of detections that vote, and what they say."""
+    prepared = prepare(recording)
+    problem = prepared.problem
+    pose, _ = dead_reckoned(problem.stamp_s, problem.drive, problem.prior.mean, START)
+    at = sighted_at(pose[problem.pose_row], problem.reading, problem.prior.mean, problem.mount)
+    variance = (SEEN_M + SEEN_SHARE * problem.reading[:, 0]) ** 2
+    return prepared.used, Read(at, variance, problem.stamp_s[problem.pose_row], problem.pose_row, problem.landmark_row)
+
+
+def _in_space(recording: SpatialRecording, settings: SpaceConfig) -> tuple[IntArray, Read]:
+    """The same in space, with odometry."""
+    if recording.odometry is None:
+        raise DataError(f"{recording.name}: no odometry")
+    intake = prepare_space(recording, settings)
+    problem, boxes = intake.problem, np.isfinite(recording.detections.size_m).all(axis=1)
+    voting = np.flatnonzero(~(boxes | without_range(recording))[intake.used])
+    row, sensor = problem.pose_row[voting], problem.sensor[voting]
+    pose = se3.compose(intake.driven_pose[row], problem.mount[sensor])
+    at = se3.transform(pose, problem.measured[voting, :3])
+    variance = (np.linalg.inv(problem.measured_root[voting]) ** 2).sum(axis=(1, 2)) / 3.0
+    view = row * len(problem.mount) + sensor
+    return intake.used[voting], Read(at, variance, problem.stamp_s[row], view, problem.place[voting])
+
+
+def contradicted(read: Read) -> tuple[BoolArray, BoolArray]:
+    """Return which of M detections those of the seconds around contradict, and which of N names are at two places."""
+    at, variance, stamp_s, view, name = read
     near = np.column_stack([np.searchsorted(stamp_s, stamp_s + sign * VOTE_S) for sign in (-1.0, 1.0)])
     apart = _apart(at, variance, name, near)
     apart = apart[np.isfinite(apart)]
     if len(apart) >= FEWEST_PAIRS:
         variance = variance * np.maximum(np.quantile(apart, 0.25) / FIRST_QUARTILE[at.shape[1]], LEAST_SHARE)
-    own, others = _votes(at, variance, stamp_s, name, near)
+    own, others = _votes(at, variance, view, name, near)
     wrong = (others >= FEWEST_VOTES) & (others > VOTES * own)
     return wrong, _doubles(at, variance, stamp_s, name, ~wrong & (own > 0)) >= FEWEST_DOUBLES
 
@@ -120,11 +152,11 @@ def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray)
 
 @kernel
 def _votes(
-    at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: IntArray, near: IntArray
+    at: FloatArray, variance: FloatArray, view: IntArray, name: IntArray, near: IntArray
 ) -> tuple[IntArray, IntArray]:
     """(M,) detections in rows `near` (M, 2) where each is, with its name, and most with one other name.
 
-    One that is read in the same frame is another landmark, which this one is beside.
+    One that is read in the same view is another landmark, which this one is beside.
     """
     own, others = np.zeros(len(at), dtype=np.int64), np.zeros(len(at), dtype=np.int64)
     count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
@@ -136,7 +168,7 @@ def _votes(
             squared /= variance[j] + variance[k]
             if name[j] == name[k]:
                 own[k] += j != k and squared < 4.0 * VOTE_GATE * VOTE_GATE
-            elif stamp_s[j] == stamp_s[k]:
+            elif view[j] == view[k]:
                 count[name[j]] -= len(at) if squared < 4.0 * VOTE_GATE * VOTE_GATE else 0
             elif squared < VOTE_GATE * VOTE_GATE:
                 count[name[j]] += 1
