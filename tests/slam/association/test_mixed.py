@@ -100,8 +100,7 @@ def test_tags_that_are_not_always_read() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_name_helps_a_robot_that_is_lost(seed: int) -> None:
+def test_a_name_helps_a_robot_that_is_lost() -> None:
     """Odometry so bad that trees alone do not show where the loop closes; one tree in ten has a name."""
     config = ParkConfig(
         n_trees=60,
@@ -113,15 +112,17 @@ def test_a_name_helps_a_robot_that_is_lost(seed: int) -> None:
         speed_noise=0.08,
         steering_noise_rad=0.03,
     )
-    recording = simulate_park(config, seed=seed)
-    off = {}
-    for share in (0.0, 0.1, 1.0):
-        some = with_some_named(recording, share, seed=seed)
-        estimated = run_slam(some, MIXED).trajectory
+    off = np.zeros((2, 3))
+    for seed in range(2):
+        recording = simulate_park(config, seed=seed)
         assert recording.truth is not None
-        off[share] = evaluate_trajectory(estimated, recording.truth, rate_hz=2.0).rmse_m
-    assert off[0.0] > 5.0
-    assert off[0.1] < 1.3 * off[1.0]
+        for k, share in enumerate((0.0, 0.1, 1.0)):
+            some = with_some_named(recording, share, seed=seed)
+            estimated = run_slam(some, MIXED).trajectory
+            off[seed, k] = evaluate_trajectory(estimated, recording.truth, rate_hz=2.0).rmse_m
+    assert off[:, 0].min() > 5.0
+    _, some_named, all_named = np.linalg.norm(off, axis=0)
+    assert some_named < 1.3 * all_named
 
 
 def test_without_any_name_it_is_as_if_ids_were_ignored() -> None:
