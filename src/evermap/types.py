@@ -660,8 +660,9 @@ class SpatialRecording(Shown):
 
 
 AnyRecording = Recording | SpatialRecording
-AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
 """A session in the plane or in space."""
+AnyRecordingT = TypeVar("AnyRecordingT", Recording, SpatialRecording)
+"""What comes back as it was given."""
 
 
 @dataclass(frozen=True, slots=True)

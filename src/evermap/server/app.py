@@ -21,7 +21,6 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse, StreamingResponse
 from pydantic import BaseModel, Field
-from sqlalchemy.exc import InterfaceError, OperationalError
 
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
@@ -31,13 +30,11 @@ from evermap.maps.store.sql import SqlStore
 from evermap.runs import map_dicts
 from evermap.runs.sessions import WORDS, edit_landmarks
 from evermap.runs.summary import change_dict
-from evermap.server.database import Database, Job, JobState, Role
+from evermap.server.database import AWAY, Database, Job, JobState, Role
 from evermap.server.sites import NoSuchSiteError, SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest
 from evermap.types import json_number
 
-_AWAY = (OperationalError, InterfaceError)
-"""What a database that does not answer raises."""
 _EVERY_S = 1.0
 """Between two looks for new revisions."""
 _ALIVE_S = 15.0
@@ -91,7 +88,7 @@ def create_app(server: Server) -> FastAPI:
     app.middleware("http")(_guard)
     app.exception_handler(EvermapError)(_mistake)
     app.exception_handler(RequestValidationError)(_unread)
-    for away in _AWAY:
+    for away in AWAY:
         app.exception_handler(away)(_outage)
     return app
 
@@ -105,7 +102,7 @@ async def _guard(request: Request, answer: Callable[[Request], Awaitable[Respons
     if request.method != "GET":
         who = getattr(request.state, "who", "-")
         what = f"{request.method} {request.url.path} {getattr(request.state, 'said', '')}"
-        with suppress(*_AWAY):  # the answer says so
+        with suppress(*AWAY):  # the answer says so
             await run_in_threadpool(_server(request).database.note, who, what, response.status_code)
     return response
 
@@ -439,7 +436,7 @@ def _since(server: Server, site: str, told: int) -> list[tuple[int, str]]:
     try:
         with server.sites.store(site) as store:
             return _lines(store, told) if store.head() > told else []
-    except (InputError, *_AWAY):
+    except (InputError, *AWAY):
         return []
 
 

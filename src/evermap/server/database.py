@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from pathlib import Path
@@ -40,7 +38,7 @@ from sqlalchemy import (
     select,
     update,
 )
-from sqlalchemy.exc import IntegrityError
+from sqlalchemy.exc import IntegrityError, InterfaceError, OperationalError
 from sqlalchemy.schema import CreateSchema
 
 from evermap.errors import ConfigError, InputError, printable
@@ -52,6 +50,8 @@ from evermap.maps.store.sqlite import engine_of as sqlite_engine
 VERSION = 1
 """Of the tables; there is no older one to bring up to date."""
 SCHEMA = "evermap_server"
+AWAY = (OperationalError, InterfaceError)
+"""What a database that does not answer raises."""
 MOST_TRIES = 10
 """Workers that may die of a session before it is refused: more than chance has at the same one."""
 
@@ -196,16 +196,6 @@ class Database:
         # SQLite has one writer at a time; PostgreSQL locks the rows that are written
         self._writer = self._engine.execution_options(writes=not on_server, shared=True)
 
-    @contextmanager
-    def _reading(self) -> Iterator[Connection]:
-        with self._engine.begin() as connection:
-            yield connection
-
-    @contextmanager
-    def _writing(self) -> Iterator[Connection]:
-        with self._writer.begin() as connection:
-            yield connection
-
     def add_token(self, name: str, role: Role) -> str:
         """Return a new token; only its digest is kept.
 
@@ -215,7 +205,7 @@ class Database:
         text = f"evermap_{secrets.token_urlsafe(32)}"
         row = {"digest": _digest(text), "name": name, "role": role.name.lower(), "created_at": now_utc()}
         try:
-            with self._writing() as connection:
+            with self._writer.begin() as connection:
                 connection.execute(insert(_token).values(row))
         except IntegrityError:
             hint = "another name, or revoke that one first"
@@ -224,18 +214,18 @@ class Database:
 
     def revoke_token(self, name: str) -> bool:
         """Delete a token; returns whether there was one."""
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             return connection.execute(delete(_token).where(_token.c.name == name)).rowcount > 0
 
     def tokens(self) -> list[dict[str, Any]]:
         """Return names and roles of all tokens."""
         question = select(_token.c.name, _token.c.role, _token.c.created_at).order_by(_token.c.name)
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             return [dict(row) for row in connection.execute(question).mappings()]
 
     def who(self, text: str) -> tuple[str, Role] | None:
         """Return the name and role of a token; None of one that is not known."""
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             row = connection.execute(
                 select(_token.c.name, _token.c.role).where(_token.c.digest == _digest(text))
             ).one_or_none()
@@ -246,7 +236,7 @@ class Database:
         now = now_utc()
         told = {"site": site, "digest": digest, "n_bytes": len(data), "robot": robot, "state": JobState.QUEUED.value}
         try:
-            with self._writing() as connection:
+            with self._writer.begin() as connection:
                 known = self._known(connection, site, digest)
                 if known is not None:
                     return known, False
@@ -255,7 +245,7 @@ class Database:
                 connection.execute(insert(_payload).values(job=job.id, data=data))
                 return job, True
         except IntegrityError:  # sent twice at the same time
-            with self._reading() as connection:
+            with self._engine.begin() as connection:
                 known = self._known(connection, site, digest)
             assert known is not None
             return known, False
@@ -273,7 +263,7 @@ class Database:
         lapsed = and_(_job.c.state == JobState.WORKING.value, _job.c.lease_s < now)
         waiting = or_(_job.c.state == JobState.QUEUED.value, lapsed, _grown())
         oldest = select(*_SHOWN).where(waiting, not_(busy)).order_by(_job.c.id).limit(1)
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             row = connection.execute(oldest.with_for_update(skip_locked=True, of=_job)).one_or_none()
             if row is None:
                 return None
@@ -285,7 +275,7 @@ class Database:
 
     def renew(self, job: int, worker: str, lease_s: float) -> None:
         """Keep a session for another while."""
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             connection.execute(update(_job).where(_mine(job, worker)).values(lease_s=time.time() + lease_s))
 
     def finish(self, job: int, worker: str, state: JobState, reason: str = "", revision: int | None = None) -> None:
@@ -300,7 +290,7 @@ class Database:
             values["tries"] = _job.c.tries - 1
         if state is JobState.ASIDE:
             values["tries"] = 0
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             mine = update(_job).where(_mine(job, worker)).values(**values, lease_s=0.0, changed_at=now_utc())
             if connection.execute(mine).rowcount and state is JobState.ENTERED:  # the map keeps the recording
                 connection.execute(delete(_payload).where(_payload.c.job == job))
@@ -309,7 +299,7 @@ class Database:
         """Queue a session once more that was refused or set aside; returns whether it was one."""
         refused = and_(_job.c.id == job, _job.c.state.in_([JobState.REJECTED.value, JobState.ASIDE.value]))
         values = {"state": JobState.QUEUED.value, "reason": "", "tries": 0, "changed_at": now_utc()}
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             return connection.execute(update(_job).where(refused).values(values)).rowcount > 0
 
     def jobs(self, site: str | None = None, state: JobState | None = None, most: int = 100) -> list[Job]:
@@ -317,49 +307,49 @@ class Database:
         question = select(*_SHOWN).order_by(_job.c.id.desc()).limit(most)
         question = question if site is None else question.where(_job.c.site == site)
         question = question if state is None else question.where(_job.c.state == state.value)
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             return [_job_of(row) for row in connection.execute(question)]
 
     def job(self, number: int) -> Job | None:
         """Return one session that was uploaded; None of an unknown number."""
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             row = connection.execute(select(*_SHOWN).where(_job.c.id == number)).one_or_none()
         return None if row is None else _job_of(row)
 
     def payload(self, job: int) -> bytes | None:
         """Return the bytes of a session that is not entered; None where they are not kept."""
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             return connection.execute(select(_payload.c.data).where(_payload.c.job == job)).scalar()
 
     def approve(self, site: str, revision: int, who: str) -> None:
         """Make a revision the one that robots are to use."""
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             connection.execute(insert(_approval).values(site=site, revision=revision, who=who, at=now_utc()))
 
     def approved(self, site: str) -> dict[str, Any] | None:
         """Return the revision that was approved last, by whom and when; None where none was."""
         question = select(_approval.c.revision, _approval.c.who, _approval.c.at).where(_approval.c.site == site)
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             row = connection.execute(question.order_by(_approval.c.id.desc()).limit(1)).mappings().one_or_none()
         return None if row is None else dict(row)
 
     def note(self, who: str, what: str, status: int) -> None:
         """Note who asked for a change, and what came of it."""
-        with self._writing() as connection:
+        with self._writer.begin() as connection:
             row = {"at": now_utc(), "who": who, "what": printable(what, 500), "status": status}
             connection.execute(insert(_audit).values(row))
 
     def audit(self, most: int = 100) -> list[dict[str, Any]]:
         """Return the newest notes."""
         question = select(_audit.c.at, _audit.c.who, _audit.c.what, _audit.c.status)
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             rows = connection.execute(question.order_by(_audit.c.id.desc()).limit(most)).mappings()
             return [dict(row) for row in rows]
 
     def depth(self) -> int:
         """Return how many sessions wait or are worked on; proves that the database answers."""
         waiting = or_(_job.c.state.in_([JobState.QUEUED.value, JobState.WORKING.value]), _grown())
-        with self._reading() as connection:
+        with self._engine.begin() as connection:
             return connection.execute(select(func.count()).select_from(_job).where(waiting)).scalar_one()
 
     def close(self) -> None:

@@ -11,13 +11,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from sqlalchemy.exc import InterfaceError, OperationalError
-
 from evermap.config import Config
 from evermap.errors import EvermapError
 from evermap.maps.store import StaleRevisionError, StoreUnavailableError
 from evermap.runs.sessions import TwiceError, UnbridgedError, enter_session
-from evermap.server.database import MOST_TRIES, Database, Job, JobState
+from evermap.server.database import AWAY, MOST_TRIES, Database, Job, JobState
 from evermap.server.sites import SiteStores
 from evermap.server.uploads import recording_of
 
@@ -67,7 +65,7 @@ class Worker:
                 job = self.step(told)
                 if job is None and drain and not self._database.depth():
                     return
-            except (OperationalError, InterfaceError, StoreUnavailableError):  # a database that restarts
+            except (*AWAY, StoreUnavailableError):  # a database that restarts
                 time.sleep(_OUTAGE_S)
                 continue
             if job is None:
@@ -127,7 +125,7 @@ class Worker:
             while not done.wait(self._lease_s / 3.0):
                 try:
                     self._database.renew(job.id, self.name, self._lease_s)
-                except (OperationalError, InterfaceError):  # it may be back the next time
+                except AWAY:  # it may be back the next time
                     continue
 
         thread = threading.Thread(target=renew, daemon=True)

@@ -139,13 +139,22 @@ def contradicted(read: Read) -> tuple[BoolArray, BoolArray]:
 
 
 @kernel
+def _squared(at: FloatArray, variance: FloatArray, j: int, k: int) -> float:
+    """Normalised squared distance of two detections."""
+    squared = 0.0
+    for axis in range(at.shape[1]):
+        squared += (at[j, axis] - at[k, axis]) ** 2
+    return float(squared / (variance[j] + variance[k]))
+
+
+@kernel
 def _apart(at: FloatArray, variance: FloatArray, name: IntArray, near: IntArray) -> FloatArray:
     """(M,) normalised squared distance of the last detection with the same name in rows `near` (M, 2)."""
     found = np.full(len(at), np.nan)
     for k in range(len(at)):
         for j in range(near[k, 1] - 1, k, -1):
             if name[j] == name[k]:
-                found[k] = ((at[j] - at[k]) ** 2).sum() / (variance[j] + variance[k])
+                found[k] = _squared(at, variance, j, k)
                 break
     return found
 
@@ -162,10 +171,7 @@ def _votes(
     count = np.zeros(name.max() + 1 if len(name) else 0, dtype=np.int64)
     for k in range(len(at)):
         for j in range(near[k, 0], near[k, 1]):
-            squared = 0.0
-            for axis in range(at.shape[1]):
-                squared += (at[j, axis] - at[k, axis]) ** 2
-            squared /= variance[j] + variance[k]
+            squared = _squared(at, variance, j, k)
             if name[j] == name[k]:
                 own[k] += j != k and squared < 4.0 * VOTE_GATE * VOTE_GATE
             elif view[j] == view[k]:
@@ -174,7 +180,6 @@ def _votes(
                 count[name[j]] += 1
         for j in range(near[k, 0], near[k, 1]):
             others[k] = max(others[k], count[name[j]])
-        for j in range(near[k, 0], near[k, 1]):
             count[name[j]] = 0
     return own, others
 
@@ -187,7 +192,6 @@ def _doubles(at: FloatArray, variance: FloatArray, stamp_s: FloatArray, name: In
         j = k + 1
         while j < len(at) and stamp_s[j] == stamp_s[k]:
             if name[j] == name[k] and sure[j] and sure[k]:
-                squared = ((at[j] - at[k]) ** 2).sum() / (variance[j] + variance[k])
-                count[name[k]] += squared > 4.0 * VOTE_GATE * VOTE_GATE
+                count[name[k]] += _squared(at, variance, j, k) > 4.0 * VOTE_GATE * VOTE_GATE
             j += 1
     return count
