@@ -217,6 +217,41 @@ def test_a_session_is_uploaded_entered_and_asked_about(fleet: Fleet, zips: list[
     assert (fresh.sha256, f'"{fresh.tag}"') == (file.headers["X-Checksum-Sha256"], file.headers["ETag"])
 
 
+def test_an_answer_is_sent_again_only_once_the_map_is_newer(fleet: Fleet, zips: list[bytes]) -> None:
+    fleet.upload(zips[0])
+    fleet.worker().step()
+    first = fleet("GET", "/maps/ward/landmarks")
+    known = {"Authorization": f"Bearer {fleet.tokens['read']}", "If-None-Match": first.headers["ETag"]}
+    for path in ("landmarks", "changes", "revisions", "lifetimes", "landmarks/1/why", "diff"):
+        assert fleet.client.get(f"/maps/ward/{path}", headers=known).status_code == 304, path
+    assert fleet("GET", "/maps/ward/landmarks").json() == first.json()
+    fleet("POST", "/maps/ward/pin", json={"landmarks": ["1"]})
+    newer = fleet.client.get("/maps/ward/landmarks", headers=known)
+    assert (newer.status_code, newer.json()["revision"]) == (200, 2)
+    assert fleet.client.get("/maps/ward/landmarks", headers={**known, "Authorization": ""}).status_code == 401
+
+
+@pytest.mark.parametrize("where", ["postgresql"], indirect=True)
+def test_connections_that_the_database_closed_are_opened_again(fleet: Fleet, where: str) -> None:
+    import psycopg
+
+    fleet("GET", "/maps")
+    with psycopg.connect(where, autocommit=True) as connection:
+        connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+            "WHERE datname = current_database() AND pid != pg_backend_pid()"
+        )
+    assert fleet("GET", "/maps").status_code == 503  # it was in use a moment ago, and nobody asked whether it still is
+    assert fleet("GET", "/maps").status_code == 200
+    with psycopg.connect(where, autocommit=True) as connection:
+        connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity "
+            "WHERE datname = current_database() AND pid != pg_backend_pid()"
+        )
+    time.sleep(1.1)
+    assert fleet("GET", "/maps").status_code == 200
+
+
 def test_an_operator_edits_reverts_and_approves(fleet: Fleet, zips: list[bytes]) -> None:
     fleet.upload(zips[0])
     fleet.worker().step()

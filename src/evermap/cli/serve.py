@@ -76,20 +76,21 @@ def serve(
             raise ConfigError("no such file", path=path, field="tls-cert", hint="files in PEM format")
     database = _database(store)
     uvicorn = _uvicorn()
-    from evermap.server.app import Server, create_app
+    from evermap.server.app import Server, create_app, prepare
     from evermap.server.database import Role
     from evermap.server.sites import SiteStores
 
     if not database.tokens():
         typer.echo(database.add_token("admin", Role.ADMIN))
         say("this token of an administrator is shown once; more of them: evermap serve token NAME --role ROLE")
-    application = create_app(Server(database, SiteStores(store)))
+    server = Server(database, SiteStores(store))
+    prepare(server)
     scheme = "http" if certificate is None else "https"
     say(f"serving {scheme}://{host}:{port}; Ctrl-C ends it")
     tls = {} if certificate is None else {"ssl_certfile": str(certificate), "ssl_keyfile": str(key)}
     with _working(store, workers):
         uvicorn.run(
-            application,
+            create_app(server),
             host=host,
             port=port,
             log_level="warning",
@@ -166,6 +167,8 @@ def work(
       evermap work --store maps --drain
       evermap work --store postgresql://evermap@db/fleet --set living.search=gate
     """
+    with suppress(OSError):
+        os.nice(10)  # who asks the server goes first, also while this one loads its code
     chosen = configured(config, settings)
     database = _database(store)
     from evermap.server.sites import SiteStores
@@ -181,8 +184,6 @@ def work(
             + (f" ({outcome.reason})" if outcome.reason else "")
         )
 
-    with suppress(OSError):
-        os.nice(10)  # who asks the server goes first
     warm_up()
     Worker(database, SiteStores(store), chosen, lease_s).run(told, drain=drain)
 

@@ -36,12 +36,12 @@ def revision_dict(item: Revision) -> dict[str, Any]:
     }
 
 
-def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any]]:
+def landmark_dicts(living: LivingMap, p_ahead: FloatArray | None = None) -> list[dict[str, Any]]:
     """Return every landmark at its most probable place.
 
     Args:
         living: the map.
-        p_ahead: (L,) probability that each stands there at the time that was asked for.
+        p_ahead: (L,) probability that each stands there at the time that was asked for; None for the map's own.
     """
     import numpy as np
 
@@ -51,6 +51,7 @@ def landmark_dicts(living: LivingMap, p_ahead: FloatArray) -> list[dict[str, Any
     members, site = living.members, living.site_of()
     place = living.place_row(members.landmark_id, site)
     p_exists = living.p_exists()
+    p_ahead = p_exists if p_ahead is None else p_ahead
     at = np.searchsorted(living.sites.site_id, site)
     own = blocks(living.covariance_m2, living.dim)
     cliques, row_of_site = clique_rows(living.sites)

@@ -24,16 +24,19 @@ from pydantic import BaseModel, Field
 
 from evermap import __version__
 from evermap.errors import EvermapError, InputError, printable
+from evermap.maps.diff import diff as between
+from evermap.maps.living import LivingMap
 from evermap.maps.store import DamagedMapError, Provenance, StaleRevisionError, StoreUnavailableError
 from evermap.maps.store.postgres import SITE
 from evermap.maps.store.sql import SqlStore
+from evermap.maps.why import why as of_landmark
 from evermap.runs import map_dicts
 from evermap.runs.sessions import WORDS, edit_landmarks
 from evermap.runs.summary import change_dict
 from evermap.server.database import AWAY, Database, Job, JobState, Role
 from evermap.server.sites import NoSuchSiteError, SiteStores
 from evermap.server.uploads import UploadLimits, checked_digest
-from evermap.types import json_number
+from evermap.types import Landmarks, json_number
 
 _EVERY_S = 1.0
 """Between two looks for new revisions."""
@@ -41,6 +44,8 @@ _ALIVE_S = 15.0
 """Between two lines that keep a connection open."""
 _RATE_HZ, _BURST = 50.0, 200.0
 """Requests of one token, over time and at once."""
+_WARM = 16
+"""Maps that are read before the first request."""
 _POLICY = "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; frame-ancestors 'none'"
 _PAGE = {"": "text/html", "page.js": "text/javascript", "page.css": "text/css"}
 
@@ -69,6 +74,17 @@ class Server:
         left = min(_BURST, left + (now - since) * self.rate_hz)
         self._budget[who] = (max(left - 1.0, 0.0), now)
         return left >= 1.0
+
+
+def prepare(server: Server) -> None:
+    """Load the code that reading takes, and some of the maps, so that nobody who asks waits for that."""
+    row, number = np.zeros(1), np.zeros(1, dtype=np.int64)
+    one = Landmarks(number, np.zeros((1, 2)), np.zeros((1, 2, 2)), number, row + 1.0, number, number, row, row)
+    living = LivingMap.begun(one).from_now_on(0.0)
+    map_dicts.landmark_dicts(living, living.p_exists(0.0))
+    for site in server.sites.names()[:_WARM]:
+        with suppress(EvermapError), server.sites.store(site) as store:
+            server.sites.living(store)
 
 
 class PlainJSON(JSONResponse):
@@ -132,6 +148,21 @@ async def _outage(_: Request, __: Exception) -> Response:
     return PlainJSON({"detail": "the database does not answer"}, 503, {"Retry-After": "5"})
 
 
+def _told(request: Request, site: str, make: Callable[[SqlStore], Any]) -> Response:
+    """What follows from a map alone, and stays as it is until there is a newer revision."""
+    asked = f"{request.url.path}?{request.url.query}"
+    tag, found = _server(request).sites.answer(site, asked, lambda store: bytes(PlainJSON(make(store)).body))
+    return _tagged(request, found, tag, "application/json")
+
+
+def _tagged(request: Request, data: bytes, tag: str, media_type: str, **headers: str) -> Response:
+    """An answer with its ETag, or that the one who asks has it."""
+    told = {"ETag": f'"{tag}"', **headers}
+    if told["ETag"] in request.headers.get("if-none-match", ""):
+        return Response(status_code=304, headers=told)
+    return Response(data, media_type=media_type, headers=told)
+
+
 def _server(request: Request) -> Server:
     server = request.app.state.server
     assert isinstance(server, Server)
@@ -158,7 +189,12 @@ def _may(role: Role) -> Any:
     return Depends(check)
 
 
-Answering = Annotated[Server, Depends(_server)]
+async def _answering(request: Request) -> Server:
+    """As it waits for nothing, it needs no thread."""
+    return _server(request)
+
+
+Answering = Annotated[Server, Depends(_answering)]
 Reader = Annotated[str, _may(Role.READ)]
 Uploader = Annotated[str, _may(Role.UPLOAD)]
 Approver = Annotated[str, _may(Role.APPROVE)]
@@ -265,27 +301,26 @@ def _job(server: Server, number: int) -> Job:
 
 
 @router.get("/maps/{site}/revisions")
-def list_revisions(site: str, server: Answering, _: Reader) -> list[dict[str, Any]]:
+def list_revisions(request: Request, site: str, _: Reader) -> Response:
     """List the revisions, the oldest first."""
-    with server.sites.store(site) as store:
-        return [map_dicts.revision_dict(item) for item in store.log()]
+    return _told(request, site, lambda store: [map_dicts.revision_dict(item) for item in store.log()])
 
 
 @router.get("/maps/{site}/diff")
-def diff(site: str, server: Answering, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> dict[str, Any]:
+def diff(request: Request, site: str, _: Reader, a: AtRevision = 0, b: AtRevision = None) -> Response:
     """Tell what changed between two revisions."""
-    from evermap.maps.diff import diff as between
-
-    with server.sites.store(site) as store:
-        return map_dicts.diff_dict(between(store, a or 0, b))
+    return _told(request, site, lambda store: map_dicts.diff_dict(between(store, a or 0, b)))
 
 
 @router.get("/maps/{site}/changes")
-def changes(site: str, server: Answering, _: Reader, since: AtRevision = 0) -> list[dict[str, Any]]:
+def changes(request: Request, site: str, _: Reader, since: AtRevision = 0) -> Response:
     """List the changes that revisions after `since` told, one by one."""
-    with server.sites.store(site) as store:
-        numbers = [number for number in store.lineage() if number > (since or 0)]
-        return [{"revision": number, **change_dict(change)} for number in numbers for change in store.changes(number)]
+
+    def listed(store: SqlStore) -> list[dict[str, Any]]:
+        line = {number for number in store.lineage() if number > (since or 0)}
+        return [{"revision": number, **change_dict(change)} for number, change in store.changes_of() if number in line]
+
+    return _told(request, site, listed)
 
 
 class LandmarkQuery(BaseModel):
@@ -307,39 +342,43 @@ class LandmarkQuery(BaseModel):
 
 
 @router.get("/maps/{site}/landmarks")
-def landmarks(site: str, server: Answering, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> dict[str, Any]:
+def landmarks(request: Request, site: str, _: Reader, asked: Annotated[LandmarkQuery, Query()]) -> Response:
     """List landmarks within a region; `p_ahead` is the probability that each is there at `at_s`."""
-    number, living = server.sites.living(site, asked.revision)
-    found = map_dicts.landmark_dicts(living, living.p_exists(living.stamp_s if asked.at_s is None else asked.at_s))
-    return {
-        "site": site,
-        "revision": number,
-        "stamp_s": json_number(living.stamp_s),
-        "clock": living.clock.value,
-        "landmarks": [item for item in found if asked.holds(item)],
-    }
+
+    def listed(store: SqlStore) -> dict[str, Any]:
+        number, living = _server(request).sites.living(store, asked.revision)
+        found = map_dicts.landmark_dicts(living, None if asked.at_s is None else living.p_exists(asked.at_s))
+        return {
+            "site": site,
+            "revision": number,
+            "stamp_s": json_number(living.stamp_s),
+            "clock": living.clock.value,
+            "landmarks": [item for item in found if asked.holds(item)],
+        }
+
+    return _told(request, site, listed)
 
 
 @router.get("/maps/{site}/landmarks/{landmark}/why")
-def why(site: str, landmark: str, server: Answering, _: Reader, revision: AtRevision = None) -> dict[str, Any]:
+def why(request: Request, site: str, landmark: str, _: Reader, revision: AtRevision = None) -> Response:
     """Tell why a landmark is believed to be there, or gone."""
-    from evermap.maps.why import why as of_landmark
-
-    with server.sites.store(site) as store:
-        return map_dicts.answer_dict(of_landmark(store, landmark, revision))
+    return _told(request, site, lambda store: map_dicts.answer_dict(of_landmark(store, landmark, revision)))
 
 
 @router.get("/maps/{site}/lifetimes")
-def lifetimes(site: str, server: Answering, _: Reader, revision: AtRevision = None) -> dict[str, Any]:
+def lifetimes(request: Request, site: str, _: Reader, revision: AtRevision = None) -> Response:
     """Tell how long things stay, by class and place."""
-    living = server.sites.living(site, revision)[1]
-    return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
+
+    def told(store: SqlStore) -> dict[str, Any]:
+        living = _server(request).sites.living(store, revision)[1]
+        return {"priors": map_dicts.prior_dicts(living), "lifetimes": map_dicts.life_dicts(living)}
+
+    return _told(request, site, told)
 
 
 @router.get("/maps/{site}/file")
 def map_file(
-    site: str, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
-    if_none_match: Annotated[str, Header()] = "",
+    request: Request, site: str, server: Answering, _: Reader, revision: AtRevision = None, approved: bool = False,
 ) -> Response:  # fmt: skip
     """Return the map as one file, of a revision, of the approved one, or of the newest."""
     if approved:
@@ -348,11 +387,8 @@ def map_file(
             raise HTTPException(404, "no revision of it is approved")
         revision = chosen["revision"]
     found = server.sites.file(site, revision)
-    told = {"ETag": f'"{found.tag}"', "X-Checksum-Sha256": found.sha256}
-    if f'"{found.tag}"' in if_none_match:
-        return Response(status_code=304, headers=told)
-    told["Content-Disposition"] = f'attachment; filename="{site}.evermap"'
-    return Response(found.data, media_type="application/vnd.sqlite3", headers=told)
+    told = {"X-Checksum-Sha256": found.sha256, "Content-Disposition": f'attachment; filename="{site}.evermap"'}
+    return _tagged(request, found.data, found.tag, "application/vnd.sqlite3", **told)
 
 
 @router.post("/maps/{site}/approve")

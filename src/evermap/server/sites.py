@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,9 @@ _Kept = TypeVar("_Kept")
 
 ENDING = ".evermap"
 _MOST_OPEN = 200
-_MOST_FILES, _MOST_MAPS = 8, 16
+_MOST_FILES, _MOST_MAPS, _MOST_ANSWERS = 8, 16, 500
+_LONGEST_ANSWER = 500_000
+"""Bytes of an answer that is kept."""
 
 
 class NoSuchSiteError(InputError):
@@ -56,6 +58,7 @@ class SiteStores:
         self._open: dict[str, list[SqlStore]] = {}
         self._files: dict[tuple[str, str], MapFile] = {}
         self._maps: dict[tuple[str, str], LivingMap] = {}
+        self._answers: dict[tuple[str, str], tuple[str, bytes]] = {}
         self._lock = threading.Lock()
 
     def address(self, site: str) -> str:
@@ -104,8 +107,7 @@ class SiteStores:
             InputError: there is no such map or revision.
         """
         with self.store(site) as store:
-            number = store.head() if revision is None else revision
-            tag = store.name_of(number)
+            number, tag = store.named(revision)
             found = self._files.get((site, tag))
             if found is None:
                 with tempfile.TemporaryDirectory(prefix="evermap-file-") as folder:
@@ -116,20 +118,39 @@ class SiteStores:
                 self._keep(self._files, (site, tag), found, _MOST_FILES)
         return found
 
-    def living(self, site: str, revision: int | None = None) -> tuple[int, LivingMap]:
+    def living(self, store: SqlStore, revision: int | None = None) -> tuple[int, LivingMap]:
         """Return a revision's number and its map; the last few are kept.
 
         Raises:
-            InputError: there is no such map or revision.
+            InputError: there is no such revision.
+        """
+        number, tag = store.named(revision)
+        found = self._maps.get((store.where, tag))
+        if found is None:
+            found = store.load(number)
+            self._keep(self._maps, (store.where, tag), found, _MOST_MAPS)
+        return number, found
+
+    def answer(self, site: str, asked: str, make: Callable[[SqlStore], bytes]) -> tuple[str, bytes]:
+        """Return the newest revision's name and what was asked of the map; kept until there is a newer one.
+
+        Args:
+            site: its name.
+            asked: the question; equal ones have equal answers as long as the revision is the newest.
+            make: works it out.
+
+        Raises:
+            InputError: there is no such map.
         """
         with self.store(site) as store:
-            number = store.head() if revision is None else revision
-            key = (site, store.name_of(number))
-            found = self._maps.get(key)
-            if found is None:
-                found = store.load(number)
-                self._keep(self._maps, key, found, _MOST_MAPS)
-        return number, found
+            tag = store.named()[1]
+            kept = self._answers.get((site, asked))
+            if kept is not None and kept[0] == tag:
+                return kept
+            found = make(store)
+        if len(found) <= _LONGEST_ANSWER:
+            self._keep(self._answers, (site, asked), (tag, found), _MOST_ANSWERS)
+        return tag, found
 
     def _keep(self, kept: dict[tuple[str, str], _Kept], key: tuple[str, str], value: _Kept, most: int) -> None:
         """Keep a value, and forget the oldest of too many."""

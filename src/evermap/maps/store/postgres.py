@@ -9,11 +9,15 @@ version and its checksum are in each site's own row, which alembic's one table f
 from __future__ import annotations
 
 import functools
+import math
 import re
+import time
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.engine.interfaces import DBAPIConnection
+from sqlalchemy.exc import ArgumentError, DisconnectionError, NoSuchModuleError
+from sqlalchemy.pool import ConnectionPoolEntry
 
 from evermap.errors import ConfigError, InputError, MissingExtraError
 from evermap.maps.store.protocol import DamagedMapError
@@ -86,7 +90,8 @@ def engine_of(database: str, schema: str) -> Engine:
 def _engine(database: str) -> Engine:
     url = make_url(database)
     try:
-        engine = create_engine(url.set(drivername="postgresql+psycopg"), pool_pre_ping=True)
+        # the driver begins nothing by itself: a transaction begins below, with all that belongs to it, in one message
+        engine = create_engine(url.set(drivername="postgresql+psycopg"), isolation_level="AUTOCOMMIT")
     except (ImportError, NoSuchModuleError):
         problem = "PostgreSQL needs the package psycopg, which is not installed"
         raise MissingExtraError(problem, hint="pip install 'evermap[server]'") from None
@@ -95,14 +100,29 @@ def _engine(database: str) -> Engine:
     def _begin(connection: Connection) -> None:
         options = connection.get_execution_options()
         name, writes, shared = options["schema"], options.get("writes", False), options.get("shared", False)
-        if not (writes or shared):
-            connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY")
+        how = "" if writes or shared else " ISOLATION LEVEL REPEATABLE READ READ ONLY"
         # for this transaction only, so that a pool of connections in front of the database may share them
-        connection.exec_driver_sql("SELECT set_config('search_path', %s, true)", (f'"{name}"',))
+        quoted = engine.dialect.identifier_preparer.quote_identifier(name)
+        connection.exec_driver_sql(f"BEGIN{how}; SET LOCAL search_path TO {quoted}")
         if writes:
             connection.exec_driver_sql("SELECT pg_advisory_xact_lock(hashtextextended(%s, 0))", (name,))
+
+    @event.listens_for(engine, "checkin")
+    def _rests(_: object, record: ConnectionPoolEntry) -> None:
+        record.info["since_s"] = time.monotonic()
+
+    @event.listens_for(engine, "checkout")
+    def _wakes(raw: DBAPIConnection, record: ConnectionPoolEntry, _: object) -> None:
+        """One that has rested for a while may be broken: then the pool takes another."""
+        if time.monotonic() - record.info.get("since_s", math.inf) > _FRESH_S:
+            try:
+                engine.dialect.do_ping(raw)
+            except engine.dialect.loaded_dbapi.Error:
+                raise DisconnectionError from None
 
     return engine
 
 
+_FRESH_S = 1.0
+"""A connection that was used so recently is taken to be whole."""
 _FORM = "postgresql://user@host:5432/database/SITE"

@@ -228,8 +228,8 @@ class MapStore(Protocol):
         """Return what was committed as the changes of one revision."""
         ...
 
-    def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
-        """Return all changes that a landmark had a part in, each with the revision that told it, in order."""
+    def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
+        """Return all changes that a landmark (None for any) had a part in, each with its revision, in order."""
         ...
 
     def evidence(

@@ -315,12 +315,12 @@ class SqlStore(Shown):
             number = self._known(connection, revision)
             return self._record(connection, number).changes if number else ()
 
-    def changes_of(self, landmark_id: int) -> tuple[tuple[int, MapChange], ...]:
-        """Return changes of a landmark."""
+    def changes_of(self, landmark_id: int | None = None) -> tuple[tuple[int, MapChange], ...]:
+        """Return changes of a landmark, or of all."""
         with self._reading() as connection:
             records = self._chain(connection)[0]
         told = ((number, change) for number, record in sorted(records.items()) for change in record.changes)
-        return tuple((number, change) for number, change in told if landmark_id in change.landmark_ids)
+        return tuple((number, change) for number, change in told if landmark_id in (None, *change.landmark_ids))
 
     def evidence(
         self,
@@ -362,12 +362,14 @@ class SqlStore(Shown):
             name = content.name_of(attachment.digest)
             return Chunk.of_stored(name, "|u1", self._fetched(connection, [name])[name]).raw
 
-    def name_of(self, revision: int) -> str:
-        """Return the name of a revision's record, a checksum over it and all revisions before it."""
+    def named(self, revision: int | None = None) -> tuple[int, str]:
+        """Return a revision's number (None for the newest) and its name, a checksum of it and all before it."""
         with self._reading() as connection:
-            table, number = schema.revision.c, self._known(connection, revision)
-            name = connection.execute(select(table.record).where(table.number == number)).scalar()
-            return name.hex() if isinstance(name, bytes) else ""
+            number, name = self._anchor(connection)
+            if revision is not None:
+                number, table = self._known(connection, revision), schema.revision.c
+                name = connection.execute(select(table.record).where(table.number == number)).scalar()
+            return number, name.hex() if isinstance(name, bytes) else ""
 
     def rows(self) -> list[list[Any]]:
         """Return all rows of all tables, as they are stored."""
@@ -487,13 +489,13 @@ class SqlStore(Shown):
 
     def _anchor(self, connection: Connection) -> tuple[int, bytes | None]:
         """The newest revision, and the name of its record: of these all others are checked."""
-        rows = connection.execute(select(schema.store)).all()
+        listed = select(func.max(schema.revision.c.number)).scalar_subquery()
+        rows = connection.execute(select(schema.store, listed)).all()
         if len(rows) != 1:
             raise DamagedError(f"{len(rows)} rows say which revision is the newest")
-        values = tuple(rows[0])
+        *values, newest = rows[0]
         if not is_anchor(values):
             raise DamagedError("a checksum does not match: of the row that names the newest revision")
-        newest = connection.execute(select(func.max(schema.revision.c.number))).scalar()
         if (newest or 0) != values[3]:
             raise DamagedError(f"the newest revision is {values[3]}, but the last one listed is {newest}")
         return values[3], values[4]
